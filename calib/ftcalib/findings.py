@@ -318,8 +318,6 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "tool_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor and its tool are turned by {turn_deg:.2g}",
-        "fasten the screws between flange and sensor and calibrate again"),
     "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings are those of another sensor, turned by "
         "{turn_deg:.2g}, whose bias differs by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
     "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned by {turn_deg:.2g}, whose "
@@ -499,8 +497,8 @@ _EXPLAINS: Final[Sequence[tuple[frozenset[str], frozenset[str]]]] = (
         frozenset((
             "other_recording", "constant_force", "wrench_in_base", "orientations_inverted", "quaternion_order",
             "euler_angles", "columns_swapped", "pairing_shifted", "zeroed_each_pose", "pairing_or_rotations",
-            "axes_disagree", "com_shifted", "load_changed", "bias_stepped", "sensor_turned", "tool_turned",
-            "sensor_changed", "sensors_alternate",
+            "axes_disagree", "com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed",
+            "sensors_alternate",
         )),
         _OF_MISTAKES,
     ),

@@ -5,11 +5,16 @@ alone. Their size is what the fit found, else what its poses and its residuals l
 cable are smooth over the orientations: two poses near each other have nearly the same.
 """
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
+
+if TYPE_CHECKING:
+    from ftcalib.after.state import Calibrated
 
 # A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
 GAIN, CROSS = 0.02, 0.01
@@ -25,13 +30,13 @@ TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
 _CORRELATED = 0.5
 
 
-def known_response(calibration: CalibrationResult) -> Response:
+def known_response(calibration: "Calibrated") -> Response | None:
     """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
 
-    A fit of n poses shows a gain as well as n readings of the weight do, with the error of predicting one from the
-    others. Half of that counts: a small one is not found.
+    None for an update of a calibration that has none. A fit of n poses shows a gain as well as n readings of the weight
+    do, with the error of predicting one from the others. Half of that counts: a small one is not found.
     """
-    if calibration.response is not None:
+    if calibration.response is not None or not isinstance(calibration, CalibrationResult):
         return calibration.response
     quality, n = calibration.quality, calibration.n_poses - len(calibration.rejected_poses)
     left_out: list[float] = [quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
@@ -44,7 +49,7 @@ def known_response(calibration: CalibrationResult) -> Response:
     return Response(np.zeros(SIZE), covariance)
 
 
-def sensor_error_columns(calibration: CalibrationResult, p: Parameters, R_base_flange: Array) -> Array:
+def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_base_flange: Array) -> Array:
     """Give what errors of the sensor do to the reading of a load, for one sigma of each, beyond those of the tool.
 
     The response to the tool is that to any load at its centre of mass. A load at another has a torque beside, to which
@@ -52,30 +57,31 @@ def sensor_error_columns(calibration: CalibrationResult, p: Parameters, R_base_f
 
     Parameters
     ----------
-    calibration : CalibrationResult
-        Of the tool.
+    tool : Parameters
+        Of the calibration.
+    known : Response
+        To the tool, as of `known_response`.
     p : Parameters
         Of the load.
     R_base_flange : array, shape (n, 3, 3)
 
     Returns
     -------
-    array, shape (n, 6, k)
-        Independent columns.
+    array, shape (n, 6, 38)
+        Independent columns, the errors of `known` not among them.
     """
-    known, variance = calibration.response, np.diag(known_response(calibration).covariance)[15:]
-    square = variance if known is None else known.coefficients**2 + variance
+    square = known.coefficients**2 + np.diag(known.covariance)[15:]
     in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / PRIOR**2, [5]))
-    u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - calibration.p_sensor_com_m)
+    u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - tool.p_sensor_com_m)
     entries = np.where(np.eye(3) > 0, GAIN, CROSS)
     columns = np.zeros((len(u), 6, 27))
     columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * CROSS / LEVER_M))
     columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
     columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
     # A gain of one load is that of another but for what depends on the load.
-    other = p.weight_N / calibration.weight_N - 1 if calibration.weight_N else 0.0
-    unknown = np.minimum(square, LOAD**2) * min(abs(other), 1.0) ** 2 + (variance if known is None else 0.0)
-    return np.concatenate([columns, response_columns(p, R_base_flange) * np.sqrt(unknown)], axis=2)
+    other = min(abs(p.weight_N / tool.weight_N - 1), 1.0) if tool.weight_N else 1.0
+    loads = response_columns(p, R_base_flange) * np.minimum(np.sqrt(square), LOAD) * other
+    return np.concatenate([columns, loads], axis=2)
 
 
 def _products(A: Array, v: Array, sigma: Array) -> Array:

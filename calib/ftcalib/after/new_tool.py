@@ -20,7 +20,14 @@ from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import LEVER_M, Response, joint_covariance, joint_jacobian
+from ftcalib.likelihood.response import (
+    LEVER_M,
+    SIZE,
+    Response,
+    joint_covariance,
+    joint_jacobian,
+    response_columns,
+)
 from ftcalib.model import (
     BIASES,
     PARAMETER_NAMES,
@@ -199,10 +206,13 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
     """Fit all parameters; `kept` as of `CellPrior.rows`."""
     n, k = len(wrench), len(prior.coefficients)
     new, coefficients = _start(prior.earlier.parameters, R_base_flange, wrench), prior.coefficients
-    unseen: Array | None = None
+    seen = known_response(prior.earlier)
+    assert seen is not None  # noqa: S101 - of a result
+    sigma, unseen = np.sqrt(np.diag(seen.covariance)[15:]), np.zeros(38 if k else 38 + SIZE)
     for _ in range(_MOST_STEPS):
-        errors = sensor_error_columns(prior.earlier, new, R_base_flange)
-        unseen = np.zeros(errors.shape[2]) if unseen is None else unseen
+        errors = sensor_error_columns(prior.earlier.parameters, seen, new, R_base_flange)
+        if not k:
+            errors = np.concatenate([errors, response_columns(new, R_base_flange) * sigma], axis=2)
         J = np.concatenate([joint_jacobian(new, prior.earlier.response, R_base_flange), errors], axis=2)
         left = wrench - predict(new, R_base_flange) - J[..., 15:] @ np.concatenate([coefficients, unseen])
         known, of_known = prior.rows(new, coefficients, kept)

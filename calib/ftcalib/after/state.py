@@ -13,6 +13,7 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 
+from ftcalib.after.cell_errors import known_response
 from ftcalib.after.series import Estimated
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
@@ -223,7 +224,7 @@ def apply_update(
         },
         p_value=float(chi2_sf(update.dof, update.chi2)),
         components=calibration.components,
-        response=update.response,
+        response=None if calibration.response is None else update.response,
         gain_sigma=calibration.gain_sigma,
         cable_shift=calibration.cable_shift,
         second_basin_chi2=calibration.second_basin_chi2,
@@ -390,7 +391,9 @@ def tare(
             f"(d² {sigmas[i] ** 2:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has "
             "changed."
         )
-    update = reestimate(calibration, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
+    # What the fit does not know of the sensor acts on a part that is weighed after the tare.
+    known = Update(calibration.parameters, calibration.covariance, 0.0, 0, response=known_response(calibration))
+    update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(
             f"the {len(means)} poses do not agree on one bias (chi2 {update.chi2:.0f} for {update.dof} degrees of "

@@ -19,6 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
+from ftcalib.after.cell_errors import LOAD, known_response, sensor_error_columns
 from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
@@ -145,7 +146,7 @@ def weigh(
     n = len(wrench)
     R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
-    tool, response = reference.parameters, reference.response
+    tool, response = reference.parameters, known_response(reference)
     weight_N = tool.weight_N
     if not weight_N > 0:
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
@@ -172,12 +173,16 @@ def weigh(
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)
         x = covariance @ H.T @ W @ left.ravel()
     misfit = left.ravel() - H @ x
-    chi2, dof = float(misfit @ W @ misfit + np.sum((near @ x) ** 2)), 6 * n - 1
+    dof = 6 * n - 1
     sigma_kg = float(np.sqrt(covariance[0, 0]))
     com_m = x[1:] / (x[0] or 1.0)
     T = np.column_stack([-com_m, np.eye(3)]) / max(abs(x[0]), 1e-9)
     com_covariance = T @ covariance @ T.T
     variances, axes = np.linalg.eigh(com_covariance)
+    # A gain that depends on the load shows in none of its poses with the tool alone, and is no contact.
+    loads = LOAD * response_columns(_part(tool, x * g_m_s2), R_base_flange).reshape(6 * n, -1)
+    S = S + loads @ loads.T
+    chi2 = float(misfit @ np.linalg.solve(S, misfit) + np.sum((near @ x) ** 2))
     fault = _fault(left, A, S, float(chi2_sf(dof, chi2)), n)
     if fault is None and x[0] < -LEAST_SIGMAS * sigma_kg:
         fault = "lifted"
@@ -226,7 +231,7 @@ def _covariance(
     reference: Calibrated, x_N: Array, R_base_flange: Array, noise: Array, drift: Array, orientation_sigma_rad: float
 ) -> Array:
     """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0]."""
-    tool, response = reference.parameters, reference.response
+    tool, response = reference.parameters, known_response(reference)
     n, held = len(noise), _part(tool, x_N)
     J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
     across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)
@@ -237,10 +242,13 @@ def _covariance(
     C = np.array(joint_covariance(reference.covariance, response))
     C[range(6, 9), range(6, 9)] += drift[:3] ** 2
     C[range(12, 15), range(12, 15)] += drift[3:] ** 2
+    sensor = np.zeros((6 * n, 6 * n))
     if response is not None:
         J[..., 15:] += response_columns(held, R_base_flange)
+        errors = sensor_error_columns(tool, response, held, R_base_flange).reshape(6 * n, -1)
+        sensor = errors @ errors.T
     K = J.reshape(6 * n, -1)
-    return np.asarray(block_diag(*single) + K @ C @ K.T)
+    return np.asarray(block_diag(*single) + K @ C @ K.T + sensor)
 
 
 def _part(tool: Parameters, x_N: Array) -> Parameters:

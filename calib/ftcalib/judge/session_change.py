@@ -60,14 +60,14 @@ Rows = NDArray[np.integer | np.bool_]
 
 # Columns of `_columns`.
 TURN, BIAS, COM, LOAD, MOUNTING = range(3), range(3, 9), range(10, 13), range(9, 13), range(13, 16)
-# What changes, by code.
+# What changes, by code; a sensor mostly turns with its tool, and more seldom in itself.
 KINDS = {
     "bias_stepped": [*BIAS],
     "com_shifted": [*COM],
     "load_changed": [*LOAD],
     "sensor_turned": [*TURN],
     "sensor_changed": [*TURN, *BIAS],
-    "tool_turned": [*MOUNTING],
+    "sensor_and_tool_turned": [*MOUNTING],
 }
 
 
@@ -130,6 +130,8 @@ def session_change(
     poses = (order[change.starts] + 1).tolist()
     code, values = change.code, {"pose": poses if len(poses) > 1 else poses[0]} | dict(change.values)
     severity: Severity = "reject"
+    if code == "sensor_and_tool_turned":
+        code = "sensor_turned"
     if change.takes_turns:
         code = "sensors_alternate"
     elif code == "bias_stepped" or not (found.weights[order[: change.starts[0]]] > 0.5).any():  # the load as it is now
@@ -316,7 +318,7 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
         step = mean_y - _turn(mean_g, turn)[0]
         undone[rows] = _turn(y[rows] - step, turn.T)
-    if code == "tool_turned":
+    if code == "sensor_and_tool_turned":
         turn = nearest_rotation(y[rows, :3].T @ g[rows, :3])
         undone[rows, :3] = y[rows, :3] @ turn
         undone[rows, 3:] += np.cross(p.p_sensor_com_m, undone[rows, :3] - y[rows, :3])
@@ -324,7 +326,7 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
     misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
     moved = np.zeros(16)
     moved[own] = x[: len(own)]
-    if code == "tool_turned":
+    if code == "sensor_and_tool_turned":
         turn = turn @ rotation_of(moved[MOUNTING])
     step += moved[BIAS]
     values = {

@@ -8,11 +8,11 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.after.cell_errors import sensor_error_columns
+from ftcalib.after.cell_errors import known_response, sensor_error_columns
 from ftcalib.after.new_tool import _beyond, new_tool, together
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.response import Response
+from ftcalib.likelihood.response import Response, response_columns
 from ftcalib.model import Array, Parameters, predict
 from tests.first_order import assert_same, propagated
 from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
@@ -135,7 +135,12 @@ def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None
     dataset = replace(poses(now, R, 0), wrench=y)
     assert dataset.wrench_cov is not None
     noise = block_diag(*(pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, now))))
-    sensor = sensor_error_columns(earlier, now, R).reshape(24, -1)
+    known = known_response(earlier)
+    assert known is not None
+    sensor = sensor_error_columns(p, known, now, R).reshape(24, -1)
+    if response is None:
+        unseen = response_columns(now, R) * np.sqrt(np.diag(known.covariance)[15:])
+        sensor = np.concatenate([sensor, unseen.reshape(24, -1)], axis=1)
 
     def solved(e: Array, shift: Array) -> Array:
         other = None if response is None else Response(response.coefficients + e[15:], C)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ftcalib.after.cell_errors import sensor_error_columns
 from ftcalib.after.state import Calibrated, tare
 from ftcalib.after.weighing import Weight, drift_since, holding, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
@@ -67,7 +68,7 @@ def test_sigmas_hold_after_a_zero_in_the_same_pose() -> None:
         assert weight.line is not None
         force_N = gripper.part(R)[:3]
         assert abs(weight.line @ force_N) == pytest.approx(np.linalg.norm(force_N), rel=1e-2)
-    assert 0.85 < np.sqrt(np.mean(np.square(errors))) < 1.15
+    assert 0.75 < np.sqrt(np.mean(np.square(errors))) < 1.15  # the sensor may err, and does not
     assert np.abs(errors).max() < 4
     assert np.mean(com) < 1.2  # along gravity it is assumed, and mostly nearer
 
@@ -92,7 +93,7 @@ def test_several_poses_show_the_whole_centre_of_mass() -> None:
         assert weight.line is None
         assert weight.com_sigma_m.max() < 2e-3
         z += ((weight.p_sensor_com_m - gripper.com_m) / weight.com_sigma_m).tolist()
-    assert 0.8 < np.sqrt(np.mean(np.square(z))) < 1.2
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.2  # the sensor may err, and does not
 
 
 def test_what_is_no_weight_is_named() -> None:
@@ -214,6 +215,10 @@ def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -
         + propagated(lambda e: weighed(y, moved(reference, e)).moment[0], C)
         + propagated(lambda e: weighed(y, reference, turned(e)).moment[0], turn_rad**2 * np.eye(9))
     )
+    if response is not None:
+        held = Parameters(TRUTH.R_flange_sensor, x[0] * G * tool.down, np.zeros(3), x[1:] / x[0], np.zeros(3))
+        columns = sensor_error_columns(tool, response, held, R).reshape(18, -1)
+        expected += propagated(lambda e: weighed(y + e.reshape(3, 6)).moment[0], columns @ columns.T)
     assert_same(covariance, expected, 0.02)
     assert found.mass_sigma_kg == pytest.approx(np.sqrt(covariance[0, 0]))
     assert found.least_kg == pytest.approx(4 * found.mass_sigma_kg)

@@ -120,7 +120,7 @@ def test_a_tool_that_turns_with_its_sensor_is_named_with_its_angle(seed: int, me
     turn = Rotation.from_rotvec(axis / np.linalg.norm(axis), degrees=True).as_matrix()
     after = replace(TOOL, R_flange_sensor=TOOL.R_flange_sensor @ turn)
     first = session(after, 9, seed, measured=measured).findings[0]
-    assert (first.code, first.severity, first.values["pose"]) == ("tool_turned", "reject", 10)
+    assert (first.code, first.severity, first.values["pose"]) == ("sensor_turned", "reject", 10)
     assert first.values["turn_deg"] == pytest.approx(1.0, abs=0.05)
 
 
