@@ -5,16 +5,12 @@ alone. Their size is what the fit found, else what its poses and its residuals l
 cable are smooth over the orientations: two poses near each other have nearly the same.
 """
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from ftcalib.after.series import Estimated
 from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
-
-if TYPE_CHECKING:
-    from ftcalib.after.state import Calibrated
 
 # A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
 GAIN, CROSS = 0.02, 0.01
@@ -30,14 +26,14 @@ TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
 _CORRELATED = 0.5
 
 
-def known_response(calibration: "Calibrated") -> Response | None:
+def known_response(calibration: Estimated, found: Response | None) -> Response | None:
     """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
 
     None for an update of a calibration that has none. A fit of n poses shows a gain as well as n readings of the weight
     do, with the error of predicting one from the others. Half of that counts: a small one is not found.
     """
-    if calibration.response is not None or not isinstance(calibration, CalibrationResult):
-        return calibration.response
+    if found is not None or not isinstance(calibration, CalibrationResult):
+        return found
     quality, n = calibration.quality, calibration.n_poses - len(calibration.rejected_poses)
     left_out: list[float] = [quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
     error = np.repeat(left_out, [5, 6]) / np.repeat([1.0, LEVER_M], [5, 6])

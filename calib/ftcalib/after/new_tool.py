@@ -206,7 +206,7 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
     """Fit all parameters; `kept` as of `CellPrior.rows`."""
     n, k = len(wrench), len(prior.coefficients)
     new, coefficients = _start(prior.earlier.parameters, R_base_flange, wrench), prior.coefficients
-    seen = known_response(prior.earlier)
+    seen = known_response(prior.earlier, prior.earlier.response)
     assert seen is not None  # noqa: S101 - of a result
     sigma, unseen = np.sqrt(np.diag(seen.covariance)[15:]), np.zeros(38 if k else 38 + SIZE)
     for _ in range(_MOST_STEPS):

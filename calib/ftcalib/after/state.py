@@ -392,7 +392,13 @@ def tare(
             "changed."
         )
     # What the fit does not know of the sensor acts on a part that is weighed after the tare.
-    known = Update(calibration.parameters, calibration.covariance, 0.0, 0, response=known_response(calibration))
+    known = Update(
+        calibration.parameters,
+        calibration.covariance,
+        0.0,
+        0,
+        response=known_response(calibration, calibration.response),
+    )
     update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(

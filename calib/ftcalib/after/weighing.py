@@ -146,7 +146,7 @@ def weigh(
     n = len(wrench)
     R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
-    tool, response = reference.parameters, known_response(reference)
+    tool, response = reference.parameters, known_response(reference, reference.response)
     weight_N = tool.weight_N
     if not weight_N > 0:
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
@@ -231,7 +231,7 @@ def _covariance(
     reference: Calibrated, x_N: Array, R_base_flange: Array, noise: Array, drift: Array, orientation_sigma_rad: float
 ) -> Array:
     """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0]."""
-    tool, response = reference.parameters, known_response(reference)
+    tool, response = reference.parameters, known_response(reference, reference.response)
     n, held = len(noise), _part(tool, x_N)
     J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
     across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)

@@ -109,8 +109,8 @@ def test_what_is_no_weight_is_named() -> None:
         return gripper.weigh(reference, R).fault
 
     assert fault(np.zeros(6)) is None
-    assert fault(np.concatenate([0.1 * aside / np.linalg.norm(aside), np.zeros(3)])) == "contact"
-    assert fault(np.concatenate([np.zeros(3), 0.02 * u])) == "cable"
+    assert fault(np.concatenate([0.5 * aside / np.linalg.norm(aside), np.zeros(3)])) == "contact"
+    assert fault(np.concatenate([np.zeros(3), 0.1 * u])) == "cable"
     assert fault(np.concatenate([-40 * u, np.zeros(3)])) == "lifted"
     gripper.mass_kg = 0.02
     assert fault(np.concatenate([np.zeros(3), 0.3 * aside])) == "cable"  # a centre of mass far outside
