@@ -12,24 +12,29 @@ from scipy.special import ndtri
 
 from ftcalib.after.new_tool import WHOLE, CellPrior
 from ftcalib.known import Constraints, Known
+from ftcalib.likelihood.response import LEVER_M
 from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
-from ftcalib.model import Array, DriftResult, Parameters, angle_between, nearest_rotation
+from ftcalib.model import Array, DriftResult, Parameters, angle_between, cross, nearest_rotation
 from ftcalib.motion.model import (
     CROSS_TALK,
     DELAY,
     GAINS,
     HEIGHT,
     INERTIA,
+    ORDER,
     SIZE,
     Load,
     PoseError,
     RowNoise,
+    SmoothFunctions,
     jacobian,
+    lever_columns,
     runs,
     states,
+    turn_columns,
     wrench_of,
 )
-from ftcalib.motion.samples import Rows
+from ftcalib.motion.samples import Motion, Rows
 from ftcalib.published.yu import com_and_torque_bias
 
 # What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows.
@@ -46,6 +51,10 @@ MOST_CONTACT = 0.8
 MARGIN = 2
 # Distance and number of the knots of the bias.
 KNOT_S, MOST_KNOTS = 5.0, 25
+# Length of the links that turn: how far the flange moves.
+REACH_M = 0.3
+# Time constant, and distance and number of the knots, of the noise of seconds.
+SLOW_S, SLOW_KNOT_S, MOST_SLOW = 5.0, 2.5, 48
 # What the steps of zeroings, removed before, may be wrong by: one sigma.
 ZEROED_N, ZEROED_NM = 10.0, 1.0
 # Keeps what is not determined finite: its sigma becomes a million times as large as its scale.
@@ -68,12 +77,34 @@ _AROUND, _PRIOR_ROWS = 3, 1.0
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
 # Solutions, each with the noise and the contacts of the one before, and those before which components are chosen.
 _STAGES, _CHOICES = 6, (1, 2, 4)
+# The stage from which what noise hides is part of the model: before, contact would be taken for it.
+_ALWAYS = 1
 # Sizes that are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second.
 _SIZES: Mapping[str, Array] = {
     "gain": np.geomspace(5e-4, 5e-2, 9),
     "cross_talk": np.geomspace(5e-4, 2e-1, 11),
     "walk_N": np.geomspace(3e-4, 3e-1, 10),
     "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
+    "slow_N": np.geomspace(1e-4, 1.0, 41),
+    "slow_Nm": np.geomspace(2e-6, 2e-2, 41),
+    "rotation_rad": np.geomspace(1e-6, 1e-2, 41),
+    "cable_N": np.geomspace(1e-4, 1.0, 41),
+    "cable_Nm": np.geomspace(4e-6, 4e-2, 41),
+    "load_N": np.geomspace(1e-4, 1.0, 41),
+    "load_Nm": np.geomspace(4e-6, 4e-2, 41),
+}
+# Probability that a cell has none of it, and the factor within which it is of the expected size otherwise: one sigma.
+ABSENT, WITHIN = 0.7, 3.0
+# Sizes that are expected of components that are always part of the model, because noise hides them: the orientation
+# of a calibrated arm, a cable, and the noise of seconds.
+EXPECTED: Mapping[str, float] = {
+    "slow_N": 5e-3,
+    "slow_Nm": 2e-4,
+    "rotation_rad": float(np.radians(0.05)),
+    "cable_N": 0.01,
+    "cable_Nm": 1e-3,
+    "load_N": 0.01,
+    "load_Nm": 1e-3,
 }
 
 # Squared distance of a row that counts a quarter where a robust fit has settled.
@@ -91,7 +122,9 @@ class MotionFit:
     kept: NDArray[np.bool_]
     """(n,) rows without contact."""
     residuals: Array
-    """(n, 6) of all rows, drift included in the prediction."""
+    """(n, 6) of all rows, drift included in the prediction, and of the other effects none."""
+    next_use: Array
+    """(2,) root mean square error of compensating a free tool at rest in these poses, N and N·m."""
     sigma: Array
     """(n, 6) of a row's noise."""
     distance: Array
@@ -129,16 +162,124 @@ class _Problem:
         steps = np.diff(np.eye(count), axis=0) @ centred
         self.walk = steps.T @ steps / (self.knots[1] - self.knots[0])
         self.courses = count + len(zeroed_s)
-        self.centred = np.kron(block_diag(centred, np.eye(len(zeroed_s))), np.eye(6))
+        count = int(np.clip(round(self.duration_s / SLOW_KNOT_S), 1, MOST_SLOW - 1)) + 1
+        self.slow_knots = np.linspace(rows.t_s[0], rows.t_s[-1], count)
+        self.functions = SmoothFunctions.of(nearest_rotation(rows.motion.R_base_flange))
+        self.groups, self.others = self._group()
+        self.centred = block_diag(np.kron(block_diag(centred, np.eye(len(zeroed_s))), np.eye(6)), np.eye(self.others))
+
+    def _group(self) -> tuple[dict[str, tuple[NDArray[np.intp], Array]], int]:
+        """Places of each component in load and effects, with their precision at size 1, and how many effects are other.
+
+        Effects are the courses of the bias, centred, then the others: noise of seconds, turns, cable and lever.
+        """
+        distance = self.slow_knots[1] - self.slow_knots[0]
+        lags = np.abs(np.subtract.outer(self.slow_knots, self.slow_knots))
+        slow = np.linalg.inv(np.exp(-lags / max(SLOW_S, 1e-3 * distance)))
+        start = at = SIZE + 6 * (len(self.walk) + len(self.zeroed_s))
+        groups = {"gain": (np.arange(SIZE)[GAINS], np.eye(GAINS.stop - GAINS.start))}
+        turns = 3 * (len(self.functions) + 4)
+        for name, first, precision in (
+            ("walk", SIZE, self.walk),
+            ("slow", start, slow),
+            ("cable", start + 6 * len(slow) + turns, np.eye(len(self.functions))),
+            ("load", start + 6 * (len(slow) + len(self.functions)) + turns, np.eye(9)),
+        ):
+            places = first + np.arange(6 * len(precision)).reshape(-1, 6)
+            for unit, channels in (("N", slice(0, 3)), ("Nm", slice(3, 6))):
+                groups[f"{name}_{unit}"] = places[:, channels].ravel(), np.kron(precision, np.eye(3))
+            at = first + 6 * len(precision)
+        groups["rotation_rad"] = start + 6 * len(slow) + np.arange(turns), np.eye(turns)
+        # An antisymmetric entry has half the variance of an entry.
+        precision = np.diag(np.append(np.ones(CROSS_TALK.stop - CROSS_TALK.start), np.full(3, 2 / LEVER_M**2)))
+        groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
+        return groups, at + 3 - start
 
     def hats(self, t_s: Array) -> Array:
         """Weight (n, courses) of each knot, and of the bias before each zeroing."""
-        step = self.knots[1] - self.knots[0]
-        knots = np.maximum(1 - np.abs(t_s[:, None] - self.knots) / step, 0)
-        return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else np.asarray(knots)
+        knots = _hats(self.knots, t_s)
+        return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else knots
 
     def predict(self, load: Load, rows: Rows) -> Array:
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
+
+    def smooth_columns(self, load: Load, motion: Motion) -> Array:
+        """Derivative (n, 6, k) of the wrench by turns, by what they move, by a cable and by the gain of the load."""
+        R = nearest_rotation(motion.R_base_flange)
+        turned = turn_columns(load, motion) @ self.turns(load, R)
+        moved = REACH_M * lever_columns(load, motion)
+        share = load.static.down @ R @ load.static.R_flange_sensor
+        gained = np.hstack([share, np.einsum("ni,nj->nij", share, share)[:, *np.triu_indices(3)]])
+        return np.concatenate([turned, moved, _on_channels(self.functions(R)), _on_channels(gained)], axis=2)
+
+    def turns(self, load: Load, R_base_flange: Array) -> Array:
+        """Turns (n, 3, k) of poses, in flange axes: smooth ones, and those of a mount that yields to the torque.
+
+        What no session can separate belongs to the parameters: a turn that is constant in flange axes to the mounting,
+        and one in base to the direction of gravity.
+        """
+
+        def of(R: Array) -> tuple[Array, Array]:
+            torque = cross(load.lever_m / max(float(np.linalg.norm(load.lever_m)), 1e-12), load.static.down @ R)
+            values = np.hstack([self.functions(R), torque])
+            constant = np.concatenate([np.broadcast_to(np.eye(3), R.shape), R.swapaxes(1, 2)], axis=2)
+            return np.einsum("nk,ij->nikj", values, np.eye(3)).reshape(len(R), 3, -1), constant
+
+        smooth, constant = (each.reshape(-1, each.shape[2]) for each in of(self.functions.R_base_flange))
+        share = np.linalg.lstsq(constant, smooth, rcond=1e-9)[0]
+        smooth, constant = of(R_base_flange)
+        return np.asarray(smooth - constant @ share)
+
+    def columns(self, load: Load, rows: Rows) -> tuple[Array, Array]:
+        """Derivative (n, 6, 34) of the wrench by the load, and by the effects without the courses of the bias."""
+        motion = rows.motion.earlier(load.delay_s, rows.rate)
+        J, slow = jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
+        return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)
+
+    def effect(self, load: Load, rows: Rows, effects: Array) -> Array:
+        """Wrench (n, 6) of the effects."""
+        wrench = self.hats(rows.t_s) @ self.drift(effects)
+        others = effects[6 * self.courses :]
+        if others.any():
+            for start in range(0, len(rows), _CHUNK):
+                part = slice(start, start + _CHUNK)
+                wrench[part] += self.columns(load, rows[part])[1] @ others
+        return np.asarray(wrench)
+
+    def drift(self, effects: Array) -> Array:
+        """Bias (courses, 6) at the knots and before each zeroing."""
+        return effects[: 6 * self.courses].reshape(-1, 6)
+
+    @property
+    def smooth_effects(self) -> slice:
+        """Places of turns and cable among the effects, centred."""
+        start = self.centred.shape[1] - self.others + 6 * len(self.slow_knots)
+        return slice(start, self.centred.shape[1] - 3)
+
+    def unseen(self, load: Load, residual: Array) -> Array:
+        """Root (n, 6, k) of the covariance that smooth errors give the rows: of an arm, and of a cable.
+
+        The arm has the expected one, and the cable pulls by as much as the residuals (2,) of force and torque.
+        """
+        pull = {"cable_N": residual[0], "cable_Nm": residual[1]}
+        P, _, _ = self.components({**EXPECTED, **pull}, load)
+        motion = self.rows.motion.earlier(load.delay_s, self.rows.rate)
+        return np.asarray(self.smooth_columns(load, motion) / np.sqrt(np.diag(P)[SIZE:][self.smooth_effects]))
+
+    def next_use(self, load: Load, effects: Array, solved: "_Step") -> Array:
+        """Root mean square error (2,) of compensating a free tool at rest in the poses of the rows, N and N·m.
+
+        Turns and cable act then as they did in the recording, and no compensation knows them.
+        """
+        R = self.functions.R_base_flange
+        still = Motion(R, np.zeros((len(R), 3)), np.zeros((len(R), 3, 3)))
+        J = jacobian(load, still, still.earlier(1.0, still))
+        smooth = self.smooth_columns(load, still)
+        error = smooth @ (self.centred.T @ effects)[self.smooth_effects]
+        places = np.r_[0:SIZE, SIZE + np.arange(self.centred.shape[1])[self.smooth_effects]]
+        basis, inverse_root = solved.root
+        square = np.sum((np.concatenate([J, smooth], axis=2) @ basis[places] @ inverse_root) ** 2, axis=2) + error**2
+        return np.asarray(np.sqrt(square.mean(axis=0).reshape(2, 3).sum(axis=1)))
 
     def prior(self, load: Load) -> tuple[Array, Array]:
         """Precision (34,) of the values that are not static, beside that of the components, and the present values."""
@@ -165,41 +306,48 @@ class _Problem:
         Z = block_diag(self.constraints.free(load.static), np.eye(SIZE - 15))
         return np.asarray(Z[:, ~np.concatenate([np.zeros(Z.shape[1] - (SIZE - 15), bool), self.fixed[15:]])])
 
+    def estimated(self, load: Load, on: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
+        """Basis (34, m) of what is estimated of the load, and places of the effects that are."""
+        Z = self.free(load)
+        return Z[:, on[np.argmax(np.abs(Z), axis=0)]], SIZE + np.flatnonzero(on[SIZE:])
+
     def rough(self, load: Load) -> tuple[Load, float]:
         """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
         rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
-        limit, no_drift = np.inf, np.zeros((self.courses, 6))
-        nothing = np.zeros(self.centred.shape[1])
+        limit, size = np.inf, SIZE + self.centred.shape[1]
+        no_effects, H, b = np.zeros(len(self.centred)), np.zeros((size, size)), np.zeros(size)
         for _ in range(40):
             r = rows.wrench - self.predict(load, rows)
             scale, weight, limit = robust_weights(r, limit)
             J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / scale[:, None]
             weighted = (J * weight[:, None, None]).reshape(-1, SIZE)
-            H, b = block_diag(weighted.T @ J.reshape(-1, SIZE), np.diag(nothing)), weighted.T @ (r / scale).ravel()
-            step = self.solve(ROUGH, (H, np.append(b, nothing), 0.0), load, no_drift).step
+            H[:SIZE, :SIZE], b[:SIZE] = weighted.T @ J.reshape(-1, SIZE), weighted.T @ (r / scale).ravel()
+            step = self.solve(ROUGH, (H, b, 0.0), load, no_effects).step
             load = load.moved(step[:SIZE])
             if limit == LIMIT and np.abs(step[:6]).max() < 1e-6:
                 break
         return load, float(np.log(scale[::3]).sum())
 
     def sums(
-        self, load: Load, drift: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
+        self, load: Load, effects: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
     ) -> tuple[Array, Array, float]:
-        """Information, gradient and chi2 of load and drift, over kept rows as the noise weighs them."""
+        """Information, gradient and chi2 of load and effects, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
         state, place = state[kept], runs(rows.t_s, rows.row_s)
-        size = SIZE + 6 * self.courses
+        size = SIZE + len(self.centred)
+        others = np.arange(SIZE + 6 * self.courses, size)
         H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
         for start in range(0, len(rows), _CHUNK):
             part = slice(max(start - order, 0), start + _CHUNK)
             some, hats = rows[part], self.hats(rows.t_s[part])
             near = np.flatnonzero(hats.any(axis=0))
-            r = some.wrench - self.predict(load, some) - hats @ drift
-            J = jacobian(load, some.motion.earlier(load.delay_s, some.rate), some.rate)
-            on_knots = np.einsum("nk,ij->nikj", hats[:, near], np.eye(6)).reshape(len(some), 6, -1)
-            X = noise.whiten(np.concatenate([J, on_knots, r[:, :, None]], axis=2), state[part], place[part])
+            J, columns = self.columns(load, some)
+            r = some.wrench - self.predict(load, some) - hats @ self.drift(effects)
+            r -= columns @ effects[6 * self.courses :]
+            X = np.concatenate([J, _on_channels(hats[:, near]), columns, r[:, :, None]], axis=2)
+            X = noise.whiten(X, state[part], place[part])
             X = X[start - part.start :].reshape(-1, X.shape[2])
-            places = np.concatenate([np.arange(SIZE), SIZE + (6 * near[:, None] + np.arange(6)).ravel()])
+            places = np.concatenate([np.arange(SIZE), SIZE + (6 * near[:, None] + np.arange(6)).ravel(), others])
             gram = X.T @ X
             H[np.ix_(places, places)] += gram[:-1, :-1]
             b[places] += gram[:-1, -1]
@@ -212,34 +360,24 @@ class _Problem:
         if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
         basis, inverse_root = solved.root
-        J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate)
-        on_knots = np.einsum("nk,ij->nikj", self.hats(rows.t_s), np.eye(6)).reshape(len(rows), 6, -1) @ self.centred
-        return np.asarray(np.concatenate([J, on_knots], axis=2) @ basis @ inverse_root)
+        J, others = self.columns(load, rows)
+        by_effects = np.concatenate([_on_channels(self.hats(rows.t_s)), others], axis=2)
+        return np.asarray(np.concatenate([J, by_effects @ self.centred], axis=2) @ (basis @ inverse_root))
 
-    def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, Array, float]:
-        """Prior precision of response and drift, which of them are estimated, and -log det of the precision."""
+    def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, NDArray[np.bool_], float]:
+        """Prior precision of load and effects, which of them are estimated, and -log det of that of the components."""
         total = SIZE + self.centred.shape[1]
-        P, on, log_det = np.zeros((total, total)), np.ones(total, bool), 0.0
-        for name, places in (("gain", GAINS), ("cross_talk", CROSS_TALK)):
+        P, on, log_det = np.zeros((total, total)), np.ones(total, np.bool_), 0.0
+        for name, (places, precision) in self.groups.items():
             if size := sizes.get(name, 0.0):
-                count = places.stop - places.start
-                P[places, places] = np.eye(count) / size**2
-                log_det += 2 * count * float(np.log(size))
+                P[np.ix_(places, places)] = precision / size**2
+                log_det += 2 * len(places) * float(np.log(size)) - float(np.linalg.slogdet(precision)[1])
             else:
                 on[places] = False
-        at = SIZE + np.arange(len(self.walk) * 6).reshape(-1, 6)
-        for name, channels in (("walk_N", range(3)), ("walk_Nm", range(3, 6))):
-            size = sizes.get(name, 0.0)
-            for channel in channels:
-                knots = at[:, channel]
-                if size:
-                    P[np.ix_(knots, knots)] = self.walk / size**2
-                    log_det -= float(np.linalg.slogdet(self.walk / size**2)[1])
-                else:
-                    on[knots] = False
         precision, _ = self.prior(load)
         P[:SIZE, :SIZE] += np.diag(precision)
-        zeroed = range(total - 6 * len(self.zeroed_s), total)
+        last = total - self.others
+        zeroed = range(last - 6 * len(self.zeroed_s), last)
         P[zeroed, zeroed] = np.tile(1 / np.repeat([ZEROED_N, ZEROED_NM], 3) ** 2, len(self.zeroed_s))
         return P, on, log_det
 
@@ -248,13 +386,13 @@ class _Problem:
         sizes: Mapping[str, float],
         sums: tuple[Array, Array, float],
         load: Load,
-        drift: Array,
+        effects: Array,
         prior: tuple[Array, Array] | None = None,
     ) -> "_Step":
-        """Solve the sums for load and drift with these sizes of the components, and rows of a prior."""
+        """Solve the sums for load and effects with these sizes of the components, and rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
-        value = np.concatenate([load.vector, self.centred.T @ drift.ravel()])
+        value = np.concatenate([load.vector, self.centred.T @ effects])
         removed = np.where(on, 0.0, -value)  # a component that is off goes to 0
         chi2 += float(removed @ H @ removed - 2 * b @ removed)
         b, value = b - H @ removed, np.where(on, value, 0.0)
@@ -267,16 +405,50 @@ class _Problem:
             places = _RESPONDING[: rows.shape[1]]
             H[np.ix_(places, places)] += rows.T @ rows
             b[places] += rows.T @ residuals
-        Z = block_diag(self.free(load), np.eye(len(P) - SIZE))
-        Z = Z[:, on[np.argmax(np.abs(Z), axis=0)]]
-        H = Z.T @ H @ Z
+        Z, rest = self.estimated(load, on)
+        H = _among(H, Z, rest)
         scale = np.sqrt(np.diag(H))
         factor = cho_factor(H / np.outer(scale, scale) + RIDGE * np.eye(len(H)))
-        step = Z @ (cho_solve(factor, Z.T @ b / scale) / scale)
+        basis = np.zeros((len(P), len(H)))
+        basis[:SIZE, : Z.shape[1]], basis[rest, np.arange(Z.shape[1], len(H))] = Z, 1.0
+        step = basis @ (cho_solve(factor, basis.T @ b / scale) / scale)
         cost = chi2 + float(value @ P @ value + residuals @ residuals - b @ step)
         criterion = cost + log_det
         criterion += 2 * float(np.log(np.diag(factor[0]) * scale).sum())
-        return _Step(step + removed, cost, criterion, Z / scale, factor)
+        return _Step(step + removed, cost, criterion, basis / scale, factor)
+
+    def criteria(
+        self,
+        name: str,
+        tried: Array,
+        sizes: Mapping[str, float],
+        sums: tuple[Array, Array, float],
+        load: Load,
+        effects: Array,
+    ) -> Array:
+        """-2 log restricted likelihood (k,) of a component's sizes beside those of the others, less that of size 0."""
+        H, b, _ = sums
+        places, precision = self.groups[name]
+        P, on, _ = self.components({**sizes, name: 0.0}, load)
+        value = np.concatenate([load.vector, self.centred.T @ effects])
+        rows, residuals = self.constraints.measurements(load.static)
+        # About the present load and effects of 0.
+        value[:15] = 0.0
+        b, H = b + H @ value, H + P
+        H[:15, :15] += rows.T @ rows
+        b[:15] += rows.T @ residuals
+        Z, rest = self.estimated(load, on)
+        among = _among(H, Z, rest)
+        beside = np.vstack([Z.T @ H[:SIZE, places], H[np.ix_(rest, places)]])
+        scale = np.sqrt(np.diag(among))
+        factor = cho_factor(among / np.outer(scale, scale) + RIDGE * np.eye(len(among)))
+        left = cho_solve(factor, np.column_stack([beside, np.append(Z.T @ b[:SIZE], b[rest])]) / scale[:, None])
+        left = (beside / scale[:, None]).T @ left
+        root = np.linalg.inv(np.linalg.cholesky(precision))
+        information, vector = np.linalg.eigh(root @ (H[np.ix_(places, places)] - left[:, :-1]) @ root.T)
+        along = vector.T @ root @ (b[places] - left[:, -1])
+        grown = 1 + np.square(tried)[:, None] * np.maximum(information, 0.0)
+        return np.asarray(np.sum(np.log(grown) - np.square(tried)[:, None] * along**2 / grown, axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -338,54 +510,60 @@ def fit(
     load, _ = roughs[0]
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
-    drift, sizes = np.zeros((problem.courses, 6)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
+    effects, sizes = np.zeros(len(problem.centred)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
         state = states(rows.speed_rad_s, kept)
-        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
+        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
         absorbed = problem.absorb(load, rows[kept], solved)
-        noise = RowNoise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s))
+        # An autoregression would take the noise of seconds before its size is chosen.
+        order = ORDER if stage > _ALWAYS else 0
+        noise = RowNoise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s), order=order)
         if guarded:
             local = _local(r / noise.scale[state], kept)[:, None]
             place = runs(rows.t_s[kept], rows.row_s)
             noise = RowNoise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
             noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
-        sums = problem.sums(load, drift, noise, kept, state)
+        sums = problem.sums(load, effects, noise, kept, state)
+        if stage == _ALWAYS:
+            sizes = {**sizes, **EXPECTED}
         if stage in _CHOICES:
-            sizes = _choose_sizes(problem, sizes, sums, load, drift)
-        solved = problem.solve(sizes, sums, load, drift)
+            sizes = _choose_sizes(problem, sizes, sums, load, effects)
+        solved = problem.solve(sizes, sums, load, effects)
         load = load.moved(solved.step[:SIZE])
-        drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
-        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
+        effects = effects + problem.centred @ solved.step[SIZE:]
+        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _untouched(r) if guarded else _without_contact(distance)
     contradiction = ""
     if prior is not None:
         if prior.has_response:
             sizes |= {"gain": np.inf, "cross_talk": np.inf}
-        load, drift, solved, contradiction = _join(problem, prior, sizes, (load, drift), (noise, kept, state))
-        r = rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ drift
+        load, effects, solved, contradiction = _join(problem, prior, sizes, (load, effects), (noise, kept, state))
+        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
-    chi2, others = problem.sums(load, drift, noise, kept, state)[2], []
+    chi2, others = problem.sums(load, effects, noise, kept, state)[2], []
     for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
-            there = problem.sums(other, drift, noise, kept, state)
+            there = problem.sums(other, effects, noise, kept, state)
             # What one linear step would leave at the other mounting, less the chi2 of this one.
-            others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, drift).step) - chi2)
+            others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, effects).step) - chi2)
     walk = None
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
         last = len(problem.knots) - 1
-        ends = np.zeros((6, SIZE + 6 * problem.courses))
+        ends = np.zeros((6, SIZE + len(problem.centred)))
         ends[:, SIZE + 6 * last : SIZE + 6 * last + 6] += np.eye(6)
         ends[:, SIZE : SIZE + 6] -= np.eye(6)
         ends = ends @ block_diag(np.eye(SIZE), problem.centred)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
+        drift = problem.drift(effects)
         walk = DriftResult(drift[last] - drift[0], sigma, problem.hats(rows.t_s) @ drift)
     return MotionFit(
         load=load,
         covariance=solved.covariance[:SIZE, :SIZE],
         kept=kept,
-        residuals=r,
+        residuals=rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ problem.drift(effects),
+        next_use=problem.next_use(load, effects, solved),
         sigma=noise.scale[state],
         distance=distance,
         drift=walk,
@@ -403,26 +581,26 @@ def _join(
     start: tuple[Load, Array],
     weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
 ) -> tuple[Load, Array, _Step, str]:
-    """Fit rows and a prior from the load and drift of the rows alone, and name what they contradict in the prior.
+    """Fit rows and a prior from the load and effects of the rows alone, and name what they contradict in the prior.
 
     `weighed` is the noise, with the rows that count and their states, as the rows show it alone.
     """
 
     def fitted(kept: Sequence[int]) -> tuple[Load, Array, _Step]:
         """Fit; `kept` as of `CellPrior.rows`."""
-        (load, drift), before = start, np.inf
+        (load, effects), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
-            sums = problem.sums(load, drift, *weighed)
+            sums = problem.sums(load, effects, *weighed)
             known = prior.rows(load.static, load.response[: 11 * prior.has_response], kept)
-            solved = problem.solve(sizes, sums, load, drift, known)
+            solved = problem.solve(sizes, sums, load, effects, known)
             load = load.moved(solved.step[:SIZE])
-            drift = drift + (problem.centred @ solved.step[SIZE:]).reshape(-1, 6)
+            effects = effects + problem.centred @ solved.step[SIZE:]
             if abs(before - solved.cost) < _SETTLED:
                 break
             before = solved.cost
-        return load, drift, solved
+        return load, effects, solved
 
-    load, drift, solved = fitted(WHOLE)
+    load, effects, solved = fitted(WHOLE)
     alone = fitted(())[2].cost
 
     def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
@@ -431,7 +609,7 @@ def _join(
 
     misfit, words = solved.cost - alone, "calibrate this tool alone, without --from"
     contradiction = prior.contradiction(misfit, prior.count(WHOLE), refit, "the rows of the recording", words)
-    return load, drift, solved, contradiction
+    return load, effects, solved, contradiction
 
 
 def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[Array, Array, float]:
@@ -472,7 +650,7 @@ class FreeFit:
     load: Load
     error: PoseError
     covariance: Array
-    """(37, 37) of the load, as of `Load.moved`, then of scale and aside."""
+    """(37, 37) of the load, as of `Load.moved`, then of scale and aside, with what smooth errors do to them."""
     residual: Array
     """(2,) of force and torque: the median, as a standard deviation."""
 
@@ -516,7 +694,8 @@ def _freely(problem: _Problem, load: Load) -> FreeFit:
         error = replace(error, scale=error.scale + float(step[SIZE]), aside_m=error.aside_m + step[SIZE + 1 :])
         if limit == LIMIT and np.abs(step[:6]).max() < 1e-6:
             break
-    return FreeFit(load, error, Z @ covariance @ Z.T, scale[::3])
+    hidden = Z @ covariance @ (Z.T @ weighted.T @ (problem.unseen(load, scale[::3]) / scale[:, None]).reshape(len(J) * 6, -1))
+    return FreeFit(load, error, Z @ covariance @ Z.T + hidden @ hidden.T, scale[::3])
 
 
 def _first_kept(problem: _Problem, load: Load) -> NDArray[np.bool_]:
@@ -552,12 +731,47 @@ def _without_contact(distance: Array) -> NDArray[np.bool_]:
 
 
 def _choose_sizes(
-    problem: _Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, drift: Array
+    problem: _Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, effects: Array
 ) -> dict[str, float]:
-    """Choose the sizes of the components by restricted likelihood, one after the other."""
+    """Choose the sizes of the components by restricted likelihood, one after the other.
+
+    What is always part of the model has its mean square, as the data and what is expected allow it.
+    """
     chosen = dict(sizes)
+
+    def values(name: str, **others: float) -> Array:
+        return problem.criteria(name, _SIZES[name], {**chosen, **others}, sums, load, effects)
+
     for name, tried in _SIZES.items():
-        values = [problem.solve({**chosen, name: size}, sums, load, drift).criterion for size in (0.0, *tried)]
-        best = int(np.argmin(values[1:]))
-        chosen[name] = float(tried[best]) if values[1 + best] < values[0] - WORTH else 0.0
+        if name not in chosen:
+            continue
+        if name in EXPECTED:
+            expected = np.exp(-np.square(np.log(tried / EXPECTED[name]) / np.log(WITHIN)) / 2)
+            of_sizes = values(name)
+            least = min(of_sizes.min(), 0.0)
+            likely = (1 - ABSENT) * expected / expected.sum() * np.exp((least - of_sizes) / 2)
+            chosen[name] = float(np.sqrt(likely @ tried**2 / (likely.sum() + ABSENT * np.exp(least / 2))))
+            continue
+        worth, slow = -WORTH, name.replace("walk", "slow")
+        of_sizes = values(name, **{slow: 0.0})
+        if name != slow:  # noise of seconds looks like a walk
+            worth = min(worth, float(values(slow, **{name: 0.0}).min()))
+        best = int(np.argmin(of_sizes))
+        chosen[name] = float(tried[best]) if of_sizes[best] < worth else 0.0
     return chosen
+
+
+def _among(H: Array, Z: Array, rest: NDArray[np.intp]) -> Array:
+    """Information of what is estimated: of the load in the basis Z, and of these effects."""
+    beside = Z.T @ H[:SIZE, rest]
+    return np.block([[Z.T @ H[:SIZE, :SIZE] @ Z, beside], [beside.T, H[np.ix_(rest, rest)]]])
+
+
+def _hats(knots: Array, t_s: Array) -> Array:
+    """Weight (n, k) of each knot."""
+    return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - knots) / (knots[1] - knots[0]), 0))
+
+
+def _on_channels(values: Array) -> Array:
+    """Derivative (n, 6, 6 k) of a wrench that is the sum of values (n, k), each with weights of its own a channel."""
+    return np.einsum("nk,ij->nikj", values, np.eye(6)).reshape(len(values), 6, -1)

@@ -76,6 +76,11 @@ class Load:
         return self.static.weight_N / self.g_m_s2
 
     @property
+    def lever_m(self) -> Array:
+        """(3,) from the flange to the centre of mass, in flange axes."""
+        return np.asarray(np.array([0.0, 0.0, self.height_m]) + self.static.R_flange_sensor @ self.static.p_sensor_com_m)
+
+    @property
     def inertia_kg_m2(self) -> Array:
         """The inertia as a matrix (3, 3)."""
         return np.asarray(np.tensordot(self.inertia, _BASIS, 1))
@@ -134,15 +139,77 @@ def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     return wrench + static.bias if bias else wrench
 
 
+def turn_columns(load: Load, motion: Motion) -> Array:
+    """Derivative (n, 6, 3) of the wrench by a small turn of gravity, in flange axes.
+
+    An error of a joint turns the pose with its acceleration, which is the same in the axes of the flange.
+    """
+    static = load.static
+    dU = static.R_flange_sensor.T @ skew(static.gravity_force_base_N @ motion.R_base_flange)
+    return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
+
+
+def lever_columns(load: Load, motion: Motion) -> Array:
+    """Derivative (n, 6, 3) of the wrench by the place of the centre of mass, in sensor axes, where only forces see it.
+
+    Cross-talk moves the centre that torques show. That of the forces stays in its place.
+    """
+    static = load.static
+    dU = -load.mass_kg * static.R_flange_sensor.T @ motion.Omega_rad2_s2 @ static.R_flange_sensor
+    return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
+
+
+# Angle over which an error of the arm, or the pull of a cable, changes.
+SMOOTH_RAD = 1.2
+# Share of the variance below which a function is left out, and orientations that the functions rest on.
+_NEGLIGIBLE, _RESTING_ON = 1e-3, 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SmoothFunctions:
+    """Functions of the orientation whose sum, with independent weights of unit variance, is smooth.
+
+    They are the principal ones of a Gaussian process on the orientations of a recording, less their mean there.
+    """
+
+    R_base_flange: Array
+    """(m, 3, 3)"""
+    weights: Array
+    """(m, k)"""
+    mean: Array
+    """(m,)"""
+
+    @classmethod
+    def of(cls, R_base_flange: Array) -> Self:
+        """Choose for the orientations (n, 3, 3) of a recording."""
+        at = R_base_flange[:: -(-len(R_base_flange) // _RESTING_ON)]
+        alike = _alike(at, at)
+        centred = alike - alike.mean(axis=0)
+        value, vector = np.linalg.eigh(centred - centred.mean(axis=1, keepdims=True))
+        large = value > _NEGLIGIBLE * len(at)
+        return cls(at, vector[:, large] / np.sqrt(value[large]), alike.mean(axis=0))
+
+    def __len__(self) -> int:
+        return self.weights.shape[1]
+
+    def __call__(self, R_base_flange: Array) -> Array:
+        """Return their values (n, k)."""
+        return np.asarray((_alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
+
+
+def _alike(R: Array, others: Array) -> Array:
+    """Correlation (n, m) of the values at two orientations."""
+    return np.asarray(np.exp((R.reshape(-1, 9) @ others.reshape(-1, 9).T - 3) / (2 * SMOOTH_RAD**2)))
+
+
 def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     """Derivative (n, 6, 34) of the wrench by the error vector of `Load.moved`, at the motion that the delay gives."""
     static, m, Q = load.static, load.mass_kg, load.static.R_flange_sensor
     Qt, F_b, c = Q.T, static.gravity_force_base_N, static.p_sensor_com_m
-    lever = np.array([0.0, 0.0, load.height_m]) + Q @ c
     second = np.tensordot(load.inertia, SECOND_MOMENTS, 1)
     force = _force(load, motion)
     R, Omega = motion.R_base_flange, motion.Omega_rad2_s2
-    accelerated = motion.acceleration_m_s2 + Omega @ lever
+    accelerated = motion.acceleration_m_s2 + Omega @ load.lever_m
     u = force @ Q
     direction = F_b / max(static.weight_N, 1e-12) / load.g_m_s2
 
@@ -170,9 +237,8 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
 
 def _force(load: Load, motion: Motion) -> Array:
     """Force (n, 3) of the load in flange axes."""
-    lever = np.array([0.0, 0.0, load.height_m]) + load.static.R_flange_sensor @ load.static.p_sensor_com_m
     weight = load.static.gravity_force_base_N @ motion.R_base_flange
-    return np.asarray(weight - load.mass_kg * (motion.acceleration_m_s2 + motion.Omega_rad2_s2 @ lever))
+    return np.asarray(weight - load.mass_kg * (motion.acceleration_m_s2 + motion.Omega_rad2_s2 @ load.lever_m))
 
 
 def _vee(M: Array) -> Array:
@@ -232,6 +298,7 @@ class RowNoise:
         place: NDArray[np.intp],
         *,
         bursts: bool = False,
+        order: int = ORDER,
     ) -> Self:
         """Estimate from kept rows.
 
@@ -245,6 +312,8 @@ class RowNoise:
         bursts : bool
             Whether noise that seems weaker at the frequencies of the motion than above them counts as white: gears
             shake the tool quickly where a joint reverses, but unequal weights let that reach low frequencies.
+        order : int
+            Largest of the autoregression.
         """
         X = np.concatenate([residuals[:, :, None], absorbed], axis=2)
         common = np.sqrt(np.mean(np.sum(X**2, axis=2), axis=0)) + 1e-12
@@ -253,7 +322,7 @@ class RowNoise:
         by_state = np.stack([np.bincount(state, group) for group in square.T], axis=1) / counts
         scale = np.sqrt(np.repeat(by_state, 3, axis=1)) * common
         unit = X / scale[state][:, :, None]
-        channels = [_filters(channel, place, bursts=bursts) for channel in np.moveaxis(unit, 1, 0)]
+        channels = [_filters(channel, place, bursts=bursts, order=order) for channel in np.moveaxis(unit, 1, 0)]
         noise = cls(scale, _of_equal_order(channels), np.eye(6))
         left = noise.whiten(X, state, place)
         correlation = np.einsum("nik,njk->ij", left, left) / len(left)
@@ -273,9 +342,9 @@ class RowNoise:
         return np.asarray(self.root @ result)
 
 
-def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool) -> Array:
+def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool, order: int = ORDER) -> Array:
     """Predictors (order + 1, order + 1) of a channel by Levinson's recursion, of the order of least BIC."""
-    most, size = min(ORDER, len(unit) // _ROWS_PER_ORDER), len(unit)
+    most, size = min(order, len(unit) // _ROWS_PER_ORDER), len(unit)
     lags = np.empty(most + 1)
     for lag in range(most + 1):
         paired = place >= lag

@@ -155,7 +155,6 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
     places = np.r_[0:15, 23:34]
     response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if responding else None
-    error = expected_error(best.load.static, best.covariance[:15, :15], response)
     return CalibrationResult(
         parameters=best.load.static,
         covariance=best.covariance[:15, :15],
@@ -173,8 +172,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         gain_sigma=best.components.get("gain", 0.0 if earlier is None else earlier.gain_sigma),
         second_basin_chi2=best.second_basin_chi2,
         quality={
-            "next_use_force_rms_N": error[0],
-            "next_use_torque_rms_Nm": error[1],
+            "next_use_force_rms_N": float(best.next_use[0]),
+            "next_use_torque_rms_Nm": float(best.next_use[1]),
             **{name: value for name, value in quality.to_dict().items() if name in _KEPT},
         },
         motion=motion,

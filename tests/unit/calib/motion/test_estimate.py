@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.linalg import block_diag
+from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array, skew
@@ -15,6 +16,7 @@ from ftcalib.motion.estimate import (
     KNOT_S,
     TOUCH_N,
     TOUCH_NM,
+    _SIZES,
     _first_kept,
     _local,
     _Problem,
@@ -113,7 +115,9 @@ def posed() -> tuple[_Problem, Load, Array]:
     rng = np.random.default_rng(1)
     near = truth.moved(1e-3 * rng.normal(size=SIZE))
     drift = rng.normal(size=(len(problem.knots), 6)) * np.repeat([0.05, 2e-3], 3)
-    return problem, near, drift - drift.mean(axis=0)
+    effects = np.zeros(len(problem.centred))
+    effects[: drift.size] = (drift - drift.mean(axis=0)).ravel()
+    return problem, near, effects
 
 
 def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[_Problem, Load, Array]) -> None:
@@ -130,14 +134,15 @@ def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[_Problem, Load, Arr
 
 @pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
 def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load, Array], off: tuple[str, ...]) -> None:
-    problem, load, drift = posed
+    problem, load, effects = posed
     sizes = {name: 0.0 if name in off else size for name, size in ALL_ON.items()}
-    sums = problem.sums(load, drift, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
-    dense = Dense(problem, load, drift)
+    sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
+    dense = Dense(problem, load, problem.drift(effects))
     assert sums[2] == pytest.approx(float(dense.r @ dense.r))
-    found = problem.solve(sizes, sums, load, drift)
+    found = problem.solve(sizes, sums, load, effects)
     values, covariance, cost, criterion = dense.solution(sizes)
-    step = np.concatenate([found.step[:SIZE], problem.centred @ found.step[SIZE:]])
+    assert not (problem.centred @ found.step[SIZE:])[len(dense.value) - SIZE :].any()
+    step = np.concatenate([found.step[:SIZE], problem.centred @ found.step[SIZE:]])[: len(dense.value)]
     sigma = np.sqrt(np.diag(found.covariance))[:15]
     np.testing.assert_allclose((step + dense.value)[:15] / sigma, values[:15] / sigma, atol=1e-4)
     scale = np.abs(values[15:]).reshape(-1) + 1e-9
@@ -147,16 +152,75 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
     )
     assert found.cost == pytest.approx(cost, rel=1e-8)
     larger = {name: 2 * size for name, size in sizes.items()}
-    other = problem.solve(larger, sums, load, drift).criterion
+    other = problem.solve(larger, sums, load, effects).criterion
     assert other - found.criterion == pytest.approx(dense.solution(larger)[3] - criterion, abs=1e-5)
-    none = problem.solve({}, sums, load, drift).criterion
+    none = problem.solve({}, sums, load, effects).criterion
     assert none - found.criterion == pytest.approx(dense.solution(dict.fromkeys(ALL_ON, 0.0))[3] - criterion, abs=1e-5)
     taken = problem.absorb(load, problem.rows[:20], found)
-    T = block_diag(np.eye(SIZE), problem.centred)
+    T = block_diag(np.eye(SIZE), problem.centred[: len(dense.value) - SIZE])
     J = dense.J[:120].reshape(20, 6, -1) * SIGMA[:, None] @ T
     np.testing.assert_allclose(
         np.einsum("nik,njk->nij", taken, taken), J @ found.covariance @ np.swapaxes(J, 1, 2), rtol=1e-6, atol=1e-9
     )
+
+
+@pytest.mark.parametrize("name", _SIZES)
+def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(
+    posed: tuple[_Problem, Load, Array], name: str
+) -> None:
+    problem, load, effects = posed
+    sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
+    sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
+    tried = _SIZES[name][[2, -3]]
+    found = problem.criteria(name, tried, sizes, sums, load, effects)
+    at_zero = problem.solve({**sizes, name: 0.0}, sums, load, effects).criterion
+    expected = [problem.solve({**sizes, name: size}, sums, load, effects).criterion - at_zero for size in tried]
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+def slowly_turned(rows: Rows) -> Rows:
+    """The same rows in the order of a smooth path through their orientations."""
+    order = np.argsort(rows.motion.R_base_flange[:, 2, 0])
+    return replace(rows, wrench=rows.wrench[order], motion=rows.motion[order], rate=rows.rate[order])
+
+
+def test_a_smooth_error_of_the_poses_is_part_of_sigma_and_of_the_next_use() -> None:
+    truth, errors, ratios = load_of(Truth()), [], []
+    for seed in range(4):
+        rows = slowly_turned(rows_of(220, truth, seed=seed, turn_rad=0.9, sigma=SIGMA / 20))
+        R = rows.motion.R_base_flange
+        # About (R e) of a degree that no constant turn has.
+        weights = np.random.default_rng([seed, 1]).normal(size=(9, 9, 3))
+        turn_rad = 4e-4 * np.einsum("ni,nj,ijk->nk", R.reshape(-1, 9), R.reshape(-1, 9), weights)
+        true = Rotation.from_matrix(R) * Rotation.from_rotvec(turn_rad)
+        wrench = wrench_of(truth, replace(rows.motion, R_base_flange=true.as_matrix()))
+        noise = SIGMA / 20 * np.random.default_rng([seed, 2]).normal(size=(220, 6))
+        found = fit(replace(rows, wrench=wrench + noise), None, G)
+        alone = fit(rows, None, G)
+        assert found.components["rotation_rad"] > 10 * alone.components["rotation_rad"]
+        still = Motion(R, np.zeros((220, 3)), np.zeros((220, 3, 3)))
+        read = wrench_of(truth, replace(still, R_base_flange=true.as_matrix()))
+        left = (read - wrench_of(found.load, still)).reshape(-1, 2, 3)
+        ratios.append(found.next_use / np.sqrt(np.mean(np.sum(left**2, axis=2), axis=0)))
+        sigma = np.sqrt(np.diag(found.covariance))[6:15]
+        errors.append(truth.static.difference(found.load.static)[6:15] / sigma)
+    assert (0.7 < np.mean(ratios, axis=0)).all()
+    assert (np.mean(ratios, axis=0) < 1.4).all()
+    assert np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_noise_of_seconds_is_part_of_the_sigma_of_the_bias() -> None:
+    errors = []
+    for seed in range(4):
+        rows = rows_of(200, load_of(Truth()), seed=seed, turn_rad=0.9, sigma=SIGMA / 4)
+        rng = np.random.default_rng([seed, 3])
+        keeps = float(np.exp(-ROW_S / 5.0))
+        course = lfilter([np.sqrt(1 - keeps**2)], [1, -keeps], rng.normal(size=(700, 6)), axis=0)[500:]
+        found = fit(replace(rows, wrench=rows.wrench + 0.5 * SIGMA * course), None, G)
+        assert found.components["slow_N"] > 0.01
+        error = load_of(Truth()).static.difference(found.load.static)[[6, 7, 8, 12, 13, 14]]
+        errors.append(error / np.sqrt(np.diag(found.covariance))[[6, 7, 8, 12, 13, 14]])
+    assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.5
 
 
 def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load, Array]) -> None:
@@ -164,14 +228,14 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load,
     _, load, _ = posed
     rows = rows_of(1010, load, seed=4)
     wide = _Problem(rows, None, G, point_mass=False)
-    drift = np.zeros((len(wide.knots), 6))
+    effects = np.zeros(len(wide.centred))
     kept = all_kept(rows)
     kept[990:995] = False
     filters = np.zeros((2, 6, 2))
     filters[0, :, 0], filters[1] = 1.0, [1.25, -0.75]
     noise = RowNoise(SIGMA[None] * np.array([[1.0], [3.0]]), filters, np.eye(6))
     state = np.arange(1010, dtype=np.intp) % 2
-    H, b, chi2 = wide.sums(load, drift, noise, kept, state)
+    H, b, chi2 = wide.sums(load, effects, noise, kept, state)
     unit = (rows.wrench - wide.predict(load, rows)) / noise.scale[state]
     J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
     white, derivative = unit.copy(), J.copy()
