@@ -393,10 +393,12 @@ class CalibrationResult:
     def noise_explains(self) -> bool:
         """Whether the residuals agree with the noise model.
 
-        True for an update, whose poses are too few for a test, and in motion, where each state has the noise of its
-        residuals.
+        True for an update, whose poses are too few for a test. In motion each state has the noise of its residuals, and
+        smooth errors have their part of the next use: they explain the rows if they add no more to it than sigma has.
         """
-        return not self.quality or self.motion is not None or (self.p_value is not None and self.p_value >= SURE)
+        if self.motion is not None:
+            return bool((self.likely_error() <= np.array(self.predicted_error())).all())
+        return not self.quality or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self, where: Literal["next_use", "workspace", "hour"] = "next_use") -> Array:
         """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.

@@ -256,15 +256,21 @@ class _Problem:
         start = self.centred.shape[1] - self.others + 6 * len(self.slow_knots)
         return slice(start, self.centred.shape[1] - 3)
 
-    def unseen(self, load: Load, residual: Array) -> Array:
+    def unseen(self, load: Load, residuals: Array) -> Array:
         """Root (n, 6, k) of the covariance that smooth errors give the rows: of an arm, and of a cable.
 
-        The arm has the expected one, and the cable pulls by as much as the residuals (2,) of force and torque.
+        The arm has the expected one, and the cable pulls by as much as residuals (n, 6) are smooth beyond noise.
         """
-        pull = {"cable_N": residual[0], "cable_Nm": residual[1]}
-        P, _, _ = self.components({**EXPECTED, **pull}, load)
         motion = self.rows.motion.earlier(load.delay_s, self.rows.rate)
-        return np.asarray(self.smooth_columns(load, motion) / np.sqrt(np.diag(P)[SIZE:][self.smooth_effects]))
+        values = np.linalg.qr(self.functions(nearest_rotation(motion.R_base_flange)))[0]
+        noise = values.shape[1] * np.mean(residuals**2, axis=0)
+        beyond = np.sum((values.T @ residuals) ** 2, axis=0) - noise
+        pull = np.sqrt(np.maximum(beyond.reshape(2, 3).sum(axis=1) / beyond.size * 2, 0) / len(residuals))
+        sizes = {"rotation_rad": EXPECTED["rotation_rad"], "cable_N": pull[0], "cable_Nm": pull[1]}
+        variance = np.zeros(SIZE + self.centred.shape[1])
+        for name, size in sizes.items():
+            variance[self.groups[name][0]] = size**2
+        return np.asarray(self.smooth_columns(load, motion) * np.sqrt(variance[SIZE:][self.smooth_effects]))
 
     def next_use(self, load: Load, effects: Array, solved: "_Step") -> Array:
         """Root mean square error (2,) of compensating a free tool at rest in the poses of the rows, N and N·m.
@@ -694,7 +700,8 @@ def _freely(problem: _Problem, load: Load) -> FreeFit:
         error = replace(error, scale=error.scale + float(step[SIZE]), aside_m=error.aside_m + step[SIZE + 1 :])
         if limit == LIMIT and np.abs(step[:6]).max() < 1e-6:
             break
-    hidden = Z @ covariance @ (Z.T @ weighted.T @ (problem.unseen(load, scale[::3]) / scale[:, None]).reshape(len(J) * 6, -1))
+    unseen = (problem.unseen(load, r * weight[:, None]) / scale[:, None]).reshape(6 * len(rows), -1)
+    hidden = Z @ covariance @ (Z.T @ weighted.T @ unseen)
     return FreeFit(load, error, Z @ covariance @ Z.T + hidden @ hidden.T, scale[::3])
 
 
@@ -774,4 +781,4 @@ def _hats(knots: Array, t_s: Array) -> Array:
 
 def _on_channels(values: Array) -> Array:
     """Derivative (n, 6, 6 k) of a wrench that is the sum of values (n, k), each with weights of its own a channel."""
-    return np.einsum("nk,ij->nikj", values, np.eye(6)).reshape(len(values), 6, -1)
+    return np.asarray(np.einsum("nk,ij->nikj", values, np.eye(6)).reshape(len(values), 6, -1))

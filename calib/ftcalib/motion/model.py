@@ -78,7 +78,7 @@ class Load:
     @property
     def lever_m(self) -> Array:
         """(3,) from the flange to the centre of mass, in flange axes."""
-        return np.asarray(np.array([0.0, 0.0, self.height_m]) + self.static.R_flange_sensor @ self.static.p_sensor_com_m)
+        return np.asarray(self.static.R_flange_sensor @ self.static.p_sensor_com_m + [0.0, 0.0, self.height_m])
 
     @property
     def inertia_kg_m2(self) -> Array:
@@ -190,7 +190,7 @@ class SmoothFunctions:
         return cls(at, vector[:, large] / np.sqrt(value[large]), alike.mean(axis=0))
 
     def __len__(self) -> int:
-        return self.weights.shape[1]
+        return int(self.weights.shape[1])
 
     def __call__(self, R_base_flange: Array) -> Array:
         """Return their values (n, k)."""

@@ -348,7 +348,10 @@ def test_noise_explains_the_residuals_unless_a_test_says_otherwise() -> None:
         assert replace(RESULT, p_value=p_value).noise_explains == explains
     assert replace(RESULT, p_value=None, quality={}).noise_explains
     motion = MotionResult(np.eye(3), 0.01, 0.05, np.eye(23), 0.9)
-    assert replace(RESULT, p_value=None, motion=motion).noise_explains
+    for share, explains in ((1.0, True), (1.01, False)):
+        error = share * np.array(RESULT.predicted_error())
+        quality = {**RESULT.quality, "next_use_force_rms_N": error[0], "next_use_torque_rms_Nm": error[1]}
+        assert replace(RESULT, p_value=None, motion=motion, quality=quality).noise_explains == explains
     np.testing.assert_array_equal(replace(RESULT, quality={}).likely_error(), RESULT.predicted_error())
     old = {name: value for name, value in RESULT.quality.items() if not name.startswith("next_use")}
     left_out = [RESULT.quality["loo_force_rms_N"], RESULT.quality["loo_torque_rms_Nm"]]

@@ -4,11 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, NotObservable
 from ftcalib.errors import BadDataset
 from ftcalib.model import Parameters
-from ftcalib.motion.model import SIZE, Load, jacobian, wrench_of
+from ftcalib.motion.model import (
+    SIZE,
+    Load,
+    SmoothFunctions,
+    jacobian,
+    lever_columns,
+    turn_columns,
+    wrench_of,
+)
 from ftcalib.motion.samples import Means, Motion, rows_of
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
@@ -54,6 +63,32 @@ def test_jacobian_is_the_derivative() -> None:
     steps = 1e-6 * np.eye(SIZE)
     numeric = np.stack([(read(step) - read(-step)) / 2e-6 for step in steps], axis=2)
     np.testing.assert_allclose(jacobian(load, motion, rate), numeric, atol=1e-6)
+
+
+def test_turns_and_lever_are_derivatives() -> None:
+    rng = np.random.default_rng(1)
+    columns, load = rng.standard_normal((4, 21)), load_of(TRUTH)
+    columns[:, :9] = Rotation.random(4, rng).as_matrix().reshape(4, 9)
+    motion = Motion.of_columns(columns)
+    for axis, turn in enumerate(Rotation.from_rotvec(1e-6 * np.eye(3))):
+        true = replace(motion, R_base_flange=motion.R_base_flange @ turn.as_matrix())
+        numeric = (wrench_of(load, true) - wrench_of(load, motion)) / 1e-6
+        np.testing.assert_allclose(turn_columns(load, motion)[:, :, axis], numeric, atol=1e-4)
+        # The centre of mass of the torques stays, so they see only the force.
+        static = replace(load.static, p_sensor_com_m=load.static.p_sensor_com_m + 1e-6 * np.eye(3)[axis])
+        force = (wrench_of(replace(load, static=static), motion) - wrench_of(load, motion))[:, :3] / 1e-6
+        expected = np.hstack([force, np.cross(load.static.p_sensor_com_m, force)])
+        np.testing.assert_allclose(lever_columns(load, motion)[:, :, axis], expected, atol=1e-4)
+
+
+def test_smooth_functions_vary_over_the_recording_and_are_alike_nearby() -> None:
+    R = Rotation.from_euler("xyz", np.random.default_rng(2).uniform(-1, 1, (150, 3))).as_matrix()
+    functions = SmoothFunctions.of(R)
+    values = functions(R)
+    assert values.shape == (150, len(functions))
+    np.testing.assert_allclose(values.mean(axis=0), 0, atol=1e-9)
+    near = functions(R @ Rotation.from_rotvec([0.01, 0, 0]).as_matrix()) - values
+    assert (np.sum(near**2, axis=1) < 1e-3 * np.mean(np.sum(values**2, axis=1))).all()
 
 
 def test_a_sweep_gives_all_that_motion_shows(result: CalibrationResult) -> None:
