@@ -87,6 +87,7 @@ _SIZES: Mapping[str, Array] = {
     "walk_Nm": np.geomspace(6e-6, 6e-3, 10),
     "slow_N": np.geomspace(1e-4, 1.0, 41),
     "slow_Nm": np.geomspace(2e-6, 2e-2, 41),
+    "yielding_rad": np.geomspace(1e-6, 1e-2, 41),
     "rotation_rad": np.geomspace(1e-6, 1e-2, 41),
     "cable_N": np.geomspace(1e-4, 1.0, 41),
     "cable_Nm": np.geomspace(4e-6, 4e-2, 41),
@@ -100,6 +101,7 @@ ABSENT, WITHIN = 0.7, 3.0
 EXPECTED: Mapping[str, float] = {
     "slow_N": 5e-3,
     "slow_Nm": 2e-4,
+    "yielding_rad": float(np.radians(0.05)),
     "rotation_rad": float(np.radians(0.05)),
     "cable_N": 0.01,
     "cable_Nm": 1e-3,
@@ -189,7 +191,9 @@ class _Problem:
             for unit, channels in (("N", slice(0, 3)), ("Nm", slice(3, 6))):
                 groups[f"{name}_{unit}"] = places[:, channels].ravel(), np.kron(precision, np.eye(3))
             at = first + 6 * len(precision)
-        groups["rotation_rad"] = start + 6 * len(slow) + np.arange(turns), np.eye(turns)
+        of_turns = start + 6 * len(slow) + np.arange(turns)
+        groups["yielding_rad"] = of_turns[-12:-3], np.eye(9)
+        groups["rotation_rad"] = np.append(of_turns[:-12], of_turns[-3:]), np.eye(turns - 9)
         # An antisymmetric entry has half the variance of an entry.
         precision = np.diag(np.append(np.ones(CROSS_TALK.stop - CROSS_TALK.start), np.full(3, 2 / LEVER_M**2)))
         groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
