@@ -140,6 +140,11 @@ def tour(rng: Generator, n: int, where: str) -> Array:
     return np.asarray(some[rng.permutation(chosen)])
 
 
+def dwell_times(n: int, start_s: float) -> Array:
+    """Times (n, 125) of the samples of n dwells."""
+    return np.asarray(start_s + POSE_S * np.arange(n)[:, None] + np.arange(round(RATE_HZ * DWELL_S)) / RATE_HZ)
+
+
 @dataclass(frozen=True)
 class Truth:
     """What a perfect session would find."""
@@ -321,13 +326,12 @@ class Cell:
 
     def dwells(self, q: Array, start_s: float, *, load: Load | None = None, kind: int = 0) -> tuple[Array, Array]:
         """Times (n,) of dwells at joints (n, 6), and their samples (n, 125, 6); `kind` gives other noise."""
-        at: Array = start_s + POSE_S * np.arange(len(q), dtype=np.float64)
-        n = round(RATE_HZ * DWELL_S)
+        t = dwell_times(len(q), start_s)
         gaps = [round(RATE_HZ * (POSE_S - DWELL_S))] * len(q)
-        t = (at[:, None] + np.arange(n) / RATE_HZ).ravel()
-        shared = self.readings(q, load)[:, None] + self.bias + (self.warmed(t) + self.hum(t)).reshape(len(q), n, 6)
+        moving = (self.warmed(t.ravel()) + self.hum(t.ravel())).reshape(*t.shape, 6)
         rng = np.random.default_rng([*self._seed, 1000 + kind])
-        return at, shared + self.noise(rng, gaps, n, RATE_HZ)
+        shared = self.readings(q, load)[:, None] + self.bias + moving
+        return t[:, 0], shared + self.noise(rng, gaps, t.shape[1], RATE_HZ)
 
     def truth(self, q_region: Array, t_s: Array) -> Truth:
         """What a perfect session in a region would find: bias as the mean over times, gain and load as without error.
@@ -342,7 +346,7 @@ class Cell:
         return Truth(
             turned(turns[:3]) @ self.R_flange_sensor,
             turned(-turns[3:]) @ (self.load.kg * self.gravity_m_s2),
-            self.bias + self.warmed(t_s).mean(axis=0) + self.cable(q_region).mean(axis=0),
+            self.bias + (self.warmed(t_s) + self.hum(t_s)).mean(axis=0) + self.cable(q_region).mean(axis=0),
             self.load.p_sensor_com_m,
         )
 
