@@ -294,8 +294,8 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     last, n = results[-1], 15
     covariances = [one.covariance for one in results]
     differences = [last.parameters.difference(one.parameters) for one in results]
+    responses = [one for each in results if (one := known_response(each, each.response)) is not None]
     if any(one.response is not None for one in results):
-        responses = [known_response(one) for one in results]
         n += len(responses[-1].coefficients)
         covariances = [one.covariance for one in responses]
         differences = [

@@ -232,7 +232,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
         *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
-        *_response(fit.response, weight_N),
+        *_response(fit.response, weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
         *([] if cable is None else [cable[0]]),
     ]
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
@@ -487,7 +487,7 @@ def _drift(drift: DriftResult | None, ahead: DriftAhead, weight_N: float, *, is_
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 
 
-def _response(response: Response | None, weight_N: float) -> list[Finding]:
+def _response(response: Response | None, weight_N: float, *, assumed: bool = False) -> list[Finding]:
     """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
     if response is None:
         return []
@@ -504,7 +504,7 @@ def _response(response: Response | None, weight_N: float) -> list[Finding]:
     ]
     if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
         findings.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
-    return findings or [Finding.of("response_small")]
+    return findings or ([] if assumed else [Finding.of("response_small")])
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:

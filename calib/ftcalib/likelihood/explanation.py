@@ -191,11 +191,7 @@ def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Compone
     start = units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
     problem = problem.with_only(components)
-    at = best
-    if best.own.walks:
-        at = point(problem, components, theta)
-    elif best.problem is not problem:
-        at = point(problem, best.components, best.theta)
+    at = _where_all_are_seen(problem, best, components, theta)
     slope, information = score(problem, at, components, theta)
     k = len(best.components)
     curvature, slope_k = np.diag(information)[k:], slope[k:]
@@ -210,6 +206,13 @@ def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Compone
             share = np.array(c.share)
             start[i] = max(0.1 * start[i], float(square @ share) / share.sum() - start[i])
     return gains, start
+
+
+def _where_all_are_seen(problem: Linearised, best: Point, components: Sequence[Component], theta: Array) -> Point:
+    """Give a point as good as the best one at which the score of further components can be taken."""
+    if best.own.walks:
+        return point(problem, components, theta)
+    return best if best.problem is problem else point(problem, best.components, best.theta)
 
 
 def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) -> list[tuple[Point, float]]:
@@ -237,7 +240,7 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
     """Add the candidates whose variance is positive where the likelihood, as a parabola from zero, is largest."""
     start = NEGLIGIBLE * units(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, start])
-    at = point(problem, components, theta) if best.own.walks else best
+    at = _where_all_are_seen(problem, best, components, theta)
     slope, information = score(problem, at, components, theta)
     acting = np.arange(len(components))
     while True:

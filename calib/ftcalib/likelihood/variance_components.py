@@ -465,8 +465,9 @@ def expected_variances(problem: Linearised, at: Point) -> Array:
     """
     slope, information = score(problem, at, at.components, at.theta)
     scale = column_scale(information)
-    correlation = information / np.outer(scale, scale) + 1e-9 * np.eye(len(scale))
-    spread = at.theta / scale * np.sqrt(np.diag(np.linalg.inv(correlation)))
+    value, vector = np.linalg.eigh(information / np.outer(scale, scale))
+    # By rounding alone eigenvalues are not positive.
+    spread = at.theta / scale * np.sqrt((vector**2 / np.maximum(value, 1e-9)).sum(axis=1))
     mode = at.theta / spread + spread * slope / at.theta
     variance = (np.linspace(0.0, 1.0, 200)[:, None] * np.sqrt(np.maximum(mode, 0.0) + 6.0)) ** 2
     density = np.exp(variance * np.minimum(mode, 0.0) - (variance - np.maximum(mode, 0.0)) ** 2 / 2)

@@ -216,7 +216,7 @@ def test_calibrate_solve_and_library_say_the_same(lab: Lab, capsys: pytest.Captu
         up_in_base=(np.sin(lean), 0, np.cos(lean)), cylinders_m=[(0.0, 0.2, 0.1)], payload_kg=2.5, sensor_mass_kg=None
     )
     result = solve(outcome.dataset, g_m_s2=outcome.result.g_m_s2, setup=setup)
-    assert [one.code for one in result.findings] == ["payload_mismatch", "base_leans"]
+    assert [one.code for one in result.findings] == ["payload_mismatch", "gain_unknown", "base_leans"]
     assert (result.verdict, result.findings) == (outcome.result.verdict, outcome.result.findings)
     capsys.readouterr()
     print_result(outcome.result, drift=outcome.drift, records=records)
