@@ -141,7 +141,9 @@ class CalibrationResult:
     if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
     linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
     `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
-    share of its last swing by which each axis lags."""
+    share of its last swing by which each axis lags. `load_…`, `cable_…` and `kinematics_rad` are errors that have a
+    structure (`ftcalib.likelihood.structure`). In motion `rotation_rad` and `yielding_rad` are smooth turns of arm and
+    mount, and `slow_…` is noise of seconds."""
     drift: DriftResult | None = None
     """None: no drift was found, or `drift="none"`."""
     response: Response | None = None
@@ -405,8 +407,9 @@ class CalibrationResult:
 
         It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
         each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
-        bias from the mean of the tour to one minute after the last pose. In the "workspace" it is that in any
-        orientation, and after an "hour" that with the drift until then: NaN where the tour shows none.
+        bias from the mean of the tour to one minute after the last pose. In motion it is that of load and smooth
+        errors, at rest in the orientations of the recording. In the "workspace" it is that in any orientation, and
+        after an "hour" that with the drift until then: NaN where the tour shows none.
         """
         if not self.quality:
             return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)

@@ -87,8 +87,8 @@ def verify(
     """Compare fresh poses, far from those of the calibration, with its prediction.
 
     The session is that of `calibrate`: a certified plan, checks, safety questions, guards. Without --max-force and
-    --max-torque, 1 to 3 % of unchanged cells fail. If it fails, it names what has changed, offers the smallest
-    sufficient update, and ends with exit code 7.
+    --max-torque, 1 % of unchanged cells fail near the poses of the fit, more far from them. If it fails, it names what
+    has changed, offers the smallest sufficient update, and ends with exit code 7.
     """
     from ftdrive.errors import NotAccepted
     from ftdrive.runs.verification import AcceptanceLimits

@@ -282,8 +282,8 @@ class DriftFilter:
 
 
 def variance_at_next_use(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) of an axis at the next use beyond the prediction: what residuals leave, and drift."""
-    excess = np.square(calibration.likely_error()) - np.square(calibration.predicted_error())
+    """Return the variance (6,) of an axis in any orientation beyond the prediction: what residuals leave, and drift."""
+    excess = np.square(calibration.likely_error("workspace")) - np.square(calibration.predicted_error())
     return np.repeat(excess.clip(0.0) / 3, 3)
 
 

@@ -159,7 +159,9 @@ def error_in_words(result: CalibrationResult) -> str:
     if result.noise_explains and likely == predicted:
         return f"{predicted} rms (predicted)"
     sources = []
-    if not result.noise_explains:
+    if result.motion is not None and not result.noise_explains:
+        sources.append("with smooth errors of arm, cable and load")
+    elif not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
         sources.append(f"cross-validated, as {why}")
     if any(result.quality.get("last_bias_offset", ())):
@@ -415,7 +417,7 @@ def verdict_in_words(verified: Verified) -> str:
         given = ((limits.force_N, "N"), (limits.torque_Nm, "N·m"))
         return f"{words}; limit {', '.join(f'{limit:g} {unit}' for limit, unit in given if limit is not None)}"
     found = verified.verification
-    alarms = f"{100 * FALSE_ALARMS:g} % of unchanged cells fail"
+    alarms = f"{100 * FALSE_ALARMS:g} % of unchanged cells fail near the poses of the fit"
     return f"{words}; chi2 {found.chi2:.0f} for {found.dof} degrees of freedom, p {found.p_value:.2g} ({alarms})"
 
 

@@ -69,7 +69,9 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
 
 
 def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
-    assert "p 1e-09 (1 % of unchanged cells fail)" in verdict_in_words(failed(tmp_path, AcceptanceLimits()))
+    assert "p 1e-09 (1 % of unchanged cells fail near the poses of the fit)" in verdict_in_words(
+        failed(tmp_path, AcceptanceLimits())
+    )
     given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))
     assert verdict_in_words(given) == "largest difference 0.520 N, 0.5196 N·m; limit 1 N, 0.1 N·m"
     assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
