@@ -125,7 +125,11 @@ def session_change(
     changes = [likeliest_change(found.parameters, R, wrench, sigma), bias_steps(R, wrench) if steps else None]
     costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
     cost, change = min(costs, key=lambda pair: pair[0], default=(np.inf, None))
-    if change is None or cost >= minus_two_log_likelihood(fit(R, wrench, cov, t_s=times)):
+    if change is None or not np.isfinite(cost):
+        return []
+    # The same poses with the same noise have been fitted already.
+    known = found if sigma is None and n == len(found.wrench) else fit(R, wrench, cov, t_s=times)
+    if cost >= minus_two_log_likelihood(known):
         return []
     poses = (order[change.starts] + 1).tolist()
     code, values = change.code, {"pose": poses if len(poses) > 1 else poses[0]} | dict(change.values)
