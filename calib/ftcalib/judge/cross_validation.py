@@ -138,6 +138,8 @@ USUAL_INTERVAL_S = 10.0
 # From the last pose to the next use.
 NEXT_USE_S = 60.0
 HOUR = 3600.0 / NEXT_USE_S
+# A linear drift is mostly the beginning of a warm-up, of 10 to 30 min.
+WARM_UP = 1200.0 / NEXT_USE_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,5 +181,6 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
     linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.
     known = fit.drift.sigma**2 / 2
-    square, hour = ((offset + steps * linear) ** 2 + steps * walk + known for steps in (1.0, HOUR))
+    square = (offset + linear) ** 2 + walk + known
+    hour = (offset + WARM_UP * (1 - np.exp(-HOUR / WARM_UP)) * linear) ** 2 + HOUR * walk + known
     return DriftAhead(offset, np.sqrt(walk + linear**2), square, hour)
