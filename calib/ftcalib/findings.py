@@ -430,6 +430,12 @@ CODES: Final[Mapping[str, Code]] = {
     "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
         "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
         "look for drift, cables, contact and inexact orientations"),
+    "response_not_linear": Code(_LIMIT_OR_NOTE, "the response of the sensor is not linear, by {share_percent:.2g} of "
+        "the weight, which compensation does not know", "stay within the range of the sensor, or have it calibrated"),
+    "cable_acts": Code(_LIMIT_OR_NOTE, "something pulls as the tool turns, as a cable does, by {force_N:.2g} and "
+        "{torque_Nm:.2g}, which compensation does not know", "give cables and hoses more slack"),
+    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have an error of {turn_deg:.2g} that is smooth "
+        "over the poses", "take the factory calibration of the arm, or stiffen the mount"),
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
@@ -489,7 +495,8 @@ _OF_UNITS: Final = frozenset((
 _OF_MISTAKES: Final = _OF_UNITS | {
     "drift", "weight_insignificant", "second_solution", "force_error", "torque_error", "known_values_misfit_force",
     "known_values_misfit_torque", "noise_exceeded", "poses_rejected", "poses_unchecked", "gain_x", "gain_y", "gain_z",
-    "axes_mixed", "cross_talk", "response_small", "cable_spring", "residuals_alike", "pose_deviates",
+    "axes_mixed", "cross_talk", "response_small", "response_not_linear", "cable_acts", "orientations_smoothly_off",
+    "cable_spring", "residuals_alike", "pose_deviates",
 }  # fmt: skip
 _EXPLAINS: Final[Sequence[tuple[frozenset[str], frozenset[str]]]] = (
     (frozenset(("bias_implausible", "torques_about_point", "torques_reversed", "forces_reversed")), _OF_UNITS),

@@ -39,6 +39,8 @@ USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
 SENSELESS_SHARE = 0.5
 # Largest error of a good result whose residuals exceed the measured noise.
 NOISY_SHARE = 0.01
+# Largest error of a good result that has a structure, of the weight: its sigmas rest on a few numbers.
+STRUCTURED_SHARE = 0.002
 # Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
 CORRELATED = 0.9
@@ -231,6 +233,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
+        *(_structure(fit, weight_N) if single_poses else []),
         *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
         *([] if cable is None else [cable[0]]),
@@ -438,6 +441,23 @@ def _left_out_rms(fit: Judged, poses: NDArray[np.bool_]) -> tuple[float, float]:
 def _is_unchecked(fit: Judged) -> NDArray[np.bool_]:
     """(n,) whether the other poses determine too little to predict this one."""
     return np.asarray(np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2)
+
+
+def _structure(fit: Judged, weight_N: float) -> list[Finding]:
+    """Name errors that are smooth over the poses; from 0.2 % of the weight on they limit the result."""
+    sizes, findings = fit.components, list[Finding]()
+    lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
+    load = max(sizes.get("load_force", 0.0), sizes.get("load_torque", 0.0))
+    pull_N, pull_Nm = (sizes.get(f"cable_{unit}", 0.0) for unit in ("force_N", "torque_Nm"))
+    turn_rad = sizes.get("kinematics_rad", 0.0)
+    for code, share, values in (
+        ("response_not_linear", load, {"share_percent": 100 * load}),
+        ("cable_acts", max(pull_N, pull_Nm / lever_m) / weight_N, {"force_N": pull_N, "torque_Nm": pull_Nm}),
+        ("orientations_smoothly_off", turn_rad, {"turn_deg": np.degrees(turn_rad)}),
+    ):
+        if share > 0:
+            findings.append(Finding.of(code, "limit" if share > STRUCTURED_SHARE else "note", **values))
+    return findings
 
 
 def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity, setup: Setup) -> list[Finding]:

@@ -23,6 +23,7 @@ from ftcalib.judge.verdict import (
     _response,
     _second_solution,
     _some_runs,
+    _structure,
     _weight,
     expected_error,
     judge,
@@ -517,6 +518,24 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
     assert (finding.severity, finding.values["components"]) == (severity, {"walk_force_N": 0.1})
     assert _noise(loud, statistics(chi2_p=1.1e-3, noise_factor=factor)) == []
     assert [one.code for one in _noise(loud, statistics(chi2_p=None))] == ["noise_unknown"]
+
+
+@pytest.mark.parametrize(
+    ("components", "found"),
+    [
+        ({"load_force": 0.0019, "load_torque": 0.0005}, [("response_not_linear", "note")]),
+        ({"load_torque": 0.0021}, [("response_not_linear", "limit")]),
+        ({"cable_force_N": 0.0019 * WEIGHT_N}, [("cable_acts", "note")]),
+        ({"cable_torque_Nm": 0.0021 * WEIGHT_N * 0.1}, [("cable_acts", "limit")]),
+        ({"kinematics_rad": 0.0021, "gain": 0.1}, [("orientations_smoothly_off", "limit")]),
+        ({"walk_force_N": 1.0}, []),
+    ],
+)
+def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
+    components: dict[str, float], found: list[tuple[str, str]]
+) -> None:
+    named = _structure(replace(FITTED, components=components), WEIGHT_N)
+    assert [(one.code, one.severity) for one in named] == found
 
 
 def test_poses_are_pointed_at_beyond_their_limits() -> None:
