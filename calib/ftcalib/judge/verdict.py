@@ -41,6 +41,8 @@ SENSELESS_SHARE = 0.5
 NOISY_SHARE = 0.01
 # Largest error of a good result that has a structure, of the weight: its sigmas rest on a few numbers.
 STRUCTURED_SHARE = 0.002
+# The same in motion, and what calibrated arms keep.
+SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 # Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
 CORRELATED = 0.9
@@ -233,7 +235,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
         *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
-        *(_structure(fit, weight_N) if single_poses else []),
+        *_structure(fit, weight_N, in_motion=not single_poses),
         *_drift(fit.drift, quality.ahead, weight_N, is_cause=verdict_of([*broken, *mistakes, *changed]) == "good"),
         *_response(fit.response, weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
         *([] if cable is None else [cable[0]]),
@@ -443,20 +445,37 @@ def _is_unchecked(fit: Judged) -> NDArray[np.bool_]:
     return np.asarray(np.trace(fit.left_out_cov[:, :3, :3], axis1=1, axis2=2) > fit.parameters.weight_N**2)
 
 
-def _structure(fit: Judged, weight_N: float) -> list[Finding]:
-    """Name errors that are smooth over the poses; from 0.2 % of the weight on they limit the result."""
+def _structure(fit: Judged, weight_N: float, *, in_motion: bool = False) -> list[Finding]:
+    """Name errors that are smooth over the poses; large ones limit the result.
+
+    In motion they are always part of the model, and only what limits is named: less than at rest, because little noise
+    is left of so many rows.
+    """
     sizes, findings = fit.components, list[Finding]()
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
-    load = max(sizes.get("load_force", 0.0), sizes.get("load_torque", 0.0))
-    pull_N, pull_Nm = (sizes.get(f"cable_{unit}", 0.0) for unit in ("force_N", "torque_Nm"))
-    turn_rad = sizes.get("kinematics_rad", 0.0)
-    for code, share, values in (
-        ("response_not_linear", load, {"share_percent": 100 * load}),
-        ("cable_acts", max(pull_N, pull_Nm / lever_m) / weight_N, {"force_N": pull_N, "torque_Nm": pull_Nm}),
-        ("orientations_smoothly_off", turn_rad, {"turn_deg": np.degrees(turn_rad)}),
+    per_N = np.array([1.0, lever_m]) * weight_N
+
+    def shares(*names: str) -> Array:
+        return np.array([sizes.get(name, 0.0) for name in names])
+
+    if in_motion:
+        load, pull = (shares(f"{name}_N", f"{name}_Nm") for name in ("load", "cable"))
+        load = load / per_N
+        # An orientation of the arm may be off by as much as calibrated arms are.
+        turn_rad = shares("yielding_rad", "rotation_rad")
+        limits = SMOOTH_SHARE, SMOOTH_SHARE, np.array([SMOOTH_SHARE, CALIBRATED_ARM_RAD])
+    else:
+        load, pull = shares("load_force", "load_torque"), shares("cable_force_N", "cable_torque_Nm")
+        turn_rad = shares("kinematics_rad")
+        limits = STRUCTURED_SHARE, STRUCTURED_SHARE, np.array([STRUCTURED_SHARE])
+    for code, share, limit, values in (
+        ("response_not_linear", load, limits[0], {"share_percent": 100 * float(load.max())}),
+        ("cable_acts", pull / per_N, limits[1], {"force_N": float(pull[0]), "torque_Nm": float(pull[1])}),
+        ("orientations_smoothly_off", turn_rad, limits[2], {"turn_deg": float(np.degrees(turn_rad.max()))}),
     ):
-        if share > 0:
-            findings.append(Finding.of(code, "limit" if share > STRUCTURED_SHARE else "note", **values))
+        too_large = bool((share > limit).any())
+        if too_large or (share.any() and not in_motion):
+            findings.append(Finding.of(code, "limit" if too_large else "note", **values))
     return findings
 
 

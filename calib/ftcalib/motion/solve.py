@@ -57,7 +57,9 @@ WRONG_HEIGHT_M = 3e-3
 MOSTLY = 0.5
 # Share of the change of the force that a wrong recording leaves.
 _UNEXPLAINED = 0.3
-# A recording has no last pose from which a bias could go on, so its next use has the error expected from noise alone.
+# Components that are smooth over the poses.
+_SMOOTH = ("load", "cable", "rotation", "yielding")
+# A recording has no last pose from which a bias could go on, and its next use has an error of its own.
 _KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")
 
 
@@ -269,6 +271,7 @@ def _judge(
         np.ones(len(places)),
         measured=False,
         second_basin_chi2=best.second_basin_chi2,
+        components={name: size for name, size in best.components.items() if name.startswith(_SMOOTH)},
     )
     quality = judge(judged, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2, single_poses=False)
     return quality, places

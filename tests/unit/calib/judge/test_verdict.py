@@ -538,6 +538,21 @@ def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     assert [(one.code, one.severity) for one in named] == found
 
 
+@pytest.mark.parametrize(
+    ("components", "found"),
+    [
+        ({"load_N": 0.0004 * WEIGHT_N, "cable_N": 0.0004 * WEIGHT_N, "yielding_rad": 4e-4, "rotation_rad": 9e-4}, []),
+        ({"load_Nm": 0.0006 * WEIGHT_N * 0.1}, ["response_not_linear"]),
+        ({"cable_N": 0.0006 * WEIGHT_N}, ["cable_acts"]),
+        ({"yielding_rad": 6e-4}, ["orientations_smoothly_off"]),
+        ({"rotation_rad": 1.1e-3}, ["orientations_smoothly_off"]),
+    ],
+)
+def test_in_motion_a_smooth_error_is_named_only_where_it_limits(components: dict[str, float], found: list[str]) -> None:
+    named = _structure(replace(FITTED, components=components), WEIGHT_N, in_motion=True)
+    assert [(one.code, one.severity) for one in named] == [(code, "limit") for code in found]
+
+
 def test_poses_are_pointed_at_beyond_their_limits() -> None:
     def found(fitted: Judged = FITTED, **values: Any) -> list[str]:
         return [one.code for one in _poses(fitted, statistics(**values), "note", Setup())]
