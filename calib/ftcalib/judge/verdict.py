@@ -41,7 +41,7 @@ SENSELESS_SHARE = 0.5
 NOISY_SHARE = 0.01
 # Largest error of a good result that has a structure, of the weight: its sigmas rest on a few numbers.
 STRUCTURED_SHARE = 0.002
-# The same in motion, and what calibrated arms keep.
+# The same in motion, and what is named at rest; and what calibrated arms keep.
 SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 # Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
@@ -448,8 +448,7 @@ def _is_unchecked(fit: Judged) -> NDArray[np.bool_]:
 def _structure(fit: Judged, weight_N: float, *, in_motion: bool = False) -> list[Finding]:
     """Name errors that are smooth over the poses; large ones limit the result.
 
-    In motion they are always part of the model, and only what limits is named: less than at rest, because little noise
-    is left of so many rows.
+    Less limits in motion than at rest, because little noise is left of so many rows.
     """
     sizes, findings = fit.components, list[Finding]()
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
@@ -474,7 +473,7 @@ def _structure(fit: Judged, weight_N: float, *, in_motion: bool = False) -> list
         ("orientations_smoothly_off", turn_rad, limits[2], {"turn_deg": float(np.degrees(turn_rad.max()))}),
     ):
         too_large = bool((share > limit).any())
-        if too_large or (share.any() and not in_motion):
+        if too_large or (not in_motion and (share > SMOOTH_SHARE).any()):
             findings.append(Finding.of(code, "limit" if too_large else "note", **values))
     return findings
 

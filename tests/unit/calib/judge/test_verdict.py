@@ -528,7 +528,7 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
         ({"cable_force_N": 0.0019 * WEIGHT_N}, [("cable_acts", "note")]),
         ({"cable_torque_Nm": 0.0021 * WEIGHT_N * 0.1}, [("cable_acts", "limit")]),
         ({"kinematics_rad": 0.0021, "gain": 0.1}, [("orientations_smoothly_off", "limit")]),
-        ({"walk_force_N": 1.0}, []),
+        ({"walk_force_N": 1.0, "load_force": 0.0004}, []),
     ],
 )
 def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(

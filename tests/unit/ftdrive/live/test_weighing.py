@@ -194,6 +194,6 @@ def test_a_mean_of_few_samples_counts_less() -> None:
 def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
     for explained, variance in ((True, np.zeros(6)), (False, np.repeat([(0.05**2 - 0.03**2) / 3, 0.0], 3))):
         calibration: Any = SimpleNamespace(
-            noise_explains=explained, likely_error=lambda: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
+            noise_explains=explained, likely_error=lambda _: (0.05, 0.002), predicted_error=lambda: (0.03, 0.003)
         )
         np.testing.assert_allclose(unexplained_variance(calibration), variance)
