@@ -503,10 +503,14 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     x, C = estimates(at)
     if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
+    # A variance that was assumed is known.
+    free = np.flatnonzero(at.theta > 1.001 * np.array([at.problem.smallest(c) for c in at.components]))
+    if not free.size:
+        return x, C
     _, information = score(at.problem, at, at.components, at.theta)
-    uncertainty = np.linalg.pinv(information, rcond=1e-6, hermitian=True)
-    k, h = len(at.theta), 1e-3
-    around = [estimates(point(at.problem, at.components, at.theta * np.exp(h * row), at)) for row in np.eye(k)]
+    uncertainty = np.linalg.pinv(information[np.ix_(free, free)], rcond=1e-6, hermitian=True)
+    h, steps = 1e-3, np.eye(len(at.theta))[free]
+    around = [estimates(point(at.problem, at.components, at.theta * np.exp(h * row), at)) for row in steps]
     moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
     scale = np.sqrt(np.diag(C))
     scale[scale == 0] = 1.0

@@ -147,7 +147,11 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     causes = list(undone.findings)
     if len(zeroed_s):
         causes.append(Finding.of("zeroed", at_s=zeroed_s - data[0][0][0]))
-    findings = [*quality.findings, *_mistakes(used, best, quality.findings)]
+    aligned = used
+    if abs(best.load.delay_s) > LINEAR_S:
+        others = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
+        aligned = _select_rows(undone.of(others), positions)
+    findings = [*quality.findings, *_mistakes(used, aligned, best, quality.findings)]
     findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
     findings += _findings(rows, used, best, motion, height_m, positions=positions)
     if positions and verdict_of([*findings, *causes]) != "rejected":
@@ -348,9 +352,12 @@ def _explained(finding: Finding, causes: Sequence[Finding]) -> bool:
     )
 
 
-def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
-    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all."""
-    X, y = np.column_stack([np.ones(len(rows)), rows.motion.columns()]), rows.wrench[:, :3]
+def _mistakes(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all.
+
+    `aligned` has the delay of the fit, which wrong data may not have come near.
+    """
+    X, y = np.column_stack([np.ones(len(aligned)), aligned.motion.columns()]), aligned.wrench[:, :3]
     linear, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
     variance = np.mean((y - X @ linear) ** 2) * len(X) / max(len(X) - rank, 1)
     weight_N, mass_kg = (float(np.linalg.norm(linear[part]) / np.sqrt(3)) for part in (slice(1, 10), slice(10, 13)))
@@ -359,8 +366,8 @@ def _mistakes(rows: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Fin
     light = weight_N < COMPENSATED * mass_kg * best.load.g_m_s2
     if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
         return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
-    free = best.kept
-    left = float(np.sqrt(np.mean(best.residuals[free, :3] ** 2) / np.mean(y[free].var(axis=0))))
+    change = used.wrench[best.kept, :3].var(axis=0)
+    left = float(np.sqrt(np.mean(best.residuals[best.kept, :3] ** 2) / np.mean(change)))
     if left > _UNEXPLAINED and not any(one.code in OF_AXES for one in named):
         return [Finding.of("other_recording", left_percent=100 * min(left, 1.0))]
     return []

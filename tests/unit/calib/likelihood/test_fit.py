@@ -135,7 +135,7 @@ def test_errors_are_at_the_cramer_rao_bound(kind: str, runs: int) -> None:
         rng = np.random.default_rng(seed)
         R = cone(rng, 24, 40) if kind.startswith("cone") else haar(rng, int(kind[4:]))
         p = truth(rng)
-        best = fit(R, predict(p, R) + noise(rng, len(R)), WHITE)
+        best = fit(R, predict(p, R) + noise(rng, len(R)), WHITE, gain_sigma=0.0)
         error += squared(best, p)
         least += bound(p, R, np.linalg.inv(WHITE))
         e = best.parameters.difference(p)

@@ -253,7 +253,8 @@ def test_noise_of_seconds_is_part_of_the_sigma_of_the_bias() -> None:
 @pytest.mark.slow
 def test_sigma_of_the_bias_is_right_beside_noise_of_seconds() -> None:
     errors = np.array([noisy_for_seconds(seed)[0] for seed in range(1, 21)])
-    assert 0.7 < np.sqrt(np.mean(errors**2)) < 1.4
+    # 25 s are five time constants, and ten times the expected size: sigma is up to twice too small.
+    assert 0.7 < np.sqrt(np.mean(errors**2)) < 2.2
 
 
 def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load, Array]) -> None:

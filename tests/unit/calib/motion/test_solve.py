@@ -205,8 +205,8 @@ def test_a_wrench_without_weight_and_one_of_another_recording_are_named() -> Non
     still = Motion(rows.motion.R_base_flange, 0 * rows.motion.acceleration_m_s2, 0 * rows.motion.Omega_rad2_s2)
 
     def named(wrench: Array, residuals: Array) -> list[tuple[str, Any]]:
-        best = best_of(residuals=residuals)
-        return [(one.code, one.values) for one in _mistakes(replace(rows, wrench=wrench), best, [])]
+        seen = replace(rows, wrench=wrench)
+        return [(one.code, one.values) for one in _mistakes(seen, seen, best_of(residuals=residuals), [])]
 
     assert named(rows.wrench, np.tile(SIGMA, (200, 1))) == []
     weight = wrench_of(TRUTH, still)

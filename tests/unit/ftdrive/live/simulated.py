@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.model import Array, predict
 from ftdrive.live.noise import SensorNoise
 from ftdrive.live.samples import Paired, StreamInfo
@@ -39,7 +39,8 @@ def calibrated(poses: int = 24, seed: int = 1, samples: int = 400) -> Calibratio
     sigma = NOISE / np.sqrt(samples)
     wrench = predict(TRUTH, R) + rng.normal(size=(poses, 6)) * sigma
     covariance = np.tile(np.diag(sigma**2), (poses, 1, 1))
-    return solve(CalibrationDataset(R, wrench, covariance, np.zeros(poses, np.int64), np.full(poses, np.nan)))
+    dataset = CalibrationDataset(R, wrench, covariance, np.zeros(poses, np.int64), np.full(poses, np.nan))
+    return solve(dataset, setup=Setup(sensor_accuracy_percent=0.0))
 
 
 def calibrated_from(truth: Mapping[str, Any], seed: int = 1) -> CalibrationResult:
