@@ -297,8 +297,10 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
         return call(self, name, *args, **how)
 
     monkeypatch.setattr(kind, "call", interrupted)
+    interrupt = Trigger(arm, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
-        arm.move_to(q, timeout_s=30, guard=Trigger(arm, lambda: signal.raise_signal(signal.SIGINT)))
+        # So slow that the arm still moves when a busy computer looks at it.
+        arm.move_to(q, timeout_s=30, guard=interrupt, speed_rad_s=0.5)
     state = station.wait_for(lambda state: not state["moving"])
     assert abs(state["q_rad"][5] - q[5]) > 0.1
 
