@@ -300,7 +300,7 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
     interrupt = Trigger(arm, lambda: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         # So slow that the arm still moves when a busy computer looks at it.
-        arm.move_to(q, timeout_s=30, guard=interrupt, speed_rad_s=0.5)
+        arm.move_to(q, timeout_s=30, guard=interrupt, speed_rad_s=SPEED_RAD_S / 2)
     state = station.wait_for(lambda state: not state["moving"])
     assert abs(state["q_rad"][5] - q[5]) > 0.1
 
