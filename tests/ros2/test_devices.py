@@ -117,7 +117,7 @@ def test_poses_by_hand_and_topics_give_the_load(stack: ExitStack, tmp_path: Path
     assert session.wait(60) == 0, "".join(said)
     (path,) = tmp_path.glob("runs/*/calibration.json")
     result = CalibrationResult.load(path)
-    assert result.verdict == "good"
+    assert result.verdict == "usable"  # six poses do not show the gain of the sensor
     assert max(off_in_sigmas(result).values()) < 3.5  # the largest of ten
     for words in (["live", "--once"], ["record", "--count", "200", "-o", "samples.csv"]):
         until_it_succeeds([*words, "--calibration", str(path), "--config", "cell.toml"], tmp_path)
