@@ -184,6 +184,8 @@ def _across(direction: Array) -> Array:
 
 # One sigma of the entries of the gain of mounted sensors, measured against other sensors: 2 to 5 % at most.
 USUAL_GAIN: Final = 0.02
+# Cross-talk over gain, as sigmas of their entries.
+CROSS_TALK_SHARE: Final = 0.5
 
 
 @dataclass(frozen=True, slots=True)

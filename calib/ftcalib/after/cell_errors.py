@@ -8,12 +8,13 @@ cable are smooth over the orientations: two poses near each other have nearly th
 import numpy as np
 
 from ftcalib.after.series import Estimated
+from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
 from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
 
 # A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
-GAIN, CROSS = 0.02, 0.01
+GAIN, CROSS = USUAL_GAIN, CROSS_TALK_SHARE * USUAL_GAIN
 # What of the gain depends on the load.
 LOAD = 0.005
 # Of the coefficients of `Response`: two of the diagonal and three of pairs, and for the cross-talk six.

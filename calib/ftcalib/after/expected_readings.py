@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
@@ -213,10 +214,8 @@ def expected_with_smooth_errors(
 
     What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
     """
-    p, response = calibration.parameters, calibration.response
-    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
-    dof = 6 * int(kept.sum()) - 15
-    if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof:
+    p, response, kept = calibration.parameters, calibration.response, _kept(calibration, fitted)
+    if kept is None or fitted.wrench_cov is None:
         return []
     rows = np.flatnonzero(kept)[:: -(-int(kept.sum()) // FEW_TO_SMOOTH)]
     R, dof = fitted.R_base_flange[rows], 6 * len(rows) - 15
@@ -256,6 +255,18 @@ def expected_with_smooth_errors(
         joint = with_covariance(response, joint_covariance(calibration.covariance, response) / factor)
         update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
         explanations.append(Expected(update, noise, dof, factor))
+    return _weighted(explanations, likelihood)
+
+
+def _kept(calibration: CalibrationResult, fitted: CalibrationDataset) -> NDArray[np.bool_] | None:
+    """Return which poses (n,) the fit used; None where its residuals are not those of all 15 parameters."""
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    complete = calibration.method == "ml" and calibration.dof == 6 * int(kept.sum()) - 15
+    return kept if complete else None
+
+
+def _weighted(explanations: Sequence[Expected], likelihood: Sequence[float]) -> list[Expected]:
+    """Give each explanation its share of the likelihood."""
     weights = np.exp(np.array(likelihood) - max(likelihood))
     return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
 
@@ -268,11 +279,10 @@ def _weigh_explanations(
     usual: Sequence[tuple[float, float, tuple[float, float]]],
 ) -> list[Expected]:
     """Explain the fit with each error of the orientations (rad), share of the last change of load, and walk."""
-    p, response = calibration.parameters, calibration.response
-    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
-    dof = 6 * int(kept.sum()) - 15
-    if fitted.wrench_cov is None or calibration.method != "ml" or calibration.dof != dof or len(kept) > MANY_POSES:
+    p, response, kept = calibration.parameters, calibration.response, _kept(calibration, fitted)
+    if kept is None or fitted.wrench_cov is None or len(kept) > MANY_POSES:
         return []
+    dof = calibration.dof
     order = np.argsort(pose_times(fitted.t_s), kind="stable")
     lag, order = hysteresis_columns(p, fitted.R_base_flange[order])[kept[order]], order[kept[order]]
     R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
@@ -304,8 +314,7 @@ def _weigh_explanations(
         noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
         noise += walk_new * np.tile(each, len(later)) ** 2
         explanations.append(Expected(Update(p, C[:15, :15], 0.0, 0, response=joint), noise, dof, factor))
-    weights = np.exp(np.array(likelihood) - max(likelihood))
-    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
+    return _weighted(explanations, likelihood)
 
 
 def _posterior(J: Array, V: Array, sigma: Array, e: Array, offset: Array) -> tuple[Array, Array, float, float]:

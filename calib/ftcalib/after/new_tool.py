@@ -30,7 +30,6 @@ from ftcalib.likelihood.response import (
 )
 from ftcalib.model import (
     BIASES,
-    PARAMETER_NAMES,
     Array,
     Parameters,
     angle_between,
@@ -291,17 +290,18 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     """
     if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
         raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
-    last, n = results[-1], 15
+    last = results[-1]
     covariances = [one.covariance for one in results]
     differences = [last.parameters.difference(one.parameters) for one in results]
-    responses = [one for each in results if (one := known_response(each, each.response)) is not None]
+    responses = []
     if any(one.response is not None for one in results):
-        n += len(responses[-1].coefficients)
+        responses = [one for each in results if (one := known_response(each, each.response)) is not None]
         covariances = [one.covariance for one in responses]
         differences = [
             np.append(off, one.coefficients - responses[-1].coefficients)
             for off, one in zip(differences, responses, strict=True)
         ]
+    n = len(differences[-1])
     alike = np.append(_SHARED, np.arange(15, n))
     # What was not looked for has no variance.
     alike = alike[np.all([np.diag(one)[alike] > 0 for one in covariances], axis=0)]
@@ -329,7 +329,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     alone = before[np.ix_(own, own)] - G @ before[np.ix_(alike, own)]
     covariance[np.ix_(own, own)] = alone + G @ C @ G.T
     covariance = (covariance + covariance.T) / 2
-    response = Response(responses[-1].coefficients + step[15:], covariance) if n > len(PARAMETER_NAMES) else None
+    response = Response(responses[-1].coefficients + step[15:], covariance) if responses else None
     note = Finding.of("together", n_runs=len(results))
     return replace(
         last,

@@ -271,7 +271,7 @@ def _statistics(fit: Judged, t_s: Array | None) -> Quality:
         largest_share,
         errors,
         *left_out_rms,
-        np.array(_left_out_rms(fit, used if few_rejected(used) else np.ones_like(used))),
+        np.array(left_out_rms if few_rejected(used) else _left_out_rms(fit, np.ones_like(used))),
         fit.elsewhere.reshape(2, 3).sum(axis=1),
         np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
         drift_ahead(fit, t_s),

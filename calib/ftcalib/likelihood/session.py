@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from ftcalib.data.dwell_mean import RESOLUTION
-from ftcalib.known import USUAL_GAIN, Constraints
+from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Constraints
 from ftcalib.likelihood.descent import Descent, Kept, Minimum, Statistics, coefficients, column_scale, features
 from ftcalib.likelihood.response import LEVER_M as CROSS_TALK_LEVER_M
 from ftcalib.likelihood.response import hysteresis_columns, sensor_columns
@@ -37,8 +37,6 @@ FEW_POSES = 6
 FEW_POSES_FOR_RESPONSE = 7
 # Fewer do not show how large gain and cross-talk are: they count as large as those of mounted sensors.
 FEW_POSES_FOR_GAIN = 12
-# Cross-talk over gain, as sigmas of their entries.
-CROSS_TALK_SHARE = 0.5
 # Fewer cannot separate drift from unknown noise.
 FEW_POSES_WITHOUT_NOISE = 12
 # Fewer cannot separate it from gain and noise.
