@@ -26,6 +26,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from tests.moving_load import Recorded
+
 Array = NDArray[np.float64]
 Generator = np.random.Generator
 
@@ -368,7 +370,7 @@ class Cell:
         force, torque = pulls.sum(axis=1), np.cross(now[0] - now[1][:, None], pulls).sum(axis=1)
         return np.hstack([np.einsum("nji,nj->ni", R, force), np.einsum("nji,nj->ni", R, torque)])
 
-    def record(self, joints: "Joints", seconds: float) -> "Recording":
+    def record(self, joints: "Joints", seconds: float) -> Recorded:
         """Record sensor and arm in motion, each with its own clock phase."""
         rng = np.random.default_rng([*self._seed, 2000])
         t, t_pose = (
@@ -384,22 +386,11 @@ class Cell:
         shaken = gaussian_filter1d(shaken, 6, axis=0) - gaussian_filter1d(shaken, 14, axis=0)
         y += 0.2 * np.minimum(speed, 1.5)[:, None] * _PER_N * shaken / shaken.std(axis=0)
         y += self.bias + self.warmed(t) + self.hum(t) + self.noise(rng, [0], len(t), MOTION_HZ)[0]
-        return Recording(t, y, t_pose, R[:, 6], p[:, 6])
+        return Recorded(t, y, t_pose, R[:, 6], p[:, 6])
 
 
 Joints = Callable[[Array], Array]
 """From times (n,) to joints (n, 6)."""
-
-
-@dataclass(frozen=True)
-class Recording:
-    """What sensor and arm send in motion."""
-
-    t_s: Array
-    wrench: Array
-    t_pose_s: Array
-    R_base_flange: Array
-    p_base_flange_m: Array
 
 
 def _eased(x: Array) -> Array:

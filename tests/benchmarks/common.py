@@ -95,6 +95,15 @@ def _attempt(worker: Worker, seed: int) -> dict[str, object] | None:
         return None
 
 
+def two_workers() -> Pool:
+    """Start two processes with one thread of linear algebra each.
+
+    They read that when they import numpy; two with a thread for each core would disturb each other.
+    """
+    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
+    return get_context("spawn").Pool(2)
+
+
 def run(parts: Mapping[str, Callable[[Lab], Iterator[Row]]], description: str, after: Sequence[str] = ()) -> int:
     """Print the rows of all parts, or of those named on the command line; return how many failed."""
     parser = argparse.ArgumentParser(description=description)
@@ -102,9 +111,7 @@ def run(parts: Mapping[str, Callable[[Lab], Iterator[Row]]], description: str, a
     parser.add_argument("--only", choices=parts, action="append", help="one part; may be repeated")
     options = parser.parse_args()
     failed, start = 0, time.perf_counter()
-    # Workers read these when they import numpy: two workers with a thread for each core would disturb each other.
-    os.environ["OPENBLAS_NUM_THREADS"] = os.environ["OMP_NUM_THREADS"] = "1"
-    with get_context("spawn").Pool(2) as pool:
+    with two_workers() as pool:
         lab = Lab(pool, quick=options.quick)
         for name in options.only or parts:
             failed += show_rows(parts[name](lab))

@@ -8,13 +8,11 @@ Recording k has the seed k: load, mounting, motion, noise and contacts are drawn
 simulator (tests/moving_load.py) shares no formula with the estimator. The exit code is the number of failed rows.
 """
 
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 from multiprocessing.pool import Pool
 
 import click
@@ -27,7 +25,7 @@ from ftcalib.findings import Finding
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS
 from ftcalib.motion.solve import solve_motion
 from ftcalib.result import CalibrationResult
-from tests.benchmarks.common import Array, Row, show, show_rows
+from tests.benchmarks.common import Array, Row, show, show_rows, two_workers
 from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
 
 # Findings that name a cause.
@@ -276,10 +274,8 @@ def _counts(counter: Counter[str]) -> str:
 @click.option("--only", type=click.Choice(["right", "together", *MISTAKES]), multiple=True)
 def main(runs: int, only: Sequence[str]) -> None:
     """Print the rows."""
-    # Workers read it when they import numpy: two with a thread for each core would disturb each other.
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
     failed = 0
-    with get_context("spawn").Pool(2) as pool:
+    with two_workers() as pool:
         for name in only or ("right", *MISTAKES, "together"):
             if name == "right":
                 failed += show_rows(_right(pool, max(runs // 4, 1)))

@@ -29,10 +29,10 @@ from ftcalib.after.state import tare
 from ftcalib.after.verification import verify
 from ftcalib.after.weighing import drift_since, weigh
 from ftcalib.errors import BadDataset
-from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
 from ftdrive.live.noise import unexplained_variance
 from tests.benchmarks.common import Array, Lab, Record, Row, all_within, most, run
+from tests.moving_load import means_of
 from tests.structured_cell import (
     CELLS,
     DEG,
@@ -41,7 +41,6 @@ from tests.structured_cell import (
     RATE_HZ,
     Cell,
     Load,
-    Recording,
     Truth,
     dwell_times,
     flange,
@@ -218,14 +217,6 @@ def static(lab: Lab, options: Options) -> Iterator[Row]:
 
 
 # -- motion ------------------------------------------------------------------------------------------------------------
-
-
-def means_of(recorded: Recording) -> tuple[Means, Means]:
-    """Return the two streams as the estimator takes them."""
-    wrench, poses = Means(), Means()
-    wrench.add(recorded.t_s, recorded.wrench)
-    poses.add(recorded.t_pose_s, np.hstack([recorded.R_base_flange.reshape(-1, 9), recorded.p_base_flange_m]))
-    return wrench, poses
 
 
 def motion_run(seed: int, name: str, kind: str) -> dict[str, object]:
