@@ -193,14 +193,6 @@ def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
         Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
     OSError
         The file does not exist or cannot be read.
-
-    Examples
-    --------
-    >>> import ftdrive
-    >>> recording = ftdrive.read_recording("peg.csv")
-    >>> table = recording.table  # a DataFrame: pandas.DataFrame(table)
-    >>> table["fz"].shape, table["raw_fz"].shape
-    ((3000,), (3000,))
     """
     # A damaged file raises, because a caller in Python would not see a message.
     reader = RecordingReader(Path(path), columns)
