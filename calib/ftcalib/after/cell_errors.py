@@ -86,10 +86,10 @@ def _products(A: Array, v: Array, sigma: Array) -> Array:
     return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
 
 
-def smooth_errors(p: Parameters, R_base_flange: Array, others: Array, *, cable: bool = True) -> Array:
-    """Give the covariance (6n, 6m) that smooth errors of arm and cable cause between n and m orientations."""
+def smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
+    """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
     cosine = np.einsum("nij,mij->nm", R_base_flange, others)
     alike = _CORRELATED ** ((3 - cosine) / 2)
     turn, turn_other = (jacobian(p, R)[..., :3] * TURN_RAD for R in (R_base_flange, others))
-    each = np.einsum("nik,mjk->nimj", turn, turn_other) + cable * np.diag(CABLE**2)[None, :, None]
-    return np.asarray((alike[:, None, :, None] * each).reshape(6 * len(R_base_flange), -1))
+    of_arm = np.einsum("nm,nik,mjk->nimj", alike, turn, turn_other)
+    return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(alike, np.diag(CABLE**2))])

@@ -25,7 +25,7 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import block_diag
+from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
@@ -54,8 +54,13 @@ USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
 # Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
 # and of the torques. Before the fit, each pair is as likely as any other.
 USUAL_WALKS = np.geomspace(0.3, 30, 5)
-# Sizes of smooth errors, and of gain and cross-talk that the fit did not find, relative to usual ones.
-USUAL_SMOOTH = np.geomspace(0.03, 2, 8)
+# Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
+USUAL_GAINS = np.array([0.1, 1.0])
+USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
+# Share of smooth errors that is not one of the orientation, where a fit reaches orientations with various joint angles.
+OTHER_JOINTS = 0.8
+# Else what other joint angles add: variances of the size that the fit shows, and at least those of a usual arm.
+BEYOND, LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
 # Of more poses every second, third, ... shows smooth errors.
 FEW_TO_SMOOTH = 100
 MANY_POSES = 1000
@@ -213,6 +218,8 @@ def expected_with_smooth_errors(
     """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable; all else as the others.
 
     What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
+    Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
+    part, or its poses turn the wrist alone and cannot.
     """
     p, response, kept = calibration.parameters, calibration.response, _kept(calibration, fitted)
     if kept is None or fitted.wrench_cov is None:
@@ -224,30 +231,35 @@ def expected_with_smooth_errors(
     J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
     T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
     smooth, between, new = (smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
-    arm = smooth_errors(p, R_base_flange, R_base_flange, cable=False)
+    alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
     coefficients = np.zeros(SIZE) if response is None else response.coefficients
-    stored = joint_jacobian(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+    stored = joint_jacobian(p, response, R_base_flange).reshape(len(J_new), -1)
     stored = stored @ joint_covariance(calibration.covariance, response) @ stored.T
     explanations, likelihood = [], []
-    for size in USUAL_SMOOTH:
-        gain = np.where(sizes > 0, sizes, size * PRIOR) ** 2
-        S = D + size**2 * smooth + (T * gain) @ T.T
-        to_new = size**2 * between + (T_new * gain) @ T.T
-        P = np.linalg.inv(S)
-        H = J.T @ P @ J
-        scale = np.outer(column_scale(H), column_scale(H))
-        C = np.linalg.inv(H / scale) / scale
-        x = C @ (J.T @ (P @ e))
-        u = P @ (e - J @ x)
-        chi2, logdet = float(e @ u), float(np.linalg.slogdet(S)[1] + np.linalg.slogdet(H / scale)[1])
-        logdet += float(np.log(np.diag(scale)).sum())
+    for share, of_gain, *of_kinds in product((0.0, OTHER_JOINTS), USUAL_GAINS, USUAL_SMOOTH, USUAL_SMOOTH):
+        square = np.square(of_kinds)
+        alike, gain = (1 - share) * square, np.where(sizes > 0, sizes, of_gain * PRIOR) ** 2
+        S = D + np.tensordot(alike, smooth, 1) + np.tensordot(share * square, alone, 1) + (T * gain) @ T.T
+        to_new = np.tensordot(alike, between, 1) + (T_new * gain) @ T.T
+        L = np.linalg.cholesky(S)
+        white = solve_triangular(L, np.column_stack([J, e, to_new.T]), lower=True)
+        white_J, white_e, white_new = white[:, :15], white[:, 15], white[:, 16:]
+        H = white_J.T @ white_J
+        scale = column_scale(H)
+        H = H / np.outer(scale, scale)
+        C = np.linalg.inv(H) / np.outer(scale, scale)
+        x = C @ (white_J.T @ white_e)
+        left = white_e - white_J @ x
+        chi2 = float(left @ left)
+        logdet = 2 * float(np.log(np.diag(L)).sum() + np.log(scale).sum()) + float(np.linalg.slogdet(H)[1])
         likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
         factor = max(chi2 / dof, LEAST_FACTOR)
-        off, B = to_new @ u + J_new @ x - T_new @ coefficients, J_new - to_new @ P @ J
-        total = block_diag(*wrench_cov) + size**2 * new + (T_new * gain) @ T_new.T - to_new @ P @ to_new.T
-        # Other joint angles may reach the same orientation, where arm and cable do as much again.
-        total += size**2 * new + arm
+        off, B = white_new.T @ left + J_new @ x - T_new @ coefficients, J_new - white_new.T @ white_J
+        total = block_diag(*wrench_cov) + np.tensordot(alike, new, 1) + (T_new * gain) @ T_new.T
+        total -= white_new.T @ white_new
+        # Where joint angles follow from the orientation in the fit, others may do more than it shows.
+        total += np.tensordot(share * square if share else BEYOND * square + LEAST_BEYOND, alone_new, 1)
         # The prediction as stored is off by what this explanation moves it.
         total += B @ C @ B.T + np.outer(off, off) / factor
         value, vector = np.linalg.eigh(total - stored / factor)
