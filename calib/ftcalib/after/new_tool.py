@@ -144,6 +144,8 @@ class CellPrior:
         return f"{found} since {self.earlier.id} ({misfit}): {alone}."
 
 
+# Share of a load by which a sensor responds to it otherwise than to a smaller one, at most: usually, and rarely.
+LOADS = (LOAD, 0.02)
 _MOST_STEPS = 30
 # Squared step in standard deviations.
 _SETTLED = 1e-12
@@ -181,19 +183,24 @@ def new_tool(
         raise NotObservable(
             "the noise of the poses was not measured, so nothing tests the earlier result: leave --from out."
         )
-    about = _start(earlier.parameters, dataset.R_base_flange, dataset.wrench)
-    cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, about))
-    weights: Array = np.linalg.inv(cov).astype(np.float64)
-    poses = dataset.R_base_flange, dataset.wrench, weights
-    prior = CellPrior(earlier)
-    found = _fit_tool(prior, *poses, WHOLE)
-
-    def refit(kept: Sequence[int]) -> tuple[float, int, Parameters]:
-        again = _fit_tool(prior, *poses, kept)
-        return again.chi2, again.dof, again.parameters
-
+    start = _start(earlier.parameters, dataset.R_base_flange, dataset.wrench)
+    noise = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
+    prior, poses_in_words = CellPrior(earlier), "the poses"
     alone = "calibrate this tool alone, from 12 poses or more"
-    if changed := prior.contradiction(found.chi2, found.dof, refit, "the poses", alone):
+    # A response that depends on the load shows at a larger one: in full where no change of the cell explains the poses.
+    for load in LOADS:
+        weights: Array = np.linalg.inv(noise + np.diag(_beyond(earlier, start, load))).astype(np.float64)
+        poses = dataset.R_base_flange, dataset.wrench, weights
+        found = _fit_tool(prior, *poses, WHOLE)
+
+        def refit(kept: Sequence[int], poses: tuple[Array, Array, Array] = poses) -> tuple[float, int, Parameters]:
+            again = _fit_tool(prior, *poses, kept)
+            return again.chi2, again.dof, again.parameters
+
+        changed = prior.contradiction(found.chi2, found.dof, refit, poses_in_words, alone)
+        if not changed.startswith(poses_in_words):
+            break
+    if changed:
         raise NotObservable(changed)
     # Only the components that belong to the cell are kept: errors of the arm and of the sensor, not of one session.
     kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
@@ -249,23 +256,28 @@ def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
     return Parameters(old.R_flange_sensor, weight_N * old.down, x[1:4], x[4:7] / weight_N, x[7:])
 
 
-def _beyond(earlier: CalibrationResult, new: Parameters) -> Array:
+def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> Array:
     """Variance (6,) of a pose beyond its noise: what noise did not explain, or may have hidden, in the earlier fit.
 
-    What depends on the load grows with its square.
+    What depends on the load grows with its third power, at `most` to this share of the load.
     """
-    if earlier.noise_explains and earlier.measured_sigma is not None:
-        # one sigma of chi2
-        hidden = max(earlier.chi2 / earlier.dof - 1, 0.0) + np.sqrt(2 / earlier.dof)
-        variance = hidden * np.square(earlier.measured_sigma)
+    measured = np.square(np.zeros(6) if earlier.measured_sigma is None else earlier.measured_sigma)
+    # One sigma of chi2.
+    hidden = np.sqrt(2 / max(earlier.dof, 1))
+    if earlier.noise_explains:
+        variance = (max(earlier.chi2 / max(earlier.dof, 1) - 1, 0.0) + hidden) * measured
     else:
-        excess = np.square(earlier.likely_error()) - np.square(earlier.predicted_error())
-        variance = np.repeat(np.maximum(excess, 0.0) / 3, 3)
+        error, names = earlier.likely_error(), ("loo_force_rms_N", "loo_torque_rms_Nm")
+        left_out = np.array([earlier.quality.get(name, error[k]) for k, name in enumerate(names)], dtype=np.float64)
+        excess = left_out**2 - measured.reshape(2, 3).sum(axis=1)
+        variance = np.repeat(np.maximum(excess, 0.0) / 3, 3) + hidden * measured
     level = np.sqrt(variance)
-    for channels, lever_m in ((slice(3), 1.0), (slice(3, 6), LEVER_M)):
-        ratio = max(1.0, new.weight_N / earlier.weight_N) if earlier.weight_N else 1.0
-        most = LOAD * new.weight_N * lever_m
-        level[channels] = np.maximum(level[channels], np.minimum(level[channels] * ratio**2, most))
+    before_m, now_m = (float(np.linalg.norm(p.p_sensor_com_m)) for p in (earlier.parameters, new))
+    forces = earlier.weight_N, new.weight_N
+    torques = forces[0] * before_m, forces[1] * max(now_m, LEVER_M)
+    for channels, (before, now) in ((slice(3), forces), (slice(3, 6), torques)):
+        ratio = max(1.0, now / before) if before else 1.0
+        level[channels] = np.maximum(level[channels], np.minimum(level[channels] * ratio**3, most * now))
     return np.asarray(level**2)
 
 
