@@ -256,7 +256,8 @@ class Processor:
     def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0) -> Array:
         """Standard deviation (6,) of the newest sample in the frame, or of the mean over `duration_s`.
 
-        NaN until the noise is known. `R_base_flange` (3, 3) is that of the sample.
+        NaN until the noise is known. `R_base_flange` (3, 3) is that of the sample. It grows with the age of the bias,
+        where earlier runs of the sensor show how that moves.
         """
         noise = self._noise.of(self._state)
         if noise is None:
@@ -267,6 +268,8 @@ class Processor:
             covariance = noise.sample * self._filter.power_gain
         if self._stages.gravity or self._stages.bias:
             covariance = covariance + self._test.uncertainty
+        if self._stages.bias:
+            covariance = covariance + np.diag(self._tool.bias_growth(self._newest_ns))
         T = self._transform.matrix(R_base_flange)
         return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
 

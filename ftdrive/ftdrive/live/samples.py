@@ -296,6 +296,8 @@ class StreamInfo:
     """Whether arm and sensor are emulated."""
     foreign: bool = False
     """Whether the calibration is of another arm, sensor or mount, and was applied all the same."""
+    hour_change: Array | None = None
+    """(6,) how far earlier runs of the sensor show its bias to move in an hour, one standard deviation, N and N·m."""
 
     @property
     def marks(self) -> tuple[str, ...]:

@@ -5,6 +5,7 @@ this order for every sample, whichever are on, because contact is judged by what
 """
 
 from collections.abc import Mapping
+from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from ftdrivers.interfaces import Array
 _STEP_K, _NOTED_K = 0.05, 1.0
 # Poses of this spacing give the acceleration.
 _KNOT_S = 0.002
+_HOUR_NS = 3600e9
 # Half the time over which poses give the acceleration: longer ones lose the edges of a move, and are later.
 _REACH_S = 0.015
 LOWPASS_ORDER = 2
@@ -86,6 +88,14 @@ class FreeTool:
         # without the temperature at the calibration there is no change since then
         self._temperature, made_C = (None, np.nan) if known_C is None else (temperature, float(known_C))
         self._now_C = self._noted_C = made_C
+        self._hour_change = info.hour_change
+        created = self._calibration.provenance.get("created_utc")
+        # Clock of the cell when the calibration was made; None where that is not known.
+        self._made_ns = (
+            round(datetime.fromisoformat(created).timestamp() * 1e9) - info.utc_offset_ns
+            if isinstance(created, str)
+            else None
+        )
         self._references = [_Reference(self._calibration, 0, made_C)]
         self.held: Weight | None = None
         self.empty: Calibrated = self._calibration
@@ -149,6 +159,13 @@ class FreeTool:
         before, self._bias_change = self._bias_change, empty.parameters.bias - self._calibration.parameters.bias
         self.empty, self.expected = empty, self._with_part(empty)
         return np.asarray(self._bias_change - before)
+
+    def bias_growth(self, t_ns: int) -> Array:
+        """Return the variance (6,) of what the bias has moved since calibration or tare, as earlier runs show."""
+        looked_ns = self._made_ns if self.tare_t_ns is None else self.tare_t_ns
+        if self._hour_change is None or looked_ns is None:
+            return np.zeros(6)
+        return self._hour_change**2 * (max(t_ns - looked_ns, 0) / _HOUR_NS)
 
     def is_warmed_by(self, temperature_C: float) -> bool:
         """Whether this temperature of the sensor moves its bias."""

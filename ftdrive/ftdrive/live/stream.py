@@ -239,6 +239,7 @@ class CompensatedStream(ProcessedStream):
         self._force = force
         self._begin = frame, stages, false_alarm_rate
         self._foreign = False
+        self._hour_change: Array | None = None
         self.block_s = 0.003
         """A block has the samples of so long, because it costs about the same with one sample as with many. May be set
         at any time: longer blocks arrive later and take less of the processor."""
@@ -305,7 +306,7 @@ class CompensatedStream(ProcessedStream):
     ) -> tuple[CalibrationResult, str, tuple[str, ...], BiasTemperature | None]:
         """Return the calibration of the devices and their mounting, its name, warnings, and what temperature does."""
         calibration, name, warnings = self._wanted, self._name, tuple[str, ...]()
-        temperature = None
+        temperature = self._hour_change = None
         mount = self.cell.sensor.mount
         if isinstance(calibration, str):
             from ftdrive.store.tools import calibration_of_tool
@@ -313,7 +314,7 @@ class CompensatedStream(ProcessedStream):
             url = self.cell.store.url
             tool = calibration_of_tool(calibration, arm, sensor, mount, url=url, force=self._force)
             calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
-            temperature = tool.temperature
+            temperature, self._hour_change = tool.temperature, tool.hour_change
         belongs = compare_devices(calibration, {"arm": arm, "sensor": sensor}, mount)
         if belongs.others and not self._force:
             raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
@@ -343,6 +344,7 @@ class CompensatedStream(ProcessedStream):
             calibration_state=state,
             emulated=self.cell.is_emulated,
             foreign=self._foreign,
+            hour_change=self._hour_change,
         )
 
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
@@ -383,6 +385,7 @@ class CompensatedStream(ProcessedStream):
             tool=name,
             verification=verification,
             calibration_state=state,
+            hour_change=self._hour_change,
         )
         self._apply_calibration(info, self._temperature)
         self._pairing.use(DelayEstimator(self._calibration, self.info.p_flange_sensor_m))

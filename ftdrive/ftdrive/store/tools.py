@@ -11,13 +11,13 @@ from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
-from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
+from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 # Searched beside the store, so that a run that is not indexed yet counts too.
 RUNS = Path("runs")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Tool:
     """A calibration that was found by the name of its tool."""
 
@@ -26,6 +26,8 @@ class Tool:
     warnings: tuple[str, ...]
     temperature: BiasTemperature | None = None
     """How the bias of the sensor follows its temperature, where that predicts other runs better."""
+    hour_change: Array | None = None
+    """(6,) how far that bias moves in an hour, one standard deviation, N and N·m; None where no runs show it."""
 
 
 def calibration_of_tool(
@@ -74,8 +76,8 @@ def calibration_of_tool(
     ours = [one for one in accepted if _may_belong(one, arm, sensor)]
     for one in (one for one in ours if one.tool == name):
         if (loaded := _load(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
-            found = _temperature(store, one, results)
-            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), found)
+            found = _of_sensor(store, one, results)
+            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), *found)
     if force:
         for one in (one for one in accepted if one.tool == name):
             if loaded := _load(one, accept_edited=True):
@@ -107,19 +109,21 @@ def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResul
         return None
 
 
-def _temperature(store: Store, one: StoredResult, results: Iterable[StoredResult]) -> BiasTemperature | None:
-    """Return what the other runs of the sensor show, if the temperature of this one is known."""
-    from ftdrive.store.trends import temperatures
+def _of_sensor(
+    store: Store, one: StoredResult, results: Iterable[StoredResult]
+) -> tuple[BiasTemperature | None, Array | None]:
+    """Return what other runs of the sensor show: how its bias follows a known temperature, and moves in an hour."""
+    from ftdrive.store.trends import hour_changes, temperatures
 
-    if one.temperature_C is None:
-        return None
     same = (one.sensor_serial, one.arm_serial, one.mount)
     alike = [each for each in results if (each.sensor_serial, each.arm_serial, each.mount) == same]
     try:
         checks = [check for each in alike for check in store.verifications(each.id)]
     except BadStore:
-        return None
-    return next((found.fit for found in temperatures(alike, checks) if any(found.fit.predicts)), None)
+        return None, None
+    warmth = temperatures(alike, checks) if one.temperature_C is not None else []
+    temperature = next((found.fit for found in warmth if any(found.fit.predicts)), None)
+    return temperature, next(iter(hour_changes(alike, checks).values()), None)
 
 
 def _failed(store: Store, one: StoredResult) -> Iterator[str]:

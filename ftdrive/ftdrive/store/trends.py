@@ -3,6 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -19,6 +20,11 @@ SIGNIFICANT: Final = 0.01
 SHORTEST_DAYS: Final = 3.0
 
 _MONTH_DAYS = 30.0
+# Runs so far apart show what the bias does while a cell works; so many pairs of them count.
+_NEAR_H: Final = (0.25, 6.0)
+_FEWEST_PAIRS: Final = 3
+# Of chi2 with one degree of freedom.
+_MEDIAN: Final = 0.4549
 _VECTORS: Final = {
     "force bias": ("force_bias_N", "N", 1.0),
     "torque bias": ("torque_bias_Nm", "N·m", 1.0),
@@ -150,9 +156,14 @@ class SensorTemperature:
             )
 
 
+# Serial number of a sensor, that of its arm, and its mount.
+Mounted = tuple[str, str | None, str | None]
+
+
 class _Run(NamedTuple):
     created_utc: datetime
-    temperature_C: float
+    tool: str | None
+    temperature_C: float | None
     bias: Array
     sigma: Array
 
@@ -161,36 +172,62 @@ def temperatures(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> list[SensorTemperature]:
     """Fit each sensor on each arm and mount that has runs enough."""
-    runs = dict[tuple[str, str | None, str | None], list[_Run]]()
+    return [
+        SensorTemperature(*mounted, fit)
+        for mounted, found in _runs(results, verifications).items()
+        if (fit := _fit([run for run in found if run.temperature_C is not None])) is not None
+    ]
+
+
+def hour_changes(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, Array]:
+    """Return how far the bias of each sensor moves in an hour (6,), one standard deviation, N and N·m.
+
+    It is that of a random walk between successive runs of one tool within a quarter of an hour to six hours. The median
+    counts, over the axes of force and torque each, so that a moved cable does not. Sensors with fewer than three such
+    pairs are left out.
+    """
+    found = dict[Mounted, Array]()
+    for mounted, runs in _runs(results, verifications).items():
+        squares, noise = list[Array](), list[Array]()
+        for before, after in pairwise(runs):
+            hours = (after.created_utc - before.created_utc).total_seconds() / 3600
+            if before.tool == after.tool and _NEAR_H[0] <= hours <= _NEAR_H[1]:
+                squares.append((after.bias - before.bias) ** 2 / hours)
+                noise.append((before.sigma**2 + after.sigma**2) / hours)
+        if len(squares) >= _FEWEST_PAIRS:
+            usual, known = (np.median(np.reshape(part, (-1, 2, 3)), axis=(0, 2)) for part in (squares, noise))
+            found[mounted] = np.repeat(np.sqrt(np.maximum(usual / _MEDIAN - known, 0.0)), 3)
+    return found
+
+
+def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, list[_Run]]:
+    """Collect what has shown the bias of each sensor, the oldest first."""
+    runs = dict[Mounted, list[_Run]]()
     made = dict[str, tuple[list[_Run], StoredResult]]()
     for one in results:
         if one.verdict == "rejected" or one.sensor_serial is None or one.emulated:
             continue
         found = runs.setdefault((one.sensor_serial, one.arm_serial, one.mount), [])
         made[one.id] = found, one
-        if one.update in (None, "tool") and one.created_utc is not None and one.temperature_C is not None:
+        if one.update in (None, "tool") and one.created_utc is not None:
             sigma = np.sqrt(np.diag(one.covariance)[BIASES])
-            found.append(_Run(datetime.fromisoformat(one.created_utc), one.temperature_C, one.parameters.bias, sigma))
+            time = datetime.fromisoformat(one.created_utc)
+            found.append(_Run(time, one.tool, one.temperature_C, one.parameters.bias, sigma))
     for check in verifications:
         if check.calibration_id not in made or not shows_bias(check):
             continue
         found, calibration = made[check.calibration_id]
         change, sigma_6 = check.bias_change, check.bias_change_sigma
-        if change is None or sigma_6 is None or check.created_utc is None or check.temperature_C is None:
+        if change is None or sigma_6 is None or check.created_utc is None:
             continue
-        found.append(
-            _Run(check.created_utc, check.temperature_C, calibration.parameters.bias + change, np.array(sigma_6))
-        )
-    return [
-        SensorTemperature(serial, arm, mount, fit)
-        for (serial, arm, mount), found in runs.items()
-        if (fit := _fit(sorted(found, key=lambda run: run.created_utc))) is not None
-    ]
+        bias = calibration.parameters.bias + change
+        found.append(_Run(check.created_utc, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
+    return {mounted: sorted(found, key=lambda run: run.created_utc) for mounted, found in runs.items()}
 
 
 def _fit(runs: Sequence[_Run]) -> BiasTemperature | None:
     if not runs:
         return None
     days = [(run.created_utc - runs[0].created_utc).total_seconds() / 86400 for run in runs]
-    columns = (np.array([run[k] for run in runs]) for k in (1, 2, 3))
+    columns = (np.array([run[k] for run in runs]) for k in (2, 3, 4))
     return bias_temperature(np.array(days), *columns)

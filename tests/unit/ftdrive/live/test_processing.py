@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -480,3 +481,22 @@ def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_one
         unknown.warm(35.0)
         assert unknown.reference()[0].parameters.bias.tolist() == made.parameters.bias.tolist()
         assert not kinds(unknown)
+
+
+def test_sigma_grows_with_the_age_of_the_bias_until_a_tare() -> None:
+    moves = np.repeat([0.3, 0.01], 3)
+    made = {"created_utc": datetime.fromtimestamp(T0_NS * 1e-9 - 4 * 3600, UTC).isoformat()}
+    calibration = replace(calibrated(), provenance=made)
+    known, unknown = (Fed(replace(info(calibration), hour_change=change)) for change in (moves, None))
+
+    def added() -> Array:
+        """What the history adds to the variance."""
+        fresh, aged = (one.sigma_of_mean(UPSIDE_DOWN) for one in (unknown, known))
+        return np.asarray(aged**2 - fresh**2)
+
+    for one in (known, unknown):
+        run(one, paired(still(2.0)), 50)
+    np.testing.assert_allclose(added(), 4 * moves**2, rtol=0.01)
+    for one in (known, unknown):
+        one.tare()
+    assert (added() < 1e-3 * moves**2).all()

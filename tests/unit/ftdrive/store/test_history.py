@@ -11,7 +11,7 @@ from ftcalib.model import BIASES, Array
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
-from ftdrive.store.trends import QuantityTrend, temperatures
+from ftdrive.store.trends import QuantityTrend, hour_changes, temperatures
 from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 
@@ -159,3 +159,19 @@ def test_the_temperature_of_a_sensor_is_fitted_over_calibrations_and_verificatio
     assert "temperature, ft-1, force bias: +0." in force
     assert force.endswith("applied by --tool")
     assert "N·m/K (1 sigma, 8 runs, 22 to 36 °C)" in torque
+
+
+def test_runs_within_hours_show_how_far_the_bias_moves(tmp_path: Path) -> None:
+    """A random walk of 0.2 N and 6 mN·m in the root of an hour; one cable was moved, and a month passed."""
+    rng = np.random.default_rng(11)
+    first, sigma = result(0, np.zeros(15)), np.repeat([0.2, 0.006], 3)
+    new_run(tmp_path, "first", first)
+    change, day = np.zeros(6), 0.0
+    for k, hours in enumerate([2.0, 0.5, 1.0, 30 * 24, 3.0, 1.0, 0.1, 2.0, 4.0, 1.0, 2.0, 0.5]):
+        day += hours / 24
+        change = change + np.sqrt(hours) * sigma * rng.normal(size=6) + (2.0 if k == 5 else 0.0)
+        values = {"value": change.tolist(), "sigma": [0.01] * 3 + [3e-4] * 3, "calibration_sigma": [1e-3] * 6}
+        verified(new_run(tmp_path, f"check-{k}"), first.id, day, bias_change=values)
+    ((_, found),) = hour_changes(*records(tmp_path)).items()
+    assert ((found > 0.6 * sigma) & (found < 1.6 * sigma)).all()
+    assert hour_changes(records(tmp_path)[0], []) == {}
