@@ -38,7 +38,8 @@ def history(
 
     They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
     significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
-    Where a sensor reports its temperature, its bias is fitted against that too.
+    Where a sensor reports its temperature, its bias is fitted against that too. Runs within hours show how far the bias
+    moves in an hour.
     """
     from ftdrive.errors import ConfigError
     from ftdrive.runs.verification import VerificationRecord
@@ -76,12 +77,17 @@ def history(
         from ftdrive.store.trends import temperatures
 
         warmth = temperatures(results, checks)
+    moved = _hour_changes(results, checks)
     last = {check.calibration_id: check for check in checks}
     if as_json:
         rows = [_as_json(one, last.get(one.id), now) for one in results]
-        trends = [one.to_dict() for one in found]
-        about = {"trends": trends, "temperature": [one.to_dict() for one in warmth], "warnings": advice}
-        about["last_weighings"] = [asdict(one) for one in weighed]
+        about = {
+            "trends": [one.to_dict() for one in found],
+            "temperature": [one.to_dict() for one in warmth],
+            "hour_changes": moved,
+            "warnings": advice,
+            "last_weighings": [asdict(one) for one in weighed],
+        }
         write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
@@ -91,13 +97,37 @@ def history(
     trend_lines = (f"trend: {drift}" for drift in found)
     warmth_lines = (line for one in warmth for line in one.lines())
     weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
-    for line in (*trend_lines, *warmth_lines, *weighing_lines):
+    hour_lines = (
+        "bias, {sensor_serial}: moves by {force_N:.2g} N, {torque_Nm:.2g} N·m an axis in an hour (1 sigma)".format(
+            **one
+        )
+        for one in moved
+    )
+    for line in (*trend_lines, *warmth_lines, *hour_lines, *weighing_lines):
         echo(line)
     if advice:
         from ftdrive.terminal.console import answer, hanging
 
         for words in advice:
             answer.print(hanging(" ! ", words, answer), style="yellow")
+
+
+def _hour_changes(results: Sequence["StoredResult"], checks: Sequence["VerificationRecord"]) -> list[dict[str, Any]]:
+    """Give how far the bias of each sensor moves in an hour, one standard deviation of an axis, where runs show it."""
+    if len(results) + len(checks) < _FEWEST_RUNS:
+        return []
+    from ftdrive.store.trends import hour_changes
+
+    return [
+        {
+            "sensor_serial": serial,
+            "arm_serial": arm,
+            "mount": mount,
+            "force_N": float(change[0]),
+            "torque_Nm": float(change[3]),
+        }
+        for (serial, arm, mount), change in hour_changes(results, checks).items()
+    ]
 
 
 def _print_left_out(left_out: Sequence[str]) -> None:
@@ -114,6 +144,8 @@ def _say(words: str) -> None:
     messages.print(words)
 
 
+# Fewer records have no three pairs of runs, and numpy is not needed.
+_FEWEST_RUNS = 4
 # Most days of weighings that are listed.
 _MOST_DAYS = 20
 # An earlier weighing is not the last one of a list.
