@@ -224,10 +224,15 @@ def _scale(unit_N: Sequence[float] | None) -> str:
     )
 
 
+def _compensated(factor: float) -> str:
+    """Write the share of the weight that a controller takes away where the weight accelerates as in shorter times."""
+    return f", or if a controller compensates {100 * (1 - factor**2):.0f} % of the weight" if factor < 1 else ""
+
+
 # Forms of values that files of earlier versions lack.
 _OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
-    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale,
+    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale, "compensated": _compensated,
 }  # fmt: skip
 
 
@@ -255,7 +260,8 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
     "other_recording": Code(_REJECT, "the wrench does not follow the poses: {left_percent:.0f} of its change remain "
-        "unexplained", "check that wrench and poses are of one recording on one clock, and the form of the rotations"),
+        "unexplained", "keep the tool free of contact, and check that wrench and poses are of one recording on one "
+        "clock, and the form of the rotations"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
     "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
@@ -289,6 +295,13 @@ CODES: Final[Mapping[str, Code]] = {
         "in these orientations only to {residual_N:.2g}, so wrenches are paired with other poses, or the "
         "orientations have another form",
         "check the pairing, and look for Euler angles (--euler), degrees or another order"),
+    "orientations_off": Code(_REJECT_OR_LIMIT, "the orientations are off by about {turn_deg:.1f}, because the forces "
+        "are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but in these orientations only to {residual_N:.2g}",
+        "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
+        "model"),
+    "torques_unrelated": Code(_REJECT_OR_LIMIT, "the torques do not follow the weight, as the forces do: "
+        "{left_percent:.0f} of their change remain unexplained", "check that forces and torques are of one sensor and "
+        "one recording, then cables and contact"),
     "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
         "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
         "check the columns (--columns), the wiring of the axes, or the sensor's matrix"),
@@ -326,7 +339,7 @@ CODES: Final[Mapping[str, Code]] = {
         "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
         "of {sigma_N:.2g}", "record the raw wrench if it is compensated already or zeroed "
-        "at each pose, or hang something heavier on the sensor"),
+        "at each pose, keep the tool free of contact, or hang something heavier on the sensor"),
     "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
         "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
     "torques_about_point": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, "
@@ -368,7 +381,8 @@ CODES: Final[Mapping[str, Code]] = {
     # The described cell
     "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
         "{tool_kg:.3g}{units:units}{unit_N:scale}",
-        "check the sensor's units and what is mounted, or correct [tool] mass_kg"),
+        "check the sensor's units, what is mounted, and whether the controller compensates a part, or correct [tool] "
+        "mass_kg"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
         "sensor{sensor_kg:?|, whose own mass is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
@@ -383,8 +397,8 @@ CODES: Final[Mapping[str, Code]] = {
     "positions_unit": Code(_REJECT, "the positions look given in {unit}, because they spread over {spread_m:.3g} and "
         "accelerate as much too fast for the weight", "give them in m"),
     "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and the acceleration of the poses agree if all times are "
-        "{factor:~sigma} times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the "
-        "stated one, or the unit of the times"),
+        "{factor:~sigma} times as long (sigma {sigma:~sigma}){factor:compensated}", "give the true rate, which is "
+        "{rate:.4g} times the stated one, the unit of the times, or the wrench as the sensor measures it"),
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
         "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
     "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the poses look like those of a TCP, because the sensor lies at "
@@ -427,15 +441,16 @@ CODES: Final[Mapping[str, Code]] = {
         "of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
     "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to {free_Nm:.2g} "
         "instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take more poses"),
-    "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
-        "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
-        "look for drift, cables, contact and inexact orientations"),
     "response_not_linear": Code(_LIMIT_OR_NOTE, "the response of the sensor is not linear, by {share_percent:.2g} of "
         "the weight, which compensation does not know", "stay within the range of the sensor, or have it calibrated"),
     "cable_acts": Code(_LIMIT_OR_NOTE, "something pulls as the tool turns, as a cable does, by {force_N:.2g} and "
         "{torque_Nm:.2g}, which compensation does not know", "give cables and hoses more slack"),
     "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have an error of {turn_deg:.2g} that is smooth "
-        "over the poses", "take the factory calibration of the arm, or stiffen the mount"),
+        "over the poses", "fasten base, sensor and tool, take the factory calibration of the arm, or stiffen the "
+        "mount"),
+    "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
+        "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
+        "look for drift, cables, contact and inexact orientations"),
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
@@ -504,8 +519,8 @@ _EXPLAINS: Final[Sequence[tuple[frozenset[str], frozenset[str]]]] = (
         frozenset((
             "other_recording", "constant_force", "wrench_in_base", "orientations_inverted", "quaternion_order",
             "euler_angles", "columns_swapped", "pairing_shifted", "zeroed_each_pose", "pairing_or_rotations",
-            "axes_disagree", "com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed",
-            "sensors_alternate",
+            "orientations_off", "torques_unrelated", "axes_disagree", "com_shifted", "load_changed", "bias_stepped",
+            "sensor_turned", "sensor_changed", "sensors_alternate",
         )),
         _OF_MISTAKES,
     ),

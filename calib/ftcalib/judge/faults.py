@@ -39,8 +39,9 @@ CORRECTED = 0.1
 IMPLAUSIBLE = 1.0
 # Residuals that differ by less than this factor are equal: the simpler explanation is taken.
 TIED = 1.3
-# Forces of a weight in other poses than given: large residuals, in shares of the weight, and little of them radial.
-OTHER_POSES, OF_A_WEIGHT = 0.03, 0.1
+# Forces of a weight in other poses than given: residuals in shares of the weight, and little of them radial. Poses that
+# are off by less than the second share are right ones that move.
+OFF_POSES, OTHER_POSES, OF_A_WEIGHT = 0.015, 0.15, 0.1
 # A constant force that points down this exactly is a weight in base axes.
 IN_BASE_RAD = np.deg2rad(10.0)
 # A force that varies by less than this share of it is constant.
@@ -180,11 +181,14 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
     radial_N = np.linalg.norm(force_N - center_N, axis=1) - weight_N
     radial_rms_N = float(np.sqrt(np.sum(radial_N**2) / (len(force_N) - len(solution))))
     torque_rms_Nm = _torque_rms(force_N - center_N, torque_Nm, *com_and_torque_bias(force_N - center_N, torque_Nm))
-    elsewhere = as_read.force_rms_N > OTHER_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
+    elsewhere = as_read.force_rms_N > OFF_POSES * weight_N and radial_rms_N < OF_A_WEIGHT * as_read.force_rms_N
     if not elsewhere or torque_rms_Nm > COLLAPSE * as_read.torque_rms_Nm:
         return []
-    residual_N = as_read.force_rms_N
-    return [Finding.of("pairing_or_rotations", weight_N=weight_N, radial_N=radial_rms_N, residual_N=residual_N)]
+    values = {"weight_N": weight_N, "radial_N": radial_rms_N, "residual_N": as_read.force_rms_N}
+    if as_read.force_rms_N > OTHER_POSES * weight_N:
+        return [Finding.of("pairing_or_rotations", **values)]
+    turn_deg = float(np.degrees(as_read.force_rms_N / weight_N))
+    return [Finding.of("orientations_off", "limit", **values, turn_deg=turn_deg)]
 
 
 def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:

@@ -47,6 +47,8 @@ SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 USUAL_LEVER_M = 0.1
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
+# Torques of another sensor leave more than this share of their change.
+UNRELATED = 0.8
 # Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing.
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # Probability of a false reason.
@@ -198,6 +200,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     accidents = few_rejected(quality.used) or bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
     suspect = quality.errors or not accidents or "cross_talk" in fit.components  # which hides axes that almost agree
     mistakes = _mistakes(fit, quality.used, t_s, setup, written) if suspect else []
+    mistakes = mistakes or _unrelated_torques(fit, quality)
     # Neighbouring rows of a motion differ too little to show a bias that changes with each.
     mistakes = [one for one in mistakes if single_poses or one.code != "zeroed_each_pose"]
     # Simulated readings without noise repeat themselves by right, also in other poses than given.
@@ -309,6 +312,17 @@ def _mistakes(fit: Judged, used: NDArray[np.bool_], t_s: Array | None, setup: Se
     if not findings and not used.all():
         findings = faults(fit.R_base_flange[order], fit.wrench[order], setup.up, written)
     return findings
+
+
+def _unrelated_torques(fit: Judged, quality: Quality) -> list[Finding]:
+    """Recognise torques that do not follow the weight while the forces do: another sensor's, or of one without load."""
+    torque_Nm, codes = fit.wrench[quality.used, 3:], {one.code: one.severity for one in quality.errors}
+    is_near = float(np.linalg.norm(fit.parameters.p_sensor_com_m)) < units.NEAREST_COM_M
+    change_Nm = _rms(torque_Nm - torque_Nm.mean(axis=0))
+    left = _rms(fit.residuals[quality.used, 3:]) / (change_Nm or 1.0)
+    if left < UNRELATED or "force_error" in codes or not (is_near or codes.get("torque_error") == "reject"):
+        return []
+    return [Finding.of("torques_unrelated", "limit", left_percent=100 * min(left, 1.0))]
 
 
 def _other_poses(fit: Judged, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:

@@ -1,5 +1,6 @@
 """What was mixed up is named, and undoing it helps."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +26,7 @@ from ftcalib.judge.faults import (
     constant_weight,
     faults,
     least_rms,
+    other_poses,
     rough_fit,
 )
 from ftcalib.known import Known
@@ -205,6 +207,34 @@ def test_wrenches_of_other_poses_are_named(order: str) -> None:
     rows = {"reverse": np.arange(n)[::-1], "two before": np.roll(np.arange(n), 2)}
     wrench = wrench[rows.get(order, np.random.default_rng(1).permutation(n))]
     assert first(R, wrench).code == "pairing_or_rotations"
+
+
+@pytest.mark.parametrize(("rock_deg", "code"), [(2.0, "orientations_off"), (20.0, "pairing_or_rotations")])
+def test_poses_that_rock_are_off_and_not_those_of_another_recording(rock_deg: float, code: str) -> None:
+    p, R, _ = session(7, 12)
+    rng = np.random.default_rng(3)
+    rock = np.deg2rad(rock_deg) * rng.choice([-1, 1], (12, 3)) * [1, 1, 0] / np.sqrt(2)
+    wrench = predict(p, Rotation.from_rotvec(rock).as_matrix() @ R) + 0.2 * SIGMA * rng.normal(size=(12, 6))
+    (finding,) = other_poses(R, wrench)
+    assert finding.code == code
+    assert 0.7 < finding.values.get("turn_deg", 2.0) < 2.5
+
+
+@pytest.mark.parametrize(("idle", "severity"), [(False, "reject"), (True, "limit")])
+def test_torques_of_another_sensor_are_named(idle: bool, severity: str) -> None:
+    _, R, wrench = session(8, 16)
+    other, posed, _ = session(9, 16)
+    noise = SIGMA[3:] * np.random.default_rng(1).normal(size=(16, 3))
+    wrench[:, 3:] = noise if idle else predict(other, posed)[:, 3:]
+    finding = first(R, wrench)
+    assert (finding.code, finding.severity) == ("torques_unrelated", severity)
+
+
+def test_a_load_balanced_on_the_sensor_is_near_and_its_torques_follow() -> None:
+    p, R, _ = session(10, 16)
+    balanced = replace(p, p_sensor_com_m=0.004 * p.p_sensor_com_m)
+    wrench = predict(balanced, R) + 0.01 * SIGMA * np.random.default_rng(2).normal(size=(16, 6))
+    assert first(R, wrench).code == "com_too_near"
 
 
 def test_two_exchanged_poses_are_rejected_and_not_called_a_wrong_pairing() -> None:
