@@ -17,7 +17,7 @@ from multiprocessing.pool import Pool
 
 import click
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from ftcalib import Setup
 from ftcalib.errors import BadDataset, FtdriveError
@@ -154,15 +154,53 @@ def _pounds(one: Drawn, rng: Generator) -> Recorded:
     return replace(one.recorded, wrench=one.recorded.wrench / np.repeat([4.4482216, torque], 3))
 
 
+def _kgf(one: Drawn, rng: Generator) -> Recorded:
+    torque = 1.0 if rng.random() < 0.5 else 9.80665
+    return replace(one.recorded, wrench=one.recorded.wrench / np.repeat([9.80665, torque], 3))
+
+
+def _compensated(one: Drawn, rng: Generator) -> Recorded:
+    """Take 40 to 80 % of the weight from the wrench, as a controller does whose payload is too small."""
+    recorded, truth = one.recorded, one.truth
+    R = Slerp(recorded.t_pose_s, Rotation.from_matrix(recorded.R_base_flange))(
+        np.clip(recorded.t_s - truth.delay_s, *recorded.t_pose_s[[0, -1]])
+    ) * Rotation.from_rotvec(truth.mounting_rotvec)
+    force = rng.uniform(0.4, 0.8) * truth.mass_kg * R.inv().apply(truth.gravity_m_s2)
+    return replace(recorded, wrench=recorded.wrench - np.hstack([force, np.cross(truth.p_sensor_com_m, force)]))
+
+
+def _held(one: Drawn, rng: Generator) -> Recorded:
+    """Lay a hand on the tool for 60 % of the time: it pulls by 3 to 15 N, slowly changing."""
+    t_s, wrench = one.recorded.t_s, one.recorded.wrench.copy()
+    start = rng.uniform(0, 0.4)
+    held = (t_s > t_s[0] + start * np.ptp(t_s)) & (t_s < t_s[0] + (start + 0.6) * np.ptp(t_s))
+    phase, hz = rng.uniform(0, 2 * np.pi, 3), rng.uniform(0.1, 0.4, 3)
+    force = rng.uniform(3, 15) * np.sin(2 * np.pi * np.outer(t_s[held], hz) + phase)
+    wrench[held] += np.hstack([force, np.cross([0.0, 0.02, 0.12], force)])
+    return replace(one.recorded, wrench=wrench)
+
+
+def _zeroed_moving(one: Drawn, rng: Generator) -> Recorded:
+    """Zero the sensor once while the arm moves or rests."""
+    wrench = one.recorded.wrench.copy()
+    first = int(rng.uniform(0.25, 0.75) * len(wrench))
+    wrench[first:] -= wrench[first - 25 : first].mean(axis=0)
+    return replace(one.recorded, wrench=wrench)
+
+
 # The mistake, and the codes that name it; those of the clock last, because others know when the arm rests.
 MISTAKES: Mapping[str, tuple[Callable[[Drawn, Generator], Recorded], frozenset[str]]] = {
     "zeroed": (_zeroed, frozenset(["zeroed"])),
+    "zeroed in motion": (_zeroed_moving, frozenset(["zeroed"])),
+    "compensated in part": (_compensated, frozenset(["wrench_compensated", "clock_rate"])),
+    "hand on the tool": (_held, frozenset(["mostly_contact", "other_recording", "force_error", "torque_error"])),
     "poses of a TCP": (_tcp, frozenset(["poses_of_tcp"])),
     "torques about a TCP": (_torques_about_tcp, frozenset(["torques_about_tcp"])),
     "positions in mm": (_mm, frozenset(["positions_unit"])),
     "reversed": (_reversed, frozenset(["reversed_in_motion"])),
     "axes": (_axes, frozenset(["axes_disagree", "reversed_in_motion"])),
     "pounds": (_pounds, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
+    "kgf": (_kgf, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
     "delay": (_delay, frozenset(["clock_offset"])),
     "rate": (_rate, frozenset(["clock_rate"])),
     "time unit": (_time_unit, frozenset(["BadDataset"])),
@@ -245,7 +283,7 @@ def _alone(pool: Pool, name: str, runs: int) -> Iterator[Row]:
         first, good = first + hit, good + (found.verdict == "good")
         if not hit:
             show(f"{name}, seed {seed}: {found.verdict}, {', '.join(found.codes)}")
-    hidden = name == "pounds"  # which motion does not show in every recording
+    hidden = name in ("pounds", "kgf")  # which motion does not show in every recording
     passed = hidden or (first >= 0.95 * runs and not good)
     target = "" if hidden else "95 %, 0 good"
     yield Row(f"{name}: named first; good", f"{100 * first / runs:.0f} %; {good}", target, passed, runs)
