@@ -327,8 +327,12 @@ def _unrelated_torques(fit: Judged, quality: Quality) -> list[Finding]:
 
 def _other_poses(fit: Judged, used: NDArray[np.bool_], t_s: Array | None) -> list[Finding]:
     order = _some_runs(t_s, len(used))
-    order = order[used[order]]
-    return other_poses(fit.R_base_flange[order], fit.wrench[order])
+    kept = order[used[order]]
+    named = other_poses(fit.R_base_flange[kept], fit.wrench[kept])
+    # Those that fit by chance do not show how far off the poses are.
+    if named and not few_rejected(used):
+        named = other_poses(fit.R_base_flange[order], fit.wrench[order]) or named
+    return named
 
 
 def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
