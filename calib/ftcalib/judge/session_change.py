@@ -23,7 +23,6 @@ from ftcalib.judge.faults import CORRECTED, ROUNDING, rough_fit
 from ftcalib.likelihood.descent import FARTHEST, column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.response import response_columns
-from ftcalib.likelihood.session import LEVER_M
 from ftcalib.likelihood.session_noise import summed_products
 from ftcalib.likelihood.variance_components import EFFECTS, GAIN, GAIN_OF_RESPONSE, squared_length
 from ftcalib.model import (
@@ -46,9 +45,13 @@ FEWEST_ON_A_SIDE = 3
 # Of longer sessions only every second, third, ... pose is looked at.
 MOST_POSES = 300
 # A change must bring the mean square misfit below this share before the likelihood is asked.
-CLEARLY = 0.5
+CLEARLY = 0.9
+# Residuals below this share of the weight are those of a change that is linear in its numbers.
+SMALL = 0.01
 # By which twice the log-likelihood must rise, beside log(6 n) for each number of the change.
-MARGIN = 20.0
+MARGIN = 10.0
+# Drift that varies looks like steps of the bias, and hysteresis like two sensors that take turns: these bring more.
+LARGER_MARGIN = 20.0
 # Numbers of mounting and gravity that a step of the bias leaves, as matrix and vector, without their common scale.
 _SHAPE = 11
 # Steps of the bias that are looked for, and poses between two.
@@ -122,7 +125,11 @@ def session_change(
         return []
     times = None if t_s is None else t_s[order]
     cov = None if sigma is None else np.diag(sigma**2)
-    changes = [likeliest_change(found.parameters, R, wrench, sigma), bias_steps(R, wrench) if steps else None]
+    used = found.residuals[order][found.weights[order] > 0.5]
+    changes = [
+        likeliest_change(found.parameters, R, wrench, np.repeat(_rms(used), 3)),
+        bias_steps(R, wrench) if steps else None,
+    ]
     costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
     cost, change = min(costs, key=lambda pair: pair[0], default=(np.inf, None))
     if change is None or not np.isfinite(cost):
@@ -154,7 +161,8 @@ def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array | None)
     if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
         return np.inf
     n, times = len(R), 1 if change.takes_turns else len(change.starts)
-    costs = times * (len(KINDS[change.code]) * np.log(6 * n) + 2 * np.log(n) + MARGIN)
+    margin = LARGER_MARGIN if change.takes_turns or change.code == "bias_stepped" else MARGIN
+    costs = times * (len(KINDS[change.code]) * np.log(6 * n) + 2 * np.log(n) + margin)
     return minus_two_log_likelihood(without) + float(costs)
 
 
@@ -171,9 +179,7 @@ def minus_two_log_likelihood(found: Fit) -> float:
     return value
 
 
-def likeliest_change(
-    parameters: Parameters, R: Array, wrench: Array, sigma: Array | None = None
-) -> SessionChange | None:
+def likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
     """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
 
     Parameters
@@ -183,27 +189,55 @@ def likeliest_change(
     R : array, shape (n, 3, 3)
         In the order of time, as the wrench.
     wrench : array, shape (n, 6)
-    sigma : array, shape (6,), optional
-        Measured noise of a pose.
+    scale : array, shape (6,)
+        How much each channel is off without a change, in any common unit.
     """
     n = len(wrench)
-    scale = np.repeat([1.0, LEVER_M], 3) if sigma is None else sigma
     ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
     J = np.concatenate([jacobian(parameters, R), response_columns(parameters, R)], axis=2)
     residuals = wrench - predict(parameters, R)
     # A steady drift is no change: what remains beside it is the measure.
     without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
-
-    best: dict[str, tuple[float, Parameters, Rows]] = {}
+    small = bool((_rms(residuals) < SMALL * _rms(gravity_wrench(parameters, R))).all())
+    changes = []
     for pure, groups in _groups(n):
-        start = parameters if pure is None else rough_fit(R[pure], wrench[pure])
-        for code, misfits in _misfits(start, R, wrench, scale, groups).items():
-            k = int(np.argmin(misfits))
-            if code not in best or misfits[k] < best[code][0]:
-                best[code] = misfits[k], start, groups[k]
-    changes = [_refine(code, start, R, wrench, scale, rows) for code, (_, start, rows) in best.items()]
+        if pure is None:
+            start, misfits = parameters, _linear_misfits(parameters, R, J, residuals, scale, groups)
+        elif not small:
+            start = rough_fit(R[pure], wrench[pure])
+            misfits = _misfits(start, R, wrench, scale, groups)
+        else:
+            continue
+        changes += [_refine(code, start, R, wrench, scale, groups[int(np.argmin(m))]) for code, m in misfits.items()]
     change = min(changes, key=lambda one: one.criterion)
     return change if change.misfit < CLEARLY * without else None
+
+
+def _rms(wrench: Array) -> Array:
+    """Root mean square (2,) of the axes of force and of torque."""
+    return np.asarray(np.sqrt(np.mean(wrench.reshape(-1, 2, 3) ** 2, axis=(0, 2))))
+
+
+def _linear_misfits(
+    p: Parameters, R: Array, J: Array, residuals: Array, scale: Array, groups: NDArray[np.bool_]
+) -> dict[str, Array]:
+    """Squared misfit (k,) of each kind of change of each group (k, n), together with the columns J (n, 6, m)."""
+    C, J, r = _columns(p, R) / scale[:, None], J / scale[:, None], residuals / scale
+    J = J / column_scale(summed_products(J, J))
+    inverse = np.linalg.pinv(summed_products(J, J), rcond=1e-12, hermitian=True)
+    r = r - J @ (inverse @ np.tensordot(J, r, ([0, 1], [0, 1])))
+    of_pose = np.einsum("nci,ncj->nij", C, np.concatenate([C, J, r[..., None]], axis=2))
+    sums = np.tensordot(groups.astype(np.float64), of_pose, 1)
+    k = C.shape[2]
+    between, moment = sums[..., k:-1], sums[..., -1]
+    gram = sums[..., :k] - between @ inverse @ between.swapaxes(1, 2)
+    unit = np.sqrt(np.maximum(np.einsum("kii->ki", gram), 1e-300))
+    gram, moment = gram / unit[:, :, None] / unit[:, None], moment / unit
+    misfits = {}
+    for code, own in KINDS.items():
+        inverse, of_own = np.linalg.pinv(gram[:, own][:, :, own], rcond=1e-9, hermitian=True), moment[:, own]
+        misfits[code] = np.sum(r**2) - np.einsum("ki,kij,kj->k", of_own, inverse, of_own)
+    return misfits
 
 
 def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
@@ -251,7 +285,7 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         if not beam:
             break
         criterion = 3 * n * np.log(left_by[beam[0]]) + count * len(BIAS) * np.log(6 * n)
-        if criterion < least - MARGIN:
+        if criterion < least - LARGER_MARGIN:
             least, best = criterion, beam[0]
     if not best:
         return None
@@ -274,11 +308,11 @@ def _less_means(values: Array, steps: Sequence[int]) -> Array:
 def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
     """Yield rows that may be of one kind, all if None, and the groups of others that may differ from them."""
     after = np.arange(n) >= np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)[:, None]
-    half = n // 2
-    yield None, after
+    half, every_other = n // 2, np.arange(n)[None] % 2 == 1
+    yield None, np.concatenate([after, every_other])
     yield slice(0, half), after[~after[:, :half].any(axis=1)]
     yield slice(half, n), ~after[after[:, half:].all(axis=1)]
-    yield slice(0, n, 2), np.arange(n)[None] % 2 == 1
+    yield slice(0, n, 2), every_other
 
 
 def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:

@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.judge.faults import rough_fit
-from ftcalib.judge.session_change import _groups, bias_steps, likeliest_change, minus_two_log_likelihood
+from ftcalib.judge.session_change import KINDS, _groups, bias_steps, likeliest_change, minus_two_log_likelihood
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.response import SIZE, response_columns
+from ftcalib.likelihood.session import LEVER_M
 from ftcalib.model import Parameters, jacobian, predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
+from tests.structured_cell import CELLS, Cell, flange, tour
 
 Array = NDArray[np.float64]
 
@@ -180,7 +182,8 @@ def test_a_change_is_as_large_as_it_is_and_can_be_undone(
 ) -> None:
     wrench = np.where(rows[:, None], predict(after, ORIENTATIONS), predict(TOOL, ORIENTATIONS))
     wrench += 0.01 * np.random.default_rng(5).normal(0, SIGMA, wrench.shape)
-    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, SIGMA if measured else None)
+    scale = SIGMA if measured else np.repeat([1.0, LEVER_M], 3)
+    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, scale)
     assert change is not None
     assert (change.code, change.takes_turns) == (code, not rows[22])
     assert change.starts[0] == np.flatnonzero(rows)[0]
@@ -200,7 +203,7 @@ def test_changes_are_tried_that_leave_three_poses_on_each_side(n: int) -> None:
         return [k >= first for k in range(n)]
 
     assert found == [
-        (None, [later(first) for first in range(3, n - 2)]),
+        (None, [*(later(first) for first in range(3, n - 2)), [k % 2 == 1 for k in range(n)]]),
         (slice(0, half), [later(first) for first in range(half, n - 2)]),
         (slice(half, n), [[not one for one in later(first)] for first in range(3, half + 1)]),
         (slice(0, n, 2), [[k % 2 == 1 for k in range(n)]]),
@@ -281,3 +284,37 @@ def test_steps_of_the_bias_are_found_where_they_are() -> None:
         assert change.starts.tolist() == places
         # A bias of a few poses is as uncertain as their fit.
         assert np.abs(change.corrected - unstepped).max() < 20 * SIGMA[0]
+
+
+def all_disturbances(seed: int, turn_deg: float) -> CalibrationResult:
+    """A tour of a cell with errors of every structure, whose sensor and tool turn on the flange in its middle."""
+    rng = np.random.default_rng([seed, 21])
+    cell, after = Cell([seed], CELLS["all"]), Cell([seed], CELLS["all"])
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(turn_deg * axis / np.linalg.norm(axis), degrees=True).as_matrix()
+    after.R_flange_sensor = cell.R_flange_sensor @ turn
+    q, first = tour(np.random.default_rng([seed, 1]), 24, "whole"), int(rng.integers(8, 17))
+    t_s, samples = cell.dwells(q, 0.0)
+    samples[first:] = after.dwells(q, 0.0)[1][first:]
+    return solve(CalibrationDataset.of(flange(q), samples.mean(axis=1), t_s=t_s))
+
+
+@pytest.mark.parametrize("seed", [3005, *(pytest.param(k, marks=pytest.mark.slow) for k in range(3006, 3016))])
+def test_a_turn_by_a_degree_is_named_beside_errors_that_have_a_structure(seed: int) -> None:
+    first = all_disturbances(seed, 1.0).findings[0]
+    assert (first.code, first.severity) == ("sensor_turned", "reject")
+    assert first.values["turn_deg"] == pytest.approx(1.0, abs=0.6)
+
+
+@pytest.mark.parametrize("seed", [4005, *(pytest.param(k, marks=pytest.mark.slow) for k in range(4006, 4012))])
+def test_errors_that_have_a_structure_are_no_change(seed: int) -> None:
+    named = {one.code for one in all_disturbances(seed, 0.0).findings}
+    assert not named & {*KINDS, "sensors_alternate"}
+
+
+@pytest.mark.slow
+def test_hysteresis_is_not_two_sensors_that_take_turns() -> None:
+    cell, q = Cell([4000], CELLS["hysteresis"]), tour(np.random.default_rng([4000, 1]), 24, "wrist")
+    t_s, samples = cell.dwells(q, 0.0)
+    result = solve(CalibrationDataset.of(flange(q), samples.mean(axis=1), t_s=t_s))
+    assert "sensors_alternate" not in {one.code for one in result.findings}
