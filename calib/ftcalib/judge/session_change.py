@@ -241,7 +241,7 @@ def _linear_misfits(
 
 
 def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
-    """Find the steps of the bias that leave the least force; None in few poses.
+    """Find the steps of the bias that leave the least force; None in few poses, or if they leave no less than none.
 
     Poses between two steps have a bias of their own, so only differences within them count. No rotation leaves less
     than any matrix of its size, whose cost needs no start. The best sets of steps each get one more.
@@ -264,6 +264,12 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         own = sums[last] - sums[first]
         return np.asarray(np.einsum("kai,kaj->kij", own, own) / np.maximum(last - first, 1)[:, None, None])
 
+    def square_left(gram: Array, steps: int) -> Array:
+        """Mean square of force (k,) that mounting and gravity leave of sums of squares (k, 12, 12)."""
+        cross = gram[:, :9, 9:]
+        left = gram[:, :9, :9] - cross @ np.linalg.pinv(gram[:, 9:, 9:], hermitian=True) @ cross.swapaxes(1, 2)
+        return np.asarray(3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - steps - 1) - _SHAPE) + finest)
+
     def with_another(others: Steps) -> Iterator[tuple[Steps, float]]:
         """Add each possible step to others: all steps, and the mean square of force that they leave."""
         bounds, at = np.array([0, *others, n]), np.arange(1, n)
@@ -271,14 +277,15 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         before, after = bounds[k - 1], bounds[np.minimum(k, len(bounds) - 1)]
         gram = total - means(bounds[:-1], bounds[1:]).sum(axis=0) + means(before, after)
         gram -= means(before, at) + means(at, after)
-        cross = gram[:, :9, 9:]
-        left = gram[:, :9, :9] - cross @ np.linalg.pinv(gram[:, 9:, 9:], hermitian=True) @ cross.swapaxes(1, 2)
-        square = 3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - len(others) - 2) - _SHAPE) + finest
+        square = square_left(gram, len(others) + 1)
         possible = np.flatnonzero(np.minimum(at - before, after - at) >= FEWEST_BETWEEN)
         for i in possible:
             yield tuple(sorted([*others, int(at[i])])), float(square[i])
 
-    least, best, beam = np.inf, Steps(), [Steps()]
+    everything = total - means(np.array([0]), np.array([n]))
+    # The first set must be better than none, and a larger one clearly better.
+    least = 3 * n * float(np.log(square_left(everything, 0)[0])) + LARGER_MARGIN
+    best, beam = Steps(), [Steps()]
     for count in range(1, min(MOST_STEPS, n - 2 - _SHAPE // 3) + 1):
         left_by = dict(one for steps in beam for one in with_another(steps))
         beam = sorted(left_by, key=left_by.__getitem__)[: max(BEAM, 1000 // n)]
