@@ -77,8 +77,8 @@ class Fit:
     lag: tuple[Array, Array] | None
     """Hysteresis and errors that have a structure (n, 6) of each pose, and their variance (n, 6, 6): compensation does
     not know them; None where none were found."""
-    elsewhere: Array
-    """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
+    at: Point | None
+    """Restricted likelihood of all unknowns; None in many poses."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -120,6 +120,17 @@ class Fit:
         if self.lag is not None:
             e, S = e + self.lag[0], S + self.lag[1]
         return e, S
+
+    @cached_property
+    def elsewhere(self) -> Array:
+        """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
+        if self.at is None:
+            return np.zeros(6)
+        R, middle = Rotation.create_group("O").as_matrix(), self.R_base_flange[self.order].mean(axis=0)
+        effects = sensor_columns(self.parameters, R) | structure_columns(self.parameters, R, middle)
+        everywhere = self.at.squares(jacobian(self.parameters, R) @ self.free, effects)
+        problem = self.at.problem
+        return everywhere - self.at.squares(problem.J, {kind: problem.effects[kind] for kind in effects})
 
     @property
     def gain_sigma(self) -> float:
@@ -200,12 +211,10 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
     Z = session.constraints.free(best.parameters)
     given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
     response = lag = None
-    measured_chi2, elsewhere = static_chi2 if session.measured else float("nan"), np.zeros(6)
+    measured_chi2 = static_chi2 if session.measured else float("nan")
     if found or session.n <= STRUCTURED_POSES:
         problem = session.linearise(best.parameters, e.kept)
         at = point(problem, e.components, e.theta)
-    if session.n <= STRUCTURED_POSES:
-        elsewhere = _elsewhere(session, best.parameters, at)
     if session.measured and found.keys() & {*RESPONSE}:
         of_sensor = [c for c in e.components if c in RESPONSE]
         measured_chi2 = point(problem, of_sensor, np.array([found[c] for c in of_sensor])).chi2
@@ -242,16 +251,8 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         covariance=covariance,
         response=response,
         lag=None if lag is None else (lag, square),
-        elsewhere=elsewhere,
+        at=at if session.n <= STRUCTURED_POSES else None,
     )
-
-
-def _elsewhere(session: Session, p: Parameters, at: Point) -> Array:
-    """Mean square error (6,) in any orientation, less that in those of the poses."""
-    R = Rotation.create_group("O").as_matrix()
-    effects = sensor_columns(p, R) | structure_columns(p, R, session.R.mean(axis=0))
-    everywhere = at.squares(jacobian(p, R) @ session.constraints.free(p), effects)
-    return everywhere - at.squares(at.problem.J, {kind: at.problem.effects[kind] for kind in effects})
 
 
 def _deviation(session: Session, c: Component, variance: float) -> float:
