@@ -416,7 +416,11 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     square[np.ix_(of_poses, of_poses)] += summed_products(Vu, noise.solve(Vu))
     known = GE[at.unknown]
     known[:, of_poses] += XV[at.unknown]
-    return slope, np.asarray(square - known.T @ C @ known) / 2
+    information = np.asarray(square - known.T @ C @ known) / 2
+    # Exact data in wrong orientations leave residuals of 1e10 of their noise, whose powers overflow: nothing is learnt.
+    if not (np.isfinite(slope).all() and np.isfinite(information).all()):
+        return np.zeros_like(slope), np.zeros_like(information)
+    return slope, information
 
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array, worse_than: float = -np.inf) -> Point:
