@@ -388,7 +388,7 @@ def test_deviations_from_the_special_orientations_are_named_with_their_error(met
             assert note.values["force_N"] == pytest.approx(np.linalg.norm(without_noise), rel=0.5)
 
 
-@pytest.mark.parametrize("runs", [6, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
 def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(
     runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -189,7 +189,7 @@ def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide() -> None:
-    seeds = 100
+    seeds = 25
     z, compensation = [], []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)

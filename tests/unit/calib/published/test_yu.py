@@ -105,7 +105,7 @@ def is_numbered(R: Array, number: NDArray[np.intp], Y: Array, expected: NDArray[
     return bool(fits) and ((number >= 0) == special).all()
 
 
-@pytest.mark.parametrize("turns", [20, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("turns", [20, pytest.param(300, marks=pytest.mark.slow)])
 def test_deviations_up_to_1_degree_are_recognised_for_any_turn_of_the_base(turns: int) -> None:
     rng = np.random.default_rng(3)
     for Y in Rotation.random(turns, rng=rng).as_matrix():
