@@ -4,7 +4,8 @@ For given parameters the expected wrench is affine in the nine entries of R_base
 
     contact = wrench - matrix @ vec(R_base_flange) - offset        vec: row by row
 
-which is `wrench - predict(parameters, R_base_flange)` of `ftcalib.model` with everything constant computed once.
+which is `wrench - predict(parameters, R_base_flange)` of `ftcalib.model` with everything constant computed once. Where
+the matrix of the sensor is known better than its maker's, all of it is multiplied by one more, constant too.
 
 Of a tool in motion, `inertial_wrench` gives what its acceleration adds.
 """
@@ -16,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ftcalib.likelihood.response import Response
-from ftcalib.model import Array, Parameters, Rotations, matrices_of, skew
+from ftcalib.model import Array, Parameters, Rotations, matrices_of, read_only, skew
 
 Reals = NDArray[np.floating[Any]]
 
@@ -34,7 +35,9 @@ class Compensator:
     dtype : float64 (default) or float32
         Type of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
     response : Response, optional
-        Gain and cross-talk of the sensor.
+        Gain and cross-talk of the sensor, as the tool shows them.
+    decoder : array, shape (6, 6), optional
+        Turns readings without the free tool into contacts: `ftcalib.sensor_matrix.ContactResponse.decoder`.
 
     Attributes
     ----------
@@ -42,6 +45,7 @@ class Compensator:
         N and N·m per entry of R_base_flange.
     offset : array, shape (6,)
         The bias, N and N·m.
+    decoder : array, shape (6, 6), or None
 
     Notes
     -----
@@ -58,7 +62,12 @@ class Compensator:
     """
 
     def __init__(
-        self, parameters: Parameters, dtype: DTypeLike = np.float64, *, response: Response | None = None
+        self,
+        parameters: Parameters,
+        dtype: DTypeLike = np.float64,
+        *,
+        response: Response | None = None,
+        decoder: Array | None = None,
     ) -> None:
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         if self.dtype not in (np.float64, np.float32):
@@ -74,7 +83,9 @@ class Compensator:
         self.offset.setflags(write=False)
         self._offsets: Reals = np.tile(self.offset, (CHUNK_ROWS, 1))  # subtracting one row from many is slow in numpy
         # One sample is a single product with (wrench, vec(R_base_flange), 1).
-        self._product = np.concatenate([np.eye(6), -matrix, -offset[:, None]], axis=1).astype(self.dtype).dot
+        product = np.concatenate([np.eye(6), -matrix, -offset[:, None]], axis=1)
+        self.decoder: Reals | None = None if decoder is None else read_only(decoder).astype(self.dtype)
+        self._product = (product if decoder is None else decoder @ product).astype(self.dtype).dot
         self._operand: Reals = np.zeros(16, self.dtype)
         self._operand[15] = 1
 
@@ -146,6 +157,8 @@ class Compensator:
             rows = slice(start, start + CHUNK_ROWS)
             np.subtract(wrench[rows], entries[rows] @ self.matrix.T, contact[rows])
             contact[rows] -= self._offsets[: len(contact[rows])]
+            if self.decoder is not None:
+                contact[rows] = contact[rows] @ self.decoder.T
         return contact
 
 

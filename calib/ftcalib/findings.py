@@ -458,6 +458,30 @@ CODES: Final[Mapping[str, Code]] = {
         "assumed, and part of all uncertainties", "take {recommended} or more, or declare its accuracy_percent"),
     "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
         "parameters", "add similar poses"),
+    # Known loads
+    "loads_swapped": Code(_REJECT, "the loads {first} and {second} hang each where the other was declared",
+        "exchange their places in --at"),
+    "load_absent": Code(_REJECT, "no weight shows at {name}", "hang the load there, and repeat that run"),
+    "load_in_pounds": Code(_REJECT, "the load at {name} weighs {found_kg:.3f}, not {given_kg:.3f}: it was given in lb",
+        "give its mass in kg"),
+    "load_in_kilograms": Code(_REJECT, "the load at {name} weighs {found_kg:.3f}, not {given_kg:.3f}, as if kg were "
+        "converted from lb", "give its mass in kg"),
+    "load_mass": Code(_REJECT, "the load at {name} weighs {found_kg:~sigma_kg}, not {given_kg:.3f}", "weigh it again"),
+    "load_tool_mass": Code(_REJECT, "the tool weighs {found_kg:~sigma_kg}, not {given_kg:.3f}", "weigh it again"),
+    "load_place": Code(_REJECT, "the load at {name} hung at {found_mm:.0f}, not at {given_mm:.0f}, {off_mm:.0f} "
+        "away", "check which hole, and measure again"),
+    "load_moved": Code(_REJECT, "the load at {name} moved by {moved_mm:.1f} after pose {pose}",
+        "fix its point, and repeat that run"),
+    "load_pulled": Code(_REJECT, "something pulls the load at {name} sideways with {force_N:.2g}",
+        "let it hang free of everything, and repeat that run"),
+    "load_bias_stepped": Code(_REJECT, "the bias changes by {force_N:.2g} and {torque_Nm:.2g} after pose {pose} of "
+        "{run}", "repeat that run without touching the arm"),
+    "load_touched": Code(_REJECT, "something touched the load or the tool in {poses:poses} of {run}",
+        "repeat that run"),
+    "sensor_not_linear": Code(_REJECT, "the sensor is not linear: {remaining_percent:.1f} of the load remain in the "
+        "readings", "use a load within its range, or have the sensor calibrated by its maker"),
+    "matrix_changed": Code(_REJECT, "the matrix of the sensor differs by {sigmas:.1f} sigma of what was known, most in "
+        "{entry}", "check masses and places, then accept it with --accept"),
     # Notes
     **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected for "
         "this load") for axis in "xyz"},

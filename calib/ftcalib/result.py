@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,9 +18,29 @@ from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
-from ftcalib.likelihood.response import COMMON_GAIN, Response, hidden_covariance, joint_covariance, predicted_covariance
-from ftcalib.model import PARAMETER_NAMES, Array, DriftResult, Parameters, Rotations, is_rotation, read_only
+from ftcalib.likelihood.response import (
+    COMMON_GAIN,
+    LEVER_M,
+    SIZE,
+    SQUARES,
+    USUAL,
+    Response,
+    hidden_covariance,
+    joint_covariance,
+    predicted_covariance,
+)
+from ftcalib.model import (
+    PARAMETER_NAMES,
+    Array,
+    DriftResult,
+    Parameters,
+    Rotations,
+    is_rotation,
+    matrices_of,
+    read_only,
+)
 from ftcalib.published.yu import weight_and_tilt
+from ftcalib.sensor_matrix import ContactResponse, SensorMatrix
 
 FORMAT = "ftdrive.calibration/1"
 
@@ -162,6 +182,8 @@ class CalibrationResult:
     minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
+    sensor: SensorMatrix | None = None
+    """What is known of the sensor's own matrix, from loads or a data sheet; None: its usual errors are assumed."""
     motion: MotionResult | None = None
     """What a recording in motion gives, whose rows count as poses; None = from poses at rest."""
 
@@ -184,11 +206,14 @@ class CalibrationResult:
                 if value.shape != (length,) or not np.isfinite(value).all():
                     raise ValueError(f"{name} must be {length} finite numbers, got shape {value.shape}")
                 object.__setattr__(self, name, value)
-        if isinstance(self.drift, Mapping):
-            object.__setattr__(self, "drift", DriftResult(self.drift["change"], self.drift["sigma"]))
-        if isinstance(self.response, Mapping):
-            given = self.response
-            object.__setattr__(self, "response", Response(given["coefficients"], given["covariance"]))
+        read: dict[str, Callable[[Mapping[str, Any]], object]] = {
+            "drift": lambda given: DriftResult(given["change"], given["sigma"]),
+            "response": lambda given: Response(given["coefficients"], given["covariance"]),
+            "sensor": SensorMatrix.from_dict,
+        }
+        for name, build in read.items():
+            if isinstance(given := getattr(self, name), Mapping):
+                object.__setattr__(self, name, build(given))
         require_positive_definite(joint_covariance(self.covariance, self.response))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
@@ -214,6 +239,8 @@ class CalibrationResult:
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
         if response is not None:
             numbers.append(response)
+        if self.sensor is not None:
+            numbers += [self.sensor.error.tolist(), self.sensor.covariance.tolist()]
         if self.motion is not None:
             numbers += [self.motion.inertia_kg_m2.tolist(), self.motion.delay_s]
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]
@@ -369,9 +396,52 @@ class CalibrationResult:
         return np.asarray(compensator(wrench, R_base_flange), dtype=np.float64)
 
     @cached_property
+    def contact(self) -> ContactResponse:
+        """How the sensor reads a contact: its decoder, and the errors that remain of it."""
+        return (self.sensor or SensorMatrix.usual()).after(self.parameters, self.shown_response)
+
+    @property
+    def shown_response(self) -> Response:
+        """Gain and cross-talk as found, or zero with the covariance that the fit leaves of the usual ones.
+
+        A fit of n poses shows a gain as well as n readings of the weight do, with the error of predicting one from the
+        others. Half of that counts: a small one is not found.
+        """
+        if self.response is not None:
+            return self.response
+        n = self.n_poses - len(self.rejected_poses)
+        left_out: list[float] = [self.quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
+        error = np.maximum(np.repeat(left_out, [5, 6]) / np.repeat([1.0, LEVER_M], [5, 6]), 1e-12)
+        shown = max(self.dof, 0) / (6 * n) / 2 * n * SQUARES * (self.weight_N / error) ** 2
+        covariance = np.zeros((15 + SIZE, 15 + SIZE))
+        covariance[:15, :15] = self.covariance
+        covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (USUAL**-2.0 + shown)
+        return Response(np.zeros(SIZE), covariance)
+
+    def contact_sigma(self, wrench: ArrayLike, R_base_flange: Rotations) -> Array:
+        """Return one standard deviation of each axis of a contact: what the free tool leaves, and its own errors.
+
+        Parameters
+        ----------
+        wrench : array, shape (6,) or (n, 6)
+            The contact as `compensate` gives it, N and N·m, in the sensor frame.
+        R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
+
+        Returns
+        -------
+        array, same shape as `wrench`
+            Without the noise of a sample.
+        """
+        contact, R = np.asarray(wrench, dtype=np.float64), matrices_of(R_base_flange)
+        excess = np.square(self.likely_error()) - np.square(self.predicted_error())
+        free = np.diagonal(self.wrench_covariance(R), axis1=-2, axis2=-1) + np.repeat(np.maximum(excess, 0.0) / 3, 3)
+        loaded = self.contact.covariance(contact, self.covariance[:3, :3])
+        return np.asarray(np.sqrt(free + np.diagonal(loaded, axis1=-2, axis2=-1)))
+
+    @cached_property
     def compensator(self) -> Compensator:
         """The fast form of `compensate`: one sample, into a buffer, or a recording."""
-        return Compensator(self.parameters, response=self.response)
+        return Compensator(self.parameters, response=self.response, decoder=self.contact.decoder)
 
     def wrench_covariance(self, R_base_flange: Array) -> Array:
         """Covariance of the predicted wrench due to the uncertainty of the estimates.
@@ -465,6 +535,7 @@ class CalibrationResult:
             else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
             "response": None if self.response is None else self.response.to_dict(),
             "gain_sigma": self.gain_sigma,
+            "sensor": None if self.sensor is None else self.sensor.to_dict(),
             "cable_shift": None if self.cable_shift is None else self.cable_shift.tolist(),
             "weights": None if self.weights is None else self.weights.tolist(),
             "rejected_poses": list(self.rejected_poses),
@@ -495,11 +566,14 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
-            plain = [field.name for field in fields(cls) if field.name not in {"parameters", "cable_shift", "motion"}]
+            apart = {"parameters", "cable_shift", "sensor", "motion"}
+            plain = [field.name for field in fields(cls) if field.name not in apart]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
                 **{name: document[name] for name in plain},
-                cable_shift=document.get("cable_shift"),  # files of version 0.1.0 and earlier have none
+                # Files of version 0.1.0 and earlier have none of these.
+                cable_shift=document.get("cable_shift"),
+                sensor=document.get("sensor"),
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))

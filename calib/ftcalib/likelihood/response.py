@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftcalib.files import JSON
+from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
 
 # Cross-talk counts relative to a force at this lever.
@@ -32,6 +33,10 @@ GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.
 # (6, 3, 3) basis of the cross-talk, m.
 CROSS_TALK_M = LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
 SIZE = len(GAIN) + len(CROSS_TALK_M)
+# One sigma of each coefficient of a mounted or aged sensor before its fit.
+USUAL = USUAL_GAIN * np.array([1.0, 1.0, *[CROSS_TALK_SHARE] * 9])
+# Sum of the squares of the entries of each basis; of the cross-talk relative to the lever.
+SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 
 # Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the symmetric
 # part of two entries has half their variance.

@@ -231,11 +231,11 @@ class Processor:
             self._state, self._reading = int(states[-1]), readings[-1]
         if self.track != "off":
             self._follow_load(rows, states)
-        readings = self._transform(readings, rows.R_base_flange)
+        readings = self._transform(self.info.calibration.contact.decode(readings), rows.R_base_flange)
         soon = (states == REST) & (known is Inertia.EXACT)
         in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings, soon)
         self._note_contacts(contacts)
-        wrench = residual
+        wrench = self.info.calibration.contact.decode(residual)
         if not stages.gravity:
             wrench = wrench + gravity
         if not stages.bias:
@@ -253,11 +253,12 @@ class Processor:
             stages=stages,
         )
 
-    def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0) -> Array:
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0, *, loaded: bool = True) -> Array:
         """Standard deviation (6,) of the newest sample in the frame, or of the mean over `duration_s`.
 
         NaN until the noise is known. `R_base_flange` (3, 3) is that of the sample. It grows with the age of the bias,
-        where earlier runs of the sensor show how that moves.
+        where earlier runs of the sensor show how that moves. With `loaded` it has the errors of the sensor under the
+        present contact; without, it is that of a free tool.
         """
         noise = self._noise.of(self._state)
         if noise is None:
@@ -270,6 +271,10 @@ class Processor:
             covariance = covariance + self._test.uncertainty
         if self._stages.bias:
             covariance = covariance + np.diag(self._tool.bias_growth(self._newest_ns))
+        if loaded:
+            contact = self.info.calibration.contact
+            rotation_covariance = self.info.calibration.covariance[:3, :3]
+            covariance = covariance + contact.covariance(contact.decode(self._reading), rotation_covariance)
         T = self._transform.matrix(R_base_flange)
         return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
 

@@ -1,0 +1,325 @@
+"""The matrix of a sensor from runs with known loads: one fit of all, and the mistakes that would spoil it.
+
+Source: S. Traversaro, D. Pucci, F. Nori, "In situ calibration of six-axis force-torque sensors using accelerometer
+measurements", ICRA 2015 (arXiv 1410.0885), with a prior of the matrix, unknown places and sizes of the disturbances
+from the marginal likelihood.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy.optimize import minimize
+
+from ftcalib.errors import NotObservable
+from ftcalib.files import JSON
+from ftcalib.findings import Finding, Verdict, ordered, verdict_of
+from ftcalib.known import Setup
+from ftcalib.loads.model import SIZES, Evaluated, LoadModel, LoadRun, Mistake, sizes_of
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.solver import solve
+
+# By which minus twice the logarithm of the likelihood falls, for a mistake to count; per pose it could be in many.
+_CLEARLY = 12.0
+_MOST_MISTAKES = 4
+# Candidates whose sizes are estimated again.
+_TRIED = 6
+_PASSES = 3
+# Of the load, beyond which a sensor is not linear.
+_MOST_REMAINING = 0.03
+# Of the prior of the matrix, in sigmas.
+_MOST_CHANGE = 5.0
+_POUND_KG = 0.45359237
+AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadSolution:
+    """What runs with known loads give."""
+
+    sensor: SensorMatrix
+    findings: tuple[Finding, ...]
+    loads: tuple[Mapping[str, JSON], ...]
+    """Of each run with a load: `run`, `name`, `mass_kg`, `mass_sigma_kg`, `p_flange_m`, `p_sigma_m`."""
+    sizes: Mapping[str, float]
+    """Of the disturbances, by name and unit."""
+    remaining: tuple[float, ...]
+    """Of each run: root mean square of what the fit leaves, relative to the load in units of the ranges."""
+    tool_mass_kg: float
+    tool_mass_sigma_kg: float
+
+    @property
+    def verdict(self) -> Verdict:
+        """Verdict of the worst finding: a rejected matrix is not saved."""
+        return verdict_of(self.findings)
+
+
+def solve_loads(
+    runs: Sequence[LoadRun],
+    prior: SensorMatrix | None = None,
+    *,
+    p_flange_sensor_m: Array | None = None,
+    g_m_s2: float = STANDARD_GRAVITY_M_S2,
+    setup: Setup | None = None,
+    tool_mass_kg: tuple[float, float] | None = None,
+    provenance: Mapping[str, JSON] | None = None,
+) -> LoadSolution:
+    """Fit the matrix of a sensor to runs with known loads.
+
+    Parameters
+    ----------
+    runs : sequence of LoadRun
+        With the tool alone, and with loads. Each has a bias of its own.
+    prior : SensorMatrix, optional
+        That of earlier loads, or of the data sheet; by default `SensorMatrix.usual()`.
+    p_flange_sensor_m : array, shape (3,), optional
+        Sensor origin, from the centre of the flange face; by default there. It moves the torque, not the force.
+    g_m_s2 : float
+        Where the arm stands: an error of it is one of all forces.
+    setup : Setup, optional
+        Its up direction is where gravity is sought.
+    tool_mass_kg : float and float, optional
+        Mass of the tool as weighed, and its sigma.
+    provenance : mapping, optional
+        Stored with the matrix.
+
+    Raises
+    ------
+    NotObservable
+        No run has a known load, or the poses of none determine the mounting.
+    """
+    if not any(run.load is not None for run in runs):
+        raise NotObservable("no run has a known load: calibrate with --load, and give that run too.")
+    setup, prior = setup or Setup(), prior or SensorMatrix.usual()
+    model = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
+    model, logarithms, at = _fit(model, np.zeros(len(SIZES)))
+    while len(model.mistakes) < _MOST_MISTAKES:
+        better = _best_mistake(model, logarithms, at)
+        if better is None:
+            break
+        model, logarithms, at = better
+    sizes, remaining = sizes_of(logarithms), _remaining(model)
+    used = slice(0, 39)
+    sensor = SensorMatrix(
+        model.error,
+        at.covariance[used, used],
+        "loads",
+        prior.lever_m,
+        max(sizes["floor"], max(remaining) / 2 if max(remaining) > _MOST_REMAINING else 0.0),
+        {**(provenance or {}), "runs": [run.name for run in runs]},
+    )
+    tool = model.at["tool"].start
+    return LoadSolution(
+        sensor=sensor,
+        findings=ordered([*_findings(model, at), *_limits(model, prior, remaining)]),
+        loads=tuple(_loads(model, at, p_flange_sensor_m)),
+        sizes=sizes,
+        remaining=tuple(remaining),
+        tool_mass_kg=float(model.x[tool]),
+        tool_mass_sigma_kg=float(np.sqrt(at.covariance[tool, tool])),
+    )
+
+
+def _begin(
+    runs: Sequence[LoadRun],
+    prior: SensorMatrix,
+    p_flange_sensor_m: Array | None,
+    g_m_s2: float,
+    setup: Setup,
+    tool_mass_kg: tuple[float, float] | None,
+) -> LoadModel:
+    """Begin at the calibration of the run that shows the mounting best: without a load, with the most poses."""
+    first = max(runs, key=lambda run: (run.load is None, len(run.dataset)))
+    alone = solve(first.dataset, g_m_s2=g_m_s2, setup=setup)
+    mass_kg, com_m = alone.mass_kg, alone.R_flange_sensor @ alone.p_sensor_com_m
+    if first.load is not None:
+        mass_kg = max(mass_kg - first.load.mass_kg, 0.1 * mass_kg)
+    return LoadModel(
+        runs,
+        prior,
+        alone.R_flange_sensor,
+        (mass_kg, com_m),
+        p_flange_sensor_m=np.zeros(3) if p_flange_sensor_m is None else np.asarray(p_flange_sensor_m),
+        gravity_base_m_s2=-g_m_s2 * setup.up,
+        tool_mass_kg=tool_mass_kg,
+    )
+
+
+def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
+    """Move a model to its best values, with the sizes of the disturbances that explain them best."""
+    for _ in range(2):
+        for _ in range(_PASSES):
+            model.move(model.evaluate(logarithms, linear := model.linear()).step)
+        linear = model.linear()
+
+        def cost(y: Array, linear=linear) -> tuple[float, Array]:  # type: ignore[no-untyped-def]
+            at = model.evaluate(y, linear)
+            return at.cost, at.gradient
+
+        found = minimize(
+            cost, logarithms, jac=True, method="L-BFGS-B", bounds=[(-5, 5)] * len(SIZES), options={"maxiter": 30}
+        )
+        logarithms = found.x
+    model.move(model.evaluate(logarithms, model.linear()).step)
+    return model, logarithms, model.evaluate(logarithms, model.linear())
+
+
+def _candidates(model: LoadModel) -> list[Mistake]:
+    found = [Mistake("tool_mass")] if model.information[model.at["tool"].start, model.at["tool"].start] > 1.0 else []
+    for k, run in enumerate(model.runs):
+        n = len(run.dataset)
+        found += [Mistake("touched", k, pose) for pose in range(n)]
+        found += [Mistake("bumped", k, pose) for pose in range(2, n - 1)]
+        if run.load is not None:
+            found += [Mistake("mass", k), Mistake("pulled", k)]
+            found += [Mistake("moved", k, pose) for pose in range(2, n - 1)]
+            if run.load.p_flange_m is not None:
+                found.append(Mistake("place", k))
+    return [one for one in found if one not in model.mistakes]
+
+
+def _best_mistake(model: LoadModel, logarithms: Array, at: Evaluated) -> tuple[LoadModel, Array, Evaluated] | None:
+    """Return the fit with the mistake that explains the readings best; None if none does so clearly."""
+    # Sizes that a mistake has raised would hide it.
+    usual = np.minimum(logarithms, 0.0)
+    extended = [model.with_mistake(one) for one in _candidates(model)]
+    costs = [other.evaluate(usual, other.linear()).cost for other in extended]
+    tried = [_fit(extended[i], usual) for i in np.argsort(costs)[:_TRIED]]
+    best = min(tried, key=lambda one: one[2].cost + _penalty(one[0].mistakes[-1], model))
+    gain = at.cost - best[2].cost - _penalty(best[0].mistakes[-1], model)
+    return best if gain > _CLEARLY else None
+
+
+def _penalty(mistake: Mistake, model: LoadModel) -> float:
+    """Return what a mistake that could be in any pose has to explain beyond others."""
+    per_pose = mistake.kind in ("touched", "bumped", "moved")
+    return 2 * float(np.log(len(model.runs[mistake.run].dataset))) if per_pose else 0.0
+
+
+def _remaining(model: LoadModel) -> list[float]:
+    """Return what the fit leaves of each run, relative to its load."""
+    linear, F = model.linear(), ranges(model.prior.lever_m)
+    shares = []
+    for r, wrench in zip(linear.residual, linear.wrench, strict=True):
+        left = np.sum((r.reshape(-1, 6) / F) ** 2, axis=1) / 6
+        shares.append(float(np.sqrt(left.mean() / np.mean(np.sum((wrench / F) ** 2, axis=1)))))
+    return shares
+
+
+def _found_load(model: LoadModel, run: int) -> tuple[float, Array]:
+    """Return mass (kg) and place (3,) of the load of a run from the sensor origin, with what mistakes add."""
+    x = model.x
+    own = x[model.at[f"load {model.load_of(run)}"]]
+    mass_kg, place = float(own[0]), own[1:] + x[model.at["origin"]]
+    for i, mistake in enumerate(model.mistakes):
+        if mistake.run == run and mistake.kind == "mass":
+            mass_kg += float(x[model.at[f"mistake {i}"]][0])
+        if mistake.run == run and mistake.kind == "place":
+            place = place + x[model.at[f"mistake {i}"]]
+    return mass_kg, place
+
+
+def _loads(model: LoadModel, at: Evaluated, p_flange_sensor_m: Array | None) -> list[Mapping[str, JSON]]:
+    origin = np.zeros(3) if p_flange_sensor_m is None else np.asarray(p_flange_sensor_m)
+    rows: list[Mapping[str, JSON]] = []
+    for k, run in enumerate(model.runs):
+        if run.load is None:
+            continue
+        mass_kg, place = _found_load(model, k)
+        sigma = np.sqrt(np.diag(at.covariance)[model.at[f"load {model.load_of(k)}"]]).tolist()
+        rows.append({
+            "run": run.name, "name": run.load.name, "mass_kg": mass_kg, "mass_sigma_kg": sigma[0],
+            "p_flange_m": (place + origin).tolist(), "p_sigma_m": sigma[1:],
+        })  # fmt: skip
+    return rows
+
+
+def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
+    """Name the mistakes that the readings show."""
+    findings = []
+    touched: dict[int, list[int]] = {}
+    swapped = _swapped(model)
+    if swapped is not None:
+        findings.append(Finding.of("loads_swapped", first=swapped[0], second=swapped[1]))
+    for i, mistake in enumerate(model.mistakes):
+        values, run = model.x[model.at[f"mistake {i}"]], model.runs[mistake.run]
+        sigma = np.sqrt(np.diag(at.covariance)[model.at[f"mistake {i}"]])
+        name = "" if run.load is None else run.load.name
+        if mistake.kind == "touched":
+            touched.setdefault(mistake.run, []).append(mistake.pose + 1)
+        elif mistake.kind == "bumped":
+            force_N, torque_Nm = (float(np.linalg.norm(part)) for part in np.split(values, 2))
+            findings.append(
+                Finding.of("load_bias_stepped", run=run.name, pose=mistake.pose, force_N=force_N, torque_Nm=torque_Nm)
+            )
+        elif mistake.kind == "tool_mass":
+            start = model.at["tool"].start
+            found_kg = float(model.x[start] + values[0])
+            findings.append(
+                Finding.of(
+                    "load_tool_mass", found_kg=found_kg, sigma_kg=float(sigma[0]), given_kg=float(model.expected[start])
+                )
+            )
+        elif mistake.kind == "mass" and run.load is not None:
+            findings.append(_mass_finding(name, _found_load(model, mistake.run)[0], float(sigma[0]), run.load.mass_kg))
+        elif mistake.kind == "moved":
+            findings.append(
+                Finding.of("load_moved", name=name, moved_mm=1e3 * float(np.linalg.norm(values)), pose=mistake.pose)
+            )
+        elif mistake.kind == "pulled":
+            findings.append(Finding.of("load_pulled", name=name, force_N=float(np.linalg.norm(values))))
+        elif swapped is None and run.load is not None and run.load.p_flange_m is not None:
+            given = np.asarray(run.load.p_flange_m)
+            findings.append(
+                Finding.of(
+                    "load_place",
+                    name=name,
+                    found_mm=(1e3 * (given + values)).round(1).tolist(),
+                    given_mm=(1e3 * given).tolist(),
+                    off_mm=1e3 * float(np.linalg.norm(values)),
+                )
+            )
+    for run_row, poses in touched.items():
+        findings.append(Finding.of("load_touched", run=model.runs[run_row].name, poses=sorted(poses)))
+    return findings
+
+
+def _mass_finding(name: str, found_kg: float, sigma_kg: float, given_kg: float) -> Finding:
+    ratio = found_kg / given_kg
+    if abs(ratio) < 0.05:
+        return Finding.of("load_absent", name=name)
+    for code, pounds in (("load_in_pounds", _POUND_KG), ("load_in_kilograms", 1 / _POUND_KG)):
+        if abs(ratio / pounds - 1) < 0.03:
+            return Finding.of(code, name=name, found_kg=found_kg, given_kg=given_kg)
+    return Finding.of("load_mass", name=name, found_kg=found_kg, sigma_kg=sigma_kg, given_kg=given_kg)
+
+
+def _swapped(model: LoadModel) -> tuple[str, str] | None:
+    """Return the names of two loads that hang each where the other was declared."""
+    off = {one.run: model.x[model.at[f"mistake {i}"]] for i, one in enumerate(model.mistakes) if one.kind == "place"}
+    for (a, moved_a), (b, moved_b) in combinations(off.items(), 2):
+        first, second = model.runs[a].load, model.runs[b].load
+        if first is None or second is None or first.p_flange_m is None or second.p_flange_m is None:
+            continue
+        apart = np.asarray(second.p_flange_m) - first.p_flange_m
+        missed = np.linalg.norm(moved_a - apart) + np.linalg.norm(moved_b + apart)
+        if missed < 0.3 * np.linalg.norm(apart):
+            return first.name, second.name
+    return None
+
+
+def _limits(model: LoadModel, prior: SensorMatrix, remaining: list[float]) -> list[Finding]:
+    """Judge whether the sensor is linear, and its change."""
+    if model.mistakes:
+        return []
+    findings = []
+    loaded = [share for run, share in zip(model.runs, remaining, strict=True) if run.load is not None]
+    if (worst := max(loaded)) > _MOST_REMAINING:
+        findings.append(Finding.of("sensor_not_linear", remaining_percent=100 * worst))
+    change = (model.error - prior.error) / prior.sigma
+    row, column = np.unravel_index(int(np.abs(change).argmax()), (6, 6))
+    if (most := float(abs(change[row, column]))) > _MOST_CHANGE:
+        findings.append(Finding.of("matrix_changed", sigmas=most, entry=f"{AXES[row]}{AXES[column]}"))
+    return findings

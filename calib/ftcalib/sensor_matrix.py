@@ -1,0 +1,259 @@
+"""What the errors of a sensor's own matrix do to a contact: without known loads as a sigma, with them corrected.
+
+    reading = (I + E) wrench + bias        in the sensor frame, about its origin
+
+A tool shows in all orientations what E does to forces at its centre of mass: the gain and cross-talk of
+`ftcalib.likelihood.response`, eleven of the 36 numbers. Of the others three are a rotation d of the sensor and three a
+shift of the centre of mass, which the calibration of the tool has in its estimates. A contact in the axes of that
+calibration is read as M times the contact, with
+
+    M = I + E - blk([d]x, [d]x)        d: half the antisymmetric part of E_FF + E_FT [p]x, p the centre of mass
+
+so its decoded error is linear in the error of E. What no load has shown of E keeps its prior.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import numpy as np
+
+from ftcalib.errors import BadCalibration
+from ftcalib.files import JSON, check_format, read_object, write_object
+from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
+from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEVER_M, SIZE, Response
+from ftcalib.model import Array, Parameters, read_only, skew
+
+FORMAT = "ftdrive.sensor/1"
+
+# Errors that are not linear, relative to the load: the certificates of six sensors have .08 to .28 % of range.
+FLOOR: Final = 0.0025
+# How many of the numbers that a tool shows the usual size of the errors counts as.
+_USUAL_COUNTS = 2.0
+
+_ENTRIES = np.eye(36).reshape(36, 6, 6)
+
+Source = Literal["assumed", "data sheet", "loads"]
+
+
+def ranges(lever_m: float) -> Array:
+    """Return the ranges (6,) of the axes relative to that of a force, for a range of torque of `lever_m` times it."""
+    return np.repeat([1.0, lever_m], 3)
+
+
+@dataclass(frozen=True, eq=False)
+class SensorMatrix:
+    """Errors of a sensor's matrix before a tool shows some of them; arrays are read-only.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> sensor = ftdrive.SensorMatrix.usual(0.02)
+    >>> sensor.source, sensor.sigma.diagonal().round(3)
+    ('assumed', array([0.02, 0.02, 0.02, 0.02, 0.02, 0.02]))
+    """
+
+    error: Array
+    """(6, 6) E in the sensor frame, N and N·m."""
+    covariance: Array
+    """(39, 39) of a rotation of the sensor (3, rad, flange axes) and of the entries of E, row by row."""
+    source: Source = "assumed"
+    lever_m: float = LEVER_M
+    """Range of torque over range of force."""
+    floor: float = FLOOR
+    """Errors that are not linear, relative to the load in units of the ranges, one sigma."""
+    provenance: Mapping[str, JSON] = field(default_factory=dict)
+    """Serial number, sets of loads, date."""
+
+    def __post_init__(self) -> None:
+        for name, shape in (("error", (6, 6)), ("covariance", (39, 39))):
+            value = read_only(getattr(self, name))
+            if value.shape != shape or not np.isfinite(value).all():
+                raise ValueError(f"the sensor's {name} must be {shape} finite numbers, got shape {value.shape}")
+            object.__setattr__(self, name, value)
+        if self.source not in ("assumed", "data sheet", "loads"):
+            raise ValueError(f"the source is {self.source!r}, not assumed, data sheet or loads")
+        if not (0 < self.lever_m < np.inf and 0 <= self.floor < 1):
+            raise ValueError(f"lever_m is {self.lever_m} and floor {self.floor}, expected positive numbers")
+
+    @classmethod
+    def usual(cls, gain_sigma: float = USUAL_GAIN, *, lever_m: float = LEVER_M, source: Source = "assumed") -> Self:
+        """Return what is known of a sensor without loads: the size of its errors.
+
+        Parameters
+        ----------
+        gain_sigma : float
+            One standard deviation of the entries of the diagonal. The others have half of it, of the ranges.
+        lever_m : float
+        source : {"assumed", "data sheet"}
+        """
+        F = ranges(lever_m)
+        sigma = gain_sigma * np.where(np.eye(6) > 0, 1.0, CROSS_TALK_SHARE) * F[:, None] / F
+        variance = np.concatenate([np.full(3, np.pi**2), sigma.ravel() ** 2])
+        return cls(np.zeros((6, 6)), np.diag(variance), source, lever_m)
+
+    @property
+    def sigma(self) -> Array:
+        """(6, 6) one standard deviation of the entries of E."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
+
+    def after(self, parameters: Parameters, seen: Response | None) -> "ContactResponse":
+        """Return how the sensor reads a contact, after the calibration of a tool.
+
+        Parameters
+        ----------
+        parameters : Parameters
+            Of the tool.
+        seen : Response or None
+            What the tool shows of gain and cross-talk, with its covariance; None shows nothing.
+        """
+        E, C = np.asarray(self.error), np.asarray(self.covariance[3:, 3:])
+        if self.source != "loads" and seen is not None:
+            H = _shown_by(parameters.p_sensor_com_m)
+            prior = H @ C @ H.T
+            shown, remaining = seen.coefficients, seen.covariance[15:, 15:]
+            # The tool shows the size of all errors too: as many numbers as Student's distribution counts.
+            squares = (shown**2 + np.diag(remaining)) / np.diag(prior)
+            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + SIZE)
+            gain = C @ H.T @ np.linalg.inv(prior)
+            E, C = (gain @ shown).reshape(6, 6), size * C - gain @ (size * prior - remaining) @ gain.T
+        return ContactResponse(self, parameters, E, C)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return the content of a sensor's file."""
+        return {
+            "format": FORMAT,
+            "error": self.error.tolist(),
+            "covariance": self.covariance.tolist(),
+            "source": self.source,
+            "lever_m": self.lever_m,
+            "floor": self.floor,
+            "provenance": dict(self.provenance),
+        }
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> Self:
+        """Build from `to_dict`. Raises `BadCalibration`."""
+        check_format(document, FORMAT, BadCalibration)
+        names = ("error", "covariance", "source", "lever_m", "floor", "provenance")
+        try:
+            return cls(*(document[name] for name in names))
+        except KeyError as exc:
+            raise BadCalibration(f"the sensor's file lacks the field {exc.args[0]}: the file is damaged.") from exc
+        except (TypeError, ValueError) as exc:
+            raise BadCalibration(f"the sensor's file cannot be read ({exc}): the file is damaged.") from exc
+
+    def save(self, path: str | Path) -> None:
+        """Write a new file; raises `FileExistsError` if it exists."""
+        write_object(path, self.to_dict())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a sensor's file. Raises `BadCalibration` or `OSError`."""
+        try:
+            return cls.from_dict(read_object(path, BadCalibration))
+        except BadCalibration as exc:
+            raise BadCalibration(f"{Path(path).name}: {exc}") from exc
+
+
+@dataclass(frozen=True, eq=False)
+class ContactResponse:
+    """How a sensor reads a contact, in the axes of a tool's calibration."""
+
+    sensor: SensorMatrix
+    parameters: Parameters
+    """Of the tool."""
+    error: Array
+    """(6, 6) E as estimated."""
+    error_covariance: Array
+    """(36, 36) of its entries, row by row."""
+
+    @cached_property
+    def decoder(self) -> Array | None:
+        """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
+        if not self.error.any():
+            return None
+        return read_only(np.linalg.inv(np.eye(6) + self._as_read(self.error)))
+
+    def decode(self, contact: Array) -> Array:
+        """Apply the decoder to wrenches (..., 6) that have the free tool subtracted."""
+        return contact if self.decoder is None else np.asarray(contact @ self.decoder.T)
+
+    def _as_read(self, E: Array) -> Array:
+        """Return E (..., 6, 6) less the rotation that the calibration has for it."""
+        turn, remaining = skew(_rotation_of(E, self.parameters.p_sensor_com_m)), np.array(E)
+        remaining[..., :3, :3] -= turn
+        remaining[..., 3:, 3:] -= turn
+        return remaining
+
+    @cached_property
+    def _effects(self) -> Array:
+        """(36, 6, 6) matrices of a unit error of each entry of E on decoded wrenches."""
+        effects = self._as_read(_ENTRIES)
+        return effects if self.decoder is None else np.asarray(self.decoder @ effects)
+
+    def error_columns(self, wrench: Array) -> Array:
+        """Return the derivative (..., 6, 36) of decoded wrenches (..., 6) by the entries of E."""
+        return np.asarray(np.einsum("aij,...j->...ia", self._effects, wrench))
+
+    def covariance(self, wrench: Array, rotation_covariance: Array | None = None) -> Array:
+        """Covariance (..., 6, 6) of decoded contacts (..., 6) that errors of the sensor cause, with the floor.
+
+        Parameters
+        ----------
+        wrench : array, shape (..., 6)
+            The contact, N and N·m.
+        rotation_covariance : array, shape (3, 3), optional
+            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it.
+        """
+        columns = self.error_columns(wrench)
+        C = columns @ self.error_covariance @ np.swapaxes(columns, -1, -2)
+        F = ranges(self.sensor.lever_m)
+        load = np.sum((wrench / F) ** 2, axis=-1)
+        C = C + (self.sensor.floor**2 * load)[..., None, None] * np.diag(F**2)
+        if rotation_covariance is not None:
+            R = self.parameters.R_flange_sensor
+            halves = np.split(np.asarray(wrench), 2, axis=-1)
+            turned = np.concatenate([skew(half) for half in halves], axis=-2)
+            C = C + turned @ (R.T @ rotation_covariance @ R) @ np.swapaxes(turned, -1, -2)
+        return np.asarray(C)
+
+    def true_load(self, seen: Response | None) -> tuple[float, Array]:
+        """Return weight (N) and centre of mass (3,) of the tool itself, where its reading is decoded."""
+        p = self.parameters
+        reading = np.concatenate([np.eye(3), skew(p.p_sensor_com_m)]) * p.weight_N
+        if seen is not None:
+            reading += p.weight_N * np.concatenate([seen.force_gain, seen.cross_talk_m])
+        force, torque = np.split(reading if self.decoder is None else self.decoder @ reading, 2)
+        weight_N = float(np.trace(force)) / 3
+        return weight_N, _vector_of(torque) / (weight_N or 1.0)
+
+
+def _gain_at(E: Array, p: Array) -> tuple[Array, Array]:
+    """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
+    P = skew(p)
+    return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
+
+
+def _vector_of(M: Array) -> Array:
+    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3)."""
+    A = (M - np.swapaxes(M, -1, -2)) / 2
+    return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
+
+
+def _rotation_of(E: Array, p: Array) -> Array:
+    """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
+    return _vector_of(_gain_at(E, p)[0])
+
+
+def _shown_by(p: Array) -> Array:
+    """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
+    force, torque = _gain_at(_ENTRIES, p)
+    torque = torque - skew(p) @ skew(_rotation_of(_ENTRIES, p))
+    parts = [
+        np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
+        for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
+    ]
+    return np.concatenate(parts)
