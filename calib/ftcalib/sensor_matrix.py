@@ -114,9 +114,9 @@ class SensorMatrix:
             H = _shown_by(parameters.p_sensor_com_m)
             prior = H @ C @ H.T
             shown, remaining = seen.coefficients, seen.covariance[15:, 15:]
-            # The tool shows the size of all errors too: as many numbers as Student's distribution counts.
+            # The tool shows the size of all errors too; two numbers less count, as for Student's distribution.
             squares = (shown**2 + np.diag(remaining)) / np.diag(prior)
-            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + SIZE)
+            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + SIZE - 2)
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ shown).reshape(6, 6), size * C - gain @ (size * prior - remaining) @ gain.T
         return ContactResponse(self, parameters, E, C)

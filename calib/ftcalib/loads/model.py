@@ -102,6 +102,8 @@ class Linear:
     """(6n,) readings minus model."""
     noise: list[Mapping[str, Array]]
     """(6n, 6n) covariances of the disturbances, for size 1, by their name in `SIZES`."""
+    readout: list[Array]
+    """(6, 6) that reads a wrench in flange axes."""
     wrench: list[Array]
     """(n, 6) true wrench of all that hangs on the sensor, in its axes."""
 
@@ -116,6 +118,15 @@ class Evaluated:
     step: Array
     covariance: Array
     """(k, k) of all unknowns."""
+    unexplained: list[tuple[Array, Array]]
+    """Of each run: weighted residual (6n,), and its covariance (6n, 6n) if the model is right."""
+
+    def gain_of(self, run: int, columns: Array, sigma: Array) -> float:
+        """Return by how much the cost falls if quantities with priors `sigma` act by `columns` (6n, m) in one run."""
+        residual, projection = self.unexplained[run]
+        b, M = (columns.T @ residual) * sigma, columns.T @ projection @ columns * np.outer(sigma, sigma)
+        with_prior = np.eye(len(b)) + M
+        return float(b @ np.linalg.solve(with_prior, b) - np.linalg.slogdet(with_prior)[1])
 
 
 class LoadModel:
@@ -213,7 +224,7 @@ class LoadModel:
         turn = np.kron(np.eye(2), self.R.T)
         N = (np.eye(6) + self.error) @ turn
         tool_kg, tool_m = x[at["tool"]][0], x[at["tool"]][1:]
-        result, load = Linear([], [], [], []), 0
+        result, load = Linear([], [], [], [], []), 0
         for k, run in enumerate(self.runs):
             R, n = run.dataset.R_base_flange, len(run.dataset)
             u, du = g @ R, np.swapaxes(R, 1, 2) @ self._across
@@ -239,22 +250,28 @@ class LoadModel:
             model = w @ N.T + x[at[f"bias {k}"]] - swing * x[at["hysteresis"]]
             for i, mistake in enumerate(self.mistakes):
                 if mistake.run == k or mistake.kind == "tool_mass":
-                    columns = self._columns_of(mistake, J, N, R)
+                    columns = self.columns_of(mistake, k, J, N)
                     J[..., at[f"mistake {i}"]] = columns
                     model = model + columns @ x[at[f"mistake {i}"]]
             off = N @ np.concatenate([M * skew(u), skew(s) @ skew(u)], axis=1)
             result.J.append(J.reshape(6 * n, -1))
+            result.readout.append(N)
             result.residual.append((run.dataset.wrench - model).ravel())
             result.noise.append(_noise(off, read, self.prior.lever_m))
             result.wrench.append(read)
         return result
 
+    @property
+    def tool_is_weighed(self) -> bool:
+        """Whether the mass of the tool is given."""
+        return bool(self.information[self.at["tool"].start, self.at["tool"].start] > _ANY_KG**-2.0)
+
     def load_of(self, run: int) -> int:
         """Return the row in `loads` of the load of a run."""
         return sum(one.load is not None for one in self.runs[:run])
 
-    def _columns_of(self, mistake: Mistake, J: Array, N: Array, R_base_flange: Array) -> Array:
-        """Return what the quantities of a mistake do to the readings (n, 6, m) of a run."""
+    def columns_of(self, mistake: Mistake, run: int, J: Array, readout: Array) -> Array:
+        """Return what the quantities of a mistake do to the readings (n, 6, m) of a run, from those of the others."""
         kind, n = mistake.kind, len(J)
         if kind == "tool_mass":
             return np.asarray(J[..., self.at["tool"]][..., :1])
@@ -266,9 +283,10 @@ class LoadModel:
         if kind == "mass":
             return np.asarray(own[..., :1])
         if kind == "pulled":
+            R_base_flange = self.runs[run].dataset.R_base_flange
             across = np.swapaxes(R_base_flange, 1, 2) @ (self._across / np.linalg.norm(self.g))
             place = self.x[self.at[f"load {self.load_of(mistake.run)}"]][1:]
-            return np.asarray(N @ np.concatenate([across, skew(place) @ across], axis=1))
+            return np.asarray(readout @ np.concatenate([across, skew(place) @ across], axis=1))
         columns = np.array(own[..., 1:])
         if kind == "moved":
             columns[: mistake.pose] = 0.0
@@ -291,18 +309,19 @@ class LoadModel:
         step = C @ v
         left = off - step
         cost += np.linalg.slogdet(H)[1] + left @ P @ left
-        gradient = dict.fromkeys(sizes, 0.0)
+        gradient, unexplained = dict.fromkeys(sizes, 0.0), []
         for (L, WJ, Wr), J, r, parts in zip(solved, linear.J, linear.residual, linear.noise, strict=True):
             a = Wr - WJ @ step
             cost += (r - J @ step) @ a
             projection = cho_solve(L, np.eye(len(r)), check_finite=False) - WJ @ C @ WJ.T
+            unexplained.append((a, projection))
             for name, part in parts.items():
                 gradient[name] += 2 * sizes[name] ** 2 * (np.sum(projection * part) - a @ part @ a)
         for name, own in (("matrix", matrix), ("hysteresis", lag)):
             z, prior = left[own], P[own, own]
             gradient[name] = 2 * (len(z) - z @ prior @ z - np.sum(C[own, own] * prior))
         y = np.asarray(logarithms) / _WIDTHS
-        return Evaluated(float(cost + y @ y), np.array([*gradient.values()]) + 2 * y / _WIDTHS, step, C)
+        return Evaluated(float(cost + y @ y), np.array([*gradient.values()]) + 2 * y / _WIDTHS, step, C, unexplained)
 
     def noise(self, run: LoadRun, parts: Mapping[str, Array], sizes: Mapping[str, float]) -> Array:
         """Return the covariance (6n, 6n) of the readings of a run."""

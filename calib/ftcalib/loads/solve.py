@@ -6,6 +6,7 @@ from the marginal likelihood.
 """
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -25,7 +26,7 @@ from ftcalib.solver import solve
 _CLEARLY = 12.0
 _MOST_MISTAKES = 4
 # Candidates whose sizes are estimated again.
-_TRIED = 6
+_TRIED = 4
 _PASSES = 3
 # Of the load, beyond which a sensor is not linear.
 _MOST_REMAINING = 0.03
@@ -93,10 +94,11 @@ def solve_loads(
     if not any(run.load is not None for run in runs):
         raise NotObservable("no run has a known load: calibrate with --load, and give that run too.")
     setup, prior = setup or Setup(), prior or SensorMatrix.usual()
-    model = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
-    model, logarithms, at = _fit(model, np.zeros(len(SIZES)))
-    while len(model.mistakes) < _MOST_MISTAKES:
-        better = _best_mistake(model, logarithms, at)
+    begun = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
+    model, logarithms, at = _fit(copy(begun), np.zeros(len(SIZES)))
+    swapped = _swapped(begun, at)
+    while swapped is None and len(model.mistakes) < _MOST_MISTAKES:
+        better = _best_mistake(begun, model, logarithms, at)
         if better is None:
             break
         model, logarithms, at = better
@@ -113,7 +115,7 @@ def solve_loads(
     tool = model.at["tool"].start
     return LoadSolution(
         sensor=sensor,
-        findings=ordered([*_findings(model, at), *_limits(model, prior, remaining)]),
+        findings=ordered([swapped] if swapped else [*_findings(model, at), *_limits(model, prior, remaining)]),
         loads=tuple(_loads(model, at, p_flange_sensor_m)),
         sizes=sizes,
         remaining=tuple(remaining),
@@ -166,30 +168,54 @@ def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluat
     return model, logarithms, model.evaluate(logarithms, model.linear())
 
 
-def _candidates(model: LoadModel) -> list[Mistake]:
-    found = [Mistake("tool_mass")] if model.information[model.at["tool"].start, model.at["tool"].start] > 1.0 else []
-    for k, run in enumerate(model.runs):
-        n = len(run.dataset)
-        found += [Mistake("touched", k, pose) for pose in range(n)]
-        found += [Mistake("bumped", k, pose) for pose in range(2, n - 1)]
-        if run.load is not None:
-            found += [Mistake("mass", k), Mistake("pulled", k)]
-            found += [Mistake("moved", k, pose) for pose in range(2, n - 1)]
-            if run.load.p_flange_m is not None:
-                found.append(Mistake("place", k))
+def _candidates(model: LoadModel, run: int) -> list[Mistake]:
+    n, load = len(model.runs[run].dataset), model.runs[run].load
+    found = [Mistake("touched", run, pose) for pose in range(n)]
+    found += [Mistake("bumped", run, pose) for pose in range(2, n - 1)]
+    if load is not None:
+        found += [Mistake("mass", run), Mistake("pulled", run)]
+        found += [Mistake("moved", run, pose) for pose in range(2, n - 1)]
+        found += [Mistake("place", run)] if load.p_flange_m is not None else []
     return [one for one in found if one not in model.mistakes]
 
 
-def _best_mistake(model: LoadModel, logarithms: Array, at: Evaluated) -> tuple[LoadModel, Array, Evaluated] | None:
-    """Return the fit with the mistake that explains the readings best; None if none does so clearly."""
+def _best_mistake(
+    begun: LoadModel, model: LoadModel, logarithms: Array, at: Evaluated
+) -> tuple[LoadModel, Array, Evaluated] | None:
+    """Return the fit with the mistake that explains the readings best; None if none does so clearly.
+
+    Each begins where the first fit has begun: a fit that lacks a mistake may be far from all that is right.
+    """
     # Sizes that a mistake has raised would hide it.
-    usual = np.minimum(logarithms, 0.0)
-    extended = [model.with_mistake(one) for one in _candidates(model)]
-    costs = [other.evaluate(usual, other.linear()).cost for other in extended]
-    tried = [_fit(extended[i], usual) for i in np.argsort(costs)[:_TRIED]]
+    usual, linear = np.minimum(logarithms, 0.0), model.linear()
+    plain = model.evaluate(usual, linear)
+    gains: dict[Mistake, float] = {}
+    for run, (flat, readout) in enumerate(zip(linear.J, linear.readout, strict=True)):
+        J = flat.reshape(-1, 6, flat.shape[1])
+        for one in _candidates(model, run):
+            columns = model.columns_of(one, run, J, readout).reshape(6 * len(J), -1)
+            gains[one] = plain.gain_of(run, columns, one.sigma) - _penalty(one, model)
+    weighed = Mistake("tool_mass")
+    if model.tool_is_weighed and weighed not in model.mistakes:
+        other = model.with_mistake(weighed)
+        gains[weighed] = plain.cost - other.evaluate(usual, other.linear()).cost
+    for mistake in model.mistakes:
+        begun = begun.with_mistake(mistake)
+    tried = [_fit(begun.with_mistake(one), usual) for one in _most(gains)]
+    if not tried:
+        return None
     best = min(tried, key=lambda one: one[2].cost + _penalty(one[0].mistakes[-1], model))
     gain = at.cost - best[2].cost - _penalty(best[0].mistakes[-1], model)
     return best if gain > _CLEARLY else None
+
+
+def _most(gains: Mapping[Mistake, float]) -> list[Mistake]:
+    """Return the candidates that are worth a fit: the best of each kind, as long as it explains something."""
+    best: dict[str, Mistake] = {}
+    for one in sorted(gains, key=lambda one: -gains[one]):
+        if gains[one] > _CLEARLY:
+            best.setdefault(f"{one.kind} {one.run}", one)
+    return list(best.values())[:_TRIED]
 
 
 def _penalty(mistake: Mistake, model: LoadModel) -> float:
@@ -240,9 +266,6 @@ def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
     """Name the mistakes that the readings show."""
     findings = []
     touched: dict[int, list[int]] = {}
-    swapped = _swapped(model)
-    if swapped is not None:
-        findings.append(Finding.of("loads_swapped", first=swapped[0], second=swapped[1]))
     for i, mistake in enumerate(model.mistakes):
         values, run = model.x[model.at[f"mistake {i}"]], model.runs[mistake.run]
         sigma = np.sqrt(np.diag(at.covariance)[model.at[f"mistake {i}"]])
@@ -270,7 +293,7 @@ def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
             )
         elif mistake.kind == "pulled":
             findings.append(Finding.of("load_pulled", name=name, force_N=float(np.linalg.norm(values))))
-        elif swapped is None and run.load is not None and run.load.p_flange_m is not None:
+        elif run.load is not None and run.load.p_flange_m is not None:
             given = np.asarray(run.load.p_flange_m)
             findings.append(
                 Finding.of(
@@ -296,17 +319,18 @@ def _mass_finding(name: str, found_kg: float, sigma_kg: float, given_kg: float) 
     return Finding.of("load_mass", name=name, found_kg=found_kg, sigma_kg=sigma_kg, given_kg=given_kg)
 
 
-def _swapped(model: LoadModel) -> tuple[str, str] | None:
-    """Return the names of two loads that hang each where the other was declared."""
-    off = {one.run: model.x[model.at[f"mistake {i}"]] for i, one in enumerate(model.mistakes) if one.kind == "place"}
-    for (a, moved_a), (b, moved_b) in combinations(off.items(), 2):
-        first, second = model.runs[a].load, model.runs[b].load
-        if first is None or second is None or first.p_flange_m is None or second.p_flange_m is None:
-            continue
-        apart = np.asarray(second.p_flange_m) - first.p_flange_m
-        missed = np.linalg.norm(moved_a - apart) + np.linalg.norm(moved_b + apart)
-        if missed < 0.3 * np.linalg.norm(apart):
-            return first.name, second.name
+def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
+    """Find two loads that hang each where the other was declared."""
+    rows = [k for k, run in enumerate(begun.runs) if run.load is not None and run.load.p_flange_m is not None]
+    for a, b in combinations(rows, 2):
+        one, other = (begun.at[f"load {begun.load_of(row)}"] for row in (a, b))
+        exchanged = copy(begun)
+        exchanged.x, exchanged.expected = begun.x.copy(), begun.expected.copy()
+        for values in (exchanged.x, exchanged.expected):
+            values[one][1:], values[other][1:] = values[other][1:].copy(), values[one][1:].copy()
+        if at.cost - _fit(exchanged, np.zeros(len(SIZES)))[2].cost > _CLEARLY:
+            names = [load.name for row in (a, b) if (load := begun.runs[row].load) is not None]
+            return Finding.of("loads_swapped", first=names[0], second=names[1])
     return None
 
 
