@@ -186,6 +186,8 @@ def _across(direction: Array) -> Array:
 USUAL_GAIN: Final = 0.02
 # Cross-talk over gain, as sigmas of their entries.
 CROSS_TALK_SHARE: Final = 0.5
+# Range of torque over range of force.
+USUAL_LEVER_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +221,8 @@ class Setup:
     """Payload as set in the controller: all that hangs on the flange."""
     sensor_accuracy_percent: float | None = None
     """Of the readings under load, 95 % of them, from the data sheet or a check; otherwise 4 is assumed."""
+    sensor_range: Sequence[float] | None = None
+    """(2,) of a force, N, and of a torque, N·m."""
     sensor_has_arbitrary_zero: bool = False
     """Whether the sensor may read anything without load, so that its bias shows no mistake."""
 
@@ -228,9 +232,16 @@ class Setup:
             if up.shape != (3,) or not 0 < np.linalg.norm(up) < np.inf:
                 raise ValueError(f"up_in_base is {self.up_in_base}, expected three numbers that are not all 0")
             object.__setattr__(self, "up_in_base", tuple(up.tolist()))
+        if self.sensor_range is not None and not (len(self.sensor_range) == 2 and min(self.sensor_range) > 0):
+            raise ValueError(f"sensor_range is {list(self.sensor_range)}, expected two positive numbers: N and N·m")
         for row in self.cylinders_m:
             if len(row) not in {3, 5} or not np.isfinite(row).all():
                 raise ValueError(f"the cylinder {list(row)} is none: give from, to, diameter, and optionally x and y")
+
+    @property
+    def sensor_lever_m(self) -> float:
+        """Range of torque over range of force."""
+        return USUAL_LEVER_M if self.sensor_range is None else self.sensor_range[1] / self.sensor_range[0]
 
     @property
     def gain_sigma(self) -> float:

@@ -227,9 +227,10 @@ class CalibrationResult:
 
     @property
     def id(self) -> str:
-        """Name of the result: 12 hex digits of the SHA-256 of all that `compensate` and its uncertainty depend on.
+        """Name of the result: 12 hex digits of the SHA-256 of all that the reading of a free tool depends on.
 
-        Two files with the same id compensate alike, whatever their provenance.
+        Two files with the same id subtract alike, whatever their provenance. The matrix of the sensor, which turns what
+        is left into a contact, is not part of it: all tools share it.
         """
         return self._id(None if self.response is None else self.response.to_dict())
 
@@ -239,8 +240,6 @@ class CalibrationResult:
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
         if response is not None:
             numbers.append(response)
-        if self.sensor is not None:
-            numbers += [self.sensor.error.tolist(), self.sensor.covariance.tolist()]
         if self.motion is not None:
             numbers += [self.motion.inertia_kg_m2.tolist(), self.motion.delay_s]
         return hashlib.sha256(json.dumps(numbers).encode()).hexdigest()[:12]

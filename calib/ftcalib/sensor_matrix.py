@@ -22,7 +22,7 @@ import numpy as np
 
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
-from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
+from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Setup
 from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEVER_M, SIZE, Response
 from ftcalib.model import Array, Parameters, read_only, skew
 
@@ -93,6 +93,12 @@ class SensorMatrix:
         sigma = gain_sigma * np.where(np.eye(6) > 0, 1.0, CROSS_TALK_SHARE) * F[:, None] / F
         variance = np.concatenate([np.full(3, np.pi**2), sigma.ravel() ** 2])
         return cls(np.zeros((6, 6)), np.diag(variance), source, lever_m)
+
+    @classmethod
+    def declared(cls, setup: Setup) -> Self:
+        """Return what a described cell has of its sensor."""
+        source: Source = "assumed" if setup.sensor_accuracy_percent is None else "data sheet"
+        return cls.usual(setup.gain_sigma, lever_m=setup.sensor_lever_m, source=source)
 
     @property
     def sigma(self) -> Array:

@@ -23,6 +23,7 @@ from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Paramet
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, Method, require_positive_definite
+from ftcalib.sensor_matrix import SensorMatrix
 
 SIMULATIONS = 400
 # No sensor resolves smaller differences of force.
@@ -127,7 +128,14 @@ def solve(
         cable_shift=quality.cable_shift,
         second_basin_chi2=best.second_basin_chi2,
         quality=quality.to_dict(),
+        sensor=declared_sensor(setup),
     )
+
+
+def declared_sensor(setup: Setup) -> SensorMatrix | None:
+    """Return what the described cell declares of its sensor; None if nothing."""
+    declares = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
+    return SensorMatrix.declared(setup) if declares else None
 
 
 def _choose(

@@ -115,6 +115,9 @@ def in_a_sentence(error: BaseException) -> str:
 
 def main() -> int:
     """Run the command line; return the exit code."""
+    # The matrices of a calibration are small: several threads of linear algebra wait for each other longer than they
+    # compute, several times as long beside another process. Read when numpy is imported, later.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
     # they are inherited as ignored, as in a job in the background; but `nohup` means that the terminal may close.
     for name in ("SIGINT", "SIGTERM"):

@@ -110,6 +110,8 @@ class SensorConfig:
         "%",
         (0, 20),
     )
+    range_N: float | None = entry("of its forces, from the data sheet", None, "N", (0, 1e5))
+    range_Nm: float | None = entry("of its torques", None, "N·m", (0, 1e4))
     delay_ms: float | None = entry(
         "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
     )

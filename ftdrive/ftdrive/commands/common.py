@@ -401,6 +401,14 @@ def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = Fal
         raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(reasons)}")
 
 
+def stop_unless(passed: bool, words: str) -> None:
+    """Raise `NotAccepted` with these words unless a check has passed."""
+    from ftdrive.errors import NotAccepted
+
+    if not passed:
+        raise NotAccepted(words)
+
+
 def rehearse(station: "Station", runs: Path, name: str, *, kept: bool = True, **options: Any) -> "Outcome":
     """Calibrate an emulated cell as `ftdrive.session.rehearsal.rehearse` does, and show it."""
     from ftdrive.session import rehearsal

@@ -92,7 +92,7 @@ def live(
         recorder: Callable[[Path], Recorder] | None = None
         push: Callable[[], object] | None = None
         if replay is not None:
-            stream = _replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
+            stream = replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
             stream.track = track
         else:
             stream = open_source(source, frame, stack, track)
@@ -110,7 +110,7 @@ def live(
             run_live(stream, recorder=recorder, push=push, checks=checks)
 
 
-def _replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
+def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
     """Replay a run folder, a recording with its own calibration unless another one is given, or another program's."""
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     if path.is_dir() and path.suffix != ".partial":

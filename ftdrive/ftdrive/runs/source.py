@@ -18,6 +18,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.motion import solve_motion_file
 from ftdrive.runs.run import Run, made_now, versions
+from ftdrive.runs.sensor_file import with_sensor
 from ftdrive.tables.table import Table, TableOptions
 
 
@@ -104,6 +105,18 @@ class RecordedData:
         return {"g_m_s2": self.g_m_s2, "setup": self.setup, "known": self.known}
 
     @property
+    def sensor_serial(self) -> str | None:
+        """Serial number of the sensor; None if it is unknown."""
+        serial = _of(self.provenance, "devices", "sensor", "serial")
+        serial = serial or _of(self.dataset.meta, "devices", "sensor", "serial")
+        return serial if isinstance(serial, str) else None
+
+    @property
+    def p_flange_sensor_m(self) -> Array:
+        """(3,) sensor origin from the flange face, where its height is described; else there."""
+        return np.array([0.0, 0.0, self.setup.sensor_height_m or 0.0])
+
+    @property
     def truth(self) -> Parameters | None:
         """What a perfect calibration finds, of an emulated cell that is described in the run."""
         truth = (self.provenance.get("station") or {}).get("truth")
@@ -179,6 +192,8 @@ def read_dataset(
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:
     """Read a calibration; `CalibrationResult.save` writes it.
 
+    If the present folder has a `sensor.json` of its sensor, the result decodes contacts with that.
+
     Parameters
     ----------
     path : str or Path
@@ -201,7 +216,8 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     'good'
     """
     path = Path(path)
-    return CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
+    found = CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
+    return with_sensor(found)
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
@@ -345,6 +361,7 @@ def circumstances_of(run: Run) -> Circumstances:
             sensor_mass_kg=setup["sensor_mass_kg"],
             payload_kg=setup["payload_kg"],
             sensor_accuracy_percent=setup["accuracy_percent"],
+            sensor_range=setup["range"],
             sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
         ),
         origin,
@@ -363,6 +380,7 @@ def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
         "p_flange_payload_m": p_flange_payload_m,
         "sensor_mass_kg": sensor.get("mass_kg"),
         "accuracy_percent": sensor.get("accuracy_percent"),
+        "range": [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None,
         "mounting": workcell.get("mounting"),
         "height_mm": sensor.get("height_mm"),
         "tool_mass_kg": tool.get("mass_kg"),

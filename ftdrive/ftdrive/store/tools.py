@@ -9,6 +9,7 @@ from ftcalib.after.series import BiasTemperature
 from ftcalib.errors import BadCalibration
 from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadStore, ConfigError
+from ftdrive.runs.sensor_file import with_sensor
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
@@ -104,7 +105,7 @@ def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
 
 def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
     try:
-        return CalibrationResult.load(Path(one.path), accept_edited=accept_edited)
+        return with_sensor(CalibrationResult.load(Path(one.path), accept_edited=accept_edited))
     except (BadCalibration, OSError):
         return None
 

@@ -1,0 +1,309 @@
+"""`ftdrive loads`: known loads show whether a sensor reads a contact right, and correct its matrix."""
+
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from ftdrive.commands.common import JSON, SOURCE, Number, Source, numbers, stop_unless, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.terminal.text import echo
+
+if TYPE_CHECKING:
+    from ftcalib.loads.model import KnownLoad, LoadRun
+    from ftcalib.loads.solve import LoadSolution
+    from ftcalib.sensor_matrix import SensorMatrix
+    from ftdrive.live.replay import ReplayedStream
+    from ftdrive.live.stream import CompensatedStream
+
+# Of a mass without its own sigma: a kitchen scale.
+_SCALE_SHARE = 0.001
+# So much of the load as known must show, for the reading to be that of it.
+_SHOWS = 0.5
+
+
+@click.group()
+def loads() -> None:
+    """Check a sensor by a known weight, and correct its matrix by several: so that 10 N are 10 N."""
+
+
+def known_load(mass: str, at: str | None) -> "KnownLoad":
+    """Read a mass such as 2.000 or 2.000±0.002 (kg) and a place such as tip=0,0,200 (mm). Raises `ConfigError`."""
+    from ftcalib.loads.model import KnownLoad
+
+    value, _, spread = mass.replace("+-", "±").partition("±")
+    (mass_kg,) = numbers("MASS", value, ";", [1])
+    sigma_kg = numbers("MASS", spread, ";", [1])[0] if spread else _SCALE_SHARE * mass_kg
+    if not 0 < mass_kg <= 100 or sigma_kg < 0:
+        raise ConfigError(f"MASS is {mass}: give the mass in kg, such as 2.000 or 2.000±0.002")
+    if at is None:
+        return KnownLoad("load", mass_kg, sigma_kg)
+    name, _, place = at.partition("=")
+    if not name or not place:
+        raise ConfigError(f"--at is '{at}': give a name and a place in mm from the flange face, such as tip=0,0,200")
+    x, y, z = (value / 1e3 for value in numbers("--at", place, ",", [3]))
+    return KnownLoad(name, mass_kg, sigma_kg, (x, y, z))
+
+
+@loads.command()
+@click.argument("mass", metavar="MASS")
+@click.option("--at", metavar="NAME=X,Y,Z", help="Where it hangs, mm from the flange face along the flange axes.")
+@SOURCE
+@click.option("--replay", type=click.Path(exists=True, path_type=Path), help="Check a recording instead of a cell.")
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests to join.")
+@click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, seconds.")
+@JSON
+def check(
+    mass: str, at: str | None, source: Source, replay: Path | None, poses: int, wait_s: float, as_json: bool
+) -> None:
+    """Hang one known MASS (kg, such as 1.000) on a string, and compare what the sensor reads.
+
+    The arm is only read. Let the load hang still; with --poses another program or your hand turns the arm between the
+    rests. The answer has scale and line of action with one sigma of each, and whether the error is within what the
+    sensor promises. The exit code is 7 if it is not.
+    """
+    from math import isfinite
+
+    from ftcalib.loads.check import check_load
+
+    load = known_load(mass, at)
+    with ExitStack() as stack:
+        stream = _opened(source, replay, stack)
+        weight, R_base_flange = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
+    calibration = stream.info.calibration
+    u_sensor = calibration.gravity_force_base_N @ (R_base_flange @ calibration.R_flange_sensor)
+    found = check_load(calibration, weight, load, u_sensor, stream.info.p_flange_sensor_m)
+    if as_json:
+        write_json({
+            "schema_version": 1, "calibration_id": calibration.id, "mass_kg": weight.mass_kg, "given_kg": load.mass_kg,
+            **{key: value if isfinite(value) else None for key, value in found._asdict().items()},
+            "is_within": found.is_within, "poses": weight.poses,
+        })  # fmt: skip
+    else:
+        _print_check(found, weight.mass_kg * calibration.g_m_s2, load, calibration.g_m_s2)
+    stop_unless(found.is_within, "the load reads otherwise than the sensor promises")
+
+
+def _opened(source: Source, replay: Path | None, stack: ExitStack) -> "CompensatedStream | ReplayedStream":
+    from ftdrive.commands.live import replayed
+    from ftdrive.commands.live_source import open_source
+    from ftdrive.live.processing import SENSOR_FRAME
+
+    if replay is not None:
+        return replayed(replay, source.path, SENSOR_FRAME, speed=float("inf"), force=source.force)
+    return open_source(source, SENSOR_FRAME, stack)
+
+
+def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed: bool) -> tuple[Any, Any]:
+    """Weigh what hangs at rest until enough poses are joined, or until a recording ends; the last R_base_flange too."""
+    from ftdrive.live.weighing import CannotWeigh, Scale
+
+    scale, refusal, best, R = Scale(stream), CannotWeigh("samples"), None, None
+    for _ in stream.clock.looks(wait_s):
+        rows = stream.read()
+        if replayed and not len(rows):
+            break
+        try:
+            weight = scale.weigh(more=True)
+        except CannotWeigh as error:
+            refusal = error
+            continue
+        if weight.mass_kg > _SHOWS * mass_kg and (best is None or weight.poses >= best.poses):
+            best, R = weight, rows.R_base_flange[-1]
+            if not replayed and best.poses >= poses:
+                break
+    if best is None:
+        if refusal.code == "samples":
+            raise ConfigError(f"no load of about {mass_kg:g} kg hangs at rest: hang it, or check MASS (kg)")
+        raise refusal
+    return best, R
+
+
+def _print_check(found: Any, read_N: float, load: "KnownLoad", g_m_s2: float) -> None:
+    from ftcalib.rounding import with_sigma
+
+    expected_N = load.mass_kg * g_m_s2
+    off = with_sigma(100 * found.scale_error, 100 * found.scale_sigma, "+")
+    echo(f"reads {read_N:.3f} N, expected {expected_N:.3f} N: {off} %")
+    if load.p_flange_m is not None:
+        line = with_sigma(1e3 * found.off_m, 1e3 * found.off_sigma_m)
+        echo(f"line of action {line} mm from {load.name}")
+    promised = f"{100 * found.promised_sigma:.1f} % (1 sigma) that the sensor promises"
+    if not found.is_within:
+        echo(f"OUTSIDE the {promised}: calibrate with known loads, or check the mass.")
+    elif found.is_significant:
+        echo(f"Within the {promised}; known loads correct it: ftdrive calibrate --load, ftdrive loads solve")
+    else:
+        echo(f"Right within the check, and within the {promised}.")
+
+
+@loads.command()
+@click.argument("runs", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--tool-mass", metavar="KG", help="Mass of the tool as weighed, such as 1.300 or 1.300±0.002.")
+@click.option("--accept", is_flag=True, help="Save a matrix that differs much from the one known before.")
+@JSON
+def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: bool) -> None:
+    """Fit the matrix of the sensor to RUNS: the tool alone, and runs of `calibrate --load`.
+
+    It is saved as sensor.json in this folder, only if the runs agree. Every command here then decodes contacts of this
+    sensor with it, whatever the tool. Later loads narrow it.
+    """
+    from ftdrive.runs.sensor_file import next_sensor_file
+
+    read = [_run_of(path) for path in runs]
+    serials = {serial for _, serial, _ in read}
+    if len(serials) > 1:
+        raise ConfigError(f"the runs are of different sensors ({', '.join(map(str, serials))}): give those of one")
+    data = read[0][2]
+    weighed = None if tool_mass is None else known_load(tool_mass, None)
+    prior = _prior(data, next(iter(serials)), [path.name for path in runs])
+    from ftcalib.loads.solve import solve_loads
+
+    solution = solve_loads(
+        [run for run, _, _ in read],
+        prior,
+        p_flange_sensor_m=data.p_flange_sensor_m,
+        g_m_s2=data.g_m_s2,
+        setup=data.setup,
+        tool_mass_kg=None if weighed is None else (weighed.mass_kg, weighed.mass_sigma_kg),
+        provenance={"serial": next(iter(serials)), "created_utc": datetime.now(UTC).isoformat(timespec="seconds")},
+    )
+    hindering = [one for one in solution.findings if one.severity == "reject"]
+    saved = None
+    if not hindering or (accept and {one.code for one in hindering} == {"matrix_changed"}):
+        saved = next_sensor_file()
+        solution.sensor.save(saved)
+    if as_json:
+        write_json(_solution_json(solution, saved))
+    else:
+        _print_solution(solution, prior, saved)
+    stop_unless(saved is not None, "the runs do not agree on a matrix")
+
+
+def _run_of(path: Path) -> tuple["LoadRun", str | None, Any]:
+    """Read one run with its load, the serial number of its sensor, and what is known of its cell."""
+    from ftcalib.loads.model import KnownLoad, LoadRun
+    from ftdrive.runs.source import SolveOptions, read_source
+
+    data = read_source(path, SolveOptions())
+    given = data.dataset.meta.get("load")
+    load = None
+    if given is not None:
+        place_mm = given["p_flange_mm"]
+        load = KnownLoad(
+            given["name"],
+            given["mass_kg"],
+            given["mass_sigma_kg"],
+            None if place_mm is None else (place_mm[0] / 1e3, place_mm[1] / 1e3, place_mm[2] / 1e3),
+            given["place_sigma_mm"] / 1e3,
+        )
+    return LoadRun(path.name, data.dataset, load), data.sensor_serial, data
+
+
+def _prior(data: Any, serial: str | None, names: list[str]) -> "SensorMatrix":
+    """Return what is known of the sensor before these runs: by earlier loads, its data sheet, or as usual."""
+    from ftcalib.sensor_matrix import SensorMatrix
+    from ftdrive.runs.sensor_file import sensor_files
+
+    for path in reversed(sensor_files()):
+        known = SensorMatrix.load(path)
+        if known.provenance.get("serial") == serial and not {*known.provenance.get("runs", ())} & {*names}:
+            echo(f"Begins with {path.name} of {str(known.provenance.get('created_utc'))[:10]}.", err=True)
+            return known
+    return SensorMatrix.declared(data.setup)
+
+
+def _contact_sigma(sensor: "SensorMatrix", tip_m: float) -> tuple[float, float]:
+    """Return one sigma of force and torque of 100 N at the tip: of the length of the vector, mean over directions."""
+    import numpy as np
+
+    from ftcalib.model import Parameters
+    from ftcalib.sensor_matrix import ContactResponse
+
+    nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
+    contact = ContactResponse(sensor, nothing, sensor.error, sensor.covariance[3:, 3:])
+    force = 100 * np.eye(3)
+    C = contact.covariance(np.concatenate([force, np.cross([0, 0, tip_m], force)], axis=1)).mean(axis=0)
+    return float(np.sqrt(np.trace(C[:3, :3]))), float(np.sqrt(np.trace(C[3:, 3:])))
+
+
+def _solution_json(solution: "LoadSolution", saved: Path | None) -> dict[str, Any]:
+    return {
+        "schema_version": 1,
+        "verdict": solution.verdict,
+        "findings": [one.to_dict() for one in solution.findings],
+        "loads": [dict(one) for one in solution.loads],
+        "sizes": dict(solution.sizes),
+        "remaining": list(solution.remaining),
+        "tool_mass_kg": solution.tool_mass_kg,
+        "tool_mass_sigma_kg": solution.tool_mass_sigma_kg,
+        "sensor": solution.sensor.to_dict(),
+        "saved": None if saved is None else str(saved),
+    }
+
+
+def _print_solution(solution: "LoadSolution", prior: "SensorMatrix", saved: Path | None) -> None:
+    from ftcalib.rounding import with_sigma
+
+    echo(f"{'load':14}{'mass, kg':>22}{'place from the flange, mm':>44}")
+    for one in solution.loads:
+        place = ", ".join(
+            with_sigma(1e3 * p, 1e3 * s) for p, s in zip(one["p_flange_m"], one["p_sigma_m"], strict=True)
+        )
+        echo(f"{one['name']:14}{with_sigma(one['mass_kg'], one['mass_sigma_kg']):>22}{place:>44}")
+    echo(f"{'tool':14}{with_sigma(solution.tool_mass_kg, solution.tool_mass_sigma_kg):>22}")
+    _print_matrix(solution.sensor)
+    tip_m = max((abs(one["p_flange_m"][2]) for one in solution.loads), default=0.2)
+    (before, _), (after, torque) = _contact_sigma(prior, tip_m), _contact_sigma(solution.sensor, tip_m)
+    echo(f"100 N at {1e3 * tip_m:.0f} mm: ± {after:.2g} N (before ± {before:.2g}), ± {torque:.2g} N·m")
+    for finding in solution.findings:
+        echo(f"{finding.severity.upper()}  {finding.words}")
+    if saved is not None:
+        echo(f"The runs agree. Saved {saved}: commands in this folder decode contacts with it.")
+
+
+def _print_matrix(sensor: "SensorMatrix") -> None:
+    from ftcalib.loads.solve import AXES
+    from ftcalib.rounding import with_sigma
+
+    diagonal = zip(AXES, sensor.error.diagonal(), sensor.sigma.diagonal(), strict=True)
+    echo("diagonal, %: " + ", ".join(f"{axis} {with_sigma(100 * e, 100 * s, '+')}" for axis, e, s in diagonal))
+
+
+@loads.command()
+@JSON
+def show(as_json: bool) -> None:
+    """Show the matrix of the sensor in this folder: sensor.json, or the newest sensor-N.json."""
+    from ftcalib.sensor_matrix import SensorMatrix
+
+    path = _newest()
+    sensor = SensorMatrix.load(path)
+    if as_json:
+        write_json({"schema_version": 1, "file": str(path), **sensor.to_dict()})
+        return
+    known = sensor.provenance
+    echo(f"{path.name}: sensor {known.get('serial') or 'without serial number'}, {known.get('created_utc')}")
+    echo(f"runs: {', '.join(map(str, known.get('runs', ())))}")
+    _print_matrix(sensor)
+    force, torque = _contact_sigma(sensor, 0.2)
+    echo(f"100 N at 200 mm: ± {force:.2g} N, ± {torque:.2g} N·m; not linear by {100 * sensor.floor:.2g} % of the load")
+
+
+@loads.command()
+@click.option("--yes", is_flag=True, help="Do not ask.")
+def drop(yes: bool) -> None:
+    """Delete the newest file of the sensor's matrix in this folder, so that the one before it, or none, counts."""
+    path = _newest()
+    if yes or click.confirm(f"Delete {path.name}?", err=True):
+        path.unlink()
+        echo(f"Deleted {path.name}.")
+
+
+def _newest() -> Path:
+    from ftdrive.runs.sensor_file import sensor_files
+
+    if not (files := sensor_files()):
+        raise ConfigError("this folder has no sensor.json: `ftdrive loads solve RUN RUN …` makes one")
+    return files[-1]
