@@ -96,12 +96,12 @@ def solve_loads(
     setup, prior = setup or Setup(), prior or SensorMatrix.usual()
     begun = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
     model, logarithms, at = _fit(copy(begun), np.zeros(len(SIZES)))
-    swapped = _swapped(begun, at)
-    while swapped is None and len(model.mistakes) < _MOST_MISTAKES:
+    agrees = False
+    while not agrees and len(model.mistakes) < _MOST_MISTAKES:
         better = _best_mistake(begun, model, logarithms, at)
-        if better is None:
-            break
-        model, logarithms, at = better
+        agrees = better is None
+        model, logarithms, at = better or (model, logarithms, at)
+    swapped = _swapped(begun, at)
     sizes, remaining = sizes_of(logarithms), _remaining(model)
     used = slice(0, 39)
     sensor = SensorMatrix(
@@ -320,7 +320,7 @@ def _mass_finding(name: str, found_kg: float, sigma_kg: float, given_kg: float) 
 
 
 def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
-    """Find two loads that hang each where the other was declared."""
+    """Find two loads that hang each where the other was declared: that explains more than all else."""
     rows = [k for k, run in enumerate(begun.runs) if run.load is not None and run.load.p_flange_m is not None]
     for a, b in combinations(rows, 2):
         one, other = (begun.at[f"load {begun.load_of(row)}"] for row in (a, b))

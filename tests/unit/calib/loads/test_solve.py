@@ -1,0 +1,130 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ftcalib import NotObservable
+from ftcalib.after.weighing import drift_since, weigh
+from ftcalib.loads.check import check_load
+from ftcalib.loads.model import KnownLoad, LoadModel, LoadRun, Mistake
+from ftcalib.loads.solve import LoadSolution, solve_loads
+from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.solver import solve
+from tests.loaded_sensor import LEVER_M, PROTOCOLS, SIDE_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor, with_load
+
+USUAL = SensorMatrix.usual(lever_m=LEVER_M)
+
+
+def solved(sensor: LoadedSensor, runs: list[LoadRun]) -> LoadSolution:
+    return solve_loads(runs, USUAL, tool_mass_kg=sensor.weighed_tool_kg())
+
+
+@pytest.mark.parametrize("name", ["hung, side and tip", "bar, gripped twice"])
+def test_contacts_are_decoded_within_their_sigma(name: str) -> None:
+    sensor = LoadedSensor(7)
+    runs = sensor.runs(PROTOCOLS[name])
+    solution = solved(sensor, runs)
+    assert solution.verdict == "good", solution.findings
+    result = solve(runs[0].dataset)
+    contact = solution.sensor.after(result.parameters, result.shown_response)
+    true, read = sensor.contacts(60)
+    R = result.R_flange_sensor
+    wanted = np.concatenate([half @ R for half in np.split(true, 2, axis=1)], axis=1)
+    e = contact.decode(read) - wanted
+    sigma = np.sqrt(np.diagonal(contact.covariance(contact.decode(read)), axis1=1, axis2=2))
+    assert 0.3 < np.sqrt(np.mean((e / sigma) ** 2)) < 2.2
+    assert np.linalg.norm(e[:, :3]) < 0.3 * np.linalg.norm((read - wanted)[:, :3])
+
+
+def test_later_loads_narrow_the_same_matrix() -> None:
+    sensor = LoadedSensor(8)
+    tool, side, tip = sensor.runs(PROTOCOLS["hung, side and tip"])
+    first = solve_loads([tool, tip], USUAL).sensor
+    (again,) = sensor.runs([TOOL])
+    second = solve_loads([again, side], first).sensor
+    entries = np.trace(first.covariance[3:, 3:]), np.trace(second.covariance[3:, 3:])
+    assert entries[1] < 0.8 * entries[0]
+    assert np.abs((second.error - sensor.E) / second.sigma).mean() < 1.6
+
+
+def test_the_gradient_of_the_likelihood_is_right() -> None:
+    sensor = LoadedSensor(2)
+    runs = sensor.runs([replace(TOOL, poses=6), replace(PROTOCOLS["hung, tip"][1], poses=4)])
+    start = np.eye(3), (1.3, np.array([0.0, 0, 0.06]))
+    gravity = np.array([0, 0, -9.81])
+    model = LoadModel(runs, USUAL, *start, p_flange_sensor_m=np.zeros(3), gravity_base_m_s2=gravity)
+    model = model.with_mistake(Mistake("place", 1))
+    linear, y = model.linear(), np.linspace(-0.4, 0.5, 8)
+    steps = 1e-4 * np.eye(8)
+    costs = [(model.evaluate(y + d, linear).cost - model.evaluate(y - d, linear).cost) / 2e-4 for d in steps]
+    np.testing.assert_allclose(model.evaluate(y, linear).gradient, costs, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("code", "row", "changed"),
+    [
+        ("load_mass", 1, {"mass_kg": 2.1, "mass_sigma_kg": 0.002}),
+        ("load_in_pounds", 2, {"mass_kg": 4.409, "mass_sigma_kg": 0.004}),
+        ("load_place", 1, {"p_flange_m": (0.1, 0.04, 0.05)}),
+    ],
+)
+def test_a_wrong_declaration_is_named_first(code: str, row: int, changed: dict[str, object]) -> None:
+    sensor = LoadedSensor(9)
+    solution = solved(sensor, with_load(sensor.runs(PROTOCOLS["hung, side and tip"]), row, **changed))
+    assert solution.findings[0].code == code
+    assert solution.verdict == "rejected"
+
+
+def test_exchanged_places_are_named() -> None:
+    sensor = LoadedSensor(10)
+    runs = sensor.runs(PROTOCOLS["hung, side and tip"])
+    runs = with_load(with_load(runs, 1, p_flange_m=tuple(TIP_M)), 2, p_flange_m=tuple(SIDE_M))
+    assert [one.code for one in solved(sensor, runs).findings] == ["loads_swapped"]
+
+
+def test_a_touch_in_two_poses_is_named_with_the_poses() -> None:
+    sensor = LoadedSensor(11)
+    runs = sensor.runs(PROTOCOLS["hung, side and tip"])
+    wrench = np.array(runs[1].dataset.wrench)
+    wrench[[3, 8]] += [[1.0, -0.5, 0.8, 0.05, 0.08, 0.02], [-0.6, 1.0, 0.3, 0.06, -0.05, 0.03]]
+    runs[1] = replace(runs[1], dataset=replace(runs[1].dataset, wrench=wrench))
+    (finding,) = solved(sensor, runs).findings
+    assert (finding.code, finding.values["poses"]) == ("load_touched", [4, 9])
+
+
+def test_a_sensor_that_is_not_linear_is_refused() -> None:
+    sensor = LoadedSensor(12, not_linear=1.5)
+    codes = {one.code for one in solved(sensor, sensor.runs(PROTOCOLS["hung, side and tip"])).findings}
+    assert "sensor_not_linear" in codes
+
+
+def test_a_run_with_a_load_is_needed() -> None:
+    with pytest.raises(NotObservable, match="--load"):
+        solve_loads(LoadedSensor(1).runs([TOOL]))
+
+
+def test_one_weight_on_a_string_shows_the_scale_and_its_line() -> None:
+    sensor = LoadedSensor(13, gain=0.0)
+    sensor.E = 0.03 * np.eye(6)
+    tool, tip = sensor.runs([TOOL, replace(PROTOCOLS["hung, tip"][1], mass_kg=1.0)])
+    result = solve(tool.dataset)
+    R, wrench = tip.dataset.R_base_flange[:1], tip.dataset.wrench[:1]
+    # The bias of another run is that of the tool after a tare.
+    near = result.R_flange_sensor.T @ TIP_M
+    weight = weigh(
+        result, R, wrench - tip_bias(sensor, tip, result.parameters.bias), tip.dataset.wrench_cov[:1],  # type: ignore[index]
+        drift=drift_since(0.0), g_m_s2=9.80665, p_sensor_near_m=near,
+    )  # fmt: skip
+    u = result.gravity_force_base_N @ (R[0] @ result.R_flange_sensor)
+    found = check_load(result, weight, KnownLoad("tip", 1.0, 0.001, tuple(TIP_M)), u, np.zeros(3))
+    assert found.scale_error == pytest.approx(0.03, abs=0.012)
+    assert found.off_m < 0.01
+    assert found.is_significant == (abs(found.scale_error) > 2 * found.scale_sigma)
+
+
+def tip_bias(sensor: LoadedSensor, run: LoadRun, wanted: np.ndarray) -> np.ndarray:
+    """Return by how much the bias of a run differs from that of the tool."""
+    u = sensor.gravity @ run.dataset.R_base_flange
+    s = TOOL_KG * TOOL_COM_M + TIP_M
+    w = np.concatenate([(TOOL_KG + 1.0) * u, np.cross(s, u)], axis=1)
+    return np.asarray((run.dataset.wrench - sensor.read(w)).mean(axis=0) - wanted)

@@ -1,0 +1,140 @@
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Setup, solve
+from ftcalib.likelihood.response import SIZE, Response
+from ftcalib.model import Array, Parameters, predict
+from ftcalib.sensor_matrix import SensorMatrix
+from tests.loaded_sensor import LEVER_M, TOOL, LoadedSensor
+
+
+def parameters(R: Array | None = None) -> Parameters:
+    R = Rotation.from_rotvec([0.3, -0.2, 1.0]).as_matrix() if R is None else R
+    return Parameters(R, *map(np.array, ([0.1, 0, -12.0], [1.0, 2, 3], [0.01, -0.02, 0.06], [0.1, 0.2, 0.3])))
+
+
+def errors(rng: np.random.Generator, size: float = 0.01) -> Array:
+    F = np.repeat([1.0, LEVER_M], 3)
+    return np.asarray(size * rng.normal(size=(6, 6)) * F[:, None] / F)
+
+
+def calibration_of(E: Array, p: Parameters) -> tuple[Parameters, Response]:
+    """Calibrate a tool by readings without noise of a sensor with these errors."""
+    R = Rotation.random(24, rng=3).as_matrix()
+    sigma = np.repeat([3e-3, 1e-4], 3)
+    wrench = predict(p, R) + (predict(p, R) - p.bias) @ E.T + sigma * np.random.default_rng(0).normal(size=(24, 6))
+    dataset = CalibrationDataset.of(R, wrench, wrench_cov=np.diag(sigma**2))
+    result = solve(dataset)
+    assert result.response is not None
+    return result.parameters, result.response
+
+
+def test_decoding_by_known_errors_is_exact_to_first_order() -> None:
+    rng, p = np.random.default_rng(0), parameters()
+    E = errors(rng, 0.001)
+    found, seen = calibration_of(E, p)
+    exact = SensorMatrix(E, 1e-12 * np.eye(39), "loads", LEVER_M)
+    contact = exact.after(found, seen)
+    true_flange = rng.normal(size=(20, 6)) * np.repeat([60.0, 6.0], 3)
+
+    def in_sensor(R: Array) -> Array:
+        return np.concatenate([half @ R for half in np.split(true_flange, 2, axis=1)], axis=1)
+
+    read = in_sensor(p.R_flange_sensor) @ (np.eye(6) + E).T
+    left = contact.decode(read) - in_sensor(found.R_flange_sensor)
+    before = read - in_sensor(found.R_flange_sensor)
+    assert np.abs(left).max() < 0.05 * np.abs(before).max()
+    weight_N, com_m = contact.true_load(seen)
+    assert weight_N == pytest.approx(p.weight_N, rel=1e-4)
+    np.testing.assert_allclose(com_m, p.p_sensor_com_m, atol=2e-4)
+
+
+def test_a_tool_shows_the_errors_of_forces_at_its_centre_of_mass() -> None:
+    rng, p = np.random.default_rng(1), parameters()
+    found, seen = calibration_of(errors(rng), p)
+    sure = Response(seen.coefficients, 1e-16 * np.eye(15 + SIZE))
+    contact = SensorMatrix.usual(lever_m=LEVER_M).after(found, sure)
+    force = 50 * rng.normal(size=(30, 3))
+
+    def sigma(place: Array) -> float:
+        """One sigma of the force across its direction: along it the scale remains unknown."""
+        wrench = np.concatenate([force, np.cross(place, force)], axis=1)
+        C = contact.covariance(wrench)[:, :3, :3]
+        along = force / np.linalg.norm(force, axis=1)[:, None]
+        return float(np.mean(np.trace(C, axis1=1, axis2=2) - np.einsum("ni,nij,nj->n", along, C, along)))
+
+    assert sigma(found.p_sensor_com_m) < 0.05 * sigma(found.p_sensor_com_m + np.array([0, 0, 0.15]))
+
+
+def test_sigma_follows_the_prior_and_the_contact() -> None:
+    contact = SensorMatrix.usual(0.02).after(parameters(), None)
+    along_x = contact.covariance(np.array([100.0, 0, 0, 0, 0, 0]))
+    assert np.sqrt(along_x[0, 0]) == pytest.approx(np.hypot(2.0, 0.25), rel=1e-6)
+    np.testing.assert_allclose(contact.covariance(np.full(6, 2.0)), 4 * contact.covariance(np.ones(6)))
+    assert not contact.covariance(np.zeros(6)).any()
+    assert contact.decoder is None
+
+
+def test_a_rotation_of_the_sensor_turns_the_contact() -> None:
+    contact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0).after(parameters(), None)
+    turned = contact.covariance(np.array([0, 0, 100.0, 0, 0, 0]), 1e-6 * np.eye(3))
+    np.testing.assert_allclose(np.sqrt(np.diag(turned)), [0.1, 0.1, 0, 0, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.5, 2.5])
+def test_the_size_of_the_errors_is_learnt_from_the_tool(size: float) -> None:
+    rng, prior = np.random.default_rng(4), SensorMatrix.usual(0.02)
+    squares = [
+        SensorMatrix.usual(0.02)
+        .after(*calibration_of(errors(rng, size * 0.02), parameters()))
+        .covariance(np.array([0, 60.0, 0, 3, 0, 0]))[1, 1]
+        for _ in range(4)
+    ]
+    plain = prior.after(parameters(), None).covariance(np.array([0, 60.0, 0, 3, 0, 0]))[1, 1]
+    assert (np.mean(squares) > plain) == (size > 1)
+
+
+def solved() -> CalibrationResult:
+    (tool,) = LoadedSensor(1).runs([TOOL])
+    return solve(tool.dataset, setup=Setup(sensor_accuracy_percent=3.0, sensor_range=(130.0, 10.0)))
+
+
+def test_a_result_keeps_what_is_known_of_its_sensor(tmp_path: Path) -> None:
+    result = solved()
+    assert result.sensor is not None
+    assert result.sensor.source == "data sheet"
+    assert result.sensor.lever_m == pytest.approx(10 / 130)
+    result.save(tmp_path / "a.json")
+    again = CalibrationResult.load(tmp_path / "a.json")
+    contact = np.array([10.0, 20, 30, 1, 2, 3])
+    R = Rotation.random(rng=2).as_matrix()
+    np.testing.assert_array_equal(again.contact_sigma(contact, R), result.contact_sigma(contact, R))
+    many = result.contact_sigma(np.tile(contact, (2, 1)), np.tile(R, (2, 1, 1)))
+    np.testing.assert_allclose(many[1], result.contact_sigma(contact, R))
+    assert (result.contact_sigma(np.zeros(6), R) < 0.2 * result.contact_sigma(contact, R)).all()
+
+
+def test_compensating_one_sample_or_many_decodes_alike() -> None:
+    result = solved()
+    assert result.response is not None
+    wrench, R = np.random.default_rng(5).normal(size=(9, 6)), Rotation.random(9, rng=6).as_matrix()
+    many = result.compensate(wrench, R)
+    np.testing.assert_allclose([result.compensate(*one) for one in zip(wrench, R, strict=True)], many, atol=1e-12)
+    assert result.compensator.decoder is not None
+
+
+def test_a_file_is_read_back_and_damage_is_named(tmp_path: Path) -> None:
+    sensor = SensorMatrix.usual(0.01)
+    sensor.save(tmp_path / "sensor.json")
+    np.testing.assert_array_equal(SensorMatrix.load(tmp_path / "sensor.json").covariance, sensor.covariance)
+    text = (tmp_path / "sensor.json").read_text()
+    (tmp_path / "broken.json").write_text(re.sub('"floor": [^,]*', '"floor": 0.5', text))
+    with pytest.raises(BadCalibration, match="checksum"):
+        SensorMatrix.load(tmp_path / "broken.json")
+    (tmp_path / "other.json").write_text('{"format": "ftdrive.calibration/1"}')
+    with pytest.raises(BadCalibration, match=r"ftdrive\.sensor/1"):
+        SensorMatrix.load(tmp_path / "other.json")
