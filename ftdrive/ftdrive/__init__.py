@@ -9,6 +9,7 @@ Modules behind them may move; these names stay.
 | judge a result | `CalibrationResult`, `Finding` |
 | keep and read results | `read_calibration`, `Run`, `read_recording`, `write_recording` |
 | compensate | `CalibrationResult.compensate`, `Compensator`, `predict`, `Parameters` |
+| know the sensor | `SensorMatrix`, `KnownLoad`, `LoadRun`, `solve_loads` |
 | live | `open_stream`, `WrenchFrame`, `Stages`, `Contact` |
 | weigh | `weigh`, `Weight`, `CannotWeigh` |
 | devices | `open_sensor`, `open_arm`, `ForceTorqueSensor`, `RobotArm`, `FtSamples`, `ArmState`, `DeviceInfo` |
@@ -28,8 +29,11 @@ if TYPE_CHECKING:
     from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, UsageError
     from ftcalib.findings import Finding
     from ftcalib.known import Known, Setup
+    from ftcalib.loads.model import KnownLoad, LoadRun
+    from ftcalib.loads.solve import solve_loads
     from ftcalib.model import Parameters, predict
     from ftcalib.result import CalibrationResult
+    from ftcalib.sensor_matrix import SensorMatrix
     from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour, read_recording, solve
     from ftdrive.live.contact import Contact
     from ftdrive.live.samples import Stages, WrenchFrame
@@ -59,10 +63,13 @@ __all__ = [
     "FtSamples",
     "FtdriveError",
     "Known",
+    "KnownLoad",
+    "LoadRun",
     "Parameters",
     "ReadOnlyArm",
     "RobotArm",
     "Run",
+    "SensorMatrix",
     "Setup",
     "Stages",
     "StreamingSensor",
@@ -80,6 +87,7 @@ __all__ = [
     "read_dataset",
     "read_recording",
     "solve",
+    "solve_loads",
     "weigh",
     "write_recording",
 ]
@@ -92,8 +100,11 @@ _MODULES = {
     "ftcalib.after.weighing": ("Weight",),
     "ftcalib.findings": ("Finding",),
     "ftcalib.known": ("Known", "Setup"),
+    "ftcalib.loads.model": ("KnownLoad", "LoadRun"),
+    "ftcalib.loads.solve": ("solve_loads",),
     "ftcalib.model": ("Parameters", "predict"),
     "ftcalib.result": ("CalibrationResult",),
+    "ftcalib.sensor_matrix": ("SensorMatrix",),
     "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour", "read_recording", "solve"),
     "ftdrive.live.contact": ("Contact",),
     "ftdrive.live.samples": ("Stages", "WrenchFrame"),

@@ -28,13 +28,14 @@ RESULTS = ["CalibrationDataset", "CalibrationResult", "Compensator", "Finding", 
 FUNCTIONS = ["compare", "predict", "read_calibration", "read_dataset", "read_recording", "solve", "write_recording"]
 DEVICES = ["ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm", "StreamingSensor"]
 LIVE = ["CannotWeigh", "Contact", "Stages", "Weight", "WrenchFrame", "weigh"]
+LOADS = ["KnownLoad", "LoadRun", "SensorMatrix", "solve_loads"]
 OPENED = ["TableOptions", "open_arm", "open_sensor", "open_stream", "plan_tour"]
 EMULATED = {"ForceTorqueSensor", "RobotArm", "Weight", "open_arm", "open_sensor", "open_stream", "weigh"}
 SLOW = EMULATED | {"compare"}  # every method of estimation
 
 
 def test_the_names_are_these() -> None:
-    assert sorted(ftdrive.__all__) == sorted(ERRORS + RESULTS + FUNCTIONS + DEVICES + LIVE + OPENED)
+    assert sorted(ftdrive.__all__) == sorted(ERRORS + RESULTS + FUNCTIONS + DEVICES + LIVE + LOADS + OPENED)
     assert set(ftdrive.__all__) < set(dir(ftdrive))
     with pytest.raises(AttributeError, match="module 'ftdrive' has no attribute 'sovle'"):
         _ = ftdrive.sovle  # type: ignore[attr-defined]  # the point of the test

@@ -42,7 +42,14 @@ _LEAST_KG = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class KnownLoad:
-    """A weighed load on the tool, hung from a point or rigid."""
+    """A weighed load on the tool, hung from a point or rigid.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.KnownLoad("tip", 2.0, 0.002, (0.0, 0.0, 0.2)).place_sigma_m
+    0.0005
+    """
 
     name: str
     mass_kg: float
@@ -54,7 +61,14 @@ class KnownLoad:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadRun:
-    """Poses at rest with one load on the tool, or with the tool alone."""
+    """Poses at rest with one load on the tool, or with the tool alone.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.LoadRun("tool", ftdrive.read_dataset("poses.csv")).load is None
+    True
+    """
 
     name: str
     dataset: CalibrationDataset

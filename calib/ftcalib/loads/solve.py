@@ -90,6 +90,17 @@ def solve_loads(
     ------
     NotObservable
         No run has a known load, or the poses of none determine the mounting.
+
+    Examples
+    --------
+    The poses of one tool, which we here pretend to be of two bodies: a tool of 1.035 kg, and 0.2 kg that hang on it.
+
+    >>> import ftdrive
+    >>> poses = ftdrive.read_dataset("poses.csv")
+    >>> load = ftdrive.KnownLoad("tip", 0.2, 0.01)
+    >>> solution = ftdrive.solve_loads([ftdrive.LoadRun("with load", poses, load)])
+    >>> solution.sensor.source
+    'loads'
     """
     if not any(run.load is not None for run in runs):
         raise NotObservable("no run has a known load: calibrate with --load, and give that run too.")

@@ -9,7 +9,7 @@ import click
 
 from ftdrive.commands.common import JSON, SOURCE, Number, Source, numbers, stop_unless, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import echo, visible
 
 if TYPE_CHECKING:
     from ftcalib.loads.model import KnownLoad, LoadRun
@@ -296,7 +296,7 @@ def show(as_json: bool) -> None:
 def drop(yes: bool) -> None:
     """Delete the newest file of the sensor's matrix in this folder, so that the one before it, or none, counts."""
     path = _newest()
-    if yes or click.confirm(f"Delete {path.name}?", err=True):
+    if yes or click.confirm(visible(f"Delete {path.name}?"), err=True):
         path.unlink()
         echo(f"Deleted {path.name}.")
 
