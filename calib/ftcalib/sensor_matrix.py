@@ -116,7 +116,8 @@ class SensorMatrix:
             What the tool shows of gain and cross-talk, with its covariance; None shows nothing.
         """
         E, C = np.asarray(self.error), np.asarray(self.covariance[3:, 3:])
-        if self.source != "loads" and seen is not None:
+        # A sensor that is declared perfect has nothing to learn.
+        if self.source != "loads" and seen is not None and C.any():
             H = _shown_by(parameters.p_sensor_com_m)
             prior = H @ C @ H.T
             shown, remaining = seen.coefficients, seen.covariance[15:, 15:]
