@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from ftcalib import CalibrationDataset, solve
+from ftcalib import CalibrationDataset, NotObservable, solve
 from ftcalib.loads.model import LoadRun
 from ftcalib.loads.solve import solve_loads
 from ftcalib.sensor_matrix import SensorMatrix
@@ -42,6 +42,8 @@ def judged(
 ) -> dict[str, object]:
     """Return errors of decoded contacts and their sigmas, after the calibration of the tool."""
     result = solve(tool)
+    if result.verdict == "rejected":
+        raise NotObservable("the calibration of the tool is rejected")
     contact = matrix.after(result.parameters, result.shown_response)
     true, read = sensor.contacts(40, torque_Nm, most_N)
     R = result.R_flange_sensor
