@@ -12,6 +12,7 @@ from ftmocks.imperfections import Imperfections
 from ftmocks.kinematics import MODELS
 from ftmocks.sensors.catalogue import CHOICES, KINDS
 from ftmocks.station import Station, parse_vector
+from ftmocks.workcell import SWING_DEG
 from ftmocks.world import MOUNTS_RAD
 
 
@@ -52,6 +53,13 @@ def _not_negative(text: str) -> float:
     return value
 
 
+def _load(text: str) -> dict[str, object]:
+    mass, sign, place = text.partition("@")
+    if not sign:
+        raise argparse.ArgumentTypeError(f"a load is KG@x,y,z, not {text!r}")
+    return {"mass_kg": _positive(mass), "at_mm": _vector(3)(place).tolist()}
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m ftmocks", description="Emulated robot cells.", allow_abbrev=False)
     station = parser.add_subparsers(dest="what", required=True).add_parser(
@@ -83,6 +91,19 @@ def _parser() -> argparse.ArgumentParser:
     add("--sensor-delay-ms", type=float, metavar="D", help="time between the measurement of a sample and its sending")
     add("--rtde-delay-ms", type=float, metavar="D", help="the same for the samples of the arm")
     add("--recording", type=Path, metavar="FILE.csv", help="serve the raw wrench and the joints of a recording")
+    add(
+        "--load",
+        type=_load,
+        metavar="KG@x,y,z",
+        help="a load that hangs on a string of 250 mm; its hook in mm from the flange, in flange axes",
+    )
+    add(
+        "--swing",
+        type=_not_negative,
+        default=SWING_DEG,
+        metavar="DEG",
+        help=f"swing of a load after it is hung (default {SWING_DEG:g})",
+    )
     add("--pace", type=_not_negative, metavar="K", help="play it K times faster (default 1; 0: hold the first row)")
     add("--do", action="append", default=[], metavar="JSON", help="a request of the control channel to begin with")
 
@@ -142,6 +163,21 @@ def _parser() -> argparse.ArgumentParser:
     add("--force-bias", type=_vector(3), metavar="x,y,z", help="N")
     add("--torque-bias", type=_vector(3), metavar="x,y,z", help="N·m")
     add("--noise", type=_vector(2), metavar="sF,sT", help="standard deviation of one reading, N and N·m")
+    add("--gain", type=_not_negative, default=0.0, metavar="PERCENT", help="errors of the sensor's gains, one sigma")
+    add(
+        "--cross-talk",
+        type=_not_negative,
+        default=0.0,
+        metavar="PERCENT",
+        help="cross-talk between its axes, one sigma, of the ranges (150 N, 10 N·m)",
+    )
+    add(
+        "--nonlinear",
+        type=_not_negative,
+        default=0.0,
+        metavar="PERCENT",
+        help="square and cube at the end of its range",
+    )
     add("--force-drift", type=_vector(3), metavar="x,y,z", help="N per minute (default 0)")
     add("--torque-drift", type=_vector(3), metavar="x,y,z", help="N·m per minute (default 0)")
     return parser

@@ -25,6 +25,7 @@ from ftmocks.imperfections import WRIST_DRIFT_N, Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
+from ftmocks.sensor_errors import SensorErrors
 from ftmocks.sensors.catalogue import KINDS, WRIST, Sensor, parse_settings
 from ftmocks.ur.operator import Operator
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
@@ -35,7 +36,10 @@ from ftmocks.world import MOUNTS_RAD, Truth, World, up_of
 FORMAT = "mocks.station/1"
 HOST_TRIALS = 20
 LONGEST_DELAY_MS = 1000
-WITHOUT_EFFECT_ON_A_RECORDING = ("payload-shift", "push-joint", "hand-guide", "slider", "speed-scaling")
+WITHOUT_EFFECT_ON_A_RECORDING = {
+    *("payload-shift", "hang", "grip", "unhang"),
+    *("push-joint", "hand-guide", "slider", "speed-scaling"),
+}
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
 """Near the first pose of the tour: q4 = -90° - q2 - q3."""
@@ -88,6 +92,11 @@ def truth_from(options: Namespace) -> Truth:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
     if options.sensor == WRIST and options.sensor_rotvec_deg is not None:
         raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
+    sizes = [options.gain, options.cross_talk, options.nonlinear]
+    if any(sizes):
+        if options.recording is not None:
+            raise ValueError("--recording has the errors of its sensor: leave --gain, --cross-talk, --nonlinear out")
+        changes["sensor_errors"] = SensorErrors.drawn(options.seed, *(1e-2 * percent for percent in sizes))
     return replace(truth, **changes)
 
 
@@ -206,7 +215,7 @@ class Station:
         self._verbs: dict[str, Callable[[dict[str, Any]], dict[str, Any] | None]] = {
             "state": self._state,
             "delay": self._delay,
-            **Workcell(self.world, self._sensors).verbs,
+            **Workcell(self.world, self._sensors, options.swing).verbs,
             **Operator(self.robot, self.server).verbs,
         }
         if recording is not None:
@@ -220,7 +229,7 @@ class Station:
             signal.signal(number, self._on_signal)
         try:
             self._start_sensors()
-            for request in (*self._delays(), *self._options.do):
+            for request in (*self._delays(), *self._loads(), *self._options.do):
                 if "error" in (answer := self._answer(request.encode())):
                     sys.stderr.write(f"--do {request}: {answer['error']}\n")
                     return 2
@@ -252,7 +261,7 @@ class Station:
         wanted = {"both": ("can", "serial"), "none": ()}.get(self._options.sensor, (self._options.sensor,))
         if WRIST in wanted:
             robot = self.robot
-            self.world.sensor_error = robot.wrist_error
+            self.world.wrist_error = robot.wrist_error
             robot.wrist_sensor = lambda n: self.world.measure_at(np.full(n, robot.cycle_s))
         for name in wanted:
             self._sensors[name] = Sensor(
@@ -324,6 +333,10 @@ class Station:
         given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
         return [json.dumps({"do": "delay", **given})] if given else []
 
+    def _loads(self) -> list[str]:
+        """Return the request that --load stands for."""
+        return [] if self._options.load is None else [json.dumps({"do": "hang", **self._options.load})]
+
     def _delay(self, request: dict[str, Any]) -> None:
         """Set the time between measurement and sending."""
         given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
@@ -368,6 +381,7 @@ class Station:
             "speed_scaling": arm.pace,
             **({} if self._recording is None else {"recording_s": self._recording.at_s(self._clock.now_s())}),
             "true_wrench": self.world.true_wrench().tolist(),
+            "swing_deg": None if self.world.hung is None else self.world.hung.swing_deg,
             "bad_inputs": [
                 *self.server.rtde.bad_inputs,
                 *(doubt for event in robot.events for doubt in event.detail.get("doubts", ())),

@@ -1,5 +1,6 @@
 """Control requests that act on the tool and on the sensor: the verbs that are not about the arm."""
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any
@@ -8,15 +9,21 @@ import numpy as np
 
 from ftmocks.arrays import Array
 from ftmocks.disturbances import FOREVER_S, Cable, Push, SensorDrift
+from ftmocks.inertia import Body
 from ftmocks.sensors.catalogue import Sensor
 from ftmocks.wires.faults import Faults
-from ftmocks.world import World
+from ftmocks.world import Truth, World
 
 Request = dict[str, Any]
 
 BUMP_BASE = (15.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 BUMP_S = 0.3
 CABLE_POINT_M = (0.04, 0.0, 0.06)
+STRING_MM = 250.0
+SWING_DEG = 2.0
+"""An operator who hangs a load leaves this swing."""
+GRIPPED_M = 0.06
+"""Edge of a load in the gripper, a cube."""
 NO_NUMBER: Array = np.full(6, np.nan)
 
 
@@ -29,17 +36,25 @@ class Workcell:
         The truth, which changes.
     sensors
         By name.
+    swing_deg
+        Swing of a load after it is hung.
     """
 
-    def __init__(self, world: World, sensors: Mapping[str, Sensor]) -> None:
+    def __init__(self, world: World, sensors: Mapping[str, Sensor], swing_deg: float = SWING_DEG) -> None:
         self._world = world
         self._sensors = sensors
+        self._swing_deg = swing_deg
+        self._empty: Truth | None = None
+        """The cell before a load was gripped."""
         self.verbs: dict[str, Callable[[Request], dict[str, Any] | None]] = {
             "push": self._push,
             "bump": self._bump,
             "cable": self._cable,
             "drift": self._drift,
             "payload-shift": self._payload_shift,
+            "hang": self._hang,
+            "grip": self._grip,
+            "unhang": lambda _: self._unload(),
             "freeze-sensor": self._freeze_sensor,
             "nan": self._nan,
             "saturate": self._saturate,
@@ -91,6 +106,27 @@ class Workcell:
         self._world.shift_payload(mass_kg, com_m)
         return {"truth": self._world.truth.to_json()}
 
+    def _hang(self, request: Request) -> None:
+        mass_kg, p_flange_m = _load(request)
+        string_m = 1e-3 * float(request.get("string_mm", STRING_MM))
+        swing_deg = float(request.get("swing_deg", self._swing_deg))
+        if not (0.0 < string_m < math.inf and 0.0 <= swing_deg < 90.0):
+            raise ValueError(f"a string of {1e3 * string_m} mm, or a swing of {swing_deg}°, is not possible")
+        self._unload()
+        self._world.hang(mass_kg, p_flange_m, string_m, math.radians(swing_deg))
+
+    def _grip(self, request: Request) -> None:
+        mass_kg, p_flange_m = _load(request)
+        self._unload()
+        self._empty = self._world.truth
+        load = Body(mass_kg, self._empty.in_sensor(p_flange_m), np.eye(3) * GRIPPED_M**2 / 6)
+        self._world.truth = self._empty.holding(load)
+
+    def _unload(self) -> None:
+        self._world.unhang()
+        if self._empty is not None:
+            self._world.truth, self._empty = self._empty, None
+
     def _freeze_sensor(self, request: Request) -> None:
         self._world.read_always(None)
         if request.get("on", True):
@@ -127,6 +163,14 @@ class Workcell:
         if not chosen:
             raise ValueError("this station has no sensor")
         return chosen
+
+
+def _load(request: Request) -> tuple[float, Array]:
+    """Return mass and place of a load: kg, and (3,) m in the flange frame."""
+    mass_kg = float(request["mass_kg"])
+    if not 0.0 < mass_kg < math.inf:
+        raise ValueError(f"a load of {mass_kg} kg")
+    return mass_kg, 1e-3 * _numbers(request["at_mm"], 3)
 
 
 def _numbers(values: Any, count: int) -> Array:

@@ -16,9 +16,21 @@ import numpy as np
 from ftmocks.arrays import Array
 from ftmocks.clock import CellClock
 from ftmocks.disturbances import Contact, SensorDrift
+from ftmocks.hung_load import HungLoad
 from ftmocks.imperfections import IDEAL, Imperfections, Ripple
 from ftmocks.inertia import Body, drawn_gyration, moved_load
-from ftmocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, rotation
+from ftmocks.kinematics import (
+    Dh,
+    FlangeMotion,
+    JointState,
+    Vector6,
+    cross,
+    flange_motion,
+    forward,
+    jacobian,
+    rotation,
+)
+from ftmocks.sensor_errors import PERFECT, SensorErrors
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
@@ -61,6 +73,7 @@ class Truth:
     """Inertia tensor per mass about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
     sensor_mass_kg: float = 0.0
     """Sensor and adapter, which the sensor does not feel: a point mass halfway between flange and sensor origin."""
+    sensor_errors: SensorErrors = PERFECT
 
     @classmethod
     def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
@@ -130,6 +143,10 @@ class Truth:
         moment = self.mass_kg * p_flange_tool_m + self.sensor_mass_kg * self.p_flange_sensor_com_m
         return moment / (self.payload_kg or 1.0)
 
+    def in_sensor(self, p_flange_m: Array) -> Array:
+        """Return a point of the flange frame, (3,), in the sensor frame."""
+        return np.asarray(self.R_flange_sensor.T @ (p_flange_m - self.p_flange_sensor_m))
+
     def holding(self, part: Body) -> "Truth":
         """Return the cell with a part in the gripper."""
         own_m2 = self.gyration_m2
@@ -159,6 +176,8 @@ class Truth:
             "force_drift_N_min": self.force_drift_N_min.tolist(),
             "torque_drift_Nm_min": self.torque_drift_Nm_min.tolist(),
             "g_m_s2": self.g_m_s2,
+            "sensor_error": self.sensor_errors.error.tolist(),
+            "sensor_nonlinearity": self.sensor_errors.nonlinearity.tolist(),
         }
 
 
@@ -223,8 +242,10 @@ class World:
         """What touches the tool, by name."""
         self.drifts: tuple[SensorDrift, ...] = ()
         """Drifts of the zero besides the drift of the truth."""
-        self.sensor_error: Callable[[], Array] | None = None
-        """What a sensor adds to each reading besides bias and noise, (6,)."""
+        self.hung: HungLoad | None = None
+        """What hangs on a string; it is a contact too."""
+        self.wrist_error: Callable[[], Array] | None = None
+        """What friction and drift add to each reading of a sensor in the wrist, (6,)."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._ripple = Ripple(imperfections, seed)
@@ -386,8 +407,11 @@ class World:
         t_s = t_s - self.imperfections.wrench_delay_s
         with self._lock:
             noise = self._noise.standard_normal((len(t_s), 6))
-            readings: Array = self._true_wrenches(t_s) + noise * self._noise_sd
-        return readings if self.sensor_error is None else readings + self.sensor_error()
+            readings: Array = self._true_wrenches(t_s)
+            if (errors := self.truth.sensor_errors) is not PERFECT:
+                readings = readings + errors.of(readings - self.bias(float(t_s[-1])))
+            readings = readings + noise * self._noise_sd
+        return readings if self.wrist_error is None else readings + self.wrist_error()
 
     def _true_wrenches(self, t_s: Array) -> Array:
         """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
@@ -408,6 +432,39 @@ class World:
         """Set the contact of that name; None removes it."""
         others = {key: value for key, value in self.contacts.items() if key != name}
         self.contacts = others if contact is None else {**others, name: contact}
+
+    def hang(self, mass_kg: float, p_flange_hook_m: Array, string_m: float, swing_rad: float) -> None:
+        """Hang a load on a string, in place of any other; it is let go `swing_rad` off the vertical."""
+        _, hook_m = self._hook(p_flange_hook_m)
+        gravity_m_s2 = self.truth.gravity_m_s2
+        # a horizontal direction that differs from cell to cell
+        aside = cross(gravity_m_s2, np.random.default_rng([self.seed, 13]).normal(size=3))
+        aside *= swing_rad / np.linalg.norm(aside)
+        p_sensor_hook_m = self.truth.in_sensor(p_flange_hook_m)
+        self.hung = HungLoad(mass_kg, p_flange_hook_m, p_sensor_hook_m, string_m, gravity_m_s2, hook_m, aside)
+        self.touch("load", self.hung)
+
+    def unhang(self) -> None:
+        """Take the load from its hook."""
+        self.hung = None
+        self.touch("load", None)
+
+    def swing(self, seconds: float, qd: Vector6) -> None:
+        """Let what hangs follow its hook for a control cycle; `qd` are the speeds of the joints (rad/s) at its end."""
+        if self.hung is None:
+            return
+        lever_m, hook_m = self._hook(self.hung.p_flange_hook_m)
+        velocity_m_s = np.zeros(3)
+        if any(qd):
+            twist = jacobian(self.dh, self.q) @ qd
+            velocity_m_s = twist[:3] + cross(twist[3:], lever_m)
+        self.hung.follow(seconds, hook_m, velocity_m_s)
+
+    def _hook(self, p_flange_hook_m: Array) -> tuple[Array, Array]:
+        """Return where a hook is, (3,) in base axes: from the flange, and from the base."""
+        X = forward(self.dh, self.q)
+        lever_m = X[:3, :3] @ p_flange_hook_m
+        return lever_m, X[:3, 3] + lever_m
 
     def change_load(self, truth: Truth, name: str, contact: Contact) -> None:
         """Set truth and contact at once: a part that is grasped is still carried by what it lies on."""

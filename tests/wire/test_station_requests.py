@@ -62,6 +62,34 @@ def test_cables_drift_and_payload(station: StationProcess) -> None:
     assert np.linalg.norm(weight_N) == pytest.approx(3 * 9.80665)
 
 
+def test_a_load_hangs_swings_and_is_taken_off(station: StationProcess) -> None:
+    before = wrench(station)
+    station.ask("hang", mass_kg=2.0, at_mm=[0, 0, 200], string_mm=250, swing_deg=0)
+    assert np.linalg.norm((wrench(station) - before)[:3]) == pytest.approx(2 * 9.80665)
+    station.ask("hang", mass_kg=2.0, at_mm=[0, 0, 200])
+    assert 0.1 < station.ask("state")["swing_deg"] < 2.1
+    station.ask("grip", mass_kg=2.0, at_mm=[0, 0, 200])
+    assert station.ask("state")["swing_deg"] is None
+    assert np.linalg.norm((wrench(station) - before)[:3]) == pytest.approx(2 * 9.80665)
+    station.ask("unhang")
+    np.testing.assert_allclose(wrench(station), before)
+
+
+def test_options_give_the_sensor_errors_and_a_load() -> None:
+    with StationProcess(*OPTIONS) as plain:
+        perfect = plain.hello["truth"]
+    options = ("--gain", "2", "--cross-talk", "1", "--nonlinear", "0.3", "--load", "1.5@0,0,200", "--swing", "0")
+    with StationProcess(*OPTIONS, *options) as other:
+        truth, state = other.hello["truth"], other.ask("state")
+    assert not np.any(perfect["sensor_error"])
+    assert 0.002 < np.abs(np.diag(truth["sensor_error"])).max() < 0.08
+    changed = {name for name in truth if truth[name] != perfect[name]}
+    assert changed == {"sensor_error", "sensor_nonlinearity"}
+    weight_N = np.array(state["true_wrench"])[:3] - truth["force_bias_N"]
+    assert np.linalg.norm(weight_N) == pytest.approx(truth["weight_N"] + 1.5 * 9.80665)
+    assert state["swing_deg"] == pytest.approx(0.0, abs=1e-6)
+
+
 @pytest.mark.parametrize(
     ("verb", "how", "why"),
     [
@@ -70,6 +98,8 @@ def test_cables_drift_and_payload(station: StationProcess) -> None:
         ("cable", {"joint": 7, "beyond_deg": 0, "force_N_deg": [1, 0, 0]}, "joint 7"),
         ("cable", {}, "force_N"),
         ("payload-shift", {}, "mass_kg"),
+        ("hang", {"mass_kg": 2.0}, "at_mm"),
+        ("grip", {"mass_kg": -2.0, "at_mm": [0, 0, 200]}, "load of -2.0 kg"),
         ("saturate", {"axis": 6}, "axis 6"),
         ("saturate", {"device": "can"}, "can"),
         ("sensor-faults", {"dropp": 1}, "unknown fault dropp"),
@@ -267,6 +297,8 @@ def test_requests_to_begin_with() -> None:
         (["--sensor", "lab"], "invalid choice"),
         (["--inertia", "1,1,3,0,0,0"], "no body has"),
         (["--imperfections", "ripples=1"], "no setting of a real cell"),
+        (["--load", "2.0"], "KG@x,y,z"),
+        (["--recording", "README.md", "--gain", "1"], "leave --gain"),
         (["--recording", "missing.csv"], "cannot read the recording"),
         (["--recording", "README.md", "--time-scale", "2"], "leave --time-scale"),
         (["--sensor", "ur-ft", "--sensor-delay-ms", "5"], "no wire of its own"),

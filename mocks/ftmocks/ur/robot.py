@@ -224,6 +224,7 @@ class Robot:
             return state._replace(qdd=vector6([a + b for a, b in zip(state.qdd, ringing.at(t).tolist(), strict=True)]))
 
         self.world.move(begun_s, q, None if motion is None and ringing.amplitudes is None else at)
+        self.world.swing(dt, self.arm.actual_qd)
 
     @property
     def measured_q(self) -> Vector6:

@@ -1,0 +1,181 @@
+"""A load on a string: what its hook feels, its period, its energy, and what makes it swing."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ftmocks.clock import CellClock
+from ftmocks.hung_load import HungLoad
+from ftmocks.kinematics import forward, rotation, vector6
+from ftmocks.ur.motion import JointMove, LineMove
+from ftmocks.ur.robot import Robot, RobotSettings
+from ftmocks.workcell import Workcell
+from ftmocks.world import Truth, World
+from tests.unit.mocks.real_time import RealTime
+from tests.unit.mocks.test_world import DH, POSTURE, plain, reach
+
+Array = NDArray[np.float64]
+
+TIP_M, CYCLE_S = np.array([0.0, 0.0, 0.2]), 0.002
+DOWN = np.array([0.0, 0.0, -1.0])
+
+
+def load(string_m: float = 0.25, swing_deg: float = 0.0) -> HungLoad:
+    aside = np.array([math.radians(swing_deg), 0.0, 0.0])
+    return HungLoad(2.0, TIP_M, TIP_M, string_m, 9.81 * DOWN, np.zeros(3), aside)
+
+
+def cell(time_scale: float = 1.0) -> Robot:
+    world = World(plain(), DH, POSTURE, clock=CellClock(RealTime()))
+    world.hang(2.0, TIP_M, 0.25, 0.0)
+    return Robot(world, RobotSettings(time_scale=time_scale))
+
+
+def hung(robot: Robot) -> HungLoad:
+    assert robot.world.hung is not None
+    return robot.world.hung
+
+
+@pytest.mark.parametrize(
+    ("rotation_vector", "wrench"),
+    [
+        ([math.pi, 0.0, 0.0], [0, 0, 19.62, 0, 0, 0]),  # flange z down, hook 200 mm below: no lever
+        ([0.0, math.pi / 2, 0.0], [19.62, 0, 0, 0, 0.16 * 19.62, 0]),  # z along base x, x down: 160 mm
+    ],
+)
+def test_two_kilograms_hang_from_a_hook(rotation_vector: list[float], wrench: list[float]) -> None:
+    """The sensor is 40 mm from the flange."""
+    world = World(plain(p_flange_sensor_m=np.array([0.0, 0.0, 0.04])), DH, reach(rotation_vector))
+    free = world.true_wrench()
+    world.hang(2.0, TIP_M, 0.25, 0.0)
+    np.testing.assert_allclose(world.true_wrench() - free, wrench, atol=1e-9)
+    world.unhang()
+    np.testing.assert_array_equal(world.true_wrench(), free)
+
+
+def test_a_gripped_load_is_a_mass_at_its_place_until_it_is_released() -> None:
+    world = World(Truth.drawn(3), DH, POSTURE)
+    free, verbs = world.true_wrench(), Workcell(world, {}).verbs
+    verbs["hang"]({"mass_kg": 2.0, "at_mm": [60, 0, 120], "swing_deg": 0})
+    as_hung = world.true_wrench()
+    verbs["grip"]({"mass_kg": 2.0, "at_mm": [60, 0, 120]})
+    np.testing.assert_allclose(world.true_wrench(), as_hung, atol=1e-9)
+    assert world.hung is None
+    verbs["unhang"]({})
+    np.testing.assert_array_equal(world.true_wrench(), free)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "why"),
+    [
+        ({"mass_kg": 0}, "load of 0"),
+        ({"string_mm": 0}, "string of 0"),
+        ({"swing_deg": 90}, "swing of 90"),
+        ({"at_mm": [0, 0]}, "3 numbers"),
+    ],
+)
+def test_an_impossible_load_is_refused(wrong: dict[str, object], why: str) -> None:
+    world = World(plain(), DH, POSTURE)
+    with pytest.raises(ValueError, match=why):
+        Workcell(world, {}).verbs["hang"]({"mass_kg": 2.0, "at_mm": [0, 0, 200], **wrong})
+    assert world.hung is None
+
+
+@pytest.mark.parametrize(("string_m", "cycle_s"), [(0.15, CYCLE_S), (0.6, CYCLE_S), (0.25, 20 * CYCLE_S)])
+def test_the_period_is_that_of_a_pendulum_and_its_swing_decays(string_m: float, cycle_s: float) -> None:
+    """Half a percent of damping leaves exp(-2 pi 0.005) of the swing in each period."""
+    one, period_s = load(string_m, 1.0), 2 * math.pi * math.sqrt(string_m / 9.81)
+    sideways = []
+    for _ in range(round(10 * period_s / cycle_s)):
+        one.follow(cycle_s, np.zeros(3), np.zeros(3))
+        sideways.append(one.force_base_N[0])
+    crossings = np.flatnonzero(np.diff(np.sign(sideways)) > 0)
+    exact = crossings - np.take(sideways, crossings) / np.diff(sideways)[crossings]
+    assert np.diff(exact).mean() * cycle_s == pytest.approx(period_s, rel=1e-3)
+    assert one.swing_deg <= math.exp(-2 * math.pi * 0.005 * 10) * 1.01
+    assert max(sideways[-round(period_s / cycle_s) :]) == pytest.approx(
+        19.62 * math.radians(1.0) * math.exp(-2 * math.pi * 0.005 * 9.5), rel=0.03
+    )
+
+
+def test_without_damping_energy_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After 20 periods it turns where it began, and its pull at the lowest point is that of its speed from there."""
+    monkeypatch.setattr("ftmocks.hung_load.DAMPING_RATIO", 0.0)
+    one, swings_deg, pulls_N = load(swing_deg=30.0), [], []
+    for _ in range(10_200):
+        one.follow(CYCLE_S, np.zeros(3), np.zeros(3))
+        swings_deg.append(one.swing_deg)
+        pulls_N.append(float(np.linalg.norm(one.force_base_N)))
+    assert max(swings_deg[-510:]) == pytest.approx(30.0, rel=1e-3)
+    turn, lowest = math.cos(math.radians(30.0)), 3 - 2 * math.cos(math.radians(30.0))
+    np.testing.assert_allclose([min(pulls_N[-510:]), max(pulls_N[-510:])], [19.62 * turn, 19.62 * lowest], rtol=1e-3)
+
+
+def follow(one: HungLoad, at: Callable[[float], Array], seconds: float, cycle_s: float) -> list[Array]:
+    """Let the hook follow a path; the pull at each cycle."""
+    pulls = []
+    for t in np.arange(1, round(seconds / cycle_s) + 1) * cycle_s:
+        one.follow(cycle_s, at(t), (at(t + 1e-5) - at(t - 1e-5)) / 2e-5)
+        pulls.append(one.force_base_N)
+    return pulls
+
+
+@pytest.mark.parametrize("cycle_s", [CYCLE_S, 20 * CYCLE_S])
+def test_a_load_feels_that_its_hook_accelerates(cycle_s: float) -> None:
+    """As in a lift and in a bus: it pulls with m (g - a), and swings about that direction."""
+    up = follow(load(), lambda t: np.array([0, 0, t * t]), 1.0, cycle_s)
+    np.testing.assert_allclose(up[-5:], [[0, 0, -2 * 11.81]] * 5, rtol=1e-3)
+    pulls = follow(load(), lambda t: np.array([0.25 * t * t, 0, 0]), 2.0, cycle_s)
+    largest = max(math.atan2(-pull[0], -pull[2]) for pull in pulls)
+    assert largest == pytest.approx(2 * math.atan(0.5 / 9.81), rel=0.04)
+
+
+def ran(robot: Robot, path: JointMove | LineMove) -> tuple[float, float]:
+    """Let the arm follow a path and stand: largest swing (degrees), and largest distance of the hook (m)."""
+    start, swing_deg, moved_m = hook(robot), 0.0, 0.0
+    robot.arm.start(path, "test")
+    for _ in range(2000):
+        robot.tick(robot.cycle_s + CYCLE_S)
+        swing_deg = max(swing_deg, hung(robot).swing_deg)
+        moved_m = max(moved_m, float(np.linalg.norm(hook(robot) - start)))
+        if not robot.arm.busy and robot.arm.motion is None:
+            break
+    return swing_deg, moved_m
+
+
+def hook(robot: Robot) -> Array:
+    X = forward(DH, robot.world.q)
+    return np.asarray(X[:3, :3] @ TIP_M + X[:3, 3])
+
+
+@pytest.mark.parametrize("time_scale", [1.0, 20.0])
+def test_a_hook_that_stays_while_the_flange_turns_does_not_swing(time_scale: float) -> None:
+    robot = cell(time_scale)
+    X_flange_tip = np.eye(4)
+    X_flange_tip[:3, 3] = TIP_M
+    goal = forward(DH, POSTURE) @ X_flange_tip
+    goal[:3, :3] = rotation([0.5, 0.0, 0.0]) @ goal[:3, :3]
+    swing_deg, moved_m = ran(robot, LineMove(DH, X_flange_tip, goal, 0.5, 1.0))
+    assert moved_m < 1e-4
+    assert swing_deg < 0.05
+    R_base_flange = forward(DH, robot.world.q)[:3, :3]
+    assert math.acos((np.trace(R_base_flange @ forward(DH, POSTURE)[:3, :3].T) - 1) / 2) == pytest.approx(0.5, abs=1e-6)
+    pull_N = R_base_flange @ robot.world.contact_wrench(robot.cycle_s)[:3]
+    np.testing.assert_allclose(pull_N, 19.62 * DOWN, atol=0.02)
+
+
+@pytest.mark.parametrize("time_scale", [1.0, 20.0])
+def test_a_hook_that_moves_leaves_a_swing_that_the_sensor_feels(time_scale: float) -> None:
+    robot = cell(time_scale)
+    goal = vector6(np.add(POSTURE, [0.6, 0, 0, 0, 0, 0]))
+    swing_deg, moved_m = ran(robot, JointMove(DH, goal, 1.0, 4.0))
+    assert moved_m > 0.2
+    assert swing_deg > 2.0
+    one = hung(robot)
+    R_base_sensor = forward(DH, robot.world.q)[:3, :3]
+    felt = robot.world.contact_wrench(robot.cycle_s)
+    np.testing.assert_allclose(R_base_sensor @ felt[:3], one.force_base_N, atol=1e-12)
+    np.testing.assert_allclose(felt[3:], np.cross(TIP_M, felt[:3]), atol=1e-12)
