@@ -18,6 +18,15 @@ def test_demo_recovers_the_truth(demo: dict[str, Any]) -> None:
     assert_demo_found_the_truth(demo)
 
 
+def test_known_loads_correct_the_contacts_of_a_sensor(ftdrive: CommandLine) -> None:
+    shown = ftdrive.json("demo", "--loads", "--seed", "1")
+    before, after = shown["contact_error"]["before"], shown["contact_error"]["after"]
+    assert shown["verdict"] == "good"
+    assert before["as_read_N"] > 2.0
+    assert after["decoded_N"] < 0.3 * before["as_read_N"]
+    assert after["decoded_N"] < 3 * after["sigma_N"]
+
+
 def test_the_run_of_a_demo_is_replayed_to_the_same_result(demo: dict[str, Any], ftdrive: CommandLine) -> None:
     again = ftdrive.json("replay", demo["run"])  # compares with the saved calibration itself
     assert again["R_flange_sensor"] == demo["result"]["R_flange_sensor"]
