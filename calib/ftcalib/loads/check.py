@@ -1,12 +1,14 @@
-"""Whether a sensor reads a known weight right: one weight on a string, weighed in one pose or several."""
+"""Whether a sensor reads a known weight right: one weight on a string, in one pose or several."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from ftcalib.after.weighing import Weight
+from ftcalib.after.state import Calibrated
+from ftcalib.compensation import Compensator
+from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.loads.model import KnownLoad
-from ftcalib.model import Array
+from ftcalib.model import Array, cross
 from ftcalib.result import CalibrationResult
 
 # So many sigmas of what the sensor promises are within it.
@@ -16,12 +18,17 @@ _WITHIN = 2.0
 class LoadCheck(NamedTuple):
     """What a known weight shows."""
 
+    read_N: float
+    """Force along gravity, mean over the poses."""
+    expected_N: float
     scale_error: float
-    """Weight as read over the weight as known, less 1."""
+    """The one over the other, less 1."""
     scale_sigma: float
     """One standard deviation of that, without the sensor's own errors."""
     promised_sigma: float
     """What the sensor may be off at this load, one standard deviation."""
+    off_vertical_rad: float
+    """Angle between the force and gravity, mean over the poses."""
     off_m: float
     """Distance of the line of action from the place of the load; NaN where no place is given."""
     off_sigma_m: float
@@ -38,37 +45,63 @@ class LoadCheck(NamedTuple):
 
 
 def check_load(
-    calibration: CalibrationResult, weight: Weight, load: KnownLoad, u_sensor: Array, p_flange_sensor_m: Array
+    calibration: CalibrationResult,
+    reference: Calibrated,
+    load: KnownLoad,
+    poses: tuple[Array, Array, Array],
+    *,
+    drift: Array,
+    p_flange_sensor_m: Array,
 ) -> LoadCheck:
-    """Compare a weighing with the load that hangs there.
+    """Compare readings with the load that hangs there.
 
     Parameters
     ----------
     calibration : CalibrationResult
         Of the tool.
-    weight : Weight
-        As `ftcalib.after.weighing.weigh` gives it.
+    reference : CalibrationResult or Update
+        The same, or its tare.
     load : KnownLoad
-    u_sensor : array, shape (3,)
-        Down in the sensor frame, in the last pose.
+    poses : array, shape (n, 3, 3), array, shape (n, 6), and array, shape (n, 6, 6)
+        R_base_flange, mean readings as measured, and their covariances.
+    drift : array, shape (6,)
+        One standard deviation of the change of the bias since the reference.
     p_flange_sensor_m : array, shape (3,)
         Sensor origin from the flange.
     """
-    down = u_sensor / np.linalg.norm(u_sensor)
-    R = calibration.R_flange_sensor
-    place = (
-        weight.p_sensor_com_m if load.p_flange_m is None else R.T @ (np.asarray(load.p_flange_m) - p_flange_sensor_m)
-    )
-    force = down * load.mass_kg * calibration.g_m_s2
-    covariance = calibration.contact.covariance(np.concatenate([force, np.cross(place, force)]))
-    promised = float(np.sqrt(down @ covariance[:3, :3] @ down)) / float(np.linalg.norm(force))
-    across = np.eye(3) - np.outer(down, down)
+    R_base_flange, wrench, noise = poses
+    tool, contact = reference.parameters, calibration.contact
+    free = Compensator(tool, response=reference.response).batch(wrench, R_base_flange)
+    left = contact.decode(np.asarray(free, dtype=np.float64))
+    force, torque = left[:, :3], left[:, 3:]
+    down = tool.down @ (R_base_flange @ tool.R_flange_sensor)
+    expected_N = load.mass_kg * calibration.g_m_s2
+    read_N = float(np.mean(np.sum(force * down, axis=1)))
+    # The error of the bias is the same in all poses.
+    common = predicted_covariance(tool, reference.covariance, reference.response, R_base_flange) + np.diag(drift**2)
+
+    def along(C: Array) -> float:
+        return float(np.mean(np.einsum("ni,nij,nj->n", down, C[:, :3, :3], down)))
+
+    sigma_N = np.sqrt(along(common) + along(noise) / len(wrench))
+    place = np.zeros(3)
+    if load.p_flange_m is not None:
+        place = tool.R_flange_sensor.T @ (np.asarray(load.p_flange_m) - p_flange_sensor_m)
+    of_load = expected_N * np.concatenate([down, cross(place, down)], axis=1)
+    own = contact.covariance(of_load)
+    across = float(np.mean(np.linalg.norm(np.cross(down, force), axis=1)))
     off, off_sigma = float("nan"), float("nan")
     if load.p_flange_m is not None:
-        off = float(np.linalg.norm(across @ (weight.p_sensor_com_m - place)))
-        torque_sigma = np.sqrt(np.trace(across @ covariance[3:, 3:] @ across)) / float(np.linalg.norm(force))
-        spread = np.trace(across @ weight.com_covariance @ across)
-        off_sigma = float(np.sqrt(spread + torque_sigma**2 + 2 * load.place_sigma_m**2))
-    ratio = weight.mass_kg / load.mass_kg
-    sigma = float(np.hypot(weight.mass_sigma_kg / load.mass_kg, ratio * load.mass_sigma_kg / load.mass_kg))
-    return LoadCheck(ratio - 1, sigma, promised, off, off_sigma)
+        lever = (torque - cross(place, force)).mean(axis=0) / expected_N
+        spread = np.trace((own + common)[:, 3:, 3:], axis1=1, axis2=2).mean() / expected_N**2
+        off, off_sigma = float(np.linalg.norm(lever)), float(np.sqrt(spread + 2 * load.place_sigma_m**2))
+    return LoadCheck(
+        read_N,
+        expected_N,
+        read_N / expected_N - 1,
+        float(np.hypot(sigma_N / expected_N, load.mass_sigma_kg / load.mass_kg)),
+        np.sqrt(along(own)) / expected_N,
+        float(np.arctan2(across, read_N)),
+        off,
+        off_sigma,
+    )

@@ -12,11 +12,11 @@ from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo, visible
 
 if TYPE_CHECKING:
+    from ftcalib.loads.check import LoadCheck
     from ftcalib.loads.model import KnownLoad, LoadRun
     from ftcalib.loads.solve import LoadSolution
     from ftcalib.sensor_matrix import SensorMatrix
-    from ftdrive.live.replay import ReplayedStream
-    from ftdrive.live.stream import CompensatedStream
+    from ftdrive.live.weighing import Scale
 
 # Of a mass without its own sigma: a kitchen scale.
 _SCALE_SHARE = 0.001
@@ -34,8 +34,8 @@ def known_load(mass: str, at: str | None) -> "KnownLoad":
     from ftcalib.loads.model import KnownLoad
 
     value, _, spread = mass.replace("+-", "±").partition("±")
-    (mass_kg,) = numbers("MASS", value, ";", [1])
-    sigma_kg = numbers("MASS", spread, ";", [1])[0] if spread else _SCALE_SHARE * mass_kg
+    (mass_kg,) = numbers("MASS", value, " ", [1])
+    sigma_kg = numbers("MASS", spread, " ", [1])[0] if spread else _SCALE_SHARE * mass_kg
     if not 0 < mass_kg <= 100 or sigma_kg < 0:
         raise ConfigError(f"MASS is {mass}: give the mass in kg, such as 2.000 or 2.000±0.002")
     if at is None:
@@ -52,11 +52,19 @@ def known_load(mass: str, at: str | None) -> "KnownLoad":
 @click.option("--at", metavar="NAME=X,Y,Z", help="Where it hangs, mm from the flange face along the flange axes.")
 @SOURCE
 @click.option("--replay", type=click.Path(exists=True, path_type=Path), help="Check a recording instead of a cell.")
+@click.option("--zero", is_flag=True, help="First tare the free tool: then drift since the calibration is no error.")
 @click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests to join.")
 @click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, seconds.")
 @JSON
 def check(
-    mass: str, at: str | None, source: Source, replay: Path | None, poses: int, wait_s: float, as_json: bool
+    mass: str,
+    at: str | None,
+    source: Source,
+    replay: Path | None,
+    zero: bool,
+    poses: int,
+    wait_s: float,
+    as_json: bool,
 ) -> None:
     """Hang one known MASS (kg, such as 1.000) on a string, and compare what the sensor reads.
 
@@ -66,27 +74,38 @@ def check(
     """
     from math import isfinite
 
+    from ftcalib.after.weighing import drift_since
     from ftcalib.loads.check import check_load
+    from ftdrive.live.weighing import Scale
 
     load = known_load(mass, at)
     with ExitStack() as stack:
         stream = _opened(source, replay, stack)
-        weight, R_base_flange = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
-    calibration = stream.info.calibration
-    u_sensor = calibration.gravity_force_base_N @ (R_base_flange @ calibration.R_flange_sensor)
-    found = check_load(calibration, weight, load, u_sensor, stream.info.p_flange_sensor_m)
+        if zero and replay is None:
+            _zero(Scale(stream), stream, wait_s)
+        reference, since_s = stream.reference()
+        if source.simulate and load.p_flange_m is not None:
+            at_mm = [1e3 * x for x in load.p_flange_m]
+            stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=at_mm, string_mm=250, swing_deg=0)
+        measured = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
+    found = check_load(
+        stream.info.calibration,
+        reference,
+        load,
+        measured,
+        drift=drift_since(since_s),
+        p_flange_sensor_m=stream.info.p_flange_sensor_m,
+    )
     if as_json:
-        write_json({
-            "schema_version": 1, "calibration_id": calibration.id, "mass_kg": weight.mass_kg, "given_kg": load.mass_kg,
-            **{key: value if isfinite(value) else None for key, value in found._asdict().items()},
-            "is_within": found.is_within, "poses": weight.poses,
-        })  # fmt: skip
+        values = {key: value if isfinite(value) else None for key, value in found._asdict().items()}
+        head = {"schema_version": 1, "calibration_id": stream.info.calibration.id, "given_kg": load.mass_kg}
+        write_json({**head, **values, "is_within": found.is_within, "poses": len(measured[0])})
     else:
-        _print_check(found, weight.mass_kg * calibration.g_m_s2, load, calibration.g_m_s2)
+        _print_check(found, load)
     stop_unless(found.is_within, "the load reads otherwise than the sensor promises")
 
 
-def _opened(source: Source, replay: Path | None, stack: ExitStack) -> "CompensatedStream | ReplayedStream":
+def _opened(source: Source, replay: Path | None, stack: ExitStack) -> Any:
     from ftdrive.commands.live import replayed
     from ftdrive.commands.live_source import open_source
     from ftdrive.live.processing import SENSOR_FRAME
@@ -96,11 +115,28 @@ def _opened(source: Source, replay: Path | None, stack: ExitStack) -> "Compensat
     return open_source(source, SENSOR_FRAME, stack)
 
 
-def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed: bool) -> tuple[Any, Any]:
-    """Weigh what hangs at rest until enough poses are joined, or until a recording ends; the last R_base_flange too."""
+def _zero(scale: "Scale", stream: Any, wait_s: float) -> None:
+    """Tare the free tool. Raises `CannotWeigh`."""
+    from ftdrive.live.weighing import CannotWeigh
+
+    refusal = CannotWeigh("samples")
+    for _ in stream.clock.looks(wait_s):
+        stream.read()
+        try:
+            scale.zero()
+        except CannotWeigh as error:
+            refusal = error
+        else:
+            echo("Tared. Hang the load, and let it hang still.", err=True)
+            return
+    raise refusal
+
+
+def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed: bool) -> Any:
+    """Average what hangs at rest until enough poses are joined, or until a recording ends."""
     from ftdrive.live.weighing import CannotWeigh, Scale
 
-    scale, refusal, best, R = Scale(stream), CannotWeigh("samples"), None, None
+    scale, refusal, best = Scale(stream), CannotWeigh("samples"), None
     for _ in stream.clock.looks(wait_s):
         rows = stream.read()
         if replayed and not len(rows):
@@ -110,26 +146,28 @@ def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed
         except CannotWeigh as error:
             refusal = error
             continue
-        if weight.mass_kg > _SHOWS * mass_kg and (best is None or weight.poses >= best.poses):
-            best, R = weight, rows.R_base_flange[-1]
-            if not replayed and best.poses >= poses:
+        if weight.mass_kg > _SHOWS * mass_kg:
+            best = scale.poses
+            if not replayed and weight.poses >= poses:
                 break
-    if best is None:
-        if refusal.code == "samples":
-            raise ConfigError(f"no load of about {mass_kg:g} kg hangs at rest: hang it, or check MASS (kg)")
-        raise refusal
-    return best, R
+    if best is not None:
+        return best
+    if refusal.code == "samples":
+        raise ConfigError(f"no load of about {mass_kg:g} kg hangs at rest: hang it, or check MASS (kg)")
+    raise refusal
 
 
-def _print_check(found: Any, read_N: float, load: "KnownLoad", g_m_s2: float) -> None:
+def _print_check(found: "LoadCheck", load: "KnownLoad") -> None:
+    from math import degrees
+
     from ftcalib.rounding import with_sigma
 
-    expected_N = load.mass_kg * g_m_s2
     off = with_sigma(100 * found.scale_error, 100 * found.scale_sigma, "+")
-    echo(f"reads {read_N:.3f} N, expected {expected_N:.3f} N: {off} %")
+    echo(f"reads {found.read_N:.3f} N, expected {found.expected_N:.3f} N: {off} %")
+    line = ""
     if load.p_flange_m is not None:
-        line = with_sigma(1e3 * found.off_m, 1e3 * found.off_sigma_m)
-        echo(f"line of action {line} mm from {load.name}")
+        line = f"; line of action {with_sigma(1e3 * found.off_m, 1e3 * found.off_sigma_m)} mm from {load.name}"
+    echo(f"{degrees(found.off_vertical_rad):.1f}° off the vertical{line}")
     promised = f"{100 * found.promised_sigma:.1f} % (1 sigma) that the sensor promises"
     if not found.is_within:
         echo(f"OUTSIDE the {promised}: calibrate with known loads, or check the mass.")

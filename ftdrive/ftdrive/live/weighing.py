@@ -136,6 +136,13 @@ class Scale:
             raise CannotWeigh(weight.fault, weight)
         return weight
 
+    @property
+    def poses(self) -> tuple[Array, Array, Array]:
+        """R_base_flange (n, 3, 3), means (n, 6) and covariances (n, 6, 6) of the poses that were joined last."""
+        means = [mean for _, mean in self._readings]
+        R_base_flange = np.array([R for R, _ in self._readings])
+        return R_base_flange, np.array([one.mean for one in means]), np.array([one.covariance for one in means])
+
     def zero(self, since_ns: int = 0) -> StreamEvent:
         """Tare the empty gripper by the last half second: the drift of the bias up to now is no error any more.
 

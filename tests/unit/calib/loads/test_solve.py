@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ftcalib import NotObservable
-from ftcalib.after.weighing import drift_since, weigh
 from ftcalib.loads.check import check_load
 from ftcalib.loads.model import KnownLoad, LoadModel, LoadRun, Mistake
 from ftcalib.loads.solve import LoadSolution, solve_loads
@@ -103,23 +102,28 @@ def test_a_run_with_a_load_is_needed() -> None:
         solve_loads(LoadedSensor(1).runs([TOOL]))
 
 
-def test_one_weight_on_a_string_shows_the_scale_and_its_line() -> None:
+@pytest.mark.parametrize("poses", [1, 4])
+def test_one_weight_on_a_string_shows_the_scale_and_its_line(poses: int) -> None:
     sensor = LoadedSensor(13, gain=0.0)
     sensor.E = 0.03 * np.eye(6)
-    tool, tip = sensor.runs([TOOL, replace(PROTOCOLS["hung, tip"][1], mass_kg=1.0)])
+    tool, tip = sensor.runs([TOOL, replace(PROTOCOLS["hung, tip"][1], mass_kg=1.0, poses=poses)])
     result = solve(tool.dataset)
-    R, wrench = tip.dataset.R_base_flange[:1], tip.dataset.wrench[:1]
+    assert tip.dataset.wrench_cov is not None
     # The bias of another run is that of the tool after a tare.
-    near = result.R_flange_sensor.T @ TIP_M
-    weight = weigh(
-        result, R, wrench - tip_bias(sensor, tip, result.parameters.bias), tip.dataset.wrench_cov[:1],  # type: ignore[index]
-        drift=drift_since(0.0), g_m_s2=9.80665, p_sensor_near_m=near,
-    )  # fmt: skip
-    u = result.gravity_force_base_N @ (R[0] @ result.R_flange_sensor)
-    found = check_load(result, weight, KnownLoad("tip", 1.0, 0.001, tuple(TIP_M)), u, np.zeros(3))
-    assert found.scale_error == pytest.approx(0.03, abs=0.012)
-    assert found.off_m < 0.01
-    assert found.is_significant == (abs(found.scale_error) > 2 * found.scale_sigma)
+    wrench = tip.dataset.wrench - tip_bias(sensor, tip, result.parameters.bias)
+    found = check_load(
+        result,
+        result,
+        KnownLoad("tip", 1.0, 0.001, tuple(TIP_M)),
+        (tip.dataset.R_base_flange, wrench, tip.dataset.wrench_cov),
+        drift=np.zeros(6),
+        p_flange_sensor_m=np.zeros(3),
+    )
+    assert found.scale_sigma < 0.01
+    assert abs(found.scale_error - 0.03) < 3 * found.scale_sigma
+    assert found.is_significant
+    assert found.off_m < 0.008
+    assert found.off_vertical_rad < 0.02
 
 
 def tip_bias(sensor: LoadedSensor, run: LoadRun, wanted: np.ndarray) -> np.ndarray:

@@ -1,0 +1,111 @@
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from ftcalib import CalibrationResult, solve
+from ftcalib.loads.model import LoadRun
+from ftdrive.cli import cli
+from ftdrive.commands.loads import known_load
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.runs.sensor_file import next_sensor_file, sensor_files
+from ftdrive.runs.source import read_calibration
+from tests.loaded_sensor import PROTOCOLS, LoadedSensor, with_load
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(cli, ["loads", *arguments])
+
+
+def save(runs: list[LoadRun], serial: str = "FT1") -> None:
+    for one in runs:
+        meta: dict[str, object] = {"devices": {"sensor": {"serial": serial}}}
+        if one.load is not None and one.load.p_flange_m is not None:
+            meta["load"] = {
+                "name": one.load.name,
+                "mass_kg": one.load.mass_kg,
+                "mass_sigma_kg": one.load.mass_sigma_kg,
+                "p_flange_mm": [1e3 * x for x in one.load.p_flange_m],
+                "place_sigma_mm": 0.5,
+                "gripped": False,
+            }
+        replace(one.dataset, meta=meta).save(f"{one.name}.json")
+
+
+@pytest.fixture
+def sensor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> LoadedSensor:
+    monkeypatch.chdir(tmp_path)
+    return LoadedSensor(3)
+
+
+def test_a_matrix_is_saved_beside_the_cell_and_used_for_its_sensor_alone(sensor: LoadedSensor) -> None:
+    runs = sensor.runs(PROTOCOLS["hung, side and tip"])
+    save(runs)
+    found = run("solve", "tool.json", "side.json", "tip.json", "--json")
+    assert found.exception is None, found.output
+    document = json.loads(found.stdout)
+    assert (document["verdict"], document["saved"]) == ("good", "sensor.json")
+    assert [one["name"] for one in document["loads"]] == ["side", "tip"]
+
+    def calibration(serial: str) -> CalibrationResult:
+        path = Path(f"{serial}.calibration.json")
+        solve(runs[0].dataset, provenance={"devices": {"sensor": {"serial": serial}}}).save(path)
+        return read_calibration(path)
+
+    of_it, of_other = calibration("FT1"), calibration("FT2")
+    assert of_it.sensor is not None
+    np.testing.assert_array_equal(of_it.sensor.error, document["sensor"]["error"])
+    assert of_other.sensor is None
+    assert of_it.id == of_other.id
+    contact, R = np.array([0, 0, 80.0, 2, 0, 0]), np.eye(3)
+    assert (of_it.contact_sigma(contact, R)[:3] < 0.5 * of_other.contact_sigma(contact, R)[:3]).all()
+    assert "sensor FT1" in run("show").output
+
+
+def test_later_loads_begin_with_the_earlier_matrix_and_can_be_dropped(sensor: LoadedSensor) -> None:
+    save(sensor.runs(PROTOCOLS["hung, tip"]))
+    assert run("solve", "tool.json", "tip.json").exception is None
+    tool, side, _ = sensor.runs(PROTOCOLS["hung, side and tip"])
+    save([replace(tool, name="again"), side])
+    assert "Begins with sensor.json" in run("solve", "again.json", "side.json").output
+    assert [path.name for path in sensor_files()] == ["sensor.json", "sensor-2.json"]
+    assert next_sensor_file().name == "sensor-3.json"
+    assert "Deleted sensor-2.json" in run("drop", "--yes").output
+    assert [path.name for path in sensor_files()] == ["sensor.json"]
+
+
+def test_nothing_is_saved_if_the_runs_do_not_agree(sensor: LoadedSensor) -> None:
+    save(with_load(sensor.runs(PROTOCOLS["hung, tip"]), 1, mass_kg=4.4, mass_sigma_kg=0.001))
+    found = run("solve", "tool.json", "tip.json", "--tool-mass", "1.300±0.002")
+    assert isinstance(found.exception, NotAccepted)
+    assert "lb" in found.output
+    assert not sensor_files()
+
+
+def test_runs_of_two_sensors_are_refused(sensor: LoadedSensor) -> None:
+    tool, tip = sensor.runs(PROTOCOLS["hung, tip"])
+    save([tool])
+    save([tip], "FT2")
+    found = run("solve", "tool.json", "tip.json")
+    assert isinstance(found.exception, ConfigError)
+    assert "FT2" in str(found.exception)
+
+
+@pytest.mark.parametrize(("mass", "at"), [("two", None), ("-1", None), ("1", "tip"), ("1", "tip=0,0"), ("1±-2", None)])
+def test_a_wrong_load_is_named_with_the_form_to_type(mass: str, at: str | None) -> None:
+    with pytest.raises(ConfigError, match=r"MASS|--at"):
+        known_load(mass, at)
+
+
+def test_a_mass_may_have_its_own_sigma() -> None:
+    load = known_load("2.000+-0.004", "tip=0,10,200")
+    assert (load.mass_kg, load.mass_sigma_kg, load.p_flange_m) == (2.0, 0.004, (0.0, 0.01, 0.2))
+
+
+def test_no_file_is_named_with_the_command_that_makes_one(sensor: LoadedSensor) -> None:
+    del sensor
+    found = run("show")
+    assert "loads solve" in str(found.exception)
