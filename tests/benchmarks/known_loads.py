@@ -15,7 +15,8 @@ from functools import partial
 import numpy as np
 
 from ftcalib import CalibrationDataset, NotObservable, solve
-from ftcalib.loads.model import LoadRun
+from ftcalib.loads.check import check_load
+from ftcalib.loads.model import KnownLoad, LoadRun
 from ftcalib.loads.solve import solve_loads
 from ftcalib.sensor_matrix import SensorMatrix
 from tests.benchmarks.common import Array, Lab, Row, band, most, run
@@ -29,6 +30,7 @@ from tests.loaded_sensor import (
     TOOL_KG,
     LoadedSensor,
     Pull,
+    Set,
     with_load,
 )
 
@@ -122,6 +124,40 @@ def assumed(lab: Lab) -> Iterator[Row]:
         )
 
 
+def checked(poses: int, seed: int) -> dict[str, object]:
+    """Check a sensor that reads 1 % too much by 1 kg at the tip, after a tare."""
+    sensor = LoadedSensor(seed, 0.0)
+    sensor.E = 0.01 * np.eye(6)
+    tool, hung = sensor.runs([TOOL, Set("tip", poses, 1.0, TIP_M, hung=True)])
+    result = solve(tool.dataset)
+    assert hung.dataset.wrench_cov is not None
+    u = sensor.gravity @ hung.dataset.R_base_flange
+    s = TOOL_KG * TOOL_COM_M + TIP_M
+    free = sensor.read(np.concatenate([(TOOL_KG + 1.0) * u, np.cross(s, u)], axis=1))
+    tared = (hung.dataset.wrench - free).mean(axis=0) - result.parameters.bias
+    found = check_load(
+        result,
+        result,
+        KnownLoad("tip", 1.0, 0.001, (0.0, 0.0, 0.2)),
+        (hung.dataset.R_base_flange, hung.dataset.wrench - tared, hung.dataset.wrench_cov),
+        drift=np.zeros(6),
+        p_flange_sensor_m=np.zeros(3),
+    )
+    off = (found.scale_error - 0.01) / found.scale_sigma
+    return {"sigma": found.scale_sigma, "off": off, "found": found.is_significant, "off_mm": 1e3 * found.off_m}
+
+
+def check(lab: Lab) -> Iterator[Row]:
+    """One weight on a string."""
+    n = lab.count(SENSORS, 12)
+    for poses in (1, 4):
+        found = lab.simulate(partial(checked, poses), n)
+        label = f"check with 1 kg, {poses} pose{'s' if poses > 1 else ''}"
+        yield most(f"{label}: sigma of the scale", 100 * float(np.median(found["sigma"])), 0.5, n, " %")
+        yield most(f"{label}: error / sigma", float(np.sqrt(np.mean(found["off"] ** 2))), 1.3, n)
+        yield band(f"{label}: 1 % found (2 sigma)", 100 * float(np.mean(found["found"])), 90.0, np.inf, n, " %")
+
+
 Changed = Callable[[LoadedSensor, list[LoadRun]], list[LoadRun]]
 
 
@@ -211,4 +247,4 @@ def mistakes(lab: Lab) -> Iterator[Row]:
 
 
 if __name__ == "__main__":
-    sys.exit(run({"protocols": protocols, "assumed": assumed, "mistakes": mistakes}, __doc__ or ""))
+    sys.exit(run({"protocols": protocols, "assumed": assumed, "check": check, "mistakes": mistakes}, __doc__ or ""))
