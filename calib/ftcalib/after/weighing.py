@@ -12,6 +12,7 @@ standard deviation, and that alone determines its centre of mass along gravity.
 A weight has no force across gravity and no torque about it. What a reading has there is a fault: see `Fault`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -31,6 +32,8 @@ from ftcalib.likelihood.response import (
     with_covariance,
 )
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
+from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import ContactResponse, ranges
 
 # A part is held so near to the given point, one standard deviation an axis.
 REACH_M = 0.1
@@ -106,7 +109,7 @@ def drift_since(seconds: float, per_h: Array = DRIFT_PER_H) -> Array:
     return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, USUAL_DRIFT))
 
 
-def weigh(
+def weigh(  # noqa: PLR0913 - the readings and what is known of them
     reference: Calibrated,
     R_base_flange: Array,
     wrench: Array,
@@ -116,6 +119,7 @@ def weigh(
     g_m_s2: float,
     p_sensor_near_m: Array,
     orientation_sigma_rad: float = 0.0,
+    contact: ContactResponse | None = None,
 ) -> Weight:
     """Weigh what is held in readings of one load.
 
@@ -137,6 +141,9 @@ def weigh(
         Where the gripper holds parts, sensor frame.
     orientation_sigma_rad : float
         Error of each reported orientation, one standard deviation an axis.
+    contact : ContactResponse, optional
+        How the sensor reads a contact, where known loads have shown it: mass and centre of mass are then decoded, and
+        `scale_sigma` is what its errors leave. `moment` remains as the sensor reads it.
 
     Raises
     ------
@@ -152,14 +159,75 @@ def weigh(
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
     left = np.asarray(Compensator(tool, response=response).batch(wrench, R_base_flange), dtype=np.float64)
     u = tool.gravity_force_base_N * (g_m_s2 / weight_N) @ (R_base_flange @ tool.R_flange_sensor)  # (n, 3)
-    A = np.zeros((n, 6, 4))
-    A[:, :3, 0], A[:, 3:, 1:] = u, -skew(u)
+    A = _unit_readings(u)
     if response is not None:
         A[:, :3, 0] += u @ response.force_gain.T
         A[:, 3:, 0] += u @ response.cross_talk_m.T
-    x = np.zeros(4)
+
+    def covariance_of(x: Array, *, sensor: bool = True) -> Array:
+        x_N = x * g_m_s2
+        return _covariance(reference, x_N, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
+
+    fit = _fit(left, A, covariance_of, p_sensor_near_m)
+    x, S, dof = fit.x, fit.S, 6 * n - 1
+    # A gain that depends on the load shows in none of its poses with the tool alone, and is no contact.
+    loads = LOAD * response_columns(_part(tool, x * g_m_s2), R_base_flange).reshape(6 * n, -1)
+    S = S + loads @ loads.T
+    chi2 = float(fit.misfit @ np.linalg.solve(S, fit.misfit) + np.sum((fit.near @ x) ** 2))
+    fault = _fault(left, A, S, float(chi2_sf(dof, chi2)), n)
+    if fault is None and x[0] < -LEAST_SIGMAS * fit.sigma_kg:
+        fault = "lifted"
+    true, of_sensor = fit, np.zeros((4, 4))
+    if contact is not None:
+        D = np.kron(np.eye(n), contact.decode(np.eye(6)).T)
+        unit = _unit_readings(u)
+        true = _fit(contact.decode(left), unit, lambda x: D @ covariance_of(x, sensor=False) @ D.T, p_sensor_near_m)
+        of_sensor = _by_sensor(true, contact, unit @ true.x)
+    com_m, sigma_kg = true.x[1:] / (true.x[0] or 1.0), true.sigma_kg
+    T = np.column_stack([-com_m, np.eye(3)]) / max(abs(true.x[0]), 1e-9)
+    com_covariance = T @ (true.covariance + of_sensor) @ T.T
+    variances, axes = np.linalg.eigh(com_covariance)
+    return Weight(
+        mass_kg=float(true.x[0]),
+        mass_sigma_kg=sigma_kg,
+        least_kg=LEAST_SIGMAS * sigma_kg,
+        p_sensor_com_m=com_m,
+        com_covariance=com_covariance,
+        line=read_only(axes[:, 2]) if variances[2] > (REACH_M / 2) ** 2 else None,
+        fault=fault,
+        chi2=chi2,
+        dof=dof,
+        poses=n,
+        scale_sigma=float(np.sqrt(of_sensor[0, 0]) / max(abs(true.x[0]), 1e-9)),
+        moment=(x, fit.covariance),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Mass and mass times centre of mass (4,), with what the estimate rests on."""
+
+    x: Array
+    covariance: Array
+    S: Array
+    """(6n, 6n) covariance of the readings."""
+    H: Array
+    """(6n, 4)"""
+    near: Array
+    """(3, 4) the prior of the place."""
+    misfit: Array
+    """(6n,)"""
+
+    @property
+    def sigma_kg(self) -> float:
+        return float(np.sqrt(self.covariance[0, 0]))
+
+
+def _fit(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_sensor_near_m: Array) -> _Fit:
+    """Estimate by generalised least squares; the covariance of the readings depends on what is held."""
+    n, x = len(left), np.zeros(4)
     for step in range(_PASSES):
-        S = _covariance(reference, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad)
+        S = covariance_of(x)
         if step == 0:  # the force alone, to know how heavy it is
             rows = np.arange(6 * n).reshape(n, 6)[:, :3].ravel()
             a, W = A[:, :3, 0].ravel(), np.linalg.inv(S[np.ix_(rows, rows)])
@@ -172,33 +240,38 @@ def weigh(
         H = A.reshape(6 * n, 4)
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)
         x = covariance @ H.T @ W @ left.ravel()
-    misfit = left.ravel() - H @ x
-    dof = 6 * n - 1
-    sigma_kg = float(np.sqrt(covariance[0, 0]))
-    com_m = x[1:] / (x[0] or 1.0)
-    T = np.column_stack([-com_m, np.eye(3)]) / max(abs(x[0]), 1e-9)
-    com_covariance = T @ covariance @ T.T
-    variances, axes = np.linalg.eigh(com_covariance)
-    # A gain that depends on the load shows in none of its poses with the tool alone, and is no contact.
-    loads = LOAD * response_columns(_part(tool, x * g_m_s2), R_base_flange).reshape(6 * n, -1)
-    S = S + loads @ loads.T
-    chi2 = float(misfit @ np.linalg.solve(S, misfit) + np.sum((near @ x) ** 2))
-    fault = _fault(left, A, S, float(chi2_sf(dof, chi2)), n)
-    if fault is None and x[0] < -LEAST_SIGMAS * sigma_kg:
-        fault = "lifted"
-    return Weight(
-        mass_kg=float(x[0]),
-        mass_sigma_kg=sigma_kg,
-        least_kg=LEAST_SIGMAS * sigma_kg,
-        p_sensor_com_m=com_m,
-        com_covariance=com_covariance,
-        line=read_only(axes[:, 2]) if variances[2] > (REACH_M / 2) ** 2 else None,
-        fault=fault,
-        chi2=chi2,
-        dof=dof,
-        poses=n,
-        moment=(x, covariance),
-    )
+    return _Fit(x, covariance, S, H, near, left.ravel() - H @ x)
+
+
+def _unit_readings(u: Array) -> Array:
+    """Return the wrenches (n, 6, 4) of unit mass and unit moments for the wrench u (n, 3) of 1 kg."""
+    A = np.zeros((len(u), 6, 4))
+    A[:, :3, 0], A[:, 3:, 1:] = u, -skew(u)
+    return A
+
+
+def _by_sensor(fit: _Fit, contact: ContactResponse, held: Array) -> Array:
+    """Return the covariance (4, 4) of an estimate by errors of the sensor, if these wrenches (n, 6) are held."""
+    by_reading = fit.covariance @ fit.H.T @ np.linalg.inv(fit.S)
+    by_entry = by_reading @ contact.error_columns(held).reshape(held.size, -1)
+    # Errors that are not linear are alike in all poses at worst.
+    F, mass_kg = ranges(contact.sensor.lever_m), fit.x[0]
+    share = contact.sensor.floor**2 * np.sum((held / F) ** 2) / max(float(np.sum(held[:, :3] ** 2)), 1e-12)
+    return np.asarray(by_entry @ contact.error_covariance @ by_entry.T + share * mass_kg**2 * np.diag(F[2:] ** 2))
+
+
+def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:
+    """Return mass (kg) and centre of mass (3,) of the tool, without errors that known loads have shown."""
+    if (contact := known_contact(calibration)) is None:
+        return calibration.mass_kg, calibration.p_sensor_com_m
+    weight_N, p_sensor_com_m = contact.true_load(calibration.shown_response)
+    return weight_N / calibration.g_m_s2, p_sensor_com_m
+
+
+def known_contact(calibration: CalibrationResult) -> ContactResponse | None:
+    """Return how the sensor reads a contact if known loads have shown it; None else."""
+    sensor = calibration.sensor
+    return calibration.contact if sensor is not None and sensor.source == "loads" else None
 
 
 def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:
@@ -228,9 +301,19 @@ def _misfit(y: Array, A: Array, S: Array) -> float:
 
 
 def _covariance(
-    reference: Calibrated, x_N: Array, R_base_flange: Array, noise: Array, drift: Array, orientation_sigma_rad: float
+    reference: Calibrated,
+    x_N: Array,
+    R_base_flange: Array,
+    noise: Array,
+    drift: Array,
+    orientation_sigma_rad: float,
+    *,
+    sensor: bool,
 ) -> Array:
-    """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0]."""
+    """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0].
+
+    Without `sensor` the sensor has no errors of its own for the part.
+    """
     tool, response = reference.parameters, known_response(reference, reference.response)
     n, held = len(noise), _part(tool, x_N)
     J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
@@ -242,13 +325,13 @@ def _covariance(
     C = np.array(joint_covariance(reference.covariance, response))
     C[range(6, 9), range(6, 9)] += drift[:3] ** 2
     C[range(12, 15), range(12, 15)] += drift[3:] ** 2
-    sensor = np.zeros((6 * n, 6 * n))
-    if response is not None:
+    of_sensor = np.zeros((6 * n, 6 * n))
+    if response is not None and sensor:
         J[..., 15:] += response_columns(held, R_base_flange)
         errors = sensor_error_columns(tool, response, held, R_base_flange).reshape(6 * n, -1)
-        sensor = errors @ errors.T
+        of_sensor = errors @ errors.T
     K = J.reshape(6 * n, -1)
-    return np.asarray(block_diag(*single) + K @ C @ K.T + sensor)
+    return np.asarray(block_diag(*single) + K @ C @ K.T + of_sensor)
 
 
 def _part(tool: Parameters, x_N: Array) -> Parameters:

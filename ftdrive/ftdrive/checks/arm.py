@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.after.weighing import true_tool
 from ftcalib.judge import described_cell
 from ftcalib.model import Array, skew
 from ftdrive.cell.config import RobotConfig, ToolConfig
@@ -248,11 +249,12 @@ def flange_load(
         counts as known within the whole height, evenly distributed.
     """
     # The sensor cannot weigh itself, and gravity does not reveal where its origin is: both are configuration.
-    arm_m = result.R_flange_sensor @ result.p_sensor_com_m
+    tool_kg, p_sensor_com_m = true_tool(result)
+    arm_m = result.R_flange_sensor @ p_sensor_com_m
     c_tool_m = np.array([0.0, 0.0, height_m]) + arm_m
     c_sensor_m = np.array([0.0, 0.0, height_m / 2]) if p_flange_sensor_com_m is None else p_flange_sensor_com_m
-    mass_kg = result.mass_kg + sensor_kg
-    share = result.mass_kg / mass_kg
+    mass_kg = tool_kg + sensor_kg
+    share = tool_kg / mass_kg
     com_m = share * c_tool_m + (1 - share) * c_sensor_m
 
     # Derivatives of (m, com) by the mass of the tool, then by the error coordinates of `Parameters.moved`.

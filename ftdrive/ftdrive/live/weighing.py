@@ -121,6 +121,7 @@ class Scale:
         self._readings = [*kept, (R, mean)]
         reference, since_s = stream.reference()
         calibration = stream.info.calibration
+        contact = weighing.known_contact(calibration)
         weight = weighing.weigh(
             reference,
             np.array([one[0] for one in self._readings]),
@@ -130,8 +131,10 @@ class Scale:
             g_m_s2=calibration.g_m_s2,
             p_sensor_near_m=gripping_point(stream.info),
             orientation_sigma_rad=calibration.components.get("rotation_rad", 0.0),
+            contact=contact,
         )
-        weight = replace(weight, scale_sigma=calibration.scale_sigma)
+        if contact is None:
+            weight = replace(weight, scale_sigma=calibration.scale_sigma)
         if weight.fault is not None:
             raise CannotWeigh(weight.fault, weight)
         return weight

@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from ftcalib import solve
 from ftcalib.after.cell_errors import sensor_error_columns
 from ftcalib.after.state import Calibrated, tare
-from ftcalib.after.weighing import Weight, drift_since, holding, weigh
+from ftcalib.after.weighing import Weight, drift_since, holding, known_contact, true_tool, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.model import Array, Parameters, predict
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 from tests.first_order import assert_same, propagated
+from tests.loaded_sensor import LEVER_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor
+from tests.loaded_sensor import NOISE as LOAD_NOISE
 from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, G, calibrated
 
 NEAR = 2 * TRUTH.p_sensor_com_m
@@ -285,3 +289,32 @@ def test_drift_grows_and_ends() -> None:
     assert drift_since(36.0).tolist() == pytest.approx([0.05] * 3 + [1.5e-3] * 3)
     assert not drift_since(-5.0).any()
     assert drift_since(NEVER).tolist() == [1.0] * 3 + [0.03] * 3
+
+
+def test_a_sensor_known_by_loads_weighs_without_its_error() -> None:
+    sensor = LoadedSensor(3, gain=0.05)
+    tool = solve(sensor.runs([TOOL])[0].dataset)
+    scale = np.where(np.eye(6) > 0, 1.0, 0.5) * ranges(LEVER_M)[:, None] / ranges(LEVER_M)
+    covariance = np.diag(np.concatenate([np.full(3, 1e-12), (0.001 * scale.ravel()) ** 2]))
+    result = replace(tool, sensor=SensorMatrix(sensor.E, covariance, "loads", LEVER_M, 0.0))
+    R = Rotation.random(4, rng=np.random.default_rng(1)).as_matrix()
+    u, p = sensor.gravity @ R, TIP_M
+    moment = 2.0 * p + TOOL_KG * TOOL_COM_M
+    held = sensor.read(np.concatenate([(2.0 + TOOL_KG) * u, np.cross(moment, u)], axis=1)) + tool.parameters.bias
+    noise = np.tile(np.diag((0.1 * LOAD_NOISE) ** 2), (4, 1, 1))
+    known = {"drift": drift_since(0.0), "g_m_s2": tool.g_m_s2, "p_sensor_near_m": tool.R_flange_sensor.T @ p}
+    as_read = weigh(result, R, held, noise, **known)
+    decoded = weigh(result, R, held, noise, **known, contact=known_contact(result))
+    sigma_kg = np.hypot(decoded.mass_sigma_kg, decoded.scale_sigma * decoded.mass_kg)
+    assert abs(decoded.mass_kg - 2.0) < 3 * sigma_kg < 0.01 * 2.0 < abs(as_read.mass_kg - 2.0)
+    # A force at the tip has the errors of the lever too: more than the gain alone.
+    assert 0.0003 < decoded.scale_sigma < 0.005
+    off_m = decoded.p_sensor_com_m - tool.R_flange_sensor.T @ p
+    assert off_m @ np.linalg.solve(decoded.com_covariance, off_m) < 16
+    # What the tool and the part read together is as before: the sensor still has its error.
+    np.testing.assert_array_equal(decoded.moment[0], as_read.moment[0])
+    mass_kg, com_m = true_tool(result)
+    assert mass_kg == pytest.approx(TOOL_KG, rel=0.005)
+    assert abs(tool.mass_kg / TOOL_KG - 1) > 0.005
+    np.testing.assert_allclose(tool.R_flange_sensor @ com_m, TOOL_COM_M, atol=0.001)
+    assert true_tool(tool)[0] == tool.mass_kg
