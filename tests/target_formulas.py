@@ -325,7 +325,8 @@ def _plain(file: Any, R_base_flange: Array, wrench: Array) -> Array:
     if file["response"] is not None:
         rows = [*file["response"]["force_gain"], *file["response"]["cross_talk_m"]]
         load += u @ np.array([numbers(row, 3) for row in rows]).T
-    return wrench - bias - load
+    contact = wrench - bias - load
+    return contact if file["decoder"] is None else contact @ np.array([numbers(row, 6) for row in file["decoder"]]).T
 
 
 def _in_sensor(frame: str, point: Array, context: Context) -> Array:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.compensation import Compensator
 from ftcalib.files import JSON
-from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation
+from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation, skew
 from ftdrive import __version__
 from ftdrive.errors import NotAccepted
 from ftdrive.exports import robots, ros
@@ -36,6 +36,9 @@ def _as_json(calibration: CalibrationResult, settings: Settings) -> Exported:
 
         force = raw - force_bias_N - u - force_gain u
         torque = raw - torque_bias_Nm - p_sensor_com_m x u - cross_talk_m u
+        contact = decoder (force, torque)
+
+    `decoder` (6 x 6) is null where no error of the sensor's matrix is known. Then the contact is (force, torque).
     """
     return Exported(json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n")
 
@@ -47,7 +50,7 @@ def _as_yaml(calibration: CalibrationResult, settings: Settings) -> Exported:
 
 def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
     result = calibration.to_dict()
-    response = calibration.response
+    response, decoder = calibration.response, calibration.contact.decoder
     origin_m = None if settings.height_mm is None else settings.p_flange_sensor_m("json").tolist()
     made, last = calibration.provenance.get("created_utc"), settings.verification
     return {
@@ -59,12 +62,13 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
         if last is None
         else {name: last.to_dict()[name] for name in ("created_utc", "passed", "change")},
         "made_by": f"ftdrive {__version__}",
-        "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = raw - bias - weight",
+        "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = decoder (raw - bias - weight)",
         **{name: result[name] for name in _FIELDS},
         "p_flange_sensor_m": origin_m,
         "response": None
         if response is None
         else {"force_gain": response.force_gain.tolist(), "cross_talk_m": response.cross_talk_m.tolist()},
+        "decoder": None if decoder is None else decoder.tolist(),
         "sigma": {name: np.asarray(value).tolist() for name, value in calibration.sigma.items()},
     }
 
@@ -75,7 +79,7 @@ _CONVERGED = 1e-12
 
 
 def _compensations(calibration: CalibrationResult, target: Format) -> tuple[Compensator, Compensator]:
-    """Return our compensation, and that of a target that expresses all but what its `expresses` lacks.
+    """Return our compensation of a free tool, and that of a target that expresses all but what its `expresses` lacks.
 
     Without tilt, gravity points along -z of the base. Without rotation, the sensor's axes are those of the flange.
     Where the target has another sensor, or none, neither has the response of ours.
@@ -165,8 +169,8 @@ def export(
         force_N, torque_Nm = largest_difference(*_compensations(calibration, target))
         if lost := list(_lost(calibration, target)):
             words = (
-                f"{name} cannot express {' and '.join(lost)}: its result differs from that of ftdrive by up to "
-                f"{force_N:.3g} N and {torque_Nm:.3g} N·m"
+                f"{name} cannot express {' and '.join(lost)}: its reading of a free tool differs from that of ftdrive "
+                f"by up to {force_N:.3g} N and {torque_Nm:.3g} N·m"
             )
             if force_N > max_force_error_N:
                 raise NotAccepted(
@@ -174,6 +178,8 @@ def export(
                     f"({', '.join(_lossless(calibration, target))}), or raise --max-force-error"
                 )
             notes.insert(0, f"{words}.")
+        if "response" not in target.expresses:
+            notes += _undecoded(name, calibration)
     notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
     notes += [f"Also set {place} = {_describe_value(value)}." for place, value in exported.elsewhere.items()]
     origin = _made_by(calibration, settings.verification)
@@ -193,6 +199,19 @@ def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
         yield f"the sensor turned by {degrees(turn_rad):.3g}° in the flange"
     if "response" not in target.expresses and calibration.response is not None:
         yield "gain and cross-talk of the sensor"
+
+
+def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
+    """State the largest error of a contact where the target does not decode it."""
+    if (decoder := calibration.contact.decoder) is None:
+        return
+    at_tool = np.concatenate([np.eye(3), skew(calibration.p_sensor_com_m)])
+    error = (np.linalg.inv(decoder) - np.eye(6)) @ at_tool
+    percent = 100 * np.linalg.norm(error[:3], 2)
+    yield (
+        f"{name} cannot decode contacts: a force at the tool's centre of mass is off by up to {percent:.2g} %. "
+        "Multiply the result by the decoder of the formats json or yaml."
+    )
 
 
 def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:

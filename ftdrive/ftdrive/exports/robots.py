@@ -5,6 +5,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.after.weighing import true_tool
 from ftcalib.model import Array
 from ftdrive.exports.shared import (
     Exported,
@@ -149,8 +150,9 @@ def urdf(calibration: CalibrationResult, settings: Settings) -> Exported:
     for name in (settings.flange_frame, settings.sensor_frame):
         ET.SubElement(robot, "link", name=name)
     inertial = ET.SubElement(ET.SubElement(robot, "link", name=settings.tool_frame), "inertial")
-    ET.SubElement(inertial, "origin", xyz=_words(calibration.p_sensor_com_m.tolist()), rpy="0 0 0")
-    ET.SubElement(inertial, "mass", value=repr(calibration.mass_kg))
+    mass_kg, p_sensor_com_m = true_tool(calibration)
+    ET.SubElement(inertial, "origin", xyz=_words(p_sensor_com_m.tolist()), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=repr(mass_kg))
     J = inertia_kg_m2(calibration)
     if J is None:
         inertial.append(ET.Comment(" not identified: zeros stand for a point mass; put values of the CAD model here "))
@@ -193,9 +195,10 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
     with the reading as the hardware interface gives it, which is minus that of MuJoCo.
     """
     # The plugin is newer than its release 0.1.2, and wrong without the weight in the model.
-    com_m = numbers(calibration.p_sensor_com_m)
+    mass_kg, p_sensor_com_m = true_tool(calibration)
+    com_m = numbers(p_sensor_com_m)
     x, y, z, w = quaternion_xyzw(R_frame_sensor(calibration, settings))
-    compensation = {"frame_id": settings.sensor_frame, "CoG": {"pos": com_m, "mass": calibration.mass_kg}}
+    compensation = {"frame_id": settings.sensor_frame, "CoG": {"pos": com_m, "mass": mass_kg}}
     plugin = {"type": "mujoco_ros2_control_plugins/FtsGravCompPlugin", settings.sensor_frame: compensation}
     parameters = yaml_text({"/**": {"ros__parameters": {"mujoco_plugins": {"fts_grav_comp_plugin": plugin}}}})
     root = ET.Element("mujoco", model=settings.tool_frame)
@@ -205,7 +208,7 @@ def mujoco(calibration: CalibrationResult, settings: Settings) -> Exported:
     body = ET.SubElement(ET.SubElement(root, "worldbody"), "body", name=settings.tool_frame)
     body.attrib |= {"pos": _words(settings.p_frame_sensor_m("mujoco").tolist()), "quat": _words([w, x, y, z])}
     J = inertia_kg_m2(calibration)
-    inertial = ET.SubElement(body, "inertial", pos=_words(com_m), mass=repr(calibration.mass_kg))
+    inertial = ET.SubElement(body, "inertial", pos=_words(com_m), mass=repr(mass_kg))
     if J is None:
         note = " inertia not identified: zeros stand for a point mass; put values of the CAD model here "
         body.insert(0, ET.Comment(note))
@@ -255,8 +258,8 @@ def _payload_inertia_kg_m2(
     J = inertia_kg_m2(calibration)
     if J is None:
         return None
-    Q, tool_kg = calibration.R_flange_sensor, calibration.mass_kg
-    tool_m = p_flange_sensor_m + Q @ calibration.p_sensor_com_m - p_flange_com_m
+    Q, (tool_kg, p_sensor_com_m) = calibration.R_flange_sensor, true_tool(calibration)
+    tool_m = p_flange_sensor_m + Q @ p_sensor_com_m - p_flange_com_m
     total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
     if sensor_kg > 0:
         total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)

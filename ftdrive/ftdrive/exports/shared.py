@@ -137,7 +137,7 @@ class Exported:
     elsewhere: Mapping[str, JSON] = field(default_factory=dict)
     """What the target reads from another place, by its name there."""
     max_force_error_N: float = 0.0
-    """Largest difference to `CalibrationResult.compensate` over all orientations."""
+    """Largest difference to `CalibrationResult.compensate` of a free tool over all orientations."""
     max_torque_error_Nm: float = 0.0
 
 

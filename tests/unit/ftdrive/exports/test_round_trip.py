@@ -6,6 +6,7 @@ all that a format declares to express and to subtract, and the limit is then zer
 """
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters
+from ftcalib.compensation import Compensator
 from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.formats import FORMATS, Property
 from ftdrive.exports.registry import export
@@ -36,6 +39,9 @@ AXES_OF_THE_FLANGE = ("xarm",)
 """Has no place for the mounting. Others have it in the file, look it up in the robot model, or have no sensor axes."""
 ONLY_THE_MOUNTING = ("static-transform",)
 """The load comes from the context, so that a wrong place of the sensor shows."""
+MATRIX_UNITS = ranges(0.067)[:, None] / ranges(0.067)
+DECODES = ("json", "yaml")
+"""Multiply the wrench without the free tool by a matrix."""
 LOSSES = [(name, lost) for name, one in FORMATS.items() if one.subtracts for lost in ALL if lost not in one.expresses]
 
 
@@ -132,9 +138,11 @@ def attached(text: str, settings: Settings) -> str:
 
 
 def expected(name: str, calibration: CalibrationResult, R_base_flange: Array, wrench: Array) -> Array:
-    """Our result, plus what the target declares not to subtract."""
+    """Our result, plus what the target declares not to subtract; decoded where the target can."""
     target, given = FORMATS[name], calibration.parameters
-    ours = calibration.compensate(wrench, R_base_flange, response=name not in OWN_READING)
+    response = None if name in OWN_READING else calibration.response
+    decoder = calibration.contact.decoder if name in DECODES else None
+    ours: Array = np.asarray(Compensator(given, response=response, decoder=decoder)(wrench, R_base_flange))
     bias = np.concatenate([given.force_bias_N, given.torque_bias_Nm])
     if "weight" not in target.subtracts and name not in ONLY_THE_MOUNTING:
         ours = wrench - bias
@@ -178,6 +186,42 @@ def test_what_a_target_cannot_express_costs_what_the_export_says(name: str, lost
     with pytest.raises(NotAccepted, match=words):
         export(calibration, name, settings, max_force_error_N=0.999 * stated[0])
     assert export(calibration, name, settings, max_force_error_N=1.001 * stated[0]).text == made.text
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if name not in ONLY_THE_MOUNTING])
+def test_a_sensor_known_by_loads_is_decoded_or_its_largest_error_is_named(name: str) -> None:
+    rng = np.random.default_rng(3)
+    sensor = replace(SensorMatrix.usual(), source="loads", error=0.02 * rng.normal(size=(6, 6)) * MATRIX_UNITS)
+    calibration = replace(arbitrary(rng, ()), sensor=sensor)
+    settings = settings_of(rng)
+    made = export(calibration, name, settings, max_force_error_N=0.0)
+    R, wrench = data(rng, 50)
+    decoder, p = calibration.contact.decoder, calibration.p_sensor_com_m
+    assert decoder is not None
+    if name in DECODES:
+        found = compensated(name, made, calibration, settings, R, wrench)
+        np.testing.assert_allclose(found, calibration.compensate(wrench, R), rtol=0, atol=1e-7)
+        assert np.abs(found - Compensator(calibration.parameters)(wrench, R)).max() > 0.1
+        return
+    notes = [note for note in made.notes if "cannot decode contacts" in note]
+    assert len(notes) == (name not in OWN_READING)
+    if notes:
+        stated = re.search(r"up to (\S+) %", notes[0])
+        assert stated
+        force = rng.normal(size=(2000, 3))
+        force /= np.linalg.norm(force, axis=1)[:, None]
+        true = np.concatenate([force, np.cross(p, force)], axis=1)
+        error = np.linalg.norm((true @ np.linalg.inv(decoder).T - true)[:, :3], axis=1)
+        assert 100 * error.max() == pytest.approx(float(stated[1]), rel=0.06)
+
+
+def test_models_have_the_mass_without_the_error_of_a_sensor_known_by_loads() -> None:
+    rng = np.random.default_rng(5)
+    sensor = replace(SensorMatrix.usual(), source="loads", error=0.03 * np.eye(6))
+    calibration = replace(arbitrary(rng, ()), sensor=sensor)
+    mass = re.search(r'mass value="([^"]*)"', export(calibration, "urdf", settings_of(rng)).text)
+    assert mass
+    assert float(mass[1]) == pytest.approx(calibration.mass_kg / 1.03)
 
 
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "bias" not in one.subtracts])
