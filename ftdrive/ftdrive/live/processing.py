@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ftcalib.after.series import BiasTemperature
 from ftcalib.after.weighing import Weight
 from ftcalib.files import JSON
+from ftcalib.sensor_matrix import ContactResponse
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.motion import READING_S, REST, wrench_by_acceleration
@@ -34,6 +35,17 @@ SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
 # More rows are processed in pieces that stay in the cache.
 _CHUNK_ROWS = 8192
+
+
+def _quadratic_form(contact: ContactResponse, rotation_covariance: Array) -> Array:
+    """Return (36, 36) that gives the covariance (36,) of a contact w, row by row, from its products w w'.
+
+    The covariance is quadratic in the contact, so that each product has a constant share of it.
+    """
+    one = np.eye(6)
+    alone = contact.covariance(one, rotation_covariance)
+    both = contact.covariance(one[:, None] + one, rotation_covariance)
+    return np.asarray((both - alone[:, None] - alone).reshape(36, 36).T / 2)
 
 
 class Processor:
@@ -84,6 +96,8 @@ class Processor:
             self._transform = FrameTransform(self._frame, info)
             self._filter = self._filter_of(self._stages)
             self._tool = FreeTool(info, temperature)
+            self._contact = calibration.contact
+            self._by_contact = _quadratic_form(self._contact, calibration.covariance[:3, :3])
             self._inertia = InertiaStage(info)
             self._motion = self._tool.motion_tracker()
             self._noise = NoiseEstimator(
@@ -231,11 +245,11 @@ class Processor:
             self._state, self._reading = int(states[-1]), readings[-1]
         if self.track != "off":
             self._follow_load(rows, states)
-        readings = self._transform(self.info.calibration.contact.decode(readings), rows.R_base_flange)
+        readings = self._transform(self._contact.decode(readings), rows.R_base_flange)
         soon = (states == REST) & (known is Inertia.EXACT)
         in_contact, contacts = self._tracker.follow(rows.t_host_ns, beyond, readings, soon)
         self._note_contacts(contacts)
-        wrench = self.info.calibration.contact.decode(residual)
+        wrench = self._contact.decode(residual)
         if not stages.gravity:
             wrench = wrench + gravity
         if not stages.bias:
@@ -272,11 +286,10 @@ class Processor:
         if self._stages.bias:
             covariance = covariance + np.diag(self._tool.bias_growth(self._newest_ns))
         if loaded:
-            contact = self.info.calibration.contact
-            rotation_covariance = self.info.calibration.covariance[:3, :3]
-            covariance = covariance + contact.covariance(contact.decode(self._reading), rotation_covariance)
+            wrench = self._contact.decode(self._reading)
+            covariance = covariance + (self._by_contact @ (wrench[:, None] * wrench).ravel()).reshape(6, 6)
         T = self._transform.matrix(R_base_flange)
-        return np.asarray(np.sqrt(np.einsum("ij,jk,ik->i", T, covariance, T)))
+        return np.asarray(np.sqrt(np.einsum("ij,ij->i", T @ covariance, T)))
 
     def restart(self, *, elsewhere: bool = False) -> None:
         """Forget the samples before an interruption; noise, tares and drift remain.

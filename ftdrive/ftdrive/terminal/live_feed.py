@@ -65,8 +65,10 @@ class Feed:
         What is new; the screen takes it.
     status : StreamStatus
     sigma : array, shape (6,)
-        Standard deviation of a mean over `MEAN_S`. Like the status it is at most 50 ms of the stream older than the
-        newest block.
+        Standard deviation of a mean over `MEAN_S`, under the present contact. Like the status it is at most 50 ms of
+        the stream older than the newest block.
+    rest_sigma, sample_sigma : array, shape (6,)
+        The same of a free tool, and that of one of its samples.
     reader : BlockReader
         Its `failure` is why the stream gives no samples now.
     crash : BaseException or None
@@ -90,7 +92,7 @@ class Feed:
         self.blocks: deque[Block] = deque(maxlen=_MOST_BLOCKS)
         self.notes: deque[Note] = deque()
         self.status = stream.status()
-        self.sigma = np.full(6, np.nan)
+        self.sigma = self.rest_sigma = self.sample_sigma = np.full(6, np.nan)
         self.reader = BlockReader(stream, math.inf)
         self.crash: BaseException | None = None
         self.newest_ns: int | None = None
@@ -147,7 +149,10 @@ class Feed:
         if abs(self.newest_ns - self._status_ns) > _STATUS_NS:
             self._status_ns = self.newest_ns
             self.status = self.stream.status()
-            self.sigma = self.stream.sigma_of_mean(block.R_base_flange[-1], MEAN_S)
+            R_base_flange = block.R_base_flange[-1]
+            self.sigma = self.stream.sigma_of_mean(R_base_flange, MEAN_S)
+            self.rest_sigma = self.stream.sigma_of_mean(R_base_flange, MEAN_S, loaded=False)
+            self.sample_sigma = self.stream.sigma_of_mean(R_base_flange, loaded=False)
 
     def _switch_recording(self) -> None:
         """Start a recording, or complete the one that runs."""

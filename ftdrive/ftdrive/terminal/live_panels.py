@@ -184,7 +184,8 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
     for first, unit in ((0, "N"), (3, "N·m")):
         places = decimals(view.reading, first)
         full = full_scale(columns, view.reading, first)
-        head = Line("        now     ± σ   -peak   +peak " if first == 0 else "", FAINT).to(_NUMBERS)
+        head = Line("        now     ± σ   -peak   +peak ", FAINT) if first == 0 else _at_rest(view)
+        head.to(_NUMBERS)
         head.join(_scale(full, unit, bar_cells))
         if trace_cells and first == 0:
             head.to(_NUMBERS + bar_cells + 4).add(span(columns), FAINT, "g")
@@ -207,9 +208,9 @@ def span(columns: PlotColumns) -> str:
 
 
 def decimals(reading: ShownWrench | None, first: int) -> int:
-    """Return how many decimals three components need to show their standard deviations."""
+    """Return how many decimals three components need to show their standard deviations without contact."""
     usual = 3 if first else 2
-    return usual if reading is None or not reading.sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
+    return usual if reading is None or not reading.rest_sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
 def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) -> float:
@@ -230,6 +231,15 @@ def _component(view: View, i: int, places: int) -> Line:
         return line.join(_peaks(view, i, places))
     line.add(f"{reading.wrench[i]:+z8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
     return line.add(f"{digits(reading.sigma[i], places):>8}", FAINT).join(_peaks(view, i, places))
+
+
+def _at_rest(view: View) -> Line:
+    """Show the sigma of a free tool, below that of the present contact."""
+    reading = view.reading
+    if reading is None or view.silent:
+        return Line()
+    force, torque = (digits(float(reading.rest_sigma[i : i + 3].max()), decimals(reading, i)) for i in (0, 3))
+    return Line(f" {'σ at rest':<11}{force:>8} N  {torque} N·m", FAINT)
 
 
 def digits(sigma: float, places: int) -> str:

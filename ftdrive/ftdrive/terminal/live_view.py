@@ -133,9 +133,11 @@ class ShownWrench:
     raw_in_frame: Array
     """(6,) the same in `frame`."""
     sigma: Array
-    """(6,) of `wrench`: noise and calibration; NaN until the noise is known."""
+    """(6,) of `wrench`: noise, calibration, sensor under this contact; NaN until the noise is known."""
+    rest_sigma: Array
+    """(6,) the same of a free tool."""
     sample_sigma: Array
-    """(6,) of one sample."""
+    """(6,) of one sample of a free tool."""
     chi2: float
     """Squared distance of the newest sample from a free tool."""
     in_contact: bool
@@ -294,7 +296,8 @@ class Summary:
             raw=np.sum([each.raw for each in self._recent], axis=0) / n,
             raw_in_frame=np.sum([each.raw_in_frame for each in self._recent], axis=0) / n,
             sigma=self._feed.sigma,
-            sample_sigma=newest.sigma,
+            rest_sigma=self._feed.rest_sigma,
+            sample_sigma=self._feed.sample_sigma,
             chi2=float(newest.chi2[-1]),
             in_contact=bool(newest.in_contact[-1]),
             R_base_flange=newest.R_base_flange[-1],

@@ -27,9 +27,11 @@ from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
 
+PUSH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+
 
 def replayed(seconds: float = 1.2, **options: Any) -> ReplayedStream:
-    rows = paired(dwells(1, round(seconds * 1000), seed=1), push=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]))
+    rows = paired(dwells(1, round(seconds * 1000), seed=1), push=PUSH)
     return ReplayedStream(info(calibrated()), rows, clock=FakeClock(), **options)
 
 
@@ -55,7 +57,8 @@ def test_each_line_is_the_mean_of_a_tenth_of_a_second(arguments: list[str]) -> N
     assert len(lines) == pytest.approx(11, abs=2)
     for line in lines:
         assert line["compensated"]["force_N"] == pytest.approx([1.0, 2.0, 3.0], abs=6 * NOISE[0] / 10)
-        assert line["sigma"]["force_N"] == pytest.approx(NOISE[:3] / 10, rel=0.3)
+        by_contact = np.diag(calibrated().contact.covariance(PUSH))
+        assert line["sigma"]["force_N"] == pytest.approx(np.sqrt((NOISE / 10) ** 2 + by_contact)[:3], rel=0.1)
         assert (line["axes"], line["about"], line["contact"], line["stale"]) == ("sensor", "sensor origin", True, None)
         assert line["delay_s"] == {"value": 0.0, "sigma": 0.0}
     assert np.diff([line["t_s"] for line in lines]) == pytest.approx(0.1, abs=0.02)
@@ -209,7 +212,7 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
         processor = Processor(replace(info(calibration), calibration=calibration), WrenchFrame("base"), Stages())
         rows = paired(np.tile(one, (1000, 1, 1)), noise=1e-3)
         processor.process(rows)
-        shown.append(processor.sigma_of_mean(one, 0.1))
+        shown.append(processor.sigma_of_mean(one, 0.1, loaded=False))
     rms = np.sqrt(np.square(shown).reshape(24, 2, 3).sum(axis=2).mean(axis=0))
     np.testing.assert_allclose(rms, headline, rtol=0.01)
     assert np.min(np.array(shown)[:, :3]) > 0.5 * headline[0] / np.sqrt(3)

@@ -3,7 +3,7 @@
 import re
 from dataclasses import replace
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -15,7 +15,9 @@ from scipy.spatial.transform import Rotation
 from ftcalib.after.series import BiasTemperature
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftdrive.errors import ConfigError
+from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Axes, Block, FrameTransform, Paired, Point, Stages, WrenchFrame
 from ftdrive.live.stages import stages_in_words
 from ftdrive.live.stream import ProcessedStream
@@ -500,3 +502,25 @@ def test_sigma_grows_with_the_age_of_the_bias_until_a_tare() -> None:
     for one in (known, unknown):
         one.tare()
     assert (added() < 1e-3 * moves**2).all()
+
+
+@pytest.mark.parametrize("source", ["assumed", "loads"])
+def test_sigma_has_the_errors_of_the_sensor_under_the_present_contact(source: Literal["assumed", "loads"]) -> None:
+    E = 0.03 * np.random.default_rng(4).normal(size=(6, 6)) * ranges(0.067)[:, None] / ranges(0.067)
+    usual = SensorMatrix.usual()
+    sensor = usual if source == "assumed" else replace(usual, source=source, error=E, covariance=usual.covariance / 100)
+    calibration = replace(calibrated(), sensor=sensor)
+    contact = np.array([30.0, -20.0, 40.0, 1.0, -2.0, 0.5])
+    decoder = np.eye(6) if calibration.contact.decoder is None else calibration.contact.decoder
+    push = np.zeros((3000, 6))
+    push[1500:] = np.linalg.solve(decoder, contact)
+    frame = WrenchFrame("base", "tcp")
+    processor = Processor(info(calibration), frame)
+    block = processor.process(paired(still(3.0), push=push))
+    T = FrameTransform(frame, info(calibration)).matrix(UPSIDE_DOWN)
+    np.testing.assert_allclose(block.wrench[2000:].mean(axis=0), T @ contact, atol=0.02)
+    loaded, rest = (processor.sigma_of_mean(UPSIDE_DOWN, loaded=one) for one in (True, False))
+    np.testing.assert_array_equal(block.sigma, loaded)
+    expected = T @ calibration.contact.covariance(contact, calibration.covariance[:3, :3]) @ T.T
+    np.testing.assert_allclose(loaded**2 - rest**2, np.diag(expected), rtol=0.02)
+    assert (loaded[:3] > (5 if source == "assumed" else 1) * rest[:3]).all()

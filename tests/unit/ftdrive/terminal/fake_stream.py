@@ -225,10 +225,14 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
             false_alarm_rate=0.001,
         )
 
-    def sigma_of_mean(self, R_base_flange: Array, duration_s: float) -> Array:
+    def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0, *, loaded: bool = True) -> Array:
         assert R_base_flange.shape == (3, 3)
-        assert duration_s == 0.1
-        return SIGMA / 3
+        assert duration_s in ((0.0, 0.1) if not loaded else (0.1,))
+        if not loaded:
+            return SIGMA / 3 if duration_s else SIGMA
+        # 2 % of a gain, on all axes alike
+        force_N = np.linalg.norm(self._contact(np.array([self.now_ns]))[0, :3])
+        return np.hypot(SIGMA / 3, 0.02 * force_N * np.repeat([1.0, 0.067], 3))
 
     def tare(self) -> StreamEvent:
         if self.scenario == "tare-refused":
