@@ -1,7 +1,7 @@
 """All facts of a report as one JSON object; every format shows only what is here."""
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.after.series import difference
+from ftcalib.after.weighing import known_contact, true_tool
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
 from ftcalib.judge.observability import assess, axes_along, largest_gap
@@ -22,7 +23,15 @@ from ftdrive.report.subject import Subject
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import MARKS, marks_of
-from ftdrive.terminal.report import drift_in_use, drift_in_words, error_in_words
+from ftdrive.terminal.report import (
+    contact_in_words,
+    drift_in_use,
+    drift_in_words,
+    error_in_words,
+    force_sigma_at_tip,
+    sensor_in_words,
+    tip_of,
+)
 
 NAMES = {
     "R_flange_sensor": "mounting of the sensor",
@@ -39,9 +48,9 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
     Returns
     -------
     dict
-        `parameters`: for each error coordinate its `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known
-        exactly in both; `groups`: `name`, `chi2`, `dof`, `p_value`; `same_data`: whether both rest on one dataset, so
-        that the test does not apply.
+        `sensors`: on what the errors of the sensor rest, before and now; `parameters`: for each error coordinate its
+        `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known exactly in both; `groups`: `name`, `chi2`,
+        `dof`, `p_value`; `same_data`: whether both rest on one dataset, so that the test does not apply.
     """
     # Results of the same data share their noise, so the test does not apply to them.
     found = difference(before, result)
@@ -53,6 +62,7 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
         "created_utc": before.provenance.get("created_utc"),
         "mass_kg": before.mass_kg,
         "same_data": data[0] is not None and data[0] == data[1],
+        "sensors": [sensor_in_words(before), sensor_in_words(result)],
         "parameters": [
             {"name": name, "change": change, "sigmas": sigmas if sigma > 0 and np.isfinite(sigmas) else None}
             for name, change, sigma, sigmas in zip(
@@ -100,6 +110,36 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
             "words": _direction_in_words(direction, "base"),
         }
     return document
+
+
+# Forces at the tip whose sigma is drawn, N.
+FORCES_N = np.arange(0.0, 101.0, 5.0)
+
+
+def contact_error(result: CalibrationResult) -> dict[str, Any]:
+    """Return the sigma of a force at the tip.
+
+    Returns
+    -------
+    dict
+        `source` of the errors of the sensor; `words`; `tip_m` (3,) from the sensor origin, sensor axes; `force_N` (n,)
+        and `sigma_N` (n,), length of the error, over all directions; `without_loads_N` (n,), and mass and centre of
+        mass of the `tool` without errors of the sensor, both null where no loads are known.
+    """
+    without, tool = None, None
+    if known_contact(result) is not None:
+        without = force_sigma_at_tip(replace(result, sensor=None), FORCES_N).tolist()
+        mass_kg, p_sensor_com_m = true_tool(result)
+        tool = {"mass_kg": mass_kg, "p_sensor_com_m": p_sensor_com_m.tolist()}
+    return {
+        "source": "assumed" if result.sensor is None else result.sensor.source,
+        "words": contact_in_words(result),
+        "tip_m": tip_of(result).tolist(),
+        "force_N": FORCES_N.tolist(),
+        "sigma_N": force_sigma_at_tip(result, FORCES_N).tolist(),
+        "without_loads_N": without,
+        "tool": tool,
+    }
 
 
 def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
@@ -180,6 +220,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
             "cross_validated": not result.noise_explains,
         },
         "error_map": error_map(result),
+        "contact": contact_error(result),
         "correlation": _correlation(result.covariance),
         "cross_validation": _cross_validation(subject),
         "poses": _poses(subject),

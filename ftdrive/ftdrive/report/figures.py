@@ -227,6 +227,18 @@ def _methods(figure: Any, facts: Facts) -> None:
     force.invert_yaxis()
 
 
+def _contact(figure: Any, facts: Facts) -> None:
+    axes, found = figure.add_subplot(), facts["contact"]
+    if found["without_loads_N"] is not None:
+        axes.plot(found["force_N"], found["without_loads_N"], "--", color=SERIES[1], label="without known loads")
+    axes.plot(found["force_N"], found["sigma_N"], color=SERIES[0], label=f"now ({found['source']})")
+    axes.set_xlim(0, found["force_N"][-1])
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel("force at the tip, N")
+    axes.set_ylabel("sigma, N")
+    axes.legend(loc="upper left")
+
+
 def _pose_residuals(figure: Any, facts: Facts) -> None:
     poses, axes = shown_poses(facts["poses"]), figure.add_subplot()
     places = np.arange(len(poses))
@@ -319,6 +331,7 @@ _Margins = tuple[float, float, float, float]
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
+    "contact": (2.6, (0.65, 0.2, 0.5, 0.1), _contact),
     "correlation": (4.6, (1.05, 0.1, 1.05, 0.1), _correlation),
     "methods": (_methods_height, (1.35, 0.2, 0.5, 0.1), _methods),
     "pose_residuals": (2.8, (0.55, 0.1, 0.65, 0.1), _pose_residuals),

@@ -104,6 +104,36 @@ def error(facts: Facts) -> Section:
     return Section("error", "Compensation error over all orientations", text, figures, [Table(caption, columns, rows)])
 
 
+def contact(facts: Facts) -> Section:
+    """Show the sigma of a contact, which has the errors of the sensor itself."""
+    found = facts["contact"]
+    text = [
+        "The compensation error above holds in free air. Under contact the errors of the sensor itself are added, and "
+        "grow with the force.",
+        f"{found['words']}.",
+    ]
+    if found["source"] != "loads":
+        text.append("To measure these errors, hang known weights: `ftdrive loads`.")
+    if (tool := found["tool"]) is not None:
+        com = ", ".join(f"{1e3 * value:.1f}" for value in tool["p_sensor_com_m"])
+        text.append(
+            f"Without the errors of the sensor the tool weighs {tool['mass_kg']:.4f} kg, with its centre of mass at "
+            f"({com}) mm in sensor axes."
+        )
+    near, far = found["sigma_N"][0], found["sigma_N"][-1]
+    without = ""
+    if found["without_loads_N"] is not None:
+        without = f" Without known loads it would be {rounded(found['without_loads_N'][-1])} N."
+    figure = Figure(
+        "contact",
+        f"Line of the sigma of a force at the tip: {rounded(near)} N without contact, {rounded(far)} N at "
+        f"{found['force_N'][-1]:g} N.{without}",
+        "Sigma of a force at the tip of the tool, as the length of its error. Good: below the accuracy that your "
+        f"contact needs.{without}",
+    )
+    return Section("contact", "Error under contact", text, [figure])
+
+
 def cross_validation(facts: Facts) -> Section:
     """Show the error in predicting each pose from the others, by method."""
     found = facts["cross_validation"]
@@ -366,6 +396,11 @@ def comparison(facts: Facts) -> Section:
     text = [
         f"Compared with {facts['compared_with']}: id {found['id']}, {found['verdict']}, mass {found['mass_kg']:.4f} kg."
     ]
+    before, now = found["sensors"]
+    if before != now:
+        text.append(
+            f"Errors of the sensor under contact: {before} before, {now} now. So the same contact reads otherwise."
+        )
     if found["same_data"]:
         text.append("Both rest on the same data: the test below does not apply, because it assumes independent noise.")
     else:
@@ -475,6 +510,7 @@ def sections_of(facts: Mapping[str, Any]) -> list[Section]:
     return [
         estimates(facts),
         error(facts),
+        contact(facts),
         *([motion(facts)] if in_motion else [cross_validation(facts)]),
         residuals(facts),
         *([] if in_motion and facts["drift"]["in_fit"] is None else [drift(facts)]),

@@ -28,6 +28,9 @@ _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
     ("after an hour", "hour"),
 )
+# A contact whose sigma is named, and where the tip is if no tool is described, from the flange.
+CONTACT_N = 100.0
+_USUAL_TIP_MM = 200.0
 # Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
 # Rows that follow from mass and tilt: printed only with -v.
@@ -74,6 +77,8 @@ def print_result(
         answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
+    if result.verdict != "rejected":
+        answer.print(hanging(" under contact: ", contact_in_words(result), answer))
     if truth is not None:
         raw, left = _free_tool_wrench(truth, _RANDOM), compensation_error(result, truth)
         words = (
@@ -171,6 +176,44 @@ def error_in_words(result: CalibrationResult) -> str:
         if error[0] > _WORSE * result.likely_error()[0]:
             sources.append("{} {:.2g} N, {:.2g} N·m".format(words, *error))
     return f"{likely} rms ({'; '.join(sources)}; predicted: {predicted})"
+
+
+def tip_of(result: CalibrationResult) -> Array:
+    """Return the far end of the tool (3,) from the sensor origin, sensor axes: of its cylinders, else 200 mm out."""
+    setup = result.provenance.get("setup")
+    given: Mapping[str, Any] = setup if isinstance(setup, dict) else {}
+    rows = given.get("cylinders_mm") or [[0.0, _USUAL_TIP_MM, 0.0]]
+    far = max(rows, key=lambda row: row[1])
+    # From, to, diameter, and perhaps where the axis is.
+    x, y = far[3:] if len(far) > 3 else (0.0, 0.0)
+    tip_mm = np.array([x, y, far[1] - (given.get("height_mm") or 0.0)])
+    return np.asarray(result.R_flange_sensor.T @ tip_mm / 1e3)
+
+
+def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTACT_N) -> Array:
+    """Return one standard deviation of a force at the tip, as the length of its error, over all directions."""
+    unit = np.concatenate([np.eye(3), np.cross(tip_of(result), np.eye(3))], axis=1)
+    # The covariance is quadratic in the force, so that its mean over all directions is that over three axes.
+    covariance = result.contact.covariance(unit, result.covariance[:3, :3])
+    share = float(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean())
+    return np.asarray(np.sqrt(result.likely_error()[0] ** 2 + share * np.square(force_N)))
+
+
+def sensor_in_words(result: CalibrationResult) -> str:
+    """Say on what the errors of the sensor under contact rest."""
+    sensor = result.sensor
+    if sensor is None or sensor.source == "assumed":
+        return "assumed, not measured"
+    if sensor.source == "data sheet":
+        return "those of the data sheet"
+    made = sensor.provenance.get("created_utc")
+    return f"known from loads, sensor.json of {made[:10]}" if isinstance(made, str) else "known from loads"
+
+
+def contact_in_words(result: CalibrationResult) -> str:
+    """Describe the sigma of a contact at the tip, and on what it rests."""
+    sigma_N = float(force_sigma_at_tip(result))
+    return f"{CONTACT_N:g} N at the tip ± {sigma_N:.2g} N (1 sigma); errors of the sensor are {sensor_in_words(result)}"
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:

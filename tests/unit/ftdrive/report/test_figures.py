@@ -115,6 +115,15 @@ def test_noise_is_drawn_in_millinewton_with_its_median(drawn: Draw) -> None:
     assert names_at(axes)[0] == "R101"
 
 
+def test_the_sigma_of_a_contact_is_drawn_with_and_without_loads(drawn: Draw) -> None:
+    facts = {"source": "loads", "force_N": [0, 50, 100], "sigma_N": [0.1, 0.2, 0.4], "without_loads_N": [0.1, 1, 2]}
+    (axes,) = drawn("contact", {"contact": facts}).axes
+    assert [line.get_ydata().tolist() for line in axes.lines] == [[0.1, 1, 2], [0.1, 0.2, 0.4]]
+    (axes,) = drawn("contact", {"contact": facts | {"without_loads_N": None}}).axes
+    assert [line.get_ydata().tolist() for line in axes.lines] == [[0.1, 0.2, 0.4]]
+    assert axes.get_ylim()[0] == 0
+
+
 def test_a_changed_parameter_reaches_beyond_the_limits(drawn: Draw) -> None:
     for largest, ticks in ((-8.0, [-3, 0, 3]), (40.0, [-30, -3, 0, 3, 30]), (4000.0, [-3000, -30, -3, 0, 3, 30, 3000])):
         sigmas = [largest, None, *[0.5] * 13]

@@ -79,7 +79,7 @@ def test_a_comparison_names_what_changed_by_more_than_chance() -> None:
         {"name": "p_sensor_com_m.z", "change": -0.00012, "sigmas": None},
     ]
     found = {"id": "29ce87", "verdict": "good", "mass_kg": 1.23456, "same_data": False, "groups": groups,
-             "parameters": parameters}  # fmt: skip
+             "sensors": ["assumed", "assumed"], "parameters": parameters}  # fmt: skip
     section = comparison({"comparison": found, "compared_with": "old.json"})
     assert section.text[0] == "Compared with old.json: id 29ce87, good, mass 1.2346 kg."
     assert section.text[1] == "Changed by more than chance explains: force bias."

@@ -22,16 +22,18 @@ from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.model import predict
 from ftcalib.result import MotionResult
 from ftcalib.routine import PoseRecord, TourPose
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.report.document import shown_poses
-from ftdrive.report.facts import about_of, compared, error_map, facts_of, orientations
+from ftdrive.report.facts import about_of, compared, contact_error, error_map, facts_of, orientations
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.report import report
 from ftdrive.report.sections import sections_of
 from ftdrive.report.subject import Subject, read_subject
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.source import SolveOptions
+from ftdrive.terminal.report import tip_of
 from ftdrivers.interfaces import FtSamples
 
 TRUTH = Parameters(
@@ -129,7 +131,7 @@ def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
     assert markdown.count("\n| ml |") == 1
     assert all(section.title in page().text for section in sections_of(facts()))
     assert [section.name for section in sections_of(facts())] == [
-        *("estimates", "error", "cross-validation", "residuals", "drift"),
+        *("estimates", "error", "contact", "cross-validation", "residuals", "drift"),
         *("noise", "coverage", "tour", "comparison", "provenance"),
     ]
 
@@ -139,7 +141,7 @@ def test_a_result_in_motion_is_not_reported_as_poses() -> None:
     found = facts_of(Subject(Path("sweep"), replace(result(), motion=motion), ""))
     named = {section.name: section for section in sections_of(found)}
     assert list(named) == [
-        *("estimates", "error", "motion", "residuals", "coverage", "tour", "comparison", "provenance"),
+        *("estimates", "error", "contact", "motion", "residuals", "coverage", "tour", "comparison", "provenance"),
     ]
     assert "parts of the motion" in named["estimates"].text[0]
     assert [figure.name for figure in named["residuals"].figures] == ["time_residuals"]
@@ -238,6 +240,41 @@ def test_the_map_names_the_direction_of_flange_z() -> None:
     np.testing.assert_allclose(R[1, 1, :, :, 2], np.broadcast_to([0, 1, 0], (12, 3)), atol=1e-12)
     tilted = error_map(with_covariance({2: 0.01**2}))["force_N"]
     assert "z" not in tilted["words"]
+
+
+def test_a_contact_has_the_sigma_of_its_sensor_with_and_without_loads() -> None:
+    usual = SensorMatrix.usual()
+    made = {"created_utc": "2026-11-20T08:00:00+00:00"}
+    sensor = replace(
+        usual, source="loads", error=0.02 * np.eye(6), covariance=usual.covariance / 100, floor=0.0, provenance=made
+    )
+    before, now = result(), replace(result(), sensor=sensor)
+    assumed, known = (contact_error(one) for one in (before, now))
+    assert (assumed["without_loads_N"], assumed["tool"]) == (None, None)
+    assert known["without_loads_N"] == assumed["sigma_N"]
+    assert max(known["sigma_N"][1:]) < 0.6 * max(assumed["sigma_N"])
+    assert known["sigma_N"][0] == assumed["sigma_N"][0] == pytest.approx(before.likely_error()[0])
+    assert known["tool"]["mass_kg"] == pytest.approx(before.mass_kg / 1.02)
+    # The figure is the mean over all directions of what `contact_sigma` says of one.
+    force = np.random.default_rng(2).normal(size=(4000, 3))
+    force *= 100 / np.linalg.norm(force, axis=1)[:, None]
+    wrench = np.concatenate([force, np.cross(tip_of(before), force)], axis=1)
+    R = Rotation.random(len(force), rng=3).as_matrix()
+    each = np.sqrt(np.mean(np.sum(before.contact_sigma(wrench, R)[:, :3] ** 2, axis=1)))
+    assert assumed["sigma_N"][-1] == pytest.approx(each, rel=0.02)
+    assert "errors of the sensor are assumed, not measured" in assumed["words"]
+    assert "known from loads, sensor.json of 2026-11-20" in known["words"]
+    page = report({**facts(), "contact": known, "comparison": compared(now, before)}, "md")
+    assert f"the tool weighs {before.mass_kg / 1.02:.4f} kg" in page
+    assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 now" in page
+
+
+def test_the_tip_is_the_far_end_of_the_described_tool() -> None:
+    R = result().R_flange_sensor
+    np.testing.assert_allclose(R @ tip_of(result()), [0, 0, 0.2], atol=1e-12)
+    setup = {"cylinders_mm": [[0, 40, 80], [40, 170, 20, 5, -3]], "height_mm": 30}
+    described = replace(result(), provenance={"setup": setup})
+    np.testing.assert_allclose(R @ tip_of(described), [0.005, -0.003, 0.14])
 
 
 def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:

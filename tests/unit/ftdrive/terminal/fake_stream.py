@@ -231,8 +231,8 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
         if not loaded:
             return SIGMA / 3 if duration_s else SIGMA
         # 2 % of a gain, on all axes alike
-        force_N = np.linalg.norm(self._contact(np.array([self.now_ns]))[0, :3])
-        return np.hypot(SIGMA / 3, 0.02 * force_N * np.repeat([1.0, 0.067], 3))
+        force_N = float(np.linalg.norm(self._contact(np.array([self.now_ns]))[0, :3]))
+        return np.asarray(np.hypot(SIGMA / 3, 0.02 * force_N * np.repeat([1.0, 0.067], 3)))
 
     def tare(self) -> StreamEvent:
         if self.scenario == "tare-refused":
