@@ -74,6 +74,9 @@ def diff(first: str, second: str, as_json: bool) -> None:
     for name, side in (("A", a), ("B", b)):
         made = (side.created_utc or "unknown time")[:16].replace("T", " ")
         echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
+    before, after = _sensor(a), _sensor(b)
+    if None not in (before, after) and before != after:
+        echo(f"One contact reads differently: errors of the sensor are {before} in A, {after} in B.")
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
     echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
@@ -109,6 +112,14 @@ def _side(text: str) -> _Side:
         raise ConfigError(f"{text} is the beginning of {ids}: give more digits")
     one = found[0]
     return _Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
+
+
+def _sensor(side: _Side) -> str | None:
+    """Say on what the errors of the sensor under contact rest; None for a result of the store, which has no sensor."""
+    from ftcalib import CalibrationResult
+    from ftdrive.terminal.report import sensor_in_words
+
+    return sensor_in_words(side.calibrated) if isinstance(side.calibrated, CalibrationResult) else None
 
 
 def _line(label: str, change: float, sigma: float) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.commands.common import CellOptions, Source, index_run
@@ -176,6 +177,20 @@ def test_two_calibrations_are_compared_by_file_run_and_id(run: Callable[..., Ran
         assert change == pytest.approx(scale * one["change"], abs=0.06 * scale * one["sigma"])
     assert out.splitlines()[-1].endswith("): force bias.")
     assert run("diff", first.id, first.id)[1].splitlines()[-1] == "The calibrations are the same."
+
+
+def test_one_tool_on_a_sensor_with_and_without_loads_reads_contacts_differently(
+    run: Callable[..., Ran], runs: Path
+) -> None:
+    alone = runs / "gripper-0" / "calibration.json"
+    made = {"created_utc": "2026-11-20T08:00:00+00:00"}
+    sensor = replace(SensorMatrix.usual(), source="loads", provenance=made)
+    replace(CalibrationResult.load(alone), sensor=sensor).save(runs / "loads.json")
+    out = run("diff", alone, runs / "loads.json")[1].splitlines()
+    assert "assumed" in out[2]
+    assert "in A" in out[2]
+    assert "sensor.json of 2026-11-20 in B" in out[2]
+    assert not [line for line in run("diff", alone, alone)[1].splitlines() if "contact" in line]
 
 
 def test_a_result_whose_run_is_gone_is_compared_from_the_store(run: Callable[..., Ran], runs: Path) -> None:
