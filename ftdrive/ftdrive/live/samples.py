@@ -117,7 +117,8 @@ class Block(Paired):
     in_contact: NDArray[np.bool_]
     """(n,) see `Sample`."""
     sigma: Array
-    """(6,) standard deviation of one sample of `wrench`: noise and calibration, N and N·m, in `frame`."""
+    """(6,) standard deviation of one sample of `wrench`, N and N·m, in `frame`: noise, calibration, and errors of the
+    sensor under the present contact."""
     frame: WrenchFrame
     stages: Stages
 
