@@ -135,6 +135,25 @@ def test_too_few_poses_to_do_without_what_is_known_blame_nothing() -> None:
     assert blamed(solve(few, known=known)) == []
 
 
+def test_the_printed_result_separates_free_air_and_contact(capsys: pytest.CaptureFixture[str]) -> None:
+    result = solve(tilted())
+    print_result(result)
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith(" under contact: "))
+    sigma_N = np.sqrt(result.likely_error()[0] ** 2 + _share(result) * 100.0**2)
+    assert f"100 N at the tip ± {sigma_N:.2g} N (1 sigma)" in line
+    print_result(solve(tilted(), known=Known(mass_kg=0.61)))
+    assert "under contact" not in capsys.readouterr().out, "a rejected result promises nothing"
+
+
+def _share(result: CalibrationResult) -> float:
+    """Squared error of a force at 200 mm below the flange, relative to the force, over random directions."""
+    force = np.random.default_rng(7).normal(size=(20_000, 3))
+    force /= np.linalg.norm(force, axis=1)[:, None]
+    p = result.R_flange_sensor.T @ [0.0, 0.0, 0.2]
+    C = result.contact.covariance(np.concatenate([force, np.cross(p, force)], axis=1), result.covariance[:3, :3])
+    return float(np.trace(C[:, :3, :3], axis1=1, axis2=2).mean())
+
+
 def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
     result = solve(tilted())
     print_result(result, truth=result.to_dict())
