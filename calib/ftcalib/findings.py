@@ -483,12 +483,11 @@ CODES: Final[Mapping[str, Code]] = {
     "matrix_changed": Code(_REJECT, "the matrix of the sensor differs by {sigmas:.1f} sigma of what was known, most in "
         "{entry}", "check masses and places, then accept it with --accept"),
     # Notes
-    **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected for "
-        "this load") for axis in "xyz"},
-    "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected for this load"),
-    "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected for this "
-        "load"),
-    "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected for this load"),
+    **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected"
+        ) for axis in "xyz"},
+    "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected"),
+    "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected"),
+    "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected"),
     "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g} turns with the orientation, as of a cable that acts as a "
         "spring; it may have moved the centre of mass by {shift_mm:.2g}, which sigma allows for",
         "give the cable more slack"),

@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib.after.series import Estimated
 from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
-from ftcalib.likelihood.response import LEVER_M, SIZE, Response, response_columns
+from ftcalib.likelihood.response import LEVER_M, USUAL, Response, response_columns
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
 
@@ -17,10 +17,6 @@ from ftcalib.result import CalibrationResult
 GAIN, CROSS = USUAL_GAIN, CROSS_TALK_SHARE * USUAL_GAIN
 # What of the gain depends on the load.
 LOAD = 0.005
-# Of the coefficients of `Response`: two of the diagonal and three of pairs, and for the cross-talk six.
-PRIOR = np.array([GAIN, GAIN, CROSS, CROSS, CROSS, *[CROSS] * 6])
-# Squares of the bases, the sum over their entries.
-_SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 # Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
 TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
 # Correlation of their effects a quarter turn apart.
@@ -30,20 +26,9 @@ _CORRELATED = 0.5
 def known_response(calibration: Estimated, found: Response | None) -> Response | None:
     """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
 
-    None for an update of a calibration that has none. A fit of n poses shows a gain as well as n readings of the weight
-    do, with the error of predicting one from the others. Half of that counts: a small one is not found.
+    None for an update of a calibration that has none.
     """
-    if found is not None or not isinstance(calibration, CalibrationResult):
-        return found
-    quality, n = calibration.quality, calibration.n_poses - len(calibration.rejected_poses)
-    left_out: list[float] = [quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
-    error = np.repeat(left_out, [5, 6]) / np.repeat([1.0, LEVER_M], [5, 6])
-    share = max(calibration.dof, 0) / (6 * n) / 2
-    shown = share * n * _SQUARES * (calibration.weight_N / np.maximum(error, 1e-12)) ** 2
-    covariance = np.zeros((15 + SIZE, 15 + SIZE))
-    covariance[:15, :15] = calibration.covariance
-    covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (PRIOR**-2 + shown)
-    return Response(np.zeros(SIZE), covariance)
+    return calibration.shown_response if found is None and isinstance(calibration, CalibrationResult) else found
 
 
 def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_base_flange: Array) -> Array:
@@ -68,7 +53,7 @@ def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_bas
         Independent columns, the errors of `known` not among them.
     """
     square = known.coefficients**2 + np.diag(known.covariance)[15:]
-    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / PRIOR**2, [5]))
+    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / USUAL**2, [5]))
     u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - tool.p_sensor_com_m)
     entries = np.where(np.eye(3) > 0, GAIN, CROSS)
     columns = np.zeros((len(u), 6, 27))

@@ -29,7 +29,7 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
-from ftcalib.after.cell_errors import PRIOR, smooth_errors
+from ftcalib.after.cell_errors import smooth_errors
 from ftcalib.after.state import Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
@@ -37,6 +37,7 @@ from ftcalib.files import JSON
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.response import (
     SIZE,
+    USUAL,
     hysteresis_columns,
     joint_covariance,
     joint_jacobian,
@@ -239,7 +240,7 @@ def expected_with_smooth_errors(
     explanations, likelihood = [], []
     for share, of_gain, *of_kinds in product((0.0, OTHER_JOINTS), USUAL_GAINS, USUAL_SMOOTH, USUAL_SMOOTH):
         square = np.square(of_kinds)
-        alike, gain = (1 - share) * square, np.where(sizes > 0, sizes, of_gain * PRIOR) ** 2
+        alike, gain = (1 - share) * square, np.where(sizes > 0, sizes, of_gain * USUAL) ** 2
         S = D + np.tensordot(alike, smooth, 1) + np.tensordot(share * square, alone, 1) + (T * gain) @ T.T
         to_new = np.tensordot(alike, between, 1) + (T_new * gain) @ T.T
         L = np.linalg.cholesky(S)
