@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, NotObservable, solve
+from ftcalib.compensation import Compensator
 from ftcalib.judge.observability import (
     ACCEPTED_DELTA_CHI2,
     AMBIGUOUS_GAP,
@@ -32,6 +33,13 @@ GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 # `RunningFit.predict` returns None if its sigma of the force is more than this share of the weight.
 TRUSTED_SHARE = 0.05
+
+
+def free_wrench(result: CalibrationResult, R_base_flange: Array) -> Array:
+    """Return the wrench (6,), N and N·m, that the sensor reads of a free tool at an orientation (3, 3)."""
+    # As read: the decoder of contacts is left out, which would scale a large bias too.
+    compensator = Compensator(result.parameters, response=result.response)
+    return np.asarray(-compensator(np.zeros(6), R_base_flange), dtype=np.float64)
 
 
 class RunningFit:
@@ -104,7 +112,7 @@ class RunningFit:
         sigma_N = float(np.sqrt(np.trace(result.wrench_covariance(R_base_flange)[:3, :3])))
         if sigma_N > TRUSTED_SHARE * result.weight_N:
             return None
-        return -result.compensate(np.zeros(6), R_base_flange)
+        return free_wrench(result, R_base_flange)
 
     def _trusted(self) -> CalibrationResult | None:
         result = self.result

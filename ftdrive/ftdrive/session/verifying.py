@@ -21,6 +21,7 @@ from ftdrive.planning.search.nodes import WRIST_6_RAD, from_usual_wrist
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import fitted_dataset
 from ftdrive.session.events import Compared
+from ftdrive.session.live_fit import free_wrench
 from ftdrive.session.open_session import Judge
 
 POSES: Final = 6
@@ -149,7 +150,7 @@ class RunningComparison:
         norms = ((np.linalg.norm(one[:3]), np.linalg.norm(one[3:])) for one in seen)
         if len(seen) < HOLDS_POSES or any(force_N > HOLDS_N or torque_Nm > HOLDS_NM for force_N, torque_Nm in norms):
             return None
-        return -self._calibration.compensate(np.zeros(6), R_base_flange)
+        return free_wrench(self._calibration, R_base_flange)
 
     def _is_fresh(self, R_base_flange: Array) -> bool:
         if not len(self._R_fitted):
