@@ -12,7 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.data.dataset import CalibrationDataset
-from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance
+from ftcalib.data.dwell_mean import (
+    LEAST_SAMPLES,
+    PoseMean,
+    is_quiet,
+    is_stationary,
+    mean_and_covariance,
+    without_swing,
+)
 from ftcalib.errors import NotObservable, TooFewSamples
 from ftcalib.model import Array
 from ftcalib.sampling import Sampling
@@ -119,11 +126,14 @@ class PoseRecord:
     """Dwells until this one, which was steady or the last."""
     clock_offset_ns: int = 0
     """From the host clock to the clock of the run, which may span a restart of the computer."""
+    swings: bool = False
+    """A weight hangs on a string: its swing is no part of the mean."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mean", mean_and_covariance(self.samples.wrench))
+        wrench = _without_swing(self.samples)[0] if self.swings else self.samples.wrench
+        object.__setattr__(self, "mean", mean_and_covariance(wrench))
 
     @property
     def t_mid_ns(self) -> int:
@@ -147,7 +157,7 @@ class DriftCheck:
         return {"change": self.change.tolist(), "sigma": self.sigma.tolist(), "elapsed_s": self.elapsed_s}
 
 
-def take_pose(
+def take_pose(  # noqa: PLR0913 - what a pose is judged by
     arm: Arm,
     sensor: Sensor,
     stop: int,
@@ -157,6 +167,7 @@ def take_pose(
     guard: Callable[[], None] | None = None,
     on_stage: Callable[[Stage], None] = lambda _: None,
     quiet_std: Array | None = None,
+    most_swing_N: float | None = None,
 ) -> PoseRecord:
     """Wait until the arm is still, and average; repeat if arm or wrench changed during the dwell.
 
@@ -172,6 +183,8 @@ def take_pose(
         Called at the start of each stage.
     quiet_std : array, shape (6,), optional
         Standard deviation of the samples of an arm at rest. A dwell with more than twice that is not steady.
+    most_swing_N : float, optional
+        A weight hangs on a string: amplitude of its force above which a dwell is not steady.
 
     Raises
     ------
@@ -190,14 +203,21 @@ def take_pose(
         after = arm.state()
         guard()
         steady = turned_rad(before, after) < MOVED_RAD
+        wrench = samples.wrench
+        if most_swing_N is not None:
+            wrench, amplitude = _without_swing(samples)
+            steady = steady and bool(np.linalg.norm(amplitude[:3]) <= most_swing_N)
         if steady:
-            wrench = samples.wrench
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
         # The last attempt is kept even if it is noisy: its covariance says so, and a tour needs its pose.
-        record = PoseRecord(stop, pose, before, after, samples, steady, attempt)
+        record = PoseRecord(stop, pose, before, after, samples, steady, attempt, swings=most_swing_N is not None)
         if steady:
             break
     return record
+
+
+def _without_swing(samples: WrenchSamples) -> tuple[Array, Array]:
+    return without_swing(samples.wrench, float(samples.t_host_ns[-1] - samples.t_host_ns[0]) * 1e-9)
 
 
 def _collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:

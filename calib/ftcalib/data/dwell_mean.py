@@ -24,6 +24,13 @@ QUIET = 4.5
 # A dwell that scatters more than this factor times the noise of the sensor is not quiet, even if its halves agree.
 RESTLESS = 2.0
 
+# Frequencies at which a weight swings on a string of 100 to 500 mm.
+SWING_HZ = (0.7, 1.6)
+# A swing explains at least this share of the scatter of all channels, which white noise does not reach.
+SWING_SHARE = 0.25
+# Means of about so many parts of a dwell show its frequency.
+SWING_BLOCKS = 200
+
 # Differences of this size, relative to the largest value, are rounding errors.
 ROUNDING = 1e-9
 
@@ -74,6 +81,58 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     np.fill_diagonal(correlation, 1.0)
     sigma = np.sqrt(variance)
     return PoseMean(mean, correlation * np.outer(sigma, sigma))
+
+
+def without_swing(wrench: Array, duration_s: float) -> tuple[Array, Array]:
+    """Take the swing of a weight on a string out of a dwell: two harmonics of one frequency, if significant.
+
+    The mean of what is left is the constant of the fit. A plain mean would keep a part of the swing, because a dwell
+    hardly ever holds whole periods.
+
+    Parameters
+    ----------
+    wrench : array, shape (N, 6)
+        Consecutive samples, evenly spaced, N and N·m; N >= 20.
+    duration_s : float
+        From the first to the last; at least three periods of the longest string, of 1.4 s, are best.
+
+    Returns
+    -------
+    left : array, shape (N, 6)
+        The samples without the swing; the samples themselves if none is significant.
+    amplitude : array, shape (6,)
+        Of the first harmonic; zero if none is significant.
+
+    Raises
+    ------
+    BadDataset
+        Too few samples, or a value that is not finite.
+    """
+    wrench = _require_samples(wrench)
+    N = len(wrench)
+    t_s = duration_s * np.linspace(0.0, 1.0, N)
+    size = max(1, N // SWING_BLOCKS)
+    blocks = wrench[: N // size * size].reshape(-1, size, 6).mean(axis=1)
+    middle_s = t_s[: N // size * size].reshape(-1, size).mean(axis=1)
+    scale = blocks.std(axis=0)
+    blocks = (blocks - blocks.mean(axis=0)) / np.where(scale > 0, scale, 1.0)
+
+    def left_of(frequency_Hz: float) -> float:
+        X = _harmonics(middle_s, frequency_Hz)
+        return float(np.square(blocks - X @ np.linalg.lstsq(X, blocks)[0]).sum())
+
+    best_Hz = min(np.arange(*SWING_HZ, 0.02), key=left_of)
+    best_Hz = min(best_Hz + np.arange(-0.02, 0.02, 0.002), key=left_of)
+    if left_of(best_Hz) > (1 - SWING_SHARE) * np.square(blocks).sum():
+        return wrench, np.zeros(6)
+    X = _harmonics(t_s, best_Hz)
+    found = np.linalg.lstsq(X, wrench)[0]
+    return wrench - X[:, 1:] @ found[1:], np.hypot(found[1], found[2])
+
+
+def _harmonics(t_s: Array, frequency_Hz: float) -> Array:
+    phase = 2 * np.pi * frequency_Hz * t_s
+    return np.column_stack([np.ones_like(t_s), *(f(k * phase) for k in (1, 2) for f in (np.cos, np.sin))])
 
 
 def is_stationary(wrench: Array) -> bool:

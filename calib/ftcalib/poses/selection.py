@@ -67,6 +67,36 @@ def cone_candidates(
     tilt = np.repeat(np.repeat(tilts, counts), spins)
     azimuth = np.repeat(np.concatenate([2 * np.pi * np.arange(count) / count for count in counts]), spins)
     spin = np.tile(2 * np.pi * np.arange(spins) / spins, counts.sum())
+    return _tilted(azimuth, tilt, spin, down_base)
+
+
+def tilted_candidates(
+    tilts_rad: ArrayLike, azimuths: int, spin_rad: float, down_base: ArrayLike = (0.0, 0.0, -1.0)
+) -> Array:
+    """Orientations with the tool axis (flange z) at these angles from straight down, without turns about that axis.
+
+    Parameters
+    ----------
+    tilts_rad : array_like, shape (k,)
+    azimuths : int
+        Directions of each tilt, evenly spaced.
+    spin_rad : float
+        Turn about the tool axis that all of them have.
+    down_base : array_like, shape (3,)
+        Direction of gravity in base, a unit vector.
+
+    Returns
+    -------
+    array, shape (k * azimuths, 3, 3)
+        R_base_flange.
+    """
+    tilt = np.repeat(np.asarray(tilts_rad, dtype=np.float64), azimuths)
+    azimuth = np.resize(2 * np.pi * np.arange(azimuths) / azimuths, len(tilt))
+    return _tilted(azimuth, tilt, np.full(len(tilt), spin_rad), down_base)
+
+
+def _tilted(azimuth: Array, tilt: Array, spin: Array, down_base: ArrayLike) -> Array:
+    """R_base_flange (m, 3, 3) of a tool that points down, tilted towards the azimuth and turned about its axis."""
     tilted = Rotation.from_euler("ZYZ", np.column_stack([azimuth, tilt, spin - azimuth]))
     down = np.asarray(down_base, dtype=np.float64)
     normal = np.cross([0.0, 0.0, -1.0], down)

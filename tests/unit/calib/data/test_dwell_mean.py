@@ -12,6 +12,7 @@ from ftcalib.data.dwell_mean import (
     is_quiet,
     noise_level,
     restless_channels,
+    without_swing,
 )
 from ftcalib.model import Array
 
@@ -326,3 +327,32 @@ def test_invalid_targets_are_rejected() -> None:
         chosen(broken)
     with pytest.raises(BadDataset, match="too short"):
         averaging_time(white(10), 0.0, target_force_N=1.0, target_torque_Nm=1.0)
+
+
+def swinging(amplitude_rad: float, seed: int) -> tuple[Array, Array]:
+    """Four seconds (N, 6) under 2 kg on a string of 300 mm, with noise, and what it reads at rest (6,)."""
+    rng, t_s = np.random.default_rng(seed), np.arange(0, 4, 1 / 250)
+    angle = amplitude_rad * np.cos(np.sqrt(9.81 / 0.3) * t_s + rng.uniform(0, 2 * np.pi))
+    # Tension of a pendulum to the second order of its angle.
+    tension = 2 * 9.81 * (1 + amplitude_rad**2 - 1.5 * angle**2)
+    force = np.column_stack([tension * np.sin(angle), 0 * t_s, -tension * np.cos(angle)])
+    torque = np.cross([0.0, 0.0, 0.2], force)
+    noise = rng.normal(size=(len(t_s), 6)) * np.repeat([0.1, 0.005], 3)
+    return np.hstack([force, torque]) + noise, np.array([0, 0, -2 * 9.81, 0, 0, 0])
+
+
+def test_a_swing_is_no_part_of_a_mean() -> None:
+    for seed in range(5):
+        wrench, rest = swinging(np.radians(4.0), seed)
+        left, amplitude = without_swing(wrench, 4.0)
+        assert left.mean(axis=0) == pytest.approx(rest, abs=0.03)
+        assert amplitude[0] == pytest.approx(2 * 9.81 * np.radians(4.0), rel=0.02)
+        assert is_quiet(left, np.repeat([0.1, 0.005], 3))
+
+
+def test_a_dwell_without_a_swing_stays_as_it_is() -> None:
+    for seed in range(5):
+        wrench, _ = swinging(0.0, seed)
+        left, amplitude = without_swing(wrench, 4.0)
+        assert left is wrench
+        assert not amplitude.any()
