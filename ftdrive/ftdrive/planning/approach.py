@@ -76,6 +76,8 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
         return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
     now, first = checked_joints(q_now), checked_joints(q_first)
+    if certifier.arm.hung is not None:
+        speeds = speeds.limited(Speeds.with_hung_load())
     direct = certifier.certify(now, first, tight=False).clear[0]
     whole = np.vstack([now, first if direct else _around(certifier, now, first, speeds)])
     certificate = certifier.certify(whole[:-1], whole[1:])

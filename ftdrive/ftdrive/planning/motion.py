@@ -27,6 +27,11 @@ class Speeds:
         """Return the slow limits for a plan that has not run in its workcell yet."""
         return cls(float(np.radians(30)), float(np.radians(40)))
 
+    @classmethod
+    def with_hung_load(cls) -> "Speeds":
+        """Return the limits with a weight on a string: slow against its period of a second, so it hardly swings."""
+        return cls(float(np.radians(15)), float(np.radians(20)), 0.1)
+
     def limited(self, other: "Speeds") -> "Speeds":
         """Return the smaller of each limit."""
         return Speeds(
@@ -76,10 +81,11 @@ def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
 
 
 def tips(arm: ArmModel, q_rad: Array) -> Array:
-    """Centres (n, k, 3) in base of the far ends of the tool's cylinders."""
+    """Centres (n, k, 3) in base of the far ends of the tool's cylinders, then the hook of a load."""
     # Centres of the far ends; a point on the rim may be somewhat faster.
     at = arm.frames(q_rad)
-    local = np.array([[part.x_m, part.y_m, part.to_m] for part in arm.tool])
+    hook = [] if arm.hung is None else [arm.hung.p_flange_m]
+    local = np.array([*((part.x_m, part.y_m, part.to_m) for part in arm.tool), *hook])
     return np.asarray(at.flange_m[:, None] + local @ np.swapaxes(at.R_base_flange, 1, 2))
 
 

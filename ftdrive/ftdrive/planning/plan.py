@@ -52,7 +52,7 @@ class Plan:
     """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
-    """constant, wrist, posture, box, cone, reachable, tool, sets, verification or sweep."""
+    """constant, wrist, posture, box, cone, reachable, tool, sets, hung, verification or sweep."""
     why: tuple[str, ...]
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]
@@ -381,6 +381,7 @@ def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[s
         "model": certifier.arm.name,
         "kinematics": kinematics_of(certifier),
         "tool": [asdict(part) for part in certifier.arm.tool],
+        **({} if certifier.arm.hung is None else {"hung": asdict(certifier.arm.hung)}),
         "scene": certifier.scene.describe(),
         "margins": asdict(certifier.margins),
         "speeds": asdict(speeds),
@@ -411,10 +412,11 @@ def ball_of(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Arr
 
 def fingerprints(certifier: Certifier) -> dict[str, str]:
     """SHA-256 of everything that a proof of clearance depends on."""
+    hung = [] if certifier.arm.hung is None else [asdict(certifier.arm.hung)]
     return {
         "model": digest(certifier.arm.describe()),
         "kinematics": digest(kinematics_of(certifier)),
-        "tool": digest([asdict(part) for part in certifier.arm.tool]),
+        "tool": digest([*(asdict(part) for part in certifier.arm.tool), *hung]),
         "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
     }
 
@@ -501,7 +503,7 @@ def _summary(plan: Plan) -> list[str]:
         f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
         f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         plan.room_in_words(),
-        *([] if plan.kind in ("verification", "tool") else [_accuracy(plan)]),
+        *([] if plan.kind in ("verification", "tool", "hung") else [_accuracy(plan)]),
     ]
 
 

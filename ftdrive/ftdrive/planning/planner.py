@@ -15,14 +15,14 @@ from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.errors import ConfigError, PlanRefused
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, HungLoad
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene, lean_of
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan, make_plan
 from ftdrive.planning.search import nodes
-from ftdrive.planning.search.chosen import Chosen, chosen_tour, tour_of_sets, verification_tour
+from ftdrive.planning.search.chosen import Chosen, chosen_tour, hung_tour, tour_of_sets, verification_tour
 from ftdrive.planning.search.nodes import WRIST_6_RAD, box_nodes, with_room, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour
 from ftdrive.planning.sweep_planner import plan_sweep
@@ -33,6 +33,8 @@ USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 # Poses of a new tool on a calibrated cell.
 TOOL_POSES = 4
+# Tilts with a load on a string.
+HUNG_POSES = 12
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
 # Orientations of a random set beyond those wanted: most of them are reachable.
@@ -148,6 +150,38 @@ def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: 
         )
     why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(found)]
     plan = make_plan("tool", why, certifier, found.numbers, found.q_rad, speeds, guess)
+    return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
+
+
+def plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
+    """Plan a tour of tilts with a load on a string: its hook stays at one point, and the arm turns about it.
+
+    Parameters
+    ----------
+    q_rad, guess
+        As of `plan_tour`.
+
+    Raises
+    ------
+    PlanRefused
+        Too few tilts are reachable by moves that are proven clear.
+    """
+    speeds = speeds.limited(Speeds.with_hung_load())
+    found = hung_tour(certifier, checked_joints(q_rad), HUNG_POSES, speeds)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {HUNG_POSES} tilts of 45 to 75 degrees is reachable and proven clear with the hanging load: "
+            "jog the arm to where the load has room below and around it, or hang it from another point of the tool"
+        )
+    numbers, q, hook_m = found
+    share = np.linspace(0, 1, 41)[:, None, None]
+    between = ((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)
+    away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
+    why = [
+        f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_point(hook_m)} at each of them, and within "
+        f"{away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
+    ]
+    plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
     return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
 
 
@@ -393,6 +427,8 @@ def plan_for(
         made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
     elif sets is not None:
         made = plan_sets(certifier, q_rad, sets, speeds=speeds, guess=guess)
+    elif certifier.arm.hung is not None:
+        made = plan_hung(certifier, q_rad, speeds=speeds, guess=guess)
     elif poses == TOOL_POSES:
         made = plan_tool(certifier, q_rad, speeds=speeds, guess=guess)
     else:
@@ -415,7 +451,12 @@ def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds:
     return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 
 
-def certifier_for(cell: CellConfig, model: str | None, kinematics: Kinematics | None = None) -> Certifier:
+def certifier_for(
+    cell: CellConfig,
+    model: str | None,
+    kinematics: Kinematics | None = None,
+    p_flange_hook_m: tuple[float, float, float] | None = None,
+) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
     Parameters
@@ -425,6 +466,8 @@ def certifier_for(cell: CellConfig, model: str | None, kinematics: Kinematics | 
         Model of the arm, as reported by the controller or configured.
     kinematics : Kinematics, optional
         The arm's own; without them nominal ones, and more distance is kept.
+    p_flange_hook_m : (float, float, float), optional
+        Where a load hangs from the tool on a string.
 
     Raises
     ------
@@ -437,7 +480,9 @@ def certifier_for(cell: CellConfig, model: str | None, kinematics: Kinematics | 
         raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
-    arm = ArmModel(model, [_cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics)
+    x, y, z = scene.down_base.tolist()
+    hung = None if p_flange_hook_m is None else HungLoad(p_flange_hook_m, (x, y, z))
+    arm = ArmModel(model, [_cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics, hung)
     certifier = Certifier(arm, scene)
     require_possible(cell, model)
     return certifier

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import Declined
-from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
+from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder, HungLoad
 from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
@@ -381,13 +381,16 @@ class SteppedWatcher(Watcher):
 
 
 @lru_cache(maxsize=100)
-def _planned(cell: CellConfig, model: str, q_rad: tuple[float, ...], poses: int, sets: str | None) -> Plan:
-    return plan_for(cell, certifier_for(cell, model), np.array(q_rad), poses, sets=sets)
+def _planned(
+    cell: CellConfig, model: str, hung: HungLoad | None, q_rad: tuple[float, ...], poses: int, sets: str | None
+) -> Plan:
+    certifier = certifier_for(cell, model, None, None if hung is None else hung.p_flange_m)
+    return plan_for(cell, certifier, np.array(q_rad), poses, sets=sets)
 
 
 def planned_once(cell: CellConfig, certifier: Certifier, q_rad: Array, poses: int, *, sets: str | None = None) -> Plan:
     """As `plan_for`, but the same question is answered from memory: planning takes most of a test's time."""
-    return _planned(cell, certifier.arm.name, tuple(q_rad.tolist()), poses, sets)
+    return _planned(cell, certifier.arm.name, certifier.arm.hung, tuple(q_rad.tolist()), poses, sets)
 
 
 _certify, _certificates = Certifier.certify, dict[tuple[object, ...], Certificate]()
@@ -398,7 +401,7 @@ def certify_once(certifier: Certifier, start_rad: ArrayLike, end_rad: ArrayLike,
     """As `Certifier.certify`, but the same moves are proven once: a session proves its plan again before it moves."""
     moves = np.stack([start_rad, end_rad])
     arm = certifier.arm
-    key = (arm.name, arm.tool, repr(certifier.scene), certifier.margins, moves.tobytes(), tight)
+    key = (arm.name, arm.tool, arm.hung, repr(certifier.scene), certifier.margins, moves.tobytes(), tight)
     if key not in _certificates:
         _certificates[key] = _certify(certifier, *moves, tight=tight)
     return _certificates[key]

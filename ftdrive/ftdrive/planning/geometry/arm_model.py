@@ -13,7 +13,7 @@ Models without measured shapes are refused.
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -277,6 +277,42 @@ class Cylinder:
         return self.offset_m + self.diameter_m / 2
 
 
+# The largest weight on the longest string that a plan keeps clear.
+STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M = 0.25, 0.1, 0.06
+
+
+@dataclass(frozen=True, slots=True)
+class HungLoad:
+    """A weight that hangs on a string from a point of the tool, straight down in base axes in every posture."""
+
+    p_flange_m: tuple[float, float, float]
+    """The hook, in flange axes from the centre of the flange face."""
+    down_base: tuple[float, float, float]
+    """Unit vector along gravity."""
+    string_m: float = STRING_M
+    height_m: float = WEIGHT_HEIGHT_M
+    """Of the weight below the string."""
+    radius_m: float = WEIGHT_RADIUS_M
+    """Of the weight."""
+    swing_rad: float = float(np.radians(10))
+    """It may swing so far: the body of the weight is wider by as much."""
+    free_m: float = 0.05
+    """Length of the string below the hook that may be close to the tool."""
+
+    @property
+    def swing_m(self) -> float:
+        """How far the end of the string swings aside."""
+        return float(self.string_m * np.sin(self.swing_rad))
+
+    @property
+    def reach_m(self) -> float:
+        """Largest distance of a point of it from the hook."""
+        return float(np.hypot(self.string_m + self.height_m, self.radius_m + self.swing_m))
+
+
+# Bodies of a hung load, after those of the tool: ends below the hook and radius.
+_HUNG: Final = ("string", "load")
+
 # Name of each body of the arm, and how many joints move it.
 _ARM = (
     ("base", 0),
@@ -313,9 +349,17 @@ class ArmModel:
     tool : sequence of Cylinder
     kinematics : Kinematics, optional
         The arm's own; without them nominal ones, from which a real arm differs: `Certifier` then keeps more distance.
+    hung : HungLoad, optional
+        A weight on a string.
     """
 
-    def __init__(self, model: str, tool: Sequence[Cylinder], kinematics: Kinematics | None = None) -> None:
+    def __init__(
+        self,
+        model: str,
+        tool: Sequence[Cylinder],
+        kinematics: Kinematics | None = None,
+        hung: HungLoad | None = None,
+    ) -> None:
         name = model_named(model, controller_major=0)
         if name is None:
             raise ConfigError(
@@ -333,9 +377,11 @@ class ArmModel:
         self.kinematics = kinematics or MODELS[name]
         self.shape = SHAPES[name]
         self.tool = tuple(tool)
-        self.names = tuple(name for name, _ in _ARM) + tuple(f"tool {i + 1}" for i in range(len(tool)))
-        self.moved_by = np.array([joints for _, joints in _ARM] + [6] * len(tool))
-        self.pairs = _pairs(len(tool))
+        self.hung = hung
+        beyond = [*(f"tool {i + 1}" for i in range(len(tool))), *(() if hung is None else _HUNG)]
+        self.names = (*(name for name, _ in _ARM), *beyond)
+        self.moved_by = np.array([joints for _, joints in _ARM] + [6] * len(beyond))
+        self.pairs = _pairs(len(tool), len(beyond) - len(tool))
         self.travel_m = self._travel()
 
     def frames(self, q_rad: ArrayLike) -> Frames:
@@ -379,6 +425,13 @@ class ArmModel:
         for part in self.tool:
             foot = at.flange_m + at.R_base_flange[:, :, :2] @ np.array([part.x_m, part.y_m])
             parts.append((foot + part.from_m * axis_6, foot + part.to_m * axis_6, part.diameter_m / 2, 0.0))
+        if (hung := self.hung) is not None:
+            hook, down = self.hook_m(at), np.array(hung.down_base)
+            string, bottom = hung.string_m * down, (hung.string_m + hung.height_m) * down
+            parts += [
+                (hook + hung.free_m * down, hook + string, 0.0, 0.0),
+                (hook + string, hook + bottom, hung.radius_m + hung.swing_m, 0.0),
+            ]
         starts, ends, radius, rounding = zip(*parts, strict=True)
         start, end = np.stack(starts, axis=1), np.stack(ends, axis=1)
         length = np.linalg.norm(end - start, axis=2)
@@ -386,12 +439,19 @@ class ArmModel:
         half_length = length.max(axis=0, initial=0.0) / 2  # the same in every posture
         return Bodies((start + end) / 2, axis, half_length, np.array(radius), np.array(rounding))
 
+    def hook_m(self, at: Frames) -> Array:
+        """Points (n, 3) in base from which the load hangs; the centres of the flange faces without one."""
+        return at.flange_m if self.hung is None else at.flange_m + at.R_base_flange @ np.array(self.hung.p_flange_m)
+
     @property
     def ball_m(self) -> float:
         """Radius about the wrist centre of a ball that holds all that the last three joints move, and 15 mm more."""
         (*_, d5_m, d6_m), r = self._lengths_m, self.shape.wrist_radius_m
         parts = [(r, d6_m), *((part.reach_m, d6_m + part.to_m) for part in self.tool)]
         ball_m = max(float(np.hypot(d5_m + reach, height)) for reach, height in parts)
+        if (hung := self.hung) is not None:
+            x_m, y_m, z_m = hung.p_flange_m
+            ball_m = max(ball_m, float(np.hypot(d5_m + np.hypot(x_m, y_m), d6_m + abs(z_m))) + hung.reach_m)
         return ball_m + float(self._off_m[3:].sum()) + 0.015
 
     def describe(self) -> dict[str, Any]:
@@ -416,6 +476,8 @@ class ArmModel:
         length_m = np.linalg.norm(self.kinematics.links_m, axis=1)
         after_m = length_m[::-1].cumsum()[::-1] - length_m
         beyond_m = max(float(np.hypot(part.to_m, part.reach_m)) for part in self.tool)
+        if self.hung is not None:
+            beyond_m = max(beyond_m, float(np.linalg.norm(self.hung.p_flange_m)))
         thick_m = max(self.shape.shoulder_radius_m, *self.shape.upper_arm_hub_m, *self.shape.elbow_hub_m)
         return np.asarray(shift_m + tilt_rad * (after_m + beyond_m + thick_m))
 
@@ -442,7 +504,13 @@ class ArmModel:
             height, reach = d6_m + part.to_m, part.reach_m
             turned = reach if part.offset_m > 0 else 0.0
             wrist.append((float(np.hypot(d5_m + reach, height)), float(np.hypot(height, reach)), turned))
-        rows = np.zeros((len(_ARM) + len(self.tool), 6))
+        if self.hung is not None:
+            # It does not turn with the flange, so every point of it moves as its hook does.
+            x_m, y_m, z_m = self.hung.p_flange_m
+            aside, height = float(np.hypot(x_m, y_m)), d6_m + abs(z_m)
+            hook = float(np.hypot(d5_m + aside, height)), float(np.hypot(height, aside)), aside
+            wrist += [hook] * len(_HUNG)
+        rows = np.zeros((len(self.names), 6))
         hubs = s.upper_arm_hub_m, s.elbow_hub_m, s.forearm_hub_m, s.forearm_end_hub_m
         sideways = max(abs(end) for hub in hubs for end in hub)
         radius = max(s.upper_arm_radius_m, s.elbow_radius_m, s.forearm_radius_m)
@@ -484,16 +552,18 @@ def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
     return bars
 
 
-def _pairs(n_tool: int) -> NDArray[np.intp]:
+def _pairs(n_tool: int, n_hung: int = 0) -> NDArray[np.intp]:
     """Pairs (p, 2) of bodies that can touch. Neighbours on a joint, and what the arm's build keeps apart, are left out.
 
     Upper arm and forearm turn past each other in parallel planes, and so do forearm and the part of wrist 2 along axis
     5. Wrists 1 and 3 are held apart by wrist 2.
     """
     tool = range(_TOOL, _TOOL + n_tool)
+    hung = range(_TOOL + n_tool, _TOOL + n_tool + n_hung)
     beyond_forearm = (*range(_WRIST_1[0], _TOOL), *tool)
     pairs = [(low, high) for low in (0, 1) for high in (*_FOREARM, *beyond_forearm)]
     pairs += [(low, high) for low in _UPPER_ARM for high in beyond_forearm]
     pairs += [(low, high) for low in (_ELBOW_SIDE, *_FOREARM) for high in (_WRIST_2_ALONG_6, _WRIST_3, *tool)]
     pairs += [(low, high) for low in _WRIST_1 for high in tool]
+    pairs += [(low, high) for low in range(_TOOL + n_tool) for high in hung]
     return np.array(pairs)

@@ -68,9 +68,17 @@ class Certifier:
         joint = np.arange(6)
         low, high = arm.moved_by[self._pairs].T
         between = (joint >= low[:, None]) & (joint < high[:, None])
-        # (p, 6) metres of approach a radian of each joint can bring; pairs of the scene after those of the arm.
-        self._lever_m = np.vstack([arm.travel_m[self._pairs[:, 1]] * between, arm.travel_m[self._of_scene[:, 0]]])
+        own_m = arm.travel_m[self._pairs[:, 1]] * between
         self._margin_m = np.repeat([self.margins.self_m, self.margins.scene_m], [len(self._pairs), len(self._of_scene)])
+        if (hung := arm.hung) is not None:
+            # To a body of the arm that a joint turns, the load turns about its hook as far.
+            own_m = own_m + hung.reach_m * ((self._pairs[:, 1:] >= len(arm.names) - 2) & ~between)
+            string = np.flatnonzero(self._pairs[:, 1] == len(arm.names) - 2)
+            # It begins at the tool, and swings towards the rest.
+            to_tool = low[string] == 6
+            self._margin_m[string] += np.where(to_tool, -Margins().self_m, hung.swing_m)
+        # (p, 6) metres of approach a radian of each joint can bring; pairs of the scene after those of the arm.
+        self._lever_m = np.vstack([own_m, arm.travel_m[self._of_scene[:, 0]]])
         if arm.is_nominal:
             self._margin_m += self._lever_m @ NOMINAL_RAD
         self._names = [f"{arm.names[i]} - {arm.names[j]}" for i, j in self._pairs]
@@ -78,6 +86,15 @@ class Certifier:
             f"box {i + 1}" for i in range(len(scene.boxes))
         ]
         self._names += [f"{arm.names[i]} - {things[k]}" for i, k in self._of_scene]
+
+    @property
+    def without_load(self) -> "Certifier":
+        """A certifier for the tool before the load hangs from it."""
+        arm = self.arm
+        if arm.hung is None:
+            return self
+        own = None if arm.is_nominal else arm.kinematics
+        return Certifier(ArmModel(arm.name, arm.tool, own), self.scene, self.margins)
 
     def reach_m(self, off_rad: Array) -> float:
         """Return how much nearer any two bodies can come if each joint is off by up to `off_rad` (6,)."""

@@ -5,17 +5,18 @@ directions out of one plane.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.poses.information import Guess, predicted_sigma
-from ftcalib.poses.selection import choose, choose_verification_poses, cone_candidates
-from ftdrive.planning.geometry.certify import Certifier
+from ftcalib.poses.selection import choose, choose_verification_poses, cone_candidates, tilted_candidates
+from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.geometry.kinematics import wrist_inverse
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.search.nodes import Nodes, grid, wrist_nodes
+from ftdrive.planning.search.nodes import Nodes, grid, hung_nodes, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 
@@ -34,6 +35,12 @@ POSTURE_STEP_DEG = 20
 FIRST_NUMBER = 101
 # Number of tool directions that compare postures.
 LOOKS = 24
+# Tilts of the tool with a load on a string, and how many azimuths each has.
+HUNG_TILTS_DEG, HUNG_AZIMUTHS = (75, 60, 45), 24
+# Azimuths of each tilt that compare places of the hook, and how many places are tried.
+LOOKS_OF_A_TILT, MOST_HOOKS = 8, 4
+# How far the hook may be from its place between two tilts; the first that has a tour.
+HOOK_M = (0.03, 0.06)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,6 +182,106 @@ def tour_of_sets(
     q_now = np.asarray(q_rad, dtype=np.float64)
     found = _first_tour(certifier, q_now, candidates, 1, sum(wanted), first_of_each, speeds)
     return None if found is None else (np.array(found[0]) - FIRST_NUMBER, found[1])
+
+
+def hung_tour(
+    certifier: Certifier, q_rad: ArrayLike, poses: int, speeds: Speeds
+) -> tuple[tuple[int, ...], Array, Array] | None:
+    """Choose tilts with a load on a string, spread evenly about straight down, and find a short closed tour.
+
+    The hook stays at one point at each of them: nearest to where it is, with the tool turned least.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles.
+    poses : int
+        4 or more.
+
+    Returns
+    -------
+    numbers : tuple of int
+        From 101 on, in the order of choice.
+    q_rad : array, shape (n, 6)
+        In the order of travel.
+    hook_m : array, shape (3,)
+        In base. None instead of all three if too few poses are reachable.
+    """
+    q_now, down = np.asarray(q_rad, dtype=np.float64), certifier.scene.down_base
+    hooks = _hooks(certifier, q_now)
+    for kept, (hook_m, heading_rad) in product((_HookKept(certifier, most_m) for most_m in HOOK_M), hooks):
+        candidates = tilted_candidates(np.radians(HUNG_TILTS_DEG), HUNG_AZIMUTHS, heading_rad, down)
+        q, group = hung_nodes(certifier, q_now, candidates, hook_m)
+        part = connected(kept, q, np.zeros(len(q), dtype=np.intp))
+        best = max(range(part.max() + 1), key=lambda p: len(np.unique(group[part == p])))
+        reached = np.unique(group[part == best])
+        if len(reached) < poses:
+            continue
+        chosen = reached[_evenly_spread(down @ candidates[reached], poses)]
+        nodes = np.flatnonzero((part == best) & np.isin(group, chosen))
+        place = np.full(len(candidates), -1)
+        place[chosen] = np.arange(poses)
+        order = clear_tour(kept, q[nodes], place[group[nodes]], speeds)
+        if order is not None:
+            nodes = nodes[order]
+            return tuple((FIRST_NUMBER + place[group[nodes]]).tolist()), q[nodes], hook_m
+    return None
+
+
+class _HookKept(Certifier):
+    """Proves only moves in which the hook of the load stays within a distance of where it is."""
+
+    def __init__(self, certifier: Certifier, most_m: float) -> None:
+        super().__init__(certifier.arm, certifier.scene, certifier.margins)
+        self._most_m = most_m
+
+    def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
+        """As `Certifier.certify`; a move that takes the hook along is not clear."""
+        start, end = (np.asarray(q, dtype=np.float64).reshape(-1, 6) for q in (start_rad, end_rad))
+        hooks_m = [self.arm.hook_m(self.arm.frames(start + share * (end - start))) for share in np.linspace(0, 1, 9)]
+        stays = np.linalg.norm(np.subtract(hooks_m, hooks_m[0]), axis=2).max(axis=0) <= self._most_m
+        certificate = super().certify(start, np.where(stays[:, None], end, start), tight=tight)
+        return replace(certificate, clear=certificate.clear & stays)
+
+
+def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
+    """Places of the hook (3,) that reach the most tilts, each with turns about the tool axis (rad), to be tried."""
+    down, at = certifier.scene.down_base, certifier.arm.frames(q_now)
+    present_rad = _heading(at.R_base_flange[0], down)
+    looks = tilted_candidates(np.radians(HUNG_TILTS_DEG), LOOKS_OF_A_TILT, present_rad, down)
+    places = certifier.arm.hook_m(at)[0] + _away(certifier, at.wrist_m[0])
+    reached = np.array([len(np.unique(hung_nodes(certifier, q_now, looks, place)[1])) for place in places])
+    best = np.argsort(-reached, kind="stable")[:MOST_HOOKS]
+    return [(places[i], present_rad + turn) for i in best if reached[i] for turn in np.radians([0, 90, -90, 180])]
+
+
+def _heading(R_base_flange: Array, down_base: Array) -> float:
+    """Turn about the tool axis of `tilted_candidates` that is nearest to an orientation (3, 3)."""
+    straight = tilted_candidates([0.0], 1, 0.0, down_base)[0]
+    turn = straight.T @ R_base_flange
+    # The tool is turned about -z there, seen along its axis.
+    return float(np.arctan2(turn[0, 1] - turn[1, 0], turn[0, 0] + turn[1, 1]))
+
+
+def _away(certifier: Certifier, wrist_m: Array) -> Array:
+    """Shifts (k, 3) of the hook from where it is, the nearest first: up and down, towards the base and away from it."""
+    down = certifier.scene.down_base
+    outwards = wrist_m - wrist_m @ down * down
+    outwards /= max(float(np.linalg.norm(outwards)), 1e-9)
+    step_m = np.abs(certifier.arm.kinematics.links_m[1:3, 0]).sum() / 8
+    up_m, out_m = step_m * np.arange(-9, 4), step_m * np.arange(-3, 5)
+    shifts = (up_m[:, None, None] * -down + out_m[None, :, None] * outwards).reshape(-1, 3)
+    return np.asarray(shifts[np.argsort(np.linalg.norm(shifts, axis=1), kind="stable")])
+
+
+def _evenly_spread(directions: Array, count: int) -> Nodes:
+    """Indices of directions (m, 3), each as far as possible from those before it, from the first on."""
+    chosen = [0]
+    while len(chosen) < count:
+        nearest = (directions @ directions[chosen].T).max(axis=1)
+        nearest[chosen] = np.inf
+        chosen.append(int(nearest.argmin()))
+    return np.array(chosen)
 
 
 def _first_tour(

@@ -79,7 +79,36 @@ def box_nodes(
     """
     places = centre_m + half_size_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)
     group, place = (index.ravel() for index in np.indices((len(R_base_flange), len(places))))
-    q = inverse(certifier.arm.kinematics, R_base_flange[group], places[place])  # (m * 27, 8, 6)
+    return _at_places(certifier, q_rad, R_base_flange[group], places[place], group)
+
+
+def hung_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array, hook_m: Array) -> tuple[Array, Nodes]:
+    """All free joint vectors with the flange in one of these orientations and the hook of the load at one point.
+
+    Parameters
+    ----------
+    q_rad : array_like, shape (6,)
+        Present joint angles; the joints stay in their windows around them.
+    R_base_flange : array, shape (m, 3, 3)
+    hook_m : array, shape (3,)
+        In base.
+
+    Returns
+    -------
+    q : array, shape (n, 6)
+    group : int array, shape (n,)
+        Index of the orientation.
+    """
+    hung = certifier.arm.hung
+    p_flange_hook_m = np.zeros(3) if hung is None else np.array(hung.p_flange_m)
+    places = hook_m - R_base_flange @ p_flange_hook_m
+    return _at_places(certifier, q_rad, R_base_flange, places, np.arange(len(R_base_flange)))
+
+
+def _at_places(
+    certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array, p_base_flange_m: Array, group: Nodes
+) -> tuple[Array, Nodes]:
+    q = inverse(certifier.arm.kinematics, R_base_flange, p_base_flange_m)  # (k, 8, 6)
     group = np.repeat(group, q.shape[1])
     q = q.reshape(-1, 6)
     reached = ~np.isnan(q[:, 0]) & (np.abs(q[:, 2]) <= ELBOW_RAD)

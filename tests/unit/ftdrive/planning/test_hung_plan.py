@@ -1,0 +1,101 @@
+"""Tilts with a load on a string: the hook stays, and the load keeps clear wherever it hangs."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
+from ftdrive.errors import PlanRefused
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.motion import Speeds
+from ftdrive.planning.plan import Plan
+from ftdrive.planning.planner import HUNG_POSES, USUAL_POSTURE_RAD, certifier_for, plan_for
+from ftdrivers.ur.kinematics import MODELS, Array
+
+HOOK_M = (0.0, 0.0, 0.2)
+CELL = CellConfig(
+    RobotConfig("arm", "UR5e"),
+    SensorConfig("fake://"),
+    ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)),
+    WorkcellConfig(),
+)
+
+
+@cache
+def certifier() -> Certifier:
+    return certifier_for(CELL, "UR5e", MODELS["UR5e"], HOOK_M)
+
+
+@cache
+def plan() -> Plan:
+    return plan_for(CELL, certifier(), USUAL_POSTURE_RAD)
+
+
+def hooks(q_rad: Array) -> Array:
+    return certifier().arm.hook_m(certifier().arm.frames(q_rad))
+
+
+def test_the_arm_turns_about_the_hook() -> None:
+    q = plan().nodes_rad
+    assert len(q) == HUNG_POSES
+    assert np.ptp(hooks(q), axis=0).max() < 1e-6
+    share = np.linspace(0, 1, 50)[:, None, None]
+    between = hooks(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6))
+    assert np.linalg.norm(between - hooks(q[:1]), axis=1).max() < 0.065
+
+
+def test_the_tilts_are_spread_around_straight_down() -> None:
+    R = plan().R_base_flange
+    tilts_deg = np.degrees(np.arccos(-R[:, 2, 2]))
+    assert tilts_deg.min() >= 45 - 1e-6
+    assert tilts_deg.max() <= 75 + 1e-6
+    aside = -R[:, 2, :2]  # gravity in the flange frame
+    azimuths_deg = np.sort(np.degrees(np.arctan2(aside[:, 1], aside[:, 0])))
+    assert np.diff(azimuths_deg, append=azimuths_deg[0] + 360).max() < 120
+
+
+def test_the_moves_are_slow() -> None:
+    fastest = Speeds.with_hung_load()
+    assert plan().top_speed_rad_s <= fastest.joint_rad_s + 1e-9
+    assert plan().acceleration_rad_s2 <= fastest.joint_rad_s2
+
+
+@pytest.mark.slow
+def test_the_plan_is_proven_with_its_load() -> None:
+    plan().require(certifier())
+    assert certifier().without_load.arm.hung is None
+
+
+def test_the_load_hangs_down_in_every_posture() -> None:
+    arm, hung = certifier().arm, certifier().arm.hung
+    assert hung is not None
+    bodies = arm.bodies(np.random.default_rng(0).uniform(-np.pi, np.pi, (20, 6)))
+    load = arm.names.index("load")
+    assert bodies.axis[:, load] == pytest.approx(np.tile(hung.down_base, (20, 1)))
+
+
+@pytest.mark.parametrize("hook_m", [HOOK_M, (0.1, 0.0, 0.05)])
+def test_no_proven_move_brings_anything_nearer_than_its_clearance(hook_m: tuple[float, float, float]) -> None:
+    found = certifier_for(CELL, "UR5e", MODELS["UR5e"], hook_m)
+    rng = np.random.default_rng(1)
+    start = USUAL_POSTURE_RAD + rng.uniform(-1.2, 1.2, (300, 6))
+    end = start + rng.uniform(-0.5, 0.5, (300, 6))
+    certificate = found.certify(start, end, tight=False)
+    clear = np.flatnonzero(certificate.clear)
+    assert 5 < len(clear) < 300
+    for share in np.linspace(0, 1, 21):
+        assert found.free(start[clear] + share * (end - start)[clear]).all()
+
+
+@pytest.mark.slow
+def test_a_load_has_no_room_under_a_low_ceiling() -> None:
+    low = CellConfig(CELL.robot, CELL.sensor, CELL.tool, WorkcellConfig(planes_mm=((0, 0, -1, -450),)))
+    with pytest.raises(PlanRefused, match="jog the arm to where the load has room"):
+        plan_for(low, certifier_for(low, "UR3e", MODELS["UR3e"], HOOK_M), USUAL_POSTURE_RAD)
+
+
+def test_a_plan_belongs_to_its_load() -> None:
+    for hook_m in (None, (0.0, 0.0, 0.19)):
+        with pytest.raises(PlanRefused, match="another tool"):
+            plan().require(certifier_for(CELL, "UR5e", MODELS["UR5e"], hook_m))
