@@ -301,6 +301,7 @@ class Run:
             "q_target_rad": record.pose.q_rad,
             "steady": np.array(record.steady),
             "clock_offset_ns": np.array(record.clock_offset_ns),
+            **({"swings": np.array(True)} if record.swings else {}),
             **readings,
             **{name: getattr(record.samples, name) for name in _SAMPLE_COLUMNS},
         }
@@ -354,6 +355,7 @@ _KINDS: Mapping[str, _Kind] = {
     "station.sensor": _TEXT,
     "station.options": _TEXTS,
     "verification": _OBJECT,
+    "load": _OBJECT,
 }
 
 
@@ -423,6 +425,7 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
         samples=FtSamples(*(data[name] for name in _SAMPLE_COLUMNS)),
         steady=bool(data["steady"]),
         clock_offset_ns=int(data.get("clock_offset_ns", 0)),
+        swings=bool(data.get("swings", False)),
     )
 
 

@@ -10,12 +10,13 @@ import numpy as np
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
-from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.load import Load
 from ftdrive.runs.motion import solve_motion_file
 from ftdrive.runs.run import Run, made_now, versions
 from ftdrive.runs.sensor_file import with_sensor
@@ -204,7 +205,7 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     Raises
     ------
     DataError
-        The file is not a calibration that this version can read, is damaged or was edited.
+        The file is not a calibration that this version can read, is damaged or was edited, or a load was on the tool.
     OSError
         It cannot be read.
 
@@ -216,8 +217,10 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     'good'
     """
     path = Path(path)
-    found = CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
-    return with_sensor(found)
+    result = CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
+    if (load := Load.of_header(result.provenance)) is not None:
+        raise BadCalibration(f"{path} was made with {load}: use it with `ftdrive loads solve`, not as that of the tool")
+    return with_sensor(result)
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
@@ -334,15 +337,17 @@ def _dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDat
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
     found = circumstances_of(run)
-    emulated = {"emulated": True} if found.origin["station"] is not None else {}
-    return dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **emulated}), found
+    marks = {"emulated": True} if found.origin["station"] is not None else {}
+    if "load" in found.origin:
+        marks["load"] = found.origin["load"]
+    return dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **marks}), found
 
 
 def circumstances_of(run: Run) -> Circumstances:
     """Return what `solve` takes beside the data of a run, without reading them."""
     header = run.header()
     config = header["config"]
-    setup = _described(run, config)
+    setup = _described(run, config, Load.of_header(header))
     mounting, height_mm = setup["mounting"], setup["height_mm"]
     origin = {
         "devices": header.get("devices", {}),
@@ -350,6 +355,7 @@ def circumstances_of(run: Run) -> Circumstances:
         "station": header.get("station"),
         "setup": setup,
         "temperature_C": run.temperature_C(),
+        **({"load": dict(header["load"])} if "load" in header else {}),
     }
     return Circumstances(
         float(config["site"]["g_m_s2"]),
@@ -368,13 +374,17 @@ def circumstances_of(run: Run) -> Circumstances:
     )
 
 
-def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting."""
+def _described(run: Run, config: Mapping[str, Any], load: Load | None) -> dict[str, Any]:
+    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting.
+
+    A tool with a load is another tool, with another name, so that its result serves no session of the tool alone.
+    """
     payload_kg = p_flange_payload_m = None
     for event in run.events():
         if event.get("event") == "weighed":
             payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
     sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
+    tool_kg, measured = tool.get("mass_kg"), workcell.get("measured")
     return {
         "payload_kg": payload_kg,
         "p_flange_payload_m": p_flange_payload_m,
@@ -383,8 +393,9 @@ def _described(run: Run, config: Mapping[str, Any]) -> dict[str, Any]:
         "range": [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None,
         "mounting": workcell.get("mounting"),
         "height_mm": sensor.get("height_mm"),
-        "tool_mass_kg": tool.get("mass_kg"),
-        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") else [],
-        "tool": tool.get("name"),
+        "tool_mass_kg": tool_kg + load.mass_kg if load and tool_kg else tool_kg,
+        # The centre of mass of a tool with a load may be anywhere between the two.
+        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if measured and not load else [],
+        "tool": f"{tool.get('name')} with {load}" if load else tool.get("name"),
         "mount": sensor.get("mount"),
     }
