@@ -31,7 +31,7 @@ from ftdrive.commands.common import (
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
-    from ftdrive.runs.run import Mode
+    from ftdrive.runs.run import Mode, Run
     from ftdrive.runs.source import Outcome
 
 
@@ -56,6 +56,17 @@ if TYPE_CHECKING:
     type=click.Path(exists=True, path_type=Path),
     help="A new tool: take mounting, base and gain from this result of the same sensor; 4 longer poses, or --sweep.",
 )
+@click.option(
+    "--load",
+    metavar="MASS",
+    help="A weighed load on the tool, kg, such as 2.0 or 2.0±0.002, for `ftdrive loads solve`; with --at or --gripped.",
+)
+@click.option(
+    "--at",
+    metavar="NAME=X,Y,Z",
+    help="The load hangs on a string from this point, mm from the flange face in flange axes: 12 tilts about it.",
+)
+@click.option("--gripped", is_flag=True, help="The load is in the gripper, at an unknown place: 6 poses.")
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
     "--passive", is_flag=True, help="No motion commands: read beside any program or freedrive until it is good."
@@ -93,6 +104,9 @@ def calibrate(
     quick: bool,
     minimal: bool,
     earlier: Path | None,
+    load: str | None,
+    at: str | None,
+    gripped: bool,
     sweep: bool,
     passive: bool,
     seconds: float | None,
@@ -113,6 +127,7 @@ def calibrate(
     """
     from ftdrive.cell.emulated import REAL_PACE, Station
     from ftdrive.commands.common import start_mover
+    from ftdrive.runs.load import Load
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
     from ftdrive.session.session import calibrate as guide
@@ -121,6 +136,7 @@ def calibrate(
     from ftdrive.terminal.screen import open_operator
 
     _refuse_contradictions(click.get_current_context())
+    known_load = None if load is None else Load.of(load, at, gripped=gripped)
     require_viz(as_session["png"], view=as_session["view"])
     chosen: dict[Mode, bool] = {"sweep": sweep, "passive": passive, "step": step, "manual": manual, "listen": listen}
     mode: Mode = next((name for name, given in chosen.items() if given), "auto")
@@ -143,7 +159,7 @@ def calibrate(
             from ftdrive.runs.source import read_calibration
 
             description["earlier"] = read_calibration(earlier).to_dict()
-        poses = 12 if quick else 6 if minimal else 4 if earlier is not None else 24
+        poses = 12 if quick else 6 if minimal or gripped else 4 if earlier is not None else 24
         options = SessionOptions(
             runs,
             poses=poses,
@@ -153,6 +169,7 @@ def calibrate(
             resume=resume,
             real=not simulate,
             description=description,
+            load=known_load,
             **as_session,
         )
         if simulate:
@@ -168,11 +185,17 @@ def calibrate(
     else:
         saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
-        folder = quote(str(outcome.run.folder))
-        with_it = f"--calibration {folder}{' --simulate' if simulate else ''}"
-        useful = () if saved is None else (f"ftdrive live {with_it}", f"ftdrive verify {with_it}")
-        messages.print_next(f"ftdrive report {folder}   (how good it is, and why)", *useful)
+        messages.print_next(*_next_commands(outcome.run, is_saved=saved is not None, simulate=simulate))
     stop_unless_accepted(outcome.result, to_be_saved=True)
+
+
+def _next_commands(run: "Run", *, is_saved: bool, simulate: bool) -> list[str]:
+    folder = quote(str(run.folder))
+    commands = [f"ftdrive report {folder}   (how good it is, and why)"]
+    if "load" in run.header():
+        return [*commands, f"ftdrive loads solve RUN-OF-THE-TOOL {folder}"]
+    with_it = f"--calibration {folder}{' --simulate' if simulate else ''}"
+    return [*commands, f"ftdrive live {with_it}", f"ftdrive verify {with_it}"] if is_saved else commands
 
 
 def _refuse_contradictions(context: click.Context) -> None:

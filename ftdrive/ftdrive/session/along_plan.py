@@ -19,14 +19,16 @@ from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import Approach, plan_approach
+from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import arm_moves, move_duration_s
 from ftdrive.planning.plan import Plan, turns_in_words, way_in_words
 from ftdrive.planning.planner import certifier_for, speeds_of
+from ftdrive.runs.load import Load
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.events import GuardTripped, Planned, rms_sigma
-from ftdrive.session.open_session import Judge, OpenCell, PoseBook, Session
+from ftdrive.session.open_session import Judge, PoseBook, Session
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
 from ftdrive.session.sweep import FreeTool, SweepTour, choose_sweep_speed
@@ -80,8 +82,9 @@ def _read(line: str) -> dict[str, object]:
 class _SafetyQuestions:
     """Asks for a free tool, free room, the emergency stop, and reduced mode; raises `Declined` unless all are yes."""
 
-    def __init__(self, cell: OpenCell, plan: Plan) -> None:
-        self._arm, self._journal, self._plan = cell.arm, cell.journal, plan
+    def __init__(self, before: Before) -> None:
+        self._arm, self._journal = before.cell.arm, before.cell.journal
+        self._plan, self._load = before.plan, before.load
         self._reduced = False  # whether the operator has confirmed the reduced mode that is active
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:
@@ -90,6 +93,7 @@ class _SafetyQuestions:
         if arm_moves(way_rad):
             room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
         for text in (
+            *_load_questions(self._load),
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
             f"Is the ball of {self._plan.ball_m:.2f} m around {self._plan.centre_in_words()} (the wrist){room} free of "
             "obstacles and people?",
@@ -104,6 +108,21 @@ class _SafetyQuestions:
         if reduced and not self._reduced:
             self._journal.require("The controller is in reduced mode. Is that intended?", assumed=assumed)
         self._reduced = reduced
+
+
+def _load_questions(load: Load | None) -> list[str]:
+    """Return what is asked about a load on the tool."""
+    if load is None:
+        return []
+    if load.gripped:
+        return [
+            f"Does the gripper hold {load.mass_kg:g} kg firmly, and does [tool] cylinders_mm describe that load too?"
+        ]
+    return [
+        f"A weight of {load.mass_kg:g} kg at {load.name} moves with the arm in the tour: a hazard. Is nothing and no "
+        f"one below and beside it, its string at most {1e3 * STRING_M:.0f} mm long, the weight at most "
+        f"{2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm high?"
+    ]
 
 
 # Joints 1 to 3 are rounded to this grid before planning, so that the same posture gives the same plan and hash.
@@ -176,7 +195,9 @@ class _AlongPlan:
             # An old controller reports no poses before.
             arm.open(control=True)
         info = arm.identify()
-        return certifier_for(self.task.cell, info.model, kinematics_of(info))
+        load = self.options.load
+        hook_m = None if load is None else load.p_flange_m
+        return certifier_for(self.task.cell, info.model, kinematics_of(info), hook_m)
 
     def _plan(self, certifier: Certifier) -> Plan:
         q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
@@ -196,11 +217,12 @@ class _AlongPlan:
             config=self.task.cell,
             certifier=certifier,
             plan=plan,
-            approach=plan_approach(certifier, cell.arm.state().q_rad, goal, SLOW),
+            approach=plan_approach(certifier.without_load, cell.arm.state().q_rad, goal, SLOW),
             runs=options.runs,
             known=not options.real or has_completed(self._serial, plan.sha256),
             quiet=cell.listen(LISTEN_S),
             resumed=self._session.resumed is not None,
+            load=options.load,
         )
         _show_plan(before, options)
         return before
@@ -259,10 +281,13 @@ class _AlongPlan:
                 cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(cell, rows, on_trip)
-        questions = _SafetyQuestions(cell, before.plan)
+        questions = _SafetyQuestions(before)
         recheck = partial(self._recheck, before, questions)
         with watcher:  # sees an emergency stop at a question too
             if options.questions and todo:
+                if before.certifier.arm.hung is not None:
+                    words = "Is the weight off the tool? It is hung when the arm stands at its first pose."
+                    cell.journal.require(words, assumed=before.known and not options.real)
                 questions.ask(way, assumed=before.known and not arm_moves(way))  # one with base or elbow is new
             run = self._session.resumed or self._keep_plan(before.plan)
             book = PoseBook(cell, run, judge, before.certifier.scene.down_base)
@@ -375,6 +400,10 @@ def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Arr
     The duration is configured, or chosen from a record of the sensor's noise. The few poses of a new tool take longer.
     """
     sampling, sigma = _usual_sampling(before, todo)
+    if before.load is not None and not before.load.gripped:
+        longer = before.load.sampling(sampling)
+        before.cell.note(f"a hanging load: {longer.average_s:g} s at each tilt, repeated while it swings by 5° or more")
+        return longer, sigma / np.sqrt(longer.average_s / sampling.average_s)
     if before.plan.kind != "tool":
         return sampling, sigma
     before.cell.note(f"a new tool: {_TOOL_AVERAGES:g} times that average at each of its {len(before.plan.steps)} poses")

@@ -90,9 +90,14 @@ def take_by_hand(session: Session) -> Run:
     if run is None:
         run = session.new_run()
         cell.journal.keep_in(run)
+    if (load := session.options.load) is not None:
+        cell.note(f"{load} is on the tool in every pose. Keep clear of it, with nothing below it.", warning=True)
     book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
     with cell.journal.reporting_early_end(run):
-        guide = HandGuided(cell, book, task.cell.sampling, listen=session.options.mode == "listen")
+        sampling, swing_N = task.cell.sampling, None
+        if load is not None:
+            sampling, swing_N = load.sampling(sampling), load.most_swing_N
+        guide = HandGuided(cell, book, sampling, listen=session.options.mode == "listen", most_swing_N=swing_N)
         guide.run(run.records() if session.resumed else (), task.goal)
     return run
 
@@ -114,6 +119,8 @@ class HandGuided:
         A program moves the arm, so no pose is suggested. Poses are taken from its start to its end, or until it
         returns to its first pose when there are enough. That return is committed too and serves
         `ftcalib.routine.drift_check`. A program that passes its first pose earlier is followed to its end.
+    most_swing_N : float, optional
+        As of `ftcalib.routine.take_pose`.
 
     Notes
     -----
@@ -121,10 +128,18 @@ class HandGuided:
     return to the first pose has its orientation number, 1. `pose.q_rad` is where the arm stood.
     """
 
-    def __init__(self, cell: OpenCell, book: PoseBook, sampling: Sampling, *, listen: bool) -> None:
+    def __init__(
+        self,
+        cell: OpenCell,
+        book: PoseBook,
+        sampling: Sampling,
+        *,
+        listen: bool,
+        most_swing_N: float | None = None,
+    ) -> None:
         self._arm, self._sensor, self._operator, self._clock = cell.arm, cell.sensor, cell.journal, cell.clock
         self._note = cell.note
-        self._book, self._sampling, self._listen = book, sampling, listen
+        self._book, self._sampling, self._listen, self._most_swing_N = book, sampling, listen, most_swing_N
         self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
         self._taken: dict[int, PoseRecord] = {}
         self._level: Array | None = None
@@ -286,7 +301,16 @@ class HandGuided:
 
         pose = TourPose(number, state.q_rad)
         try:
-            record = take_pose(held, held, stop, pose, self._sampling, on_stage=on_stage, quiet_std=self._level)
+            record = take_pose(
+                held,
+                held,
+                stop,
+                pose,
+                self._sampling,
+                on_stage=on_stage,
+                quiet_std=self._level,
+                most_swing_N=self._most_swing_N,
+            )
         except _Moved as moved:
             self._still_since_s = moved.state.t_device_s
             self._note(f"The arm moved while pose {stop} was measured: {self._hold_still()}.", warning=True)

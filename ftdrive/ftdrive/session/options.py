@@ -8,6 +8,7 @@ from typing import Any, Final, cast, get_args
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
+from ftdrive.runs.load import Load
 from ftdrive.runs.run import Mode, Run
 
 _BY_HAND: Final = ("manual", "listen", "passive")
@@ -21,6 +22,11 @@ _EXCLUDE_ONE_ANOTHER: Final = (
     ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
     ("--from", "--set"),
     *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
+    *(
+        ("--load", other)
+        for other in ("--quick", "--minimal", "--set", "--method", "--from", "--sweep", "--passive", "--resume")
+    ),
+    ("--at", "--gripped"),
     ("--fast", "--sweep", "--passive"),
     ("--from", "--resume", "--passive"),
     *((f"--{hand}", option) for hand in _BY_HAND for option in ("--quick", "--minimal", "--set", *_SHOWN)),
@@ -62,6 +68,8 @@ class SessionOptions:
     """Duration of a sweep at the planned speed; the longest of a passive calibration."""
     description: Mapping[str, Any] = field(default_factory=dict)
     """Goes into run.json."""
+    load: Load | None = None
+    """A weighed load on the tool, or what the resumed run has."""
 
     @property
     def by_hand(self) -> bool:
@@ -88,6 +96,8 @@ class SessionOptions:
 
 def refuse_contradictions(given: Mapping[str, Any]) -> None:
     """Raise `ConfigError` for options of `ftdrive calibrate` that exclude one another; their values by name."""
+    if "--load" not in given and (place := [option for option in ("--at", "--gripped") if option in given]):
+        raise ConfigError(f"{place[0]} goes with --load MASS: give the mass of the load in kg")
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:

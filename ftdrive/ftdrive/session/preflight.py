@@ -12,11 +12,12 @@ from typing import Final
 
 import numpy as np
 
+from ftcalib.judge import described_cell
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks import arm as of_arm
 from ftdrive.checks import computer
-from ftdrive.checks.arm import check_arm, check_remote, check_safety, check_speed
+from ftdrive.checks.arm import RATED_KG, check_arm, check_remote, check_safety, check_speed
 from ftdrive.checks.check import Check, merge_checks
 from ftdrive.checks.sensor import check_level, check_load, check_rate, check_rest
 from ftdrive.errors import NotAccepted, PlanRefused
@@ -24,6 +25,7 @@ from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.runs.load import Load
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import Limits, ModelGuard, Tripped
 from ftdrive.session.open_session import OpenCell
@@ -54,6 +56,8 @@ class Before:
     """`LISTEN_S` of the sensor at rest."""
     resumed: bool
     """Whether a part of the plan has run before."""
+    load: Load | None = None
+    """A weighed load that the tool carries in the tour; `config` counts it as part of the tool."""
 
     @property
     def sensor_range(self) -> Array | None:
@@ -100,8 +104,22 @@ def _check_model(before: Before) -> Check:
 
 
 def check_payload(before: Before) -> Check:
-    """Check the payload that is set in the controller."""
-    return of_arm.check_payload(before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg)
+    """Check the payload that is set in the controller; with a load it is the total, which the arm must carry."""
+    status, tool, sensor_kg = before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg
+    check = of_arm.check_payload(status, tool, sensor_kg)
+    if before.load is None:
+        return check
+    least_kg = (tool.mass_kg or before.load.mass_kg) + (sensor_kg or 0.0)
+    rated_kg = RATED_KG.get(before.certifier.arm.name)
+    if rated_kg is not None and least_kg > rated_kg:
+        found = f"sensor, tool and load are {least_kg:.2f} kg or more, the arm carries {rated_kg:g} kg"
+        return Check(check.name, "failed", found, "take a lighter load")
+    too_little = status.payload_kg is not None and status.payload_kg < least_kg - described_cell.PAYLOAD_KG
+    if check.state == "failed" or too_little:
+        total = f"{least_kg:.2f} kg" if tool.mass_kg else f"the mass of sensor, tool and load, above {least_kg:.2f} kg"
+        fix = f"set the payload to {total} and its centre at the pendant before the load hangs"
+        return Check(check.name, "failed", f"{check.found}, for {before.load}", fix)
+    return check
 
 
 def check_link(before: Before) -> Check:

@@ -21,6 +21,7 @@ from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import NUMBERS, guess_of, plan_for, sweep_for
 from ftdrive.planning.search.nodes import from_usual_wrist
+from ftdrive.runs.load import Load
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save
 from ftdrive.session import preflight
@@ -135,7 +136,7 @@ class Calibrating:
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
         """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
-        if plan.kind == "tool":
+        if plan.kind == "tool" or self.options.load is not None:
             return ""
         mass_kg = self.cell.tool.mass_kg
         force_N, torque_Nm = rms_sigma(sigma)
@@ -150,8 +151,23 @@ class Calibrating:
         )
 
 
+def loaded(cell: CellConfig, load: Load) -> CellConfig:
+    """Return the cell with the load as part of its tool, where the mass of the tool is configured."""
+    if cell.tool.mass_kg is None:
+        return cell
+    return replace(cell, tool=replace(cell.tool, mass_kg=cell.tool.mass_kg + load.mass_kg))
+
+
 def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
     """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
+    if options.resume is not None:
+        options = replace(options, load=Load.of_header(Run(options.resume).header()))
+    if (load := options.load) is not None:
+        # The run keeps the cell as it is configured; checks and guards count the load as part of the tool.
+        options = replace(
+            options, description={**options.description, "config": cell.to_dict(), "load": load.to_dict()}
+        )
+        cell = loaded(cell, load)
     cell = on_script_path(cell) if options.mode == "sweep" else cell
     run = take_poses(Calibrating(cell, options), operator, options)
     return None if run is None else solve_and_save(run)

@@ -178,6 +178,8 @@ class Tour:
         self._quiet_std, self._book, self._options = quiet_std, book, options
         self._nodes = driven.plan.nodes_rad
         self._now = Progress(len(self._nodes))
+        # A load that is to hang from the tool, and is not on it yet.
+        self._to_hang = None if driven.certifier.arm.hung is None else driven.load
 
     def run(self, todo: Sequence[int]) -> None:
         """Take the poses of these stops, counted from 1; the return to the first pose is the last.
@@ -222,6 +224,10 @@ class Tour:
         self._now.under_way = stop
         self._go(index, stop)
         self._obey_keys()
+        if (load := self._to_hang) is not None:
+            words = f"Pose {stop}: hang {load} now, and let it hang still. Its string must be free. Go on?"
+            self._confirm(words, by_operator=self._options.real)
+            self._to_hang = None
         self._take(stop, index)
         del self._now.todo[0]
 
@@ -348,6 +354,7 @@ class Tour:
                 guard=self._between_looks,
                 on_stage=on_stage,
                 quiet_std=self._quiet_std,
+                most_swing_N=None if self._options.load is None else self._options.load.most_swing_N,
             )
         self._guarded.load.judge(record.samples.wrench)
         average_s = sampling.average_s
@@ -386,7 +393,8 @@ class Tour:
 
     def _approach(self, q: Array, index: int, stop: int, *, back: bool = False) -> None:
         # The only moves that are not in the plan, so they are proven, shown and confirmed by themselves.
-        approach = plan_approach(self._certifier, q, self._nodes[index], SLOW)
+        certifier = self._certifier if self._to_hang is None else self._certifier.without_load
+        approach = plan_approach(certifier, q, self._nodes[index], SLOW)
         if not len(approach.q_rad):
             return
         way = approach.way_rad
@@ -405,7 +413,7 @@ class Tour:
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal
-        if stop == 1 and not back:
+        if stop == 1 and not back and self._to_hang is None:
             self._confirm(self._begin_words)
 
     def _passed(self, way: Array, goal: int) -> list[str]:
