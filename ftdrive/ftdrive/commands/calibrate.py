@@ -31,6 +31,8 @@ from ftdrive.commands.common import (
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
+    from ftdrive.cell.emulated import Station
+    from ftdrive.runs.load import Load
     from ftdrive.runs.run import Mode, Run
     from ftdrive.runs.source import Outcome
 
@@ -173,6 +175,7 @@ def calibrate(
             **as_session,
         )
         if simulate:
+            _put_on(station, known_load if resume is None else Load.of_header(Run(resume).header()))
             start_mover(station, options)
         with declined_aborts(), open_operator(as_json=as_json) as operator:
             outcome = guide(cell, operator, options)
@@ -187,6 +190,28 @@ def calibrate(
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
         messages.print_next(*_next_commands(outcome.run, is_saved=saved is not None, simulate=simulate))
     stop_unless_accepted(outcome.result, to_be_saved=True)
+
+
+def _put_on(station: "Station", load: "Load | None") -> None:
+    """Give the emulated cell the load, and its controller the total as payload."""
+    import numpy as np
+
+    from ftdrive.cell.emulated import TOOL_MM
+    from ftdrive.planning.geometry.arm_model import STRING_M
+
+    if load is None:
+        return
+    truth = station.truth
+    mass_kg = truth["mass_kg"] + load.mass_kg
+    station.control(do="set-payload", payload_kg=mass_kg + truth["sensor_mass_kg"])
+    if load.p_flange_mm is not None:
+        place = list(load.p_flange_mm)
+        station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M, swing_deg=0)
+    else:
+        # In the middle between the fingers, about: its place is unknown to the solution.
+        p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])
+        com_m = (truth["mass_kg"] * np.array(truth["p_sensor_com_m"]) + load.mass_kg * p_load_m) / mass_kg
+        station.control(do="payload-shift", mass_kg=mass_kg, p_sensor_com_m=com_m.tolist())
 
 
 def _next_commands(run: "Run", *, is_saved: bool, simulate: bool) -> list[str]:
