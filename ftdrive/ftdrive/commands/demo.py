@@ -128,8 +128,11 @@ def _with_loads(station: Station, runs: Path, tool: "Outcome") -> "LoadSolution"
     truth = station.truth
     taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
     for name, hook_mm in _HOOKS_MM.items():
-        messages.print(f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange.")
-        station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm)
+        messages.print(
+            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. It swings, because "
+            "this quick tour moves its hook; `calibrate --load` turns the tool about it."
+        )
+        station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm, swing_deg=0)
         whole_kg = truth["payload_kg"] + _LOAD_KG
         moment = truth["payload_kg"] * np.array(truth["payload_cog_m"]) + _LOAD_KG * np.array(hook_mm) / 1e3
         station.control(do="set-payload", payload_kg=whole_kg, payload_cog_m=(moment / whole_kg).tolist())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, SOURCE, Number, Source, numbers, stop_unless, write_json
+from ftdrive.commands.common import JSON, SOURCE, Number, Source, stop_unless, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo, visible
 
@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from ftcalib.sensor_matrix import SensorMatrix
     from ftdrive.live.weighing import Scale
 
-# Of a mass without its own sigma: a kitchen scale.
-_SCALE_SHARE = 0.001
 # So much of the load as known must show, for the reading to be that of it.
 _SHOWS = 0.5
 
@@ -27,24 +25,6 @@ _SHOWS = 0.5
 @click.group()
 def loads() -> None:
     """Check a sensor by a known weight, and correct its matrix by several: so that 10 N are 10 N."""
-
-
-def known_load(mass: str, at: str | None) -> "KnownLoad":
-    """Read a mass such as 2.000 or 2.000±0.002 (kg) and a place such as tip=0,0,200 (mm). Raises `ConfigError`."""
-    from ftcalib.loads.model import KnownLoad
-
-    value, _, spread = mass.replace("+-", "±").partition("±")
-    (mass_kg,) = numbers("MASS", value, " ", [1])
-    sigma_kg = numbers("MASS", spread, " ", [1])[0] if spread else _SCALE_SHARE * mass_kg
-    if not 0 < mass_kg <= 100 or sigma_kg < 0:
-        raise ConfigError(f"MASS is {mass}: give the mass in kg, such as 2.000 or 2.000±0.002")
-    if at is None:
-        return KnownLoad("load", mass_kg, sigma_kg)
-    name, _, place = at.partition("=")
-    if not name or not place:
-        raise ConfigError(f"--at is '{at}': give a name and a place in mm from the flange face, such as tip=0,0,200")
-    x, y, z = (value / 1e3 for value in numbers("--at", place, ",", [3]))
-    return KnownLoad(name, mass_kg, sigma_kg, (x, y, z))
 
 
 @loads.command()
@@ -77,8 +57,9 @@ def check(
     from ftcalib.after.weighing import drift_since
     from ftcalib.loads.check import check_load
     from ftdrive.live.weighing import Scale
+    from ftdrive.runs.load import Load, mass_of
 
-    load = known_load(mass, at)
+    load = (Load.of(mass, at, gripped=False) if at is not None else Load("load", *mass_of(mass), None)).known
     with ExitStack() as stack:
         stream = _opened(source, replay, stack)
         if zero and replay is None:
@@ -188,6 +169,7 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
     It is saved as sensor.json in this folder, only if the runs agree. Every command here then decodes contacts of this
     sensor with it, whatever the tool. Later loads narrow it.
     """
+    from ftdrive.runs.load import mass_of
     from ftdrive.runs.sensor_file import next_sensor_file
 
     read = [_run_of(path) for path in runs]
@@ -195,7 +177,7 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
     if len(serials) > 1:
         raise ConfigError(f"the runs are of different sensors ({', '.join(map(str, serials))}): give those of one")
     data = read[0][2]
-    weighed = None if tool_mass is None else known_load(tool_mass, None)
+    weighed = None if tool_mass is None else mass_of(tool_mass)
     prior = _prior(data, next(iter(serials)), [path.name for path in runs])
     from ftcalib.loads.solve import solve_loads
 
@@ -205,7 +187,7 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
         p_flange_sensor_m=data.p_flange_sensor_m,
         g_m_s2=data.g_m_s2,
         setup=data.setup,
-        tool_mass_kg=None if weighed is None else (weighed.mass_kg, weighed.mass_sigma_kg),
+        tool_mass_kg=weighed,
         provenance={"serial": next(iter(serials)), "created_utc": datetime.now(UTC).isoformat(timespec="seconds")},
     )
     hindering = [one for one in solution.findings if one.severity == "reject"]
@@ -222,22 +204,13 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
 
 def _run_of(path: Path) -> tuple["LoadRun", str | None, Any]:
     """Read one run with its load, the serial number of its sensor, and what is known of its cell."""
-    from ftcalib.loads.model import KnownLoad, LoadRun
+    from ftcalib.loads.model import LoadRun
+    from ftdrive.runs.load import Load
     from ftdrive.runs.source import SolveOptions, read_source
 
     data = read_source(path, SolveOptions())
-    given = data.dataset.meta.get("load")
-    load = None
-    if given is not None:
-        place_mm = given["p_flange_mm"]
-        load = KnownLoad(
-            given["name"],
-            given["mass_kg"],
-            given["mass_sigma_kg"],
-            None if place_mm is None else (place_mm[0] / 1e3, place_mm[1] / 1e3, place_mm[2] / 1e3),
-            given["place_sigma_mm"] / 1e3,
-        )
-    return LoadRun(path.name, data.dataset, load), data.sensor_serial, data
+    load = Load.of_header(data.dataset.meta)
+    return LoadRun(path.name, data.dataset, None if load is None else load.known), data.sensor_serial, data
 
 
 def _prior(data: Any, serial: str | None, names: list[str]) -> "SensorMatrix":

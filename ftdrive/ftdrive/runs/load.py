@@ -4,11 +4,14 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import isfinite, radians, sin
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ftcalib.loads.model import KnownLoad
 
 # Of a mass without a sigma of its own: a kitchen scale.
 MASS_SHARE: Final = 1e-3
@@ -40,6 +43,13 @@ class Load:
             return None
         x, y, z = (value / 1e3 for value in self.p_flange_mm)
         return x, y, z
+
+    @property
+    def known(self) -> "KnownLoad":
+        """The same for the fit of the sensor's matrix."""
+        from ftcalib.loads.model import KnownLoad
+
+        return KnownLoad(self.name, self.mass_kg, self.mass_sigma_kg, self.p_flange_m, self.place_sigma_mm / 1e3)
 
     @property
     def most_swing_N(self) -> float | None:

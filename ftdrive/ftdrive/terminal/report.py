@@ -317,9 +317,10 @@ def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
     weight = np.einsum(
         "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
     )
-    force = weight + truth["force_bias_N"]
-    torque = np.cross(truth["p_sensor_com_m"], weight) + truth["torque_bias_Nm"]
-    return np.hstack([force, torque])
+    load = np.hstack([weight, np.cross(truth["p_sensor_com_m"], weight)])
+    # Cells of version 0.1.0 and earlier have a perfect sensor.
+    load = load + load @ np.array(truth.get("sensor_error", np.zeros((6, 6)))).T
+    return np.asarray(load + np.hstack([truth["force_bias_N"], truth["torque_bias_Nm"]]))
 
 
 def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:

@@ -187,7 +187,7 @@ def test_one_tool_on_a_sensor_with_and_without_loads_reads_contacts_differently(
     sensor = replace(SensorMatrix.usual(), source="loads", provenance=made)
     replace(CalibrationResult.load(alone), sensor=sensor).save(runs / "loads.json")
     out = run("diff", alone, runs / "loads.json")[1].splitlines()
-    assert "assumed" in out[2]
+    assert "of the data sheet" in out[2]
     assert "in A" in out[2]
     assert "sensor.json of 2026-11-20 in B" in out[2]
     assert not [line for line in run("diff", alone, alone)[1].splitlines() if "contact" in line]

@@ -9,7 +9,6 @@ from click.testing import CliRunner, Result
 from ftcalib import CalibrationResult, solve
 from ftcalib.loads.model import LoadRun
 from ftdrive.cli import cli
-from ftdrive.commands.loads import known_load
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.sensor_file import next_sensor_file, sensor_files
 from ftdrive.runs.source import read_calibration
@@ -96,13 +95,13 @@ def test_runs_of_two_sensors_are_refused(sensor: LoadedSensor) -> None:
 
 @pytest.mark.parametrize(("mass", "at"), [("two", None), ("-1", None), ("1", "tip"), ("1", "tip=0,0"), ("1±-2", None)])
 def test_a_wrong_load_is_named_with_the_form_to_type(mass: str, at: str | None) -> None:
-    with pytest.raises(ConfigError, match=r"MASS|--at"):
-        known_load(mass, at)
-
-
-def test_a_mass_may_have_its_own_sigma() -> None:
-    load = known_load("2.000+-0.004", "tip=0,10,200")
-    assert (load.mass_kg, load.mass_sigma_kg, load.p_flange_m) == (2.0, 0.004, (0.0, 0.01, 0.2))
+    found = run("check", *([] if at is None else ["--at", at]), "--simulate", "--", mass)
+    assert isinstance(found.exception, ConfigError)
+    assert (
+        "2.0±0.002" in str(found.exception)
+        or "0,0,200" in str(found.exception)
+        or "0 to 100 kg" in str(found.exception)
+    )
 
 
 def test_no_file_is_named_with_the_command_that_makes_one(sensor: LoadedSensor) -> None:
