@@ -58,6 +58,7 @@ GUIDED = ("calibrate", "verify")
 """They print their events too: test_session.py and test_verify.py."""
 
 ELSEWHERE = {"demo", "ros2", "serve-load", "verify", "stream", "weigh", "fleet serve", "fleet verify"}
+ELSEWHERE |= {"loads check", "loads drop", "loads show", "loads solve"}
 """Long sessions, servers without an answer, and a question at a terminal: see their tests."""
 
 SHOWN: Mapping[str, Callable[[dict[str, Any]], bool]] = {

@@ -129,7 +129,7 @@ def _with_loads(station: Station, runs: Path, tool: "Outcome") -> "LoadSolution"
     taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
     for name, hook_mm in _HOOKS_MM.items():
         messages.print(
-            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. It swings, because "
+            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. It swings because "
             "this quick tour moves its hook; `calibrate --load` turns the tool about it."
         )
         station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm, swing_deg=0)
