@@ -116,7 +116,7 @@ def test_any_mounting_is_found_from_any_orientations(n: int) -> None:
     [
         ("24", 1, 40),
         pytest.param("24", 1, 150, marks=pytest.mark.slow),
-        pytest.param("7", 2, 150, marks=pytest.mark.slow),
+        pytest.param("7", 2, 80, marks=pytest.mark.slow),
     ],
 )
 def test_the_covariance_is_honest(orientations: str, seed: int, runs: int) -> None:
@@ -388,7 +388,7 @@ def test_deviations_from_the_special_orientations_are_named_with_their_error(met
             assert note.values["force_N"] == pytest.approx(np.linalg.norm(without_noise), rel=0.5)
 
 
-@pytest.mark.parametrize("runs", [6, pytest.param(60, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [6, pytest.param(30, marks=pytest.mark.slow)])
 def test_the_sigma_of_srom_includes_the_deviation_of_its_orientations(
     runs: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,7 +5,7 @@ import pytest
 
 from tests.benchmarks.structured_errors import new_tool_run, verify_run
 
-FRESH = range(601, 606)
+FRESH = range(601, 604)
 CHANGES = ("20 g", "3 mm", ".5 N")
 
 

@@ -701,7 +701,7 @@ def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
 def test_the_likely_error_is_that_of_the_next_use_where_the_bias_walks() -> None:
     walk, rng, ratios = np.repeat([0.1, 0.003], 3), np.random.default_rng(27), []
     times = 10.0 * np.arange(24, dtype=np.float64)
-    for _ in range(12):
+    for _ in range(7):
         moved = np.cumsum(rng.normal(size=(30, 6)) * walk, axis=0)  # six more in the minute after
         wrench = noisy(rng, R24) + moved[:24]
         result = solve(CalibrationDataset(R24, wrench, white(24), np.full(24, 500), times))

@@ -94,7 +94,7 @@ def test_a_sensor_of_wrong_gain_is_predicted_as_well_as_by_an_oracle(measured: b
 @pytest.mark.slow
 def test_the_error_of_the_prediction_is_as_stated() -> None:
     distances = []
-    for seed in range(15):
+    for seed in range(9):
         rng = np.random.default_rng(seed)
         p, R, wrench, M, L = session(rng, 12, 0.02, 0.02)
         result = solve(CalibrationDataset(R, wrench, np.tile(WHITE, (12, 1, 1)), np.zeros(12, int), np.arange(12.0)))
@@ -107,7 +107,7 @@ def test_the_error_of_the_prediction_is_as_stated() -> None:
 @pytest.mark.slow
 def test_nothing_is_found_in_a_sensor_without_error() -> None:
     found = 0
-    for seed in range(60):
+    for seed in range(40):
         _, R, wrench, _, _ = session(np.random.default_rng(seed), 24, 0.0, 0.0)
         found += fit(R, wrench, WHITE).response is not None
     assert found <= 2
@@ -190,7 +190,7 @@ def test_it_is_kept_in_the_file(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_sigmas_of_the_tool_include_what_gain_and_cross_talk_hide() -> None:
-    seeds = 25
+    seeds = 16
     z, compensation = [], []
     for seed in range(seeds):
         rng = np.random.default_rng(seed)
