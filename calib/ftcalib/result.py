@@ -397,7 +397,9 @@ class CalibrationResult:
     @cached_property
     def contact(self) -> ContactResponse:
         """How the sensor reads a contact: its decoder, and the errors that remain of it."""
-        return (self.sensor or SensorMatrix.usual()).after(self.parameters, self.shown_response)
+        return (self.sensor or SensorMatrix.usual()).after(
+            self.parameters, self.shown_response, self.covariance[:3, :3]
+        )
 
     @property
     def shown_response(self) -> Response:
@@ -434,7 +436,7 @@ class CalibrationResult:
         contact, R = np.asarray(wrench, dtype=np.float64), matrices_of(R_base_flange)
         excess = np.square(self.likely_error()) - np.square(self.predicted_error())
         free = np.diagonal(self.wrench_covariance(R), axis1=-2, axis2=-1) + np.repeat(np.maximum(excess, 0.0) / 3, 3)
-        loaded = self.contact.covariance(contact, self.covariance[:3, :3])
+        loaded = self.contact.covariance(contact)
         return np.asarray(np.sqrt(free + np.diagonal(loaded, axis1=-2, axis2=-1)))
 
     @cached_property

@@ -105,7 +105,9 @@ class SensorMatrix:
         """(6, 6) one standard deviation of the entries of E."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
 
-    def after(self, parameters: Parameters, seen: Response | None) -> "ContactResponse":
+    def after(
+        self, parameters: Parameters, seen: Response | None, rotation_covariance: Array | None = None
+    ) -> "ContactResponse":
         """Return how the sensor reads a contact, after the calibration of a tool.
 
         Parameters
@@ -114,6 +116,8 @@ class SensorMatrix:
             Of the tool.
         seen : Response or None
             What the tool shows of gain and cross-talk, with its covariance; None shows nothing.
+        rotation_covariance : array, shape (3, 3), optional
+            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it.
         """
         E, C = np.asarray(self.error), np.asarray(self.covariance[3:, 3:])
         # A sensor that is declared perfect has nothing to learn.
@@ -126,7 +130,8 @@ class SensorMatrix:
             size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + SIZE - 2)
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ shown).reshape(6, 6), size * C - gain @ (size * prior - remaining) @ gain.T
-        return ContactResponse(self, parameters, E, C)
+        turned = np.zeros((3, 3)) if rotation_covariance is None else rotation_covariance
+        return ContactResponse(self, parameters, E, C, turned)
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a sensor's file."""
@@ -176,6 +181,8 @@ class ContactResponse:
     """(6, 6) E as estimated."""
     error_covariance: Array
     """(36, 36) of its entries, row by row."""
+    rotation_covariance: Array
+    """(3, 3) of `R_flange_sensor`, flange axes, rad²."""
 
     @cached_property
     def decoder(self) -> Array | None:
@@ -205,27 +212,41 @@ class ContactResponse:
         """Return the derivative (..., 6, 36) of decoded wrenches (..., 6) by the entries of E."""
         return np.asarray(np.einsum("aij,...j->...ia", self._effects, wrench))
 
-    def covariance(self, wrench: Array, rotation_covariance: Array | None = None) -> Array:
+    @cached_property
+    def _by_products(self) -> Array:
+        """(36, 36) that gives the covariance of a contact w, row by row, from its products w w'."""
+        columns = self.error_columns(np.eye(6))  # (wrench, axis, entry)
+        C = np.einsum("kia,ab,ljb->ijkl", columns, self.error_covariance, columns)
+        turned = np.zeros((6, 6, 3))  # (wrench, axis, turn)
+        turned[:3, :3] = turned[3:, 3:] = skew(np.eye(3))
+        R = self.parameters.R_flange_sensor
+        C += np.einsum("kia,ab,ljb->ijkl", turned, R.T @ self.rotation_covariance @ R, turned)
+        F = ranges(self.sensor.lever_m)
+        C += self.sensor.floor**2 * np.einsum("ij,kl->ijkl", np.diag(F**2), np.diag(F**-2.0))
+        return np.asarray(C.reshape(36, 36))
+
+    def covariance(self, wrench: Array) -> Array:
         """Covariance (..., 6, 6) of decoded contacts (..., 6) that errors of the sensor cause, with the floor.
+
+        It is quadratic in the contact, so that one product with a constant gives it.
 
         Parameters
         ----------
         wrench : array, shape (..., 6)
             The contact, N and N·m.
-        rotation_covariance : array, shape (3, 3), optional
-            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it.
         """
-        columns = self.error_columns(wrench)
-        C = columns @ self.error_covariance @ np.swapaxes(columns, -1, -2)
-        F = ranges(self.sensor.lever_m)
-        load = np.sum((wrench / F) ** 2, axis=-1)
-        C = C + (self.sensor.floor**2 * load)[..., None, None] * np.diag(F**2)
-        if rotation_covariance is not None:
-            R = self.parameters.R_flange_sensor
-            halves = np.split(np.asarray(wrench), 2, axis=-1)
-            turned = np.concatenate([skew(half) for half in halves], axis=-2)
-            C = C + turned @ (R.T @ rotation_covariance @ R) @ np.swapaxes(turned, -1, -2)
-        return np.asarray(C)
+        wrench = np.asarray(wrench)
+        products = (wrench[..., :, None] * wrench[..., None, :]).reshape(*wrench.shape[:-1], 36)
+        return np.asarray((products @ self._by_products.T).reshape(*wrench.shape, 6))
+
+    def sigma_at(self, p_sensor_m: Array) -> tuple[float, float]:
+        """Return one sigma of a force of 1 N at a place (3,), and of its torque, N·m: of the lengths of their errors.
+
+        It is the root mean square over all directions of the force.
+        """
+        # The covariance is quadratic in the force, so that its mean over all directions is that over three axes.
+        C = self.covariance(np.concatenate([np.eye(3), np.cross(p_sensor_m, np.eye(3))], axis=1)).mean(axis=0)
+        return float(np.sqrt(np.trace(C[:3, :3]))), float(np.sqrt(np.trace(C[3:, 3:])))
 
     def true_load(self, seen: Response | None) -> tuple[float, Array]:
         """Return weight (N) and centre of mass (3,) of the tool itself, where its reading is decoded."""

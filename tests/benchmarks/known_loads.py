@@ -46,11 +46,11 @@ def judged(
     result = solve(tool)
     if result.verdict == "rejected":
         raise NotObservable("the calibration of the tool is rejected")
-    contact = matrix.after(result.parameters, result.shown_response)
+    contact = matrix.after(result.parameters, result.shown_response, result.covariance[:3, :3])
     true, read = sensor.contacts(40, torque_Nm, most_N)
     R = result.R_flange_sensor
     e = contact.decode(read) - np.concatenate([part @ R for part in np.split(true, 2, axis=1)], axis=1)
-    C = contact.covariance(contact.decode(read), result.covariance[:3, :3])
+    C = contact.covariance(contact.decode(read))
     sigma = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
     force = np.linalg.norm(true[:, :3], axis=1)
     return {

@@ -231,13 +231,10 @@ def _contact_sigma(sensor: "SensorMatrix", tip_m: float) -> tuple[float, float]:
     import numpy as np
 
     from ftcalib.model import Parameters
-    from ftcalib.sensor_matrix import ContactResponse
 
     nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    contact = ContactResponse(sensor, nothing, sensor.error, sensor.covariance[3:, 3:])
-    force = 100 * np.eye(3)
-    C = contact.covariance(np.concatenate([force, np.cross([0, 0, tip_m], force)], axis=1)).mean(axis=0)
-    return float(np.sqrt(np.trace(C[:3, :3]))), float(np.sqrt(np.trace(C[3:, 3:])))
+    force, torque = sensor.after(nothing, None).sigma_at(np.array([0, 0, tip_m]))
+    return 100 * force, 100 * torque
 
 
 def _solution_json(solution: "LoadSolution", saved: Path | None) -> dict[str, Any]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from ftcalib.after.series import BiasTemperature
 from ftcalib.after.weighing import Weight
 from ftcalib.files import JSON
-from ftcalib.sensor_matrix import ContactResponse
 from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.live.motion import READING_S, REST, wrench_by_acceleration
@@ -35,17 +34,6 @@ SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
 # More rows are processed in pieces that stay in the cache.
 _CHUNK_ROWS = 8192
-
-
-def _quadratic_form(contact: ContactResponse, rotation_covariance: Array) -> Array:
-    """Return (36, 36) that gives the covariance (36,) of a contact w, row by row, from its products w w'.
-
-    The covariance is quadratic in the contact, so that each product has a constant share of it.
-    """
-    one = np.eye(6)
-    alone = contact.covariance(one, rotation_covariance)
-    both = contact.covariance(one[:, None] + one, rotation_covariance)
-    return np.asarray((both - alone[:, None] - alone).reshape(36, 36).T / 2)
 
 
 class Processor:
@@ -97,7 +85,6 @@ class Processor:
             self._filter = self._filter_of(self._stages)
             self._tool = FreeTool(info, temperature)
             self._contact = calibration.contact
-            self._by_contact = _quadratic_form(self._contact, calibration.covariance[:3, :3])
             self._inertia = InertiaStage(info)
             self._motion = self._tool.motion_tracker()
             self._noise = NoiseEstimator(
@@ -286,8 +273,7 @@ class Processor:
         if self._stages.bias:
             covariance = covariance + np.diag(self._tool.bias_growth(self._newest_ns))
         if loaded:
-            wrench = self._contact.decode(self._reading)
-            covariance = covariance + (self._by_contact @ (wrench[:, None] * wrench).ravel()).reshape(6, 6)
+            covariance = covariance + self._contact.covariance(self._contact.decode(self._reading))
         T = self._transform.matrix(R_base_flange)
         return np.asarray(np.sqrt(np.einsum("ij,ij->i", T @ covariance, T)))
 

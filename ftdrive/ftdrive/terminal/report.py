@@ -192,11 +192,8 @@ def tip_of(result: CalibrationResult) -> Array:
 
 def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTACT_N) -> Array:
     """Return one standard deviation of a force at the tip, as the length of its error, over all directions."""
-    unit = np.concatenate([np.eye(3), np.cross(tip_of(result), np.eye(3))], axis=1)
-    # The covariance is quadratic in the force, so that its mean over all directions is that over three axes.
-    covariance = result.contact.covariance(unit, result.covariance[:3, :3])
-    share = float(np.trace(covariance[:, :3, :3], axis1=1, axis2=2).mean())
-    return np.asarray(np.sqrt(result.likely_error()[0] ** 2 + share * np.square(force_N)))
+    share, _ = result.contact.sigma_at(tip_of(result))
+    return np.asarray(np.hypot(result.likely_error()[0], share * np.asarray(force_N)))
 
 
 def sensor_in_words(result: CalibrationResult) -> str:

@@ -80,8 +80,8 @@ def test_sigma_follows_the_prior_and_the_contact() -> None:
 
 
 def test_a_rotation_of_the_sensor_turns_the_contact() -> None:
-    contact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0).after(parameters(), None)
-    turned = contact.covariance(np.array([0, 0, 100.0, 0, 0, 0]), 1e-6 * np.eye(3))
+    exact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0)
+    turned = exact.after(parameters(), None, 1e-6 * np.eye(3)).covariance(np.array([0, 0, 100.0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(turned)), [0.1, 0.1, 0, 0, 0, 0], atol=1e-9)
 
 
