@@ -59,15 +59,14 @@ def check(
     from ftdrive.live.weighing import Scale
     from ftdrive.runs.load import Load, mass_of
 
-    load = (Load.of(mass, at, gripped=False) if at is not None else Load("load", *mass_of(mass), None)).known
+    load = Load("load", *mass_of(mass)) if at is None else Load.of(mass, at, gripped=False)
     with ExitStack() as stack:
         stream = _opened(source, replay, stack)
         if zero and replay is None:
             _zero(Scale(stream), stream, wait_s)
         reference, since_s = stream.reference()
-        if source.simulate and load.p_flange_m is not None:
-            at_mm = [1e3 * x for x in load.p_flange_m]
-            stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=at_mm, string_mm=250, swing_deg=0)
+        if source.simulate and load.p_flange_mm is not None:
+            stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=load.p_flange_mm, string_mm=250, swing_deg=0)
         measured = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
     found = check_load(
         stream.info.calibration,
@@ -209,8 +208,7 @@ def _run_of(path: Path) -> tuple["LoadRun", str | None, Any]:
     from ftdrive.runs.source import SolveOptions, read_source
 
     data = read_source(path, SolveOptions())
-    load = Load.of_header(data.dataset.meta)
-    return LoadRun(path.name, data.dataset, None if load is None else load.known), data.sensor_serial, data
+    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), data.sensor_serial, data
 
 
 def _prior(data: Any, serial: str | None, names: list[str]) -> "SensorMatrix":

@@ -1,21 +1,18 @@
 """A weighed load on the tool during a run: as options describe it, and as run.json and the dataset keep it."""
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from math import isfinite, radians, sin
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import Any, Final, Self
 
+from ftcalib.loads.model import KnownLoad
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
 
-if TYPE_CHECKING:
-    from ftcalib.loads.model import KnownLoad
-
 # Of a mass without a sigma of its own: a kitchen scale.
 MASS_SHARE: Final = 1e-3
-PLACE_SIGMA_MM: Final = 0.5
 _FARTHEST_MM: Final = 2000.0
 _HEAVIEST_KG: Final = 100.0
 _MOST_SWING_RAD: Final = radians(5)
@@ -23,33 +20,23 @@ _SWING_S: Final = 4.0
 _SWING_ATTEMPTS: Final = 6
 
 
-@dataclass(frozen=True, slots=True)
-class Load:
-    """A weighed load: hung on a string from a point of the tool, or gripped at an unknown place."""
+class Load(KnownLoad):
+    """A weighed load of a session: hung on a string from a point of the tool, or gripped at an unknown place."""
 
-    name: str
-    """Of its place."""
-    mass_kg: float
-    mass_sigma_kg: float
-    p_flange_mm: tuple[float, float, float] | None
-    """(3,) where it hangs, from the centre of the flange face in flange axes; None if it is gripped."""
-    place_sigma_mm: float = PLACE_SIGMA_MM
-    gripped: bool = False
+    __slots__ = ()
 
     @property
-    def p_flange_m(self) -> tuple[float, float, float] | None:
-        """(3,) where it hangs, m."""
-        if self.p_flange_mm is None:
+    def gripped(self) -> bool:
+        """Whether it is in the gripper, at an unknown place."""
+        return self.p_flange_m is None
+
+    @property
+    def p_flange_mm(self) -> tuple[float, float, float] | None:
+        """(3,) where it hangs, as options and run.json have it; None if it is gripped."""
+        if self.p_flange_m is None:
             return None
-        x, y, z = (value / 1e3 for value in self.p_flange_mm)
+        x, y, z = (round(1e3 * value, 6) for value in self.p_flange_m)
         return x, y, z
-
-    @property
-    def known(self) -> "KnownLoad":
-        """The same for the fit of the sensor's matrix."""
-        from ftcalib.loads.model import KnownLoad
-
-        return KnownLoad(self.name, self.mass_kg, self.mass_sigma_kg, self.p_flange_m, self.place_sigma_mm / 1e3)
 
     @property
     def most_swing_N(self) -> float | None:
@@ -70,13 +57,9 @@ class Load:
         if (place is None) != gripped:
             raise ConfigError("--load needs one of two: where it hangs, such as --at tip=0,0,200, or --gripped")
         if place is None:
-            return cls("gripper", mass_kg, sigma_kg, None, gripped=True)
-        name, p_flange_mm = place_of(place)
-        if p_flange_mm is None:
-            raise ConfigError(
-                f"--at {name} has no place: give it in mm from the flange face, such as --at {name}=0,0,200"
-            )
-        return cls(name, mass_kg, sigma_kg, p_flange_mm)
+            return cls("gripper", mass_kg, sigma_kg)
+        name, p_flange_m = place_of(place)
+        return cls(name, mass_kg, sigma_kg, p_flange_m)
 
     @classmethod
     def of_header(cls, header: Mapping[str, Any]) -> Self | None:
@@ -84,19 +67,19 @@ class Load:
         found = header.get("load")
         if found is None:
             return None
-        place = found["p_flange_mm"]
-        p_flange_mm = None if place is None else (float(place[0]), float(place[1]), float(place[2]))
-        return cls(**{**found, "p_flange_mm": p_flange_mm})
+        place_mm = found["p_flange_mm"]
+        p_flange_m = None if place_mm is None else _in_m(place_mm)
+        sigma_m = found["place_sigma_mm"] / 1e3
+        return cls(found["name"], found["mass_kg"], found["mass_sigma_kg"], p_flange_m, sigma_m)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields as run.json has them."""
-        place = None if self.p_flange_mm is None else list(self.p_flange_mm)
         return {
             "name": self.name,
             "mass_kg": self.mass_kg,
             "mass_sigma_kg": self.mass_sigma_kg,
-            "p_flange_mm": place,
-            "place_sigma_mm": self.place_sigma_mm,
+            "p_flange_mm": None if self.p_flange_mm is None else list(self.p_flange_mm),
+            "place_sigma_mm": round(1e3 * self.place_sigma_m, 6),
             "gripped": self.gripped,
         }
 
@@ -115,17 +98,24 @@ def mass_of(text: str) -> tuple[float, float]:
     return mass_kg, sigma_kg
 
 
-def place_of(text: str) -> tuple[str, tuple[float, float, float] | None]:
-    """Read a place, NAME=x,y,z in mm from the flange face or NAME alone; raises `ConfigError`."""
+def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
+    """Read a place, NAME=x,y,z in mm from the flange face; return it in m. Raises `ConfigError`."""
     name, given, numbers = text.partition("=")
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(f"the place '{text}' has no name: give one such as tip=0,0,200")
     if not given:
-        return name, None
+        raise ConfigError(f"--at {name} has no place: give it in mm from the flange face, such as --at {name}=0,0,200")
     try:
-        x, y, z = map(float, numbers.split(","))
+        place_mm = [float(number) for number in numbers.split(",")]
     except ValueError:
-        raise ConfigError(f"the place '{text}' is not three numbers in mm: give one such as {name}=0,0,200") from None
-    if not all(map(isfinite, (x, y, z))) or max(abs(x), abs(y), abs(z)) > _FARTHEST_MM:
+        place_mm = []
+    if len(place_mm) != 3:
+        raise ConfigError(f"the place '{text}' is not three numbers in mm: give one such as {name}=0,0,200")
+    if not all(map(isfinite, place_mm)) or max(map(abs, place_mm)) > _FARTHEST_MM:
         raise ConfigError(f"the place '{text}' is more than {_FARTHEST_MM / 1e3:g} m from the flange: is it in mm?")
-    return name, (x, y, z)
+    return name, _in_m(place_mm)
+
+
+def _in_m(place_mm: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (value / 1e3 for value in place_mm)
+    return x, y, z
