@@ -186,8 +186,8 @@ def _across(direction: Array) -> Array:
 USUAL_GAIN: Final = 0.02
 # Cross-talk over gain, as sigmas of their entries.
 CROSS_TALK_SHARE: Final = 0.5
-# Range of torque over range of force.
-USUAL_LEVER_M: Final = 0.05
+# Range of torque over range of force, of a sensor without data sheet.
+RANGE_LEVER_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +241,7 @@ class Setup:
     @property
     def sensor_lever_m(self) -> float:
         """Range of torque over range of force."""
-        return USUAL_LEVER_M if self.sensor_range is None else self.sensor_range[1] / self.sensor_range[0]
+        return RANGE_LEVER_M if self.sensor_range is None else self.sensor_range[1] / self.sensor_range[0]
 
     @property
     def gain_sigma(self) -> float:

@@ -35,7 +35,7 @@ from tests.loaded_sensor import (
 )
 
 SENSORS = 60
-# Twice the sigma of the root mean square of so few sensors, whose contacts share a matrix.
+# Error of the force at the tip, rms.
 LIMITS_PERCENT = {"hung, tip": 0.30, "hung, side and tip": 0.35, "bar, gripped twice": 0.38}
 
 

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftcalib.files import JSON
-from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, USUAL_LEVER_M
+from ftcalib.known import CROSS_TALK_SHARE, RANGE_LEVER_M, USUAL_GAIN
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
 
 # Cross-talk counts relative to a force at this lever.
-LEVER_M = USUAL_LEVER_M
+LEVER_M = RANGE_LEVER_M
 
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 

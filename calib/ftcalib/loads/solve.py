@@ -164,19 +164,23 @@ def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluat
     """Move a model to its best values, with the sizes of the disturbances that explain them best."""
     for _ in range(2):
         for _ in range(_PASSES):
-            model.move(model.evaluate(logarithms, linear := model.linear()).step)
-        linear = model.linear()
-
-        def cost(y: Array, linear=linear) -> tuple[float, Array]:  # type: ignore[no-untyped-def]
-            at = model.evaluate(y, linear)
-            return at.cost, at.gradient
-
-        found = minimize(
-            cost, logarithms, jac=True, method="L-BFGS-B", bounds=[(-5, 5)] * len(SIZES), options={"maxiter": 30}
-        )
-        logarithms = found.x
+            model.move(model.evaluate(logarithms, model.linear()).step)
+        logarithms = _best_sizes(model, logarithms)
     model.move(model.evaluate(logarithms, model.linear()).step)
     return model, logarithms, model.evaluate(logarithms, model.linear())
+
+
+def _best_sizes(model: LoadModel, logarithms: Array) -> Array:
+    """Return the sizes that are most likely about the present values."""
+    linear = model.linear()
+
+    def cost(y: Array) -> tuple[float, Array]:
+        at = model.evaluate(y, linear)
+        return at.cost, at.gradient
+
+    bounds = [(-5, 5)] * len(SIZES)
+    found = minimize(cost, logarithms, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
+    return np.asarray(found.x)
 
 
 def _candidates(model: LoadModel, run: int) -> list[Mistake]:

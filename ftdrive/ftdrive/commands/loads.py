@@ -205,10 +205,12 @@ def _run_of(path: Path) -> tuple["LoadRun", str | None, Any]:
     """Read one run with its load, the serial number of its sensor, and what is known of its cell."""
     from ftcalib.loads.model import LoadRun
     from ftdrive.runs.load import Load
+    from ftdrive.runs.sensor_file import sensor_serial
     from ftdrive.runs.source import SolveOptions, read_source
 
     data = read_source(path, SolveOptions())
-    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), data.sensor_serial, data
+    serial = sensor_serial(data.provenance) or sensor_serial(data.dataset.meta)
+    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), serial, data
 
 
 def _prior(data: Any, serial: str | None, names: list[str]) -> "SensorMatrix":

@@ -4,9 +4,10 @@ A later one is `sensor-2.json`, and so on; the newest counts. It belongs to the 
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from ftcalib import CalibrationResult
 from ftcalib.sensor_matrix import SensorMatrix
@@ -31,9 +32,9 @@ def next_sensor_file(folder: Path = Path()) -> Path:
     return folder / f"sensor-{int((number and number[1]) or 1) + 1}.json"
 
 
-def serial_of(calibration: CalibrationResult) -> str | None:
-    """Return the serial number of the sensor that a calibration is of; None if it names none."""
-    devices = calibration.provenance.get("devices")
+def sensor_serial(origin: Mapping[str, Any]) -> str | None:
+    """Return the serial number of the sensor in the provenance of a result, or what a dataset has; None without one."""
+    devices = origin.get("devices")
     sensor = devices.get("sensor") if isinstance(devices, dict) else None
     serial = sensor.get("serial") if isinstance(sensor, dict) else None
     return serial if isinstance(serial, str) else None
@@ -46,6 +47,6 @@ def with_sensor(calibration: CalibrationResult, folder: Path = Path()) -> Calibr
     """
     for path in reversed(sensor_files(folder)):
         sensor = SensorMatrix.load(path)
-        if sensor.provenance.get("serial") == serial_of(calibration):
+        if sensor.provenance.get("serial") == sensor_serial(calibration.provenance):
             return replace(calibration, sensor=sensor)
     return calibration

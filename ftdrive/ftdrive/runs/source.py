@@ -106,13 +106,6 @@ class RecordedData:
         return {"g_m_s2": self.g_m_s2, "setup": self.setup, "known": self.known}
 
     @property
-    def sensor_serial(self) -> str | None:
-        """Serial number of the sensor; None if it is unknown."""
-        serial = _of(self.provenance, "devices", "sensor", "serial")
-        serial = serial or _of(self.dataset.meta, "devices", "sensor", "serial")
-        return serial if isinstance(serial, str) else None
-
-    @property
     def p_flange_sensor_m(self) -> Array:
         """(3,) sensor origin from the flange face, where its height is described; else there."""
         return np.array([0.0, 0.0, self.setup.sensor_height_m or 0.0])

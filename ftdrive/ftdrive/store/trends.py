@@ -229,5 +229,5 @@ def _fit(runs: Sequence[_Run]) -> BiasTemperature | None:
     if not runs:
         return None
     days = [(run.created_utc - runs[0].created_utc).total_seconds() / 86400 for run in runs]
-    columns = (np.array([run[k] for run in runs]) for k in (2, 3, 4))
+    columns = (np.array([getattr(run, name) for run in runs]) for name in ("temperature_C", "bias", "sigma"))
     return bias_temperature(np.array(days), *columns)

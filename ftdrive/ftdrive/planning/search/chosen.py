@@ -218,13 +218,9 @@ def hung_tour(
         if len(reached) < poses:
             continue
         chosen = reached[_evenly_spread(down @ candidates[reached], poses)]
-        nodes = np.flatnonzero((part == best) & np.isin(group, chosen))
-        place = np.full(len(candidates), -1)
-        place[chosen] = np.arange(poses)
-        order = clear_tour(kept, q[nodes], place[group[nodes]], speeds)
-        if order is not None:
-            nodes = nodes[order]
-            return tuple((FIRST_NUMBER + place[group[nodes]]).tolist()), q[nodes], hook_m
+        inside = part == best
+        if (tour := _tour_through(kept, q[inside], group[inside], chosen, speeds)) is not None:
+            return *tour, hook_m
     return None
 
 
@@ -331,13 +327,25 @@ def _tours_at(
         chosen = choice(reached[p])
         if len(chosen) < poses:
             continue
-        nodes = np.flatnonzero((part == p) & np.isin(group, chosen))
-        place = np.full(len(candidates), -1)
-        place[chosen] = np.arange(poses)
-        order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
-        if order is not None:
-            nodes = nodes[order]
-            yield tuple((FIRST_NUMBER + place[group[nodes]]).tolist()), q[nodes]
+        if (tour := _tour_through(certifier, q[part == p], group[part == p], chosen, speeds)) is not None:
+            yield tour
+
+
+def _tour_through(
+    certifier: Certifier, q: Array, group: Nodes, chosen: Nodes, speeds: Speeds
+) -> tuple[tuple[int, ...], Array] | None:
+    """Find a short closed tour through one of the joint vectors q (n, 6) of each chosen orientation.
+
+    `group` (n,) has the orientation of each. The tour is given as numbers from 101 on, in the order of `chosen`, and
+    joint vectors in the order of travel.
+    """
+    nodes = np.flatnonzero(np.isin(group, chosen))
+    place = np.full(group.max() + 1, -1)
+    place[chosen] = np.arange(len(chosen))
+    order = clear_tour(certifier, q[nodes], place[group[nodes]], speeds)
+    if order is None:
+        return None
+    return tuple((FIRST_NUMBER + place[group[nodes[order]]]).tolist()), q[nodes[order]]
 
 
 def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:
