@@ -265,7 +265,7 @@ def _print_solution(solution: "LoadSolution", prior: "SensorMatrix", saved: Path
     _print_matrix(solution.sensor)
     tip_m = max((abs(one["p_flange_m"][2]) for one in solution.loads), default=0.2)
     (before, _), (after, torque) = _contact_sigma(prior, tip_m), _contact_sigma(solution.sensor, tip_m)
-    echo(f"100 N at {1e3 * tip_m:.0f} mm: ± {after:.2g} N (before ± {before:.2g}), ± {torque:.2g} N·m")
+    echo(f"100 N at {1e3 * tip_m:.0f} mm: ± {after:.2g} N, ± {torque:.2g} N·m (of the sensor before: ± {before:.2g} N)")
     for finding in solution.findings:
         echo(f"{finding.severity.upper()}  {finding.words}")
     if saved is not None:
