@@ -55,7 +55,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
     from ftcalib.after.series import difference
 
     a, b = _side(first), _side(second)
-    found = difference(a.calibrated, b.calibrated)
+    found, sensors = difference(a.calibrated, b.calibrated), _sensors(a, b)
     mass_sigma_kg = (a.mass_sigma_kg**2 + b.mass_sigma_kg**2) ** 0.5
     if as_json:
         write_json(
@@ -68,22 +68,22 @@ def diff(first: str, second: str, as_json: bool) -> None:
                 "groups": {name: _as_json(test) for name, test in found.groups.items()},
                 "joint": _as_json(found.joint),
                 "significant": found.joint.p_value < _SIGNIFICANT,
+                "sensors": sensors,
             }
         )
         return
     for name, side in (("A", a), ("B", b)):
         made = (side.created_utc or "unknown time")[:16].replace("T", " ")
         echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
-    before, after = _sensor(a), _sensor(b)
-    if None not in (before, after) and before != after:
-        echo(f"One contact reads differently: errors of the sensor are {before} in A, {after} in B.")
+    if sensors is not None:
+        echo(f"One contact reads differently: errors of the sensor are {sensors[0]} in A, {sensors[1]} in B.")
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
     echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
             echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
-    echo(_describe_difference(found))
+    echo(_describe_difference(found, sensors))
 
 
 def _side(text: str) -> _Side:
@@ -114,12 +114,18 @@ def _side(text: str) -> _Side:
     return _Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
 
 
-def _sensor(side: _Side) -> str | None:
-    """Say on what the errors of the sensor under contact rest; None for a result of the store, which has no sensor."""
+def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
+    """Say on what the errors of the sensor under contact rest in A and B; None if that is the same, or not known."""
     from ftcalib import CalibrationResult
     from ftdrive.terminal.report import sensor_in_words
 
-    return sensor_in_words(side.calibrated) if isinstance(side.calibrated, CalibrationResult) else None
+    first, second = a.calibrated, b.calibrated
+    # A result of the store has no sensor.
+    if not (isinstance(first, CalibrationResult) and isinstance(second, CalibrationResult)):
+        return None
+    if first.contact.sensor.to_dict() == second.contact.sensor.to_dict():
+        return None
+    return sensor_in_words(first), sensor_in_words(second)
 
 
 def _line(label: str, change: float, sigma: float) -> str:
@@ -131,10 +137,11 @@ def _line(label: str, change: float, sigma: float) -> str:
     return f"{label:22}{to_place_of(change, sigma, '+'):>12}{spread:>12}{ratio}"
 
 
-def _describe_difference(found: "Difference") -> str:
+def _describe_difference(found: "Difference", sensors: tuple[str, str] | None) -> str:
     joint = found.joint
     if joint.dof == 0:
-        return "The calibrations are the same."
+        but = "" if sensors is None else f", the errors of the sensor are not: {sensors[0]} in A, {sensors[1]} in B"
+        return f"The calibrations are the same{but}."
     test = f"chi2 {joint.chi2:.1f} for {joint.dof} degrees of freedom, p = {joint.p_value:.2g}"
     if joint.p_value >= _SIGNIFICANT:
         return f"They agree within their uncertainty ({test})."

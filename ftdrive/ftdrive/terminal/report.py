@@ -204,7 +204,7 @@ def sensor_in_words(result: CalibrationResult) -> str:
     if sensor.source == "data sheet":
         return "those of the data sheet"
     made = sensor.provenance.get("created_utc")
-    return f"known from loads, sensor.json of {made[:10]}" if isinstance(made, str) else "known from loads"
+    return "known from loads" + (f", sensor.json of {made[:16].replace('T', ' ')}" if isinstance(made, str) else "")
 
 
 def contact_in_words(result: CalibrationResult) -> str:

@@ -183,13 +183,15 @@ def test_one_tool_on_a_sensor_with_and_without_loads_reads_contacts_differently(
     run: Callable[..., Ran], runs: Path
 ) -> None:
     alone = runs / "gripper-0" / "calibration.json"
-    made = {"created_utc": "2026-11-20T08:00:00+00:00"}
-    sensor = replace(SensorMatrix.usual(), source="loads", provenance=made)
-    replace(CalibrationResult.load(alone), sensor=sensor).save(runs / "loads.json")
-    out = run("diff", alone, runs / "loads.json")[1].splitlines()
-    assert "of the data sheet" in out[2]
-    assert "in A" in out[2]
-    assert "sensor.json of 2026-11-20 in B" in out[2]
+    for name, made in (("loads", "2026-11-20T08:00:00+00:00"), ("later", "2026-11-20T09:30:00+00:00")):
+        sensor = replace(SensorMatrix.usual(), source="loads", provenance={"created_utc": made})
+        replace(CalibrationResult.load(alone), sensor=sensor).save(runs / f"{name}.json")
+    for first, words in (("gripper-0", "of the data sheet in A"), ("loads.json", "2026-11-20 08:00 in A")):
+        out = run("diff", runs / first, runs / "later.json")[1].splitlines()
+        for line in (out[2], out[-1]):
+            assert words in line
+            assert "sensor.json of 2026-11-20 09:30 in B" in line
+    assert json.loads(run("diff", alone, runs / "later.json", "--json")[1])["sensors"][1].endswith("09:30")
     assert not [line for line in run("diff", alone, alone)[1].splitlines() if "contact" in line]
 
 

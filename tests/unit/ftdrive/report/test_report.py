@@ -266,7 +266,7 @@ def test_a_contact_has_the_sigma_of_its_sensor_with_and_without_loads() -> None:
     assert "known from loads, sensor.json of 2026-11-20" in known["words"]
     page = report({**facts(), "contact": known, "comparison": compared(now, before)}, "md")
     assert f"the tool weighs {before.mass_kg / 1.02:.4f} kg" in page
-    assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 now" in page
+    assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 08:00 now" in page
 
 
 def test_the_tip_is_the_far_end_of_the_described_tool() -> None:
