@@ -2,6 +2,7 @@
 
 bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
 environment.json    versions of all packages, and the checks of the computer that need no device
+sensor.json         the sensor's matrix in the folder where the command runs, and later ones, redacted
 <run>/...           the files of the run folder; texts are redacted, poses are copied byte for byte
 transcripts/...     the files of `ftdrive transcript record`, redacted
 """
@@ -42,6 +43,7 @@ from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, c
 from ftdrive.errors import BadBundle
 from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
 from ftdrive.runs.run import LOCK, Run, versions
+from ftdrive.runs.sensor_file import sensor_files
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
 _URL_HOST = re.compile(r"\b([a-z][a-z0-9+-]*)://(?:[^/@\s]*@)?([A-Za-z0-9][A-Za-z0-9.-]*)")
@@ -230,7 +232,7 @@ class Bundled:
 
 
 def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> Bundled:
-    """Write a run folder and transcripts to a new zip file, complete or not at all.
+    """Write a run folder, transcripts and the sensor's matrix to a new zip file, complete or not at all.
 
     Raises
     ------
@@ -259,6 +261,9 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         if (text := _text(read_file(file))) is None:
             raise BadBundle(f"{file} is not a text file: give a file of `ftdrive transcript record`")
         texts[f"transcripts/{number}-{file.name}"] = text
+    for file in sensor_files():
+        if (text := _text(read_file(file))) is not None:
+            texts[file.name] = text
     for text in texts.values():
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}

@@ -7,6 +7,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +20,14 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import predict
 from ftcalib.poses.information import special
 from ftcalib.routine import PoseRecord, TourPose
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
 from ftdrive.cli import run as run_command
 from ftdrive.errors import BadBundle
 from ftdrive.runs import bundle
 from ftdrive.runs.bundle import Bundled, unpack, write_bundle
 from ftdrive.runs.run import Reading, Run
+from ftdrive.runs.sensor_file import sensor_files
 from ftdrive.runs.source import solve_and_save
 from ftdrivers.interfaces import FtSamples
 
@@ -106,6 +109,20 @@ def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundle
     with unpack(path) as folder:
         assert len(Run(folder).records()) == 8
     assert not folder.exists()
+
+
+def test_a_bundle_has_the_matrix_by_which_contacts_are_decoded_here(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made = {"serial": "FT12345", "runs": ["/home/alice/runs/tool"]}
+    for file in ("sensor.json", "sensor-2.json"):
+        replace(SensorMatrix.usual(), source="loads", provenance=made).save(file)
+    write_bundle(run.folder, Path("a.zip"))
+    with unpack(Path("a.zip")) as folder:
+        newest = SensorMatrix.load(sensor_files(folder.parent)[-1])
+    np.testing.assert_array_equal(newest.covariance, SensorMatrix.usual().covariance)
+    assert newest.provenance == {"serial": "FT12345", "runs": ["<home-1>/runs/tool"]}
 
 
 def test_the_bytes_of_a_transcript_keep_their_number(run: Run, tmp_path: Path) -> None:
