@@ -203,6 +203,7 @@ def _reading(view: View) -> dict[str, Any]:
         "raw": wrench(reading.raw_in_frame),
         "compensated": wrench(reading.wrench),
         "sigma": wrench(reading.sigma),
+        "sigma_at_rest": wrench(reading.rest_sigma),
         "contact": None if view.silent else reading.in_contact,
         "stale": view.silent or None,
         "delay_s": {"value": status.delay_s, "sigma": status.delay_sigma_s},

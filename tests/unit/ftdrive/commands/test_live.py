@@ -59,6 +59,7 @@ def test_each_line_is_the_mean_of_a_tenth_of_a_second(arguments: list[str]) -> N
         assert line["compensated"]["force_N"] == pytest.approx([1.0, 2.0, 3.0], abs=6 * NOISE[0] / 10)
         by_contact = np.diag(calibrated().contact.covariance(PUSH))
         assert line["sigma"]["force_N"] == pytest.approx(np.sqrt((NOISE / 10) ** 2 + by_contact)[:3], rel=0.1)
+        assert line["sigma_at_rest"]["force_N"] == pytest.approx(NOISE[:3] / 10, rel=0.2)
         assert (line["axes"], line["about"], line["contact"], line["stale"]) == ("sensor", "sensor origin", True, None)
         assert line["delay_s"] == {"value": 0.0, "sigma": 0.0}
     assert np.diff([line["t_s"] for line in lines]) == pytest.approx(0.1, abs=0.02)
