@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,24 +65,28 @@ def check(
         stream = _opened(source, replay, stack)
         if zero and replay is None:
             _zero(Scale(stream), stream, wait_s)
-        reference, since_s = stream.reference()
         if source.simulate and load.p_flange_mm is not None:
             stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=load.p_flange_mm, string_mm=250, swing_deg=0)
-        measured = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
+        measured, reference, tare_age_s = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
     found = check_load(
         stream.info.calibration,
         reference,
         load,
         measured,
-        drift=drift_since(since_s),
+        drift=drift_since(tare_age_s),
         p_flange_sensor_m=stream.info.p_flange_sensor_m,
     )
     if as_json:
         values = {key: value if isfinite(value) else None for key, value in found._asdict().items()}
         head = {"schema_version": 1, "calibration_id": stream.info.calibration.id, "given_kg": load.mass_kg}
-        write_json({**head, **values, "is_within": found.is_within, "poses": len(measured[0])})
+        more = {"is_within": found.is_within, "poses": len(measured[0]), "tared": isfinite(tare_age_s)}
+        write_json({**head, **values, **more})
     else:
         _print_check(found, load)
+    if not isfinite(tare_age_s):
+        drifted = f"No tare: {100 * found.scale_sigma:.1f} % (1 sigma) has the drift since the calibration."
+        free = "Record the free tool at rest for a second, and then hang the load."
+        echo(f"{drifted} {'Use --zero.' if replay is None else free}", err=True)
     stop_unless(found.is_within, "the load reads otherwise than the sensor promises")
 
 
@@ -113,23 +118,31 @@ def _zero(scale: "Scale", stream: Any, wait_s: float) -> None:
 
 
 def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed: bool) -> Any:
-    """Average what hangs at rest until enough poses are joined, or until a recording ends."""
-    from ftdrive.live.weighing import CannotWeigh, Scale
+    """Average what hangs at rest until enough poses are joined, or until a recording ends.
 
-    scale, refusal, best = Scale(stream), CannotWeigh("samples"), None
-    for _ in stream.clock.looks(wait_s):
+    A recording is tared by the last rest of the free tool before the load. Return the poses, the empty tool, and how
+    many seconds before the poses it was tared.
+    """
+    from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale
+
+    scale, refusal, best, due_ns = Scale(stream), CannotWeigh("samples"), None, 0
+    for _ in repeat(None) if replayed else stream.clock.looks(wait_s):
         rows = stream.read()
         if replayed and not len(rows):
             break
+        if rows.t_host_ns[-1] < due_ns:
+            continue
+        due_ns = rows.t_host_ns[-1] + round(1e9 * WEIGH_S / 5)
         try:
-            weight = scale.weigh(more=True)
+            weight = scale.weigh(more=best is not None)
+            if weight.mass_kg > _SHOWS * mass_kg:
+                best = (scale.poses, *stream.reference())
+                if not replayed and weight.poses >= poses:
+                    break
+            elif replayed and best is None and stream.reference()[1] > WEIGH_S:
+                scale.zero()
         except CannotWeigh as error:
             refusal = error
-            continue
-        if weight.mass_kg > _SHOWS * mass_kg:
-            best = scale.poses
-            if not replayed and weight.poses >= poses:
-                break
     if best is not None:
         return best
     if refusal.code == "samples":

@@ -5,14 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, solve
 from ftcalib.loads.model import LoadRun
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
+from ftdrive.commands import live
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.live.replay import ReplayedStream
+from ftdrive.live.samples import Paired
 from ftdrive.runs.sensor_file import next_sensor_file, sensor_files
 from ftdrive.runs.source import read_calibration
 from tests.loaded_sensor import PROTOCOLS, LoadedSensor, with_load
+from tests.unit.ftdrive.live.simulated import calibrated, info
+from tests.unit.ftdrive.live.test_weighing import POSE, part, rests
 
 
 def run(*arguments: str) -> Result:
@@ -91,6 +98,27 @@ def test_runs_of_two_sensors_are_refused(sensor: LoadedSensor) -> None:
     found = run("solve", "tool.json", "tip.json")
     assert isinstance(found.exception, ConfigError)
     assert "FT2" in str(found.exception)
+
+
+@pytest.mark.parametrize("free_s", [0.0, 2.0])
+def test_a_recording_is_tared_where_the_tool_is_free_before_the_load(
+    free_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drift, elsewhere = np.array([0.2, -0.1, 0.3, 0.003, 0, 0]), Rotation.from_euler("x", 90, degrees=True).as_matrix()
+    load = drift + 1.09 * part(POSE, 1.0)
+    free = [rests((elsewhere, drift), (POSE, drift), seconds=free_s / 2)] if free_s else []
+    rows = Paired.concatenate([*free, rests((POSE, load), (POSE, drift), seconds=1.5)])
+    rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
+    known = info(replace(calibrated(), sensor=SensorMatrix.usual(0.02)))
+    monkeypatch.setattr(live, "replayed", lambda *_, **__: ReplayedStream(known, rows, speed=float("inf")))
+    found = run("check", "1.000", "--replay", str(tmp_path), "--json")
+    answer = json.loads(found.stdout)
+    assert answer["scale_error"] == pytest.approx(0.09, abs=4 * answer["scale_sigma"])
+    assert answer["tared"] is bool(free_s)
+    assert (answer["scale_sigma"] < 0.005) is bool(free_s)
+    # 9 % off is hidden by the drift, and only by that.
+    assert answer["is_within"] is not bool(free_s)
+    assert ("hang the load" in found.stderr) is not bool(free_s)
 
 
 @pytest.mark.parametrize(("mass", "at"), [("two", None), ("-1", None), ("1", "tip"), ("1", "tip=0,0"), ("1±-2", None)])
