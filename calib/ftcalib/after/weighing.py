@@ -182,7 +182,8 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
         D = np.kron(np.eye(n), contact.decode(np.eye(6)).T)
         unit = _unit_readings(u)
         true = _fit(contact.decode(left), unit, lambda x: D @ covariance_of(x, sensor=False) @ D.T, p_sensor_near_m)
-        of_sensor = _by_sensor(true, contact, unit @ true.x)
+        by_reading = true.covariance @ true.H.T @ np.linalg.inv(true.S)
+        of_sensor = _by_sensor(by_reading, float(true.x[0]), contact, unit @ true.x)
     com_m, sigma_kg = true.x[1:] / (true.x[0] or 1.0), true.sigma_kg
     T = np.column_stack([-com_m, np.eye(3)]) / max(abs(true.x[0]), 1e-9)
     com_covariance = T @ (true.covariance + of_sensor) @ T.T
@@ -250,14 +251,39 @@ def _unit_readings(u: Array) -> Array:
     return A
 
 
-def _by_sensor(fit: _Fit, contact: ContactResponse, held: Array) -> Array:
-    """Return the covariance (4, 4) of an estimate by errors of the sensor, if these wrenches (n, 6) are held."""
-    by_reading = fit.covariance @ fit.H.T @ np.linalg.inv(fit.S)
+def _by_sensor(by_reading: Array, mass_kg: float, contact: ContactResponse, held: Array) -> Array:
+    """Return the covariance (4, 4) of an estimate by errors of the sensor, if these wrenches (n, 6) are held.
+
+    `by_reading` (4, 6n) is the derivative of the estimate by the readings.
+    """
     by_entry = by_reading @ contact.error_columns(held).reshape(held.size, -1)
     # Errors that are not linear are alike in all poses at worst.
-    F, mass_kg = ranges(contact.sensor.lever_m), fit.x[0]
+    F = ranges(contact.sensor.lever_m)
     share = contact.sensor.floor**2 * np.sum((held / F) ** 2) / max(float(np.sum(held[:, :3] ** 2)), 1e-12)
     return np.asarray(by_entry @ contact.error_covariance @ by_entry.T + share * mass_kg**2 * np.diag(F[2:] ** 2))
+
+
+def moment_as_read(moment: tuple[Array, Array], contact: ContactResponse) -> tuple[tuple[Array, Array], Array]:
+    """Return what the sensor reads as mass and moment of a part that it carries in all directions.
+
+    Parameters
+    ----------
+    moment : array, shape (4,), and array, shape (4, 4)
+        True mass (kg) and mass times centre of mass (kg m) of the part, and their covariance.
+    contact : ContactResponse
+        How the sensor reads a contact.
+
+    Returns
+    -------
+    as_read : array, shape (4,), and array, shape (4, 4)
+        With their covariance.
+    of_sensor : array, shape (4, 4)
+        Covariance of the true ones by errors of the sensor.
+    """
+    (x, covariance), A = moment, _unit_readings(np.eye(3))
+    by_reading = np.asarray(np.linalg.pinv(A.reshape(18, 4)), dtype=np.float64)
+    T = by_reading @ np.linalg.solve(contact.decode(np.eye(6)).T, A).reshape(18, 4)
+    return (T @ x, T @ covariance @ T.T), _by_sensor(by_reading, float(x[0]), contact, A @ x)
 
 
 def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:

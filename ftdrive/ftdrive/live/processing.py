@@ -341,7 +341,7 @@ class Processor:
             if self.track != "apply":
                 continue
             if any(event.kind == "load-step" for event in events):
-                self.hold(part_of(tracked))
+                self.hold(part_of(tracked, self.info.calibration))
             if (update := update_by(self.info.calibration, tracked)) is not None:
                 self._drift.shift(self._tool.follow(update, self._newest_ns))
 

@@ -9,7 +9,7 @@ from scipy.special import chdtri
 
 from ftcalib import CalibrationResult
 from ftcalib.after.state import Update, with_bias_change
-from ftcalib.after.weighing import LEAST_SIGMAS, Weight
+from ftcalib.after.weighing import LEAST_SIGMAS, Weight, known_contact, moment_as_read
 from ftcalib.compensation import Compensator
 from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import BIASES, Array, skew
@@ -67,7 +67,7 @@ class Window:
 
     t_s: float
     residual: Array
-    """(6,) measured minus predicted wrench of the tool alone, N and N·m, sensor axes."""
+    """(6,) measured minus predicted wrench of the tool alone, decoded, N and N·m, sensor axes."""
     felt_m_s2: Array
     """(3,) gravity minus the acceleration of the sensor's origin, sensor axes."""
     lever_s2: Array
@@ -402,6 +402,7 @@ class Windows:
         self._covariance = _without_bias(calibration.covariance)
         response = calibration.response
         self._response = response and replace(response, covariance=_without_bias(response.covariance))
+        self._decoder = _decoder_of(calibration)
         self._size = round(WINDOW_S * info.sensor_rate_Hz)
         self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
         self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
@@ -456,7 +457,7 @@ class Windows:
         error = predicted_covariance(tool, self._covariance, self._response, R)
         return Window(
             t_s=float(inner.t_host_ns[self._size // 2]) * 1e-9,
-            residual=residual,
+            residual=self._decoder @ residual,
             felt_m_s2=felt,
             lever_s2=lever,
             p_sensor_near_m=self._near_m,
@@ -491,7 +492,7 @@ class Following:
 
     def __init__(self, info: StreamInfo) -> None:
         calibration = info.calibration
-        self._windows = Windows(info)
+        self._windows, self._as_read = Windows(info), np.asarray(np.linalg.inv(_decoder_of(calibration)))
         self._tracker = Tracker(calibration.mass_kg, calibration.parameters.p_sensor_com_m, _drift_per_h(calibration))
         self._reported_s = -np.inf
         self.tracked: Tracked | None = None
@@ -510,12 +511,20 @@ class Following:
     ) -> Iterator[tuple[Tracked, list[StreamEvent]]]:
         """Add samples with their states of motion; yield what is known after each window, and the events."""
         for window in self._windows.add(rows, states, noise):
-            tracked = self.tracked = self._tracker.update(window)
+            tracked = self._tracker.update(window)
+            # A bias is added to the reading, which is not decoded.
+            tracked = self.tracked = replace(tracked, bias=self._as_read @ tracked.bias)
             events = list(tracked.events)
             if tracked.t_s - self._reported_s >= _REPORT_S:
                 self._reported_s = tracked.t_s
                 events.append(StreamEvent(round(tracked.t_s * 1e9), "tracked", tracked.in_words(), tracked.to_dict()))
             yield tracked, events
+
+
+def _decoder_of(calibration: CalibrationResult) -> Array:
+    """Return the matrix (6, 6) that decodes what the sensor reads of a part, if known loads have shown it."""
+    contact = known_contact(calibration)
+    return np.eye(6) if contact is None else contact.decode(np.eye(6)).T
 
 
 def _drift_per_h(calibration: CalibrationResult) -> Array:
@@ -531,14 +540,18 @@ def update_by(calibration: CalibrationResult, tracked: Tracked) -> Update | None
     return with_bias_change(calibration, tracked.bias, tracked.sigma, measured=True)
 
 
-def part_of(tracked: Tracked) -> Weight | None:
+def part_of(tracked: Tracked, calibration: CalibrationResult) -> Weight | None:
     """Return the part as if it had been weighed; None for an empty gripper."""
-    return None if tracked.part_kg < NOTHING_KG else weight_of(tracked)
+    return None if tracked.part_kg < NOTHING_KG else weight_of(tracked, calibration)
 
 
-def weight_of(tracked: Tracked) -> Weight:
+def weight_of(tracked: Tracked, calibration: CalibrationResult) -> Weight:
     """Return what is held, nothing included, as if it had been weighed."""
     (x, covariance), mass_kg = tracked.moment, tracked.part_kg
+    as_read, of_sensor, scale_sigma = tracked.moment, np.zeros((4, 4)), calibration.scale_sigma
+    if (contact := known_contact(calibration)) is not None:
+        as_read, of_sensor = moment_as_read(tracked.moment, contact)
+        scale_sigma = float(np.sqrt(of_sensor[0, 0])) / max(abs(mass_kg), 1e-9)
     com_m = x[1:] / (mass_kg or 1.0)
     T = np.column_stack([-com_m, np.eye(3)]) / max(abs(mass_kg), 1e-9)
     return Weight(
@@ -546,12 +559,13 @@ def weight_of(tracked: Tracked) -> Weight:
         mass_sigma_kg=tracked.part_sigma_kg,
         least_kg=LEAST_SIGMAS * tracked.part_sigma_kg,
         p_sensor_com_m=com_m,
-        com_covariance=T @ covariance @ T.T,
+        com_covariance=T @ (covariance + of_sensor) @ T.T,
         line=None,
         fault=None,
         chi2=0.0,
         dof=0,
         poses=0,
+        scale_sigma=scale_sigma,
         in_motion=True,
-        moment=(x, covariance),
+        moment=as_read,
     )

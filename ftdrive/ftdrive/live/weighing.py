@@ -219,7 +219,7 @@ def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:
         raise CannotWeigh("samples")
     if not tracked.part_known:
         raise CannotWeigh("undecided")
-    return replace(weight_of(tracked), scale_sigma=stream.info.calibration.scale_sigma)
+    return weight_of(tracked, stream.info.calibration)
 
 
 def weigh(

@@ -1,5 +1,6 @@
 """Weighing a stream: rest, refusals, tare as the zero, poses, parts."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import ftdrive
+from ftcalib import CalibrationResult
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.model import Array
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
 from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
@@ -119,15 +122,26 @@ def test_a_zero_needs_an_empty_gripper_at_rest() -> None:
         assert source.reference()[1] == float("inf")
 
 
-def carried(mass_kg: float, *, push: Array = NOTHING, empty_s: float = 6.0) -> ReplayedStream:
-    """An arm that turns without rest; after `empty_s` it has a part, and from 4 s later on a push."""
+def as_read(wrench: Array, calibration: CalibrationResult) -> Array:
+    """Return what the sensor reads of contacts (n, 6)."""
+    return wrench @ np.linalg.inv(calibration.contact.decode(np.eye(6)))
+
+
+def carried(
+    mass_kg: float, *, push: Array = NOTHING, empty_s: float = 6.0, sensor: SensorMatrix | None = None
+) -> ReplayedStream:
+    """An arm that turns without rest; after `empty_s` it has a part, and from 4 s later on a push.
+
+    The errors of the sensor are those that known loads have shown.
+    """
     t_s = np.arange(0, empty_s + 8.0, 1e-3)
     R = (Rotation.from_rotvec(np.outer(t_s, [0.3, 0.2, 0.1])) * Rotation.from_matrix(POSE)).as_matrix()
-    weight = part(R, mass_kg) + inertia(R, mass_kg, COM_M)
+    calibration = replace(calibrated(), sensor=sensor)
+    weight = as_read(part(R, mass_kg) + inertia(R, mass_kg, COM_M), calibration)
     tool_kg = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
     wrench = inertia(R, tool_kg, TRUTH.p_sensor_com_m) + weight * (t_s > empty_s)[:, None]
     wrench[t_s > empty_s + 4] += push
-    source = stream(paired(R, push=wrench))
+    source = ReplayedStream(info(calibration), paired(R, push=wrench), clock=FakeClock())
     source.track = "show"
     return source
 
@@ -145,6 +159,23 @@ def test_a_part_is_weighed_while_the_arm_carries_it() -> None:
     values = load_values(weight, source.info)
     assert (values["in_motion"], values["poses"], values["line_sensor"]) == (True, 0, None)
     assert values.keys() == load_values(empty, source.info).keys()
+
+
+def test_a_part_that_a_sensor_known_by_loads_carries_is_weighed_without_its_error() -> None:
+    usual = SensorMatrix.usual(0.03)
+    error = usual.sigma * np.random.default_rng(3).normal(size=(6, 6)) + 0.03 * np.eye(6)
+    sensor = replace(usual, error=error, covariance=1e-3 * usual.covariance, source="loads", floor=0.0)
+    source = carried(2.0, sensor=sensor)
+    read(source, 9.5)
+    weight = ftdrive.weigh(source, moving=True)
+    sigma_kg = np.hypot(weight.mass_sigma_kg, weight.scale_sigma * weight.mass_kg)
+    assert abs(weight.mass_kg - 2.0) < 4 * sigma_kg < 0.02
+    np.testing.assert_allclose(weight.p_sensor_com_m, COM_M, atol=4 * weight.com_sigma_m.max())
+    # What is subtracted of the reading is as the sensor reads it.
+    units = np.concatenate([np.eye(3), np.cross(COM_M, np.eye(3))], axis=1)
+    gain = np.trace(as_read(units, source.info.calibration)[:, :3]) / 3
+    assert weight.moment[0][0] == pytest.approx(gain * 2.0, rel=0.002)
+    assert abs(gain - 1) > 0.01
 
 
 def test_a_push_in_motion_is_refused_until_it_is_over() -> None:
