@@ -14,7 +14,7 @@ from tests.house import example_data
 EXAMPLES = example_data.EXAMPLES
 PAGES = EXAMPLES.parent / "docs/examples"
 SLOW = {"live_contact", "monte_carlo", "plan_without_robot"}
-"""`test_wheel.py` runs these too."""
+"""`test_wheel.py` runs these, and no others."""
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from tests.house.example_data import EXAMPLES
+from tests.house.test_examples import SLOW
 from tests.house.uv import run_uv
 
 ROOT = EXAMPLES.parent
 PACKAGES = {"ftdrive", "ftcalib", "ftdrivers", "ftmocks"}
-NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_the_wheel_installs_four_packages_and_nothing_else(python: Path, user_fo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", sorted(SLOW))
 def test_an_example_runs_from_the_wheel(name: str, python: Path, user_folder: Path) -> None:
     printed = run(python, f"{name}.py", cwd=user_folder)
     assert printed == (EXAMPLES / f"output/{name}.txt").read_text(encoding="utf-8")

@@ -159,15 +159,21 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("command", ["live", "weigh"])
-def test_a_command_that_needs_a_calibration_makes_one(
-    command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
+def test_a_command_that_needs_a_calibration_makes_one(ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]) -> None:
+    works_with_simulate_and_json("live", ftdrive, capfd)
+
+
+@pytest.mark.slow
+def test_an_empty_gripper_is_weighed(
+    demo: dict[str, Any], ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    works_with_simulate_and_json(command, ftdrive, capfd)
+    works_with_simulate_and_json("weigh", ftdrive, capfd, "--calibration", demo["run"])
 
 
-def works_with_simulate_and_json(command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]) -> None:
-    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), "--simulate", "--json")
+def works_with_simulate_and_json(
+    command: str, ftdrive: CommandLine, capfd: pytest.CaptureFixture[str], *more: str
+) -> None:
+    outcome = ftdrive.run(*command.split(), *NEEDED.get(command, ()), *more, "--simulate", "--json")
     assert outcome.returncode == 0, outcome.stderr
     assert "Exception" not in outcome.stderr + capfd.readouterr().err
     answer = json.loads(outcome.stdout)

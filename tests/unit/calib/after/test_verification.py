@@ -352,9 +352,10 @@ def smoothly_turned(R: Array, seed: int) -> Array:
     return np.asarray(R @ Rotation.from_rotvec(R.reshape(-1, 9) @ weights.T).as_matrix())
 
 
-def test_smooth_errors_of_an_arm_are_no_change_in_other_poses_and_hide_none() -> None:
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 4), marks=pytest.mark.slow)])
+def test_smooth_errors_of_an_arm_are_no_change_in_other_poses_and_hide_none(seeds: range) -> None:
     passed, changes = 0, ("bias", "payload", "centre of mass")
-    for seed in range(4):
+    for seed in seeds:
         rng = np.random.default_rng(seed)
         near = Rotation.from_rotvec(0.7 * rng.normal(size=(24, 3))).as_matrix()
         far = Rotation.from_rotvec(0.7 * rng.normal(size=(6, 3))).as_matrix() @ np.diag([1.0, -1.0, -1.0])
@@ -366,4 +367,4 @@ def test_smooth_errors_of_an_arm_are_no_change_in_other_poses_and_hide_none() ->
             one = verify(found, far, y, noise_of(6), fitted=fitted)
             assert not name or not one.passed
             passed += one.passed
-    assert passed == 4
+    assert passed == len(seeds)

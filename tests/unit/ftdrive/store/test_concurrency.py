@@ -41,9 +41,9 @@ def test_two_connections_at_once_lose_nothing(store_url: str, tmp_path: Path) ->
 @pytest.mark.slow
 def test_eight_processes_at_once_lose_nothing(store_url: str, tmp_path: Path) -> None:
     """They begin with a database that has no tables."""
-    folders = new_runs(tmp_path, 8, 8)
+    folders = new_runs(tmp_path, 8, 4)
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload([write.__module__])
     with ProcessPoolExecutor(8, mp_context=processes) as pool:
         list(pool.map(write, 8 * [store_url], folders))
-    require_whole(store_url, 8 * 8 + 1)
+    require_whole(store_url, 8 * 4 + 1)
