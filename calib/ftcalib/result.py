@@ -397,9 +397,11 @@ class CalibrationResult:
     @cached_property
     def contact(self) -> ContactResponse:
         """How the sensor reads a contact: its decoder, and the errors that remain of it."""
-        return (self.sensor or SensorMatrix.usual()).after(
-            self.parameters, self.shown_response, self.covariance[:3, :3]
-        )
+        sensor = self.sensor or SensorMatrix.usual()
+        # The fit of the loads has the rotation of a run of its own, with its correlation.
+        is_of_loads = self.provenance.get("dataset_sha256") in (sensor.provenance.get("datasets") or ())
+        rotation = None if is_of_loads else self.covariance[:3, :3]
+        return sensor.after(self.parameters, self.shown_response, rotation)
 
     @property
     def shown_response(self) -> Response:

@@ -9,7 +9,11 @@ calibration is read as M times the contact, with
 
     M = I + E - blk([d]x, [d]x)        d: half the antisymmetric part of E_FF + E_FT [p]x, p the centre of mass
 
-so its decoded error is linear in the error of E. What no load has shown of E keeps its prior.
+so its decoded error is linear in the error of E. What no load has shown of E keeps its prior. A tool that was weighed
+shows one number more: the gain common to all axes at its centre of mass.
+
+The errors of E and of the mounting belong together. A calibration on its own has a noise of its own, beside the d of
+the present E. If its poses are among those of the loads, the fit of all has both with their correlation.
 """
 
 from collections.abc import Mapping
@@ -19,11 +23,12 @@ from pathlib import Path
 from typing import Any, Final, Literal, Self
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Setup
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEVER_M, SIZE, Response
+from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEVER_M, Response
 from ftcalib.model import Array, Parameters, read_only, skew
 
 FORMAT = "ftdrive.sensor/1"
@@ -106,7 +111,11 @@ class SensorMatrix:
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
 
     def after(
-        self, parameters: Parameters, seen: Response | None, rotation_covariance: Array | None = None
+        self,
+        parameters: Parameters,
+        seen: Response | None,
+        rotation_covariance: Array | None = None,
+        excess: tuple[float, float] | None = None,
     ) -> "ContactResponse":
         """Return how the sensor reads a contact, after the calibration of a tool.
 
@@ -117,21 +126,31 @@ class SensorMatrix:
         seen : Response or None
             What the tool shows of gain and cross-talk, with its covariance; None shows nothing.
         rotation_covariance : array, shape (3, 3), optional
-            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it.
+            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it. None: exactly known, or after loads
+            that of their fit, because it has the poses of this calibration.
+        excess : float and float, optional
+            Relative to its mass by a scale, by how much more the tool weighs as read, and one sigma.
         """
         E, C = np.asarray(self.error), np.asarray(self.covariance[3:, 3:])
+        p, R = parameters.p_sensor_com_m, parameters.R_flange_sensor
+        if self.source == "loads" and rotation_covariance is None:
+            T = block_diag(R.T, np.eye(36))
+            return ContactResponse(self, parameters, E, T @ self.covariance @ T.T)
         # A sensor that is declared perfect has nothing to learn.
         if self.source != "loads" and seen is not None and C.any():
-            H = _shown_by(parameters.p_sensor_com_m)
+            H, shown, remaining = _shown_by(p), seen.coefficients, seen.covariance[15:, 15:]
+            if excess is not None:
+                H = np.concatenate([H, _common_gain(p)])
+                shown, remaining = np.append(shown, excess[0]), block_diag(remaining, excess[1] ** 2)
             prior = H @ C @ H.T
-            shown, remaining = seen.coefficients, seen.covariance[15:, 15:]
             # The tool shows the size of all errors too; two numbers less count, as for Student's distribution.
             squares = (shown**2 + np.diag(remaining)) / np.diag(prior)
-            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + SIZE - 2)
+            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ shown).reshape(6, 6), size * C - gain @ (size * prior - remaining) @ gain.T
-        turned = np.zeros((3, 3)) if rotation_covariance is None else rotation_covariance
-        return ContactResponse(self, parameters, E, C, turned)
+        turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
+        T = np.concatenate([_rotation_of(_ENTRIES, p).T, np.eye(36)])
+        return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a sensor's file."""
@@ -180,47 +199,33 @@ class ContactResponse:
     error: Array
     """(6, 6) E as estimated."""
     error_covariance: Array
-    """(36, 36) of its entries, row by row."""
-    rotation_covariance: Array
-    """(3, 3) of `R_flange_sensor`, flange axes, rad²."""
+    """(39, 39) of the rotation of `R_flange_sensor` (3, rad, sensor axes) and of the entries of E, row by row."""
 
     @cached_property
     def decoder(self) -> Array | None:
         """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
         if not self.error.any():
             return None
-        return read_only(np.linalg.inv(np.eye(6) + self._as_read(self.error)))
+        turn = skew(_rotation_of(self.error, self.parameters.p_sensor_com_m))
+        return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
         """Apply the decoder to wrenches (..., 6) that have the free tool subtracted."""
         return contact if self.decoder is None else np.asarray(contact @ self.decoder.T)
 
-    def _as_read(self, E: Array) -> Array:
-        """Return E (..., 6, 6) less the rotation that the calibration has for it."""
-        turn, remaining = skew(_rotation_of(E, self.parameters.p_sensor_com_m)), np.array(E)
-        remaining[..., :3, :3] -= turn
-        remaining[..., 3:, 3:] -= turn
-        return remaining
-
-    @cached_property
-    def _effects(self) -> Array:
-        """(36, 6, 6) matrices of a unit error of each entry of E on decoded wrenches."""
-        effects = self._as_read(_ENTRIES)
-        return effects if self.decoder is None else np.asarray(self.decoder @ effects)
-
     def error_columns(self, wrench: Array) -> Array:
-        """Return the derivative (..., 6, 36) of decoded wrenches (..., 6) by the entries of E."""
-        return np.asarray(np.einsum("aij,...j->...ia", self._effects, wrench))
+        """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by what `error_covariance` is of."""
+        turns = -np.kron(np.eye(2), skew(np.eye(3)))
+        effects = np.concatenate([turns, _ENTRIES])
+        if self.decoder is not None:
+            effects = self.decoder @ effects
+        return np.asarray(np.einsum("aij,...j->...ia", effects, wrench))
 
     @cached_property
     def _by_products(self) -> Array:
         """(36, 36) that gives the covariance of a contact w, row by row, from its products w w'."""
-        columns = self.error_columns(np.eye(6))  # (wrench, axis, entry)
+        columns = self.error_columns(np.eye(6))  # (wrench, axis, error)
         C = np.einsum("kia,ab,ljb->ijkl", columns, self.error_covariance, columns)
-        turned = np.zeros((6, 6, 3))  # (wrench, axis, turn)
-        turned[:3, :3] = turned[3:, 3:] = skew(np.eye(3))
-        R = self.parameters.R_flange_sensor
-        C += np.einsum("kia,ab,ljb->ijkl", turned, R.T @ self.rotation_covariance @ R, turned)
         F = ranges(self.sensor.lever_m)
         C += self.sensor.floor**2 * np.einsum("ij,kl->ijkl", np.diag(F**2), np.diag(F**-2.0))
         return np.asarray(C.reshape(36, 36))
@@ -285,3 +290,9 @@ def _shown_by(p: Array) -> Array:
         for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
     ]
     return np.concatenate(parts)
+
+
+def _common_gain(p: Array) -> Array:
+    """Return the derivative (1, 36) of the gain common to all axes, of a tool at p, by the entries of E."""
+    force, _ = _gain_at(_ENTRIES, p)
+    return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

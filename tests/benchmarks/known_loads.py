@@ -43,10 +43,10 @@ def judged(
     sensor: LoadedSensor, matrix: SensorMatrix, tool: CalibrationDataset, torque_Nm: float = 0.0, most_N: float = 100.0
 ) -> dict[str, object]:
     """Return errors of decoded contacts and their sigmas, after the calibration of the tool."""
-    result = solve(tool)
+    result = replace(solve(tool), sensor=matrix)
     if result.verdict == "rejected":
         raise NotObservable("the calibration of the tool is rejected")
-    contact = matrix.after(result.parameters, result.shown_response, result.covariance[:3, :3])
+    contact = result.contact
     true, read = sensor.contacts(40, torque_Nm, most_N)
     R = result.R_flange_sensor
     e = contact.decode(read) - np.concatenate([part @ R for part in np.split(true, 2, axis=1)], axis=1)

@@ -121,7 +121,11 @@ def solve_loads(
         "loads",
         prior.lever_m,
         max(sizes["floor"], max(remaining) / 2 if max(remaining) > _MOST_REMAINING else 0.0),
-        {**(provenance or {}), "runs": [run.name for run in runs]},
+        {
+            **(provenance or {}),
+            "runs": [run.name for run in runs],
+            "datasets": [run.dataset.sha256() for run in runs],
+        },
     )
     tool = model.at["tool"].start
     return LoadSolution(

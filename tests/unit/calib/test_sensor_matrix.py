@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Setup, solve
 from ftcalib.likelihood.response import SIZE, Response
-from ftcalib.model import Array, Parameters, predict
+from ftcalib.model import Array, Parameters, predict, skew
 from ftcalib.sensor_matrix import SensorMatrix
 from tests.loaded_sensor import LEVER_M, TOOL, LoadedSensor
 
@@ -83,6 +84,29 @@ def test_a_rotation_of_the_sensor_turns_the_contact() -> None:
     exact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0)
     turned = exact.after(parameters(), None, 1e-6 * np.eye(3)).covariance(np.array([0, 0, 100.0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(turned)), [0.1, 0.1, 0, 0, 0, 0], atol=1e-9)
+
+
+def test_a_calibration_of_the_loads_has_the_rotation_of_their_fit() -> None:
+    # An error E = [r]x of force and torque, in a sensor that is turned by r, cancels in its readings.
+    cancelling = np.concatenate([parameters().R_flange_sensor, np.kron(np.eye(2), skew(np.eye(3))).reshape(3, 36).T])
+    alone = cancelling * np.repeat([1.0, 0.0], [3, 36])[:, None]
+    contact = np.array([0, 0, 100.0, 1, 2, 3])
+    for columns, sigma in ((cancelling, [0, 0, 0]), (alone, [0.1, 0.1, 0])):
+        sensor = SensorMatrix(np.zeros((6, 6)), 1e-6 * columns @ columns.T, "loads", floor=0.0)
+        of_loads = sensor.after(parameters(), None).covariance(contact)
+        np.testing.assert_allclose(np.sqrt(np.maximum(np.diag(of_loads)[:3], 0)), sigma, atol=1e-8)
+        # Another run has a rotation of its own.
+        other = sensor.after(parameters(), None, 4e-6 * np.eye(3)).covariance(contact)
+        np.testing.assert_allclose(np.sqrt(np.diag(other)[:3]), [0.2, 0.2, 0], atol=1e-8)
+
+
+def test_a_result_knows_whether_its_poses_are_of_the_loads() -> None:
+    result = solved()
+    own = {"datasets": ["0", result.provenance["dataset_sha256"]]}
+    exact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0)
+    of_loads, other = (replace(result, sensor=one).contact for one in (replace(exact, provenance=own), exact))
+    assert not of_loads.error_covariance.any()
+    assert (np.diag(other.error_covariance)[:3] > 0).all()
 
 
 @pytest.mark.parametrize("size", [0.5, 2.5])
