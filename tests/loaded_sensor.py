@@ -141,7 +141,8 @@ def _hanging(n: int, rng: np.random.Generator, most_deg: float = 75.0) -> Rotati
 
 
 TOOL = Set("tool")
-GRIP_M = np.array([0.02, -0.01, 0.15])
+GRIP_M, HIGHER_M = np.array([0.02, -0.01, 0.2]), np.array([0.02, -0.01, 0.15])
+_SHIFT_M = np.array([0.06, 0, 0])
 PROTOCOLS: dict[str, tuple[Set, ...]] = {
     "rigid, tip": (TOOL, Set("tip", 24, 2.0, TIP_M)),
     "rigid, side and tip": (TOOL, Set("side", 24, 2.0, SIDE_M), Set("tip", 24, 2.0, TIP_M)),
@@ -156,10 +157,15 @@ PROTOCOLS: dict[str, tuple[Set, ...]] = {
     "bar, gripped twice": (
         TOOL,
         Set("grip", 6, 2.0, GRIP_M, place_known=False),
-        Set("shifted", 6, 2.0, GRIP_M + np.array([0.06, 0, 0]), place_known=False),
+        Set("shifted", 6, 2.0, GRIP_M + _SHIFT_M, place_known=False),
+    ),
+    "bar, gripped 50 mm above": (
+        TOOL,
+        Set("grip", 6, 2.0, HIGHER_M, place_known=False),
+        Set("shifted", 6, 2.0, HIGHER_M + _SHIFT_M, place_known=False),
     ),
 }
-"""Of the note on known loads, section 6."""
+"""Of the note on known loads, section 6, and a bar that is held above the place of the contact."""
 
 
 def with_load(runs: Sequence[LoadRun], row: int, **changed: object) -> list[LoadRun]:

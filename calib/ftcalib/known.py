@@ -211,6 +211,8 @@ class Setup:
     robot that would have to hang on a wall or a ceiling is not good, because wrong rotations look like that too."""
     tool_mass_kg: float | None = None
     """About the mass that hangs on the sensor."""
+    tool_mass_sigma_kg: float | None = None
+    """One standard deviation of that, if it was weighed."""
     cylinders_m: Sequence[Sequence[float]] = ()
     """Tool and sensor as cylinders along flange z: from, to, diameter, and optionally x and y of the axis."""
     sensor_height_m: float | None = None
@@ -242,6 +244,12 @@ class Setup:
     def sensor_lever_m(self) -> float:
         """Range of torque over range of force."""
         return RANGE_LEVER_M if self.sensor_range is None else self.sensor_range[1] / self.sensor_range[0]
+
+    @property
+    def weighed_kg(self) -> tuple[float, float] | None:
+        """Mass of the tool by a scale, and one sigma; None if it was not weighed."""
+        mass_kg, sigma_kg = self.tool_mass_kg, self.tool_mass_sigma_kg
+        return None if mass_kg is None or sigma_kg is None else (mass_kg, sigma_kg)
 
     @property
     def gain_sigma(self) -> float:

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -46,6 +46,9 @@ FORMAT = "ftdrive.calibration/1"
 
 # Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better.
 LEAST_COMMON_GAIN = 0.002
+
+# A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
+CONTRADICTS = 4.0
 
 # Eigenvalues of a correlation matrix below this are no rounding.
 INDEFINITE = -1e-6
@@ -184,6 +187,8 @@ class CalibrationResult:
     `correlations` (pairs of parameters above 0.9)."""
     sensor: SensorMatrix | None = None
     """What is known of the sensor's own matrix, from loads or a data sheet; None: its usual errors are assumed."""
+    weighed_kg: tuple[float, float] | None = None
+    """Mass of the tool by a scale, and one sigma, which show the gain common to all axes; None: it was not weighed."""
     motion: MotionResult | None = None
     """What a recording in motion gives, whose rows count as poses; None = from poses at rest."""
 
@@ -214,6 +219,7 @@ class CalibrationResult:
         for name, build in read.items():
             if isinstance(given := getattr(self, name), Mapping):
                 object.__setattr__(self, name, build(given))
+        object.__setattr__(self, "weighed_kg", _mass_and_sigma(self.weighed_kg))
         require_positive_definite(joint_covariance(self.covariance, self.response))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
@@ -401,7 +407,17 @@ class CalibrationResult:
         # The fit of the loads has the rotation of a run of its own, with its correlation.
         is_of_loads = self.provenance.get("dataset_sha256") in (sensor.provenance.get("datasets") or ())
         rotation = None if is_of_loads else self.covariance[:3, :3]
-        return sensor.after(self.parameters, self.shown_response, rotation)
+        return sensor.after(self.parameters, self.shown_response, rotation, self._excess(sensor))
+
+    def _excess(self, sensor: SensorMatrix) -> tuple[float, float] | None:
+        """Return by how much more the tool weighs as read than by a scale, relative, and one sigma."""
+        if self.weighed_kg is None:
+            return None
+        mass_kg, sigma_kg = self.weighed_kg
+        noise_kg = self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
+        excess, sigma = self.mass_kg / mass_kg - 1, float(np.hypot(sigma_kg, noise_kg)) / mass_kg
+        # Beyond that it is another tool, or a unit, and no gain: the verdict names it.
+        return (excess, sigma) if abs(excess) <= CONTRADICTS * np.hypot(sensor.sigma[0, 0], sigma) else None
 
     @property
     def shown_response(self) -> Response:
@@ -539,6 +555,7 @@ class CalibrationResult:
             "response": None if self.response is None else self.response.to_dict(),
             "gain_sigma": self.gain_sigma,
             "sensor": None if self.sensor is None else self.sensor.to_dict(),
+            "weighed_kg": None if self.weighed_kg is None else list(self.weighed_kg),
             "cable_shift": None if self.cable_shift is None else self.cable_shift.tolist(),
             "weights": None if self.weights is None else self.weights.tolist(),
             "rejected_poses": list(self.rejected_poses),
@@ -569,7 +586,7 @@ class CalibrationResult:
         """
         check_format(document, FORMAT, BadCalibration)
         try:
-            apart = {"parameters", "cable_shift", "sensor", "motion"}
+            apart = {"parameters", "cable_shift", "sensor", "weighed_kg", "motion"}
             plain = [field.name for field in fields(cls) if field.name not in apart]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
@@ -577,6 +594,7 @@ class CalibrationResult:
                 # Files of version 0.1.0 and earlier have none of these.
                 cable_shift=document.get("cable_shift"),
                 sensor=document.get("sensor"),
+                weighed_kg=document.get("weighed_kg"),
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
@@ -622,6 +640,15 @@ def _require_known_words(result: CalibrationResult) -> None:
     for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
         if getattr(result, name) not in choices:
             raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(choices)}")
+
+
+def _mass_and_sigma(given: Sequence[float] | None) -> tuple[float, float] | None:
+    if given is None:
+        return None
+    mass_kg, sigma_kg = given
+    if not (0 < mass_kg < np.inf and 0 <= sigma_kg < np.inf):
+        raise ValueError(f"weighed_kg must be a mass and its sigma, not {list(given)}")
+    return float(mass_kg), float(sigma_kg)
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

@@ -141,7 +141,7 @@ class SensorMatrix:
             H, shown, remaining = _shown_by(p), seen.coefficients, seen.covariance[15:, 15:]
             if excess is not None:
                 H = np.concatenate([H, _common_gain(p)])
-                shown, remaining = np.append(shown, excess[0]), block_diag(remaining, excess[1] ** 2)
+                shown, remaining = np.append(shown, excess[0]), block_diag(remaining, np.array([[excess[1] ** 2]]))
             prior = H @ C @ H.T
             # The tool shows the size of all errors too; two numbers less count, as for Student's distribution.
             squares = (shown**2 + np.diag(remaining)) / np.diag(prior)

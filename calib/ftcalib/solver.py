@@ -129,6 +129,7 @@ def solve(
         second_basin_chi2=best.second_basin_chi2,
         quality=quality.to_dict(),
         sensor=declared_sensor(setup),
+        weighed_kg=setup.weighed_kg,
     )
 
 

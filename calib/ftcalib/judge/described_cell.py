@@ -187,14 +187,19 @@ def payload(
 
 def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
     """Compare mass and centre of mass with the described tool."""
-    return [*_mass(parameters, covariance, setup.tool_mass_kg, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
+    return [*_mass(parameters, covariance, setup, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
 
 
-def _mass(parameters: Parameters, covariance: Array, tool_kg: float | None, g_m_s2: float) -> list[Finding]:
-    weight_N = parameters.weight_N
+def _mass(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
+    weight_N, tool_kg = parameters.weight_N, setup.tool_mass_kg
     load_kg = weight_N / g_m_s2
     sigma_kg = parameters.weight_sigma_N(covariance) / g_m_s2
-    if tool_kg is None or abs(load_kg - tool_kg) <= max(_margin_kg(tool_kg), _SIGNIFICANT * sigma_kg):
+    if tool_kg is None:
+        return []
+    margin_kg = _margin_kg(tool_kg)
+    if setup.weighed_kg is not None:
+        margin_kg = _SIGNIFICANT * float(np.hypot(setup.gain_sigma * tool_kg, setup.weighed_kg[1]))
+    if abs(load_kg - tool_kg) <= max(margin_kg, _SIGNIFICANT * sigma_kg):
         return []
     suspects = units.suspects(parameters, units.by_mass(load_kg, tool_kg, UNIT_SHARE))
     if not suspects and load_kg < NO_TOOL_SHARE * tool_kg:

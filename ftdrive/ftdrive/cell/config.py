@@ -149,6 +149,13 @@ class ToolConfig:
         (0.001, 100),
         option="--tool-mass",
     )
+    mass_sigma_kg: float | None = entry(
+        "one standard deviation of mass_kg, if a scale gave it: the tool then shows the scale of the sensor too; 0.2 % "
+        "of the mass is usual",
+        None,
+        "kg",
+        (0, 1),
+    )
 
 
 @dataclass(frozen=True, slots=True)

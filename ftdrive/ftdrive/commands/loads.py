@@ -172,7 +172,11 @@ def _print_check(found: "LoadCheck", load: "KnownLoad") -> None:
 
 @loads.command()
 @click.argument("runs", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@click.option("--tool-mass", metavar="KG", help="Mass of the tool as weighed, such as 1.300 or 1.300±0.002.")
+@click.option(
+    "--tool-mass",
+    metavar="KG",
+    help="Mass of the tool as weighed, such as 1.300 or 1.300±0.002; else that of [tool] mass_sigma_kg.",
+)
 @click.option("--accept", is_flag=True, help="Save a matrix that differs much from the one known before.")
 @JSON
 def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: bool) -> None:
@@ -189,7 +193,8 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
     if len(serials) > 1:
         raise ConfigError(f"the runs are of different sensors ({', '.join(map(str, serials))}): give those of one")
     data = read[0][2]
-    weighed = None if tool_mass is None else mass_of(tool_mass)
+    of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
+    weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
     prior = _prior(data, next(iter(serials)), [path.name for path in runs])
     from ftcalib.loads.solve import solve_loads
 

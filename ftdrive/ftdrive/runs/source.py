@@ -355,6 +355,7 @@ def circumstances_of(run: Run) -> Circumstances:
         Setup(
             up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
             tool_mass_kg=setup["tool_mass_kg"],
+            tool_mass_sigma_kg=setup["tool_mass_sigma_kg"],
             cylinders_m=[[value / 1e3 for value in row] for row in setup["cylinders_mm"]],
             sensor_height_m=None if height_mm is None else height_mm / 1e3,
             sensor_mass_kg=setup["sensor_mass_kg"],
@@ -387,6 +388,7 @@ def _described(run: Run, config: Mapping[str, Any], load: Load | None) -> dict[s
         "mounting": workcell.get("mounting"),
         "height_mm": sensor.get("height_mm"),
         "tool_mass_kg": tool_kg + load.mass_kg if load and tool_kg else tool_kg,
+        "tool_mass_sigma_kg": None if load else tool.get("mass_sigma_kg"),
         # The centre of mass of a tool with a load may be anywhere between the two.
         "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if measured and not load else [],
         "tool": f"{tool.get('name')} with {load}" if load else tool.get("name"),

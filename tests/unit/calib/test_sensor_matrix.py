@@ -109,6 +109,19 @@ def test_a_result_knows_whether_its_poses_are_of_the_loads() -> None:
     assert (np.diag(other.error_covariance)[:3] > 0).all()
 
 
+def test_a_weighed_tool_shows_the_gain_common_to_all_axes() -> None:
+    found, seen = parameters(), Response(np.zeros(SIZE), 1e-8 * np.eye(15 + SIZE))
+    excess = 0.03, 0.002
+    plain, weighed = (SensorMatrix.usual(lever_m=LEVER_M).after(found, seen, None, one) for one in (None, excess))
+    force = np.array([30.0, -20, 40])
+    true = np.concatenate([force, np.cross(found.p_sensor_com_m, force)])
+    error, error_before = (np.linalg.norm((one.decode(1.03 * true) - true)[:3]) for one in (weighed, plain))
+    assert error < 0.1 * error_before
+    along = force / np.linalg.norm(force)
+    sigma = [float(np.sqrt(along @ one.covariance(true)[:3, :3] @ along)) for one in (plain, weighed)]
+    assert sigma[1] < 0.7 * sigma[0]
+
+
 @pytest.mark.parametrize("size", [0.5, 2.5])
 def test_the_size_of_the_errors_is_learnt_from_the_tool(size: float) -> None:
     prior, contact = SensorMatrix.usual(0.02), np.array([0, 60.0, 0, 3, 0, 0])
@@ -119,7 +132,10 @@ def test_the_size_of_the_errors_is_learnt_from_the_tool(size: float) -> None:
 
 def solved() -> CalibrationResult:
     (tool,) = LoadedSensor(1).runs([TOOL])
-    return solve(tool.dataset, setup=Setup(sensor_accuracy_percent=3.0, sensor_range=(130.0, 10.0)))
+    described = Setup(
+        sensor_accuracy_percent=3.0, sensor_range=(130.0, 10.0), tool_mass_kg=1.3, tool_mass_sigma_kg=3e-3
+    )
+    return solve(tool.dataset, setup=described)
 
 
 def test_a_result_keeps_what_is_known_of_its_sensor(tmp_path: Path) -> None:
@@ -129,6 +145,11 @@ def test_a_result_keeps_what_is_known_of_its_sensor(tmp_path: Path) -> None:
     assert result.sensor.lever_m == pytest.approx(10 / 130)
     result.save(tmp_path / "a.json")
     again = CalibrationResult.load(tmp_path / "a.json")
+    assert again.weighed_kg == (1.3, 3e-3)
+    assert (
+        again.contact_sigma(np.eye(6)[2], np.eye(3))
+        < replace(again, weighed_kg=None).contact_sigma(np.eye(6)[2], np.eye(3))
+    ).any()
     contact = np.array([10.0, 20, 30, 1, 2, 3])
     R = Rotation.random(rng=2).as_matrix()
     np.testing.assert_array_equal(again.contact_sigma(contact, R), result.contact_sigma(contact, R))

@@ -324,6 +324,13 @@ def test_torques_about_the_tcp_are_not_only_called_reversed(length_m: float, cod
     assert ("reverse" in result.findings[0].fix) == (code == "torques_reversed")
 
 
+@pytest.mark.parametrize(("load_kg", "found"), [(1.07, []), (0.91, ["tool_mass_mismatch"])])
+def test_a_weighed_tool_is_compared_within_the_gain_of_the_sensor(load_kg: float, found: list[str]) -> None:
+    weight = replace(NO_LEAN, gravity_force_base_N=9.8 * load_kg * np.array([0.6, 0, -0.8]))
+    weighed = tool(weight, CERTAIN, Setup(tool_mass_kg=1.0, tool_mass_sigma_kg=0.002), 9.8)
+    assert [one.code for one in weighed] == found
+
+
 def test_only_quaternions_can_have_been_read_in_another_order() -> None:
     on_wall = replace(NO_LEAN, gravity_force_base_N=np.array([-20.0, 0, 0]))
     said = {form: directions(on_wall, CERTAIN, Setup(), form)[0].found for form in ("quaternion", "", "matrix", "xyz")}
@@ -339,8 +346,10 @@ def test_only_quaternions_can_have_been_read_in_another_order() -> None:
     ],
 )
 def test_a_mass_unlike_the_described_tool_is_named(factor: float, code: str, units: list[list[str]]) -> None:
-    result = solve(session(factor), setup=Setup(tool_mass_kg=LOAD_KG))
+    result = solve(session(factor), setup=Setup(tool_mass_kg=LOAD_KG, tool_mass_sigma_kg=0.002))
     assert codes(result)[0] == code
+    # It is no gain of the sensor.
+    assert result.contact.decoder is None or np.abs(result.contact.decoder - np.eye(6)).max() < 0.2
     assert all(pair in units for pair in result.findings[0].values["units"])
     assert bool(units) == bool(result.findings[0].values["units"])
 
