@@ -167,13 +167,15 @@ def plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: 
         Too few tilts are reachable by moves that are proven clear.
     """
     speeds = speeds.limited(Speeds.with_hung_load())
-    found = hung_tour(certifier, checked_joints(q_rad), HUNG_POSES, speeds)
+    q_now = checked_joints(q_rad)
+    found = hung_tour(certifier, q_now, HUNG_POSES, speeds)
     if found is None:
         raise PlanRefused(
             f"no tour of {HUNG_POSES} tilts of 45 to 75 degrees is reachable and proven clear with the hanging load: "
             "jog the arm to where the load has room below and around it, or hang it from another point of the tool"
         )
-    numbers, q, hook_m = found
+    hook_m = found[2]
+    numbers, q = _from_here(q_now, found[:2])
     share = np.linspace(0, 1, 41)[:, None, None]
     between = ((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)
     away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
@@ -326,13 +328,18 @@ def plan_verification(
             f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
             "the surroundings"
         )
-    # A closed tour may begin anywhere.
-    nearest = -int(np.abs(found[1] - q_now).max(axis=1).argmin())
-    numbers, q = np.roll(found[0], nearest), np.roll(found[1], nearest, axis=0)
+    numbers, q = _from_here(q_now, found)
     why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
     why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
-    plan = make_plan("verification", why, certifier, numbers.tolist(), q, speeds, guess)
+    plan = make_plan("verification", why, certifier, numbers, q, speeds, guess)
     return replace(plan, why=tuple(why))  # without the accuracy of a calibration from these poses
+
+
+def _from_here(q_now: Array, tour: Found) -> Found:
+    """Return a closed tour from the pose nearest to the present joint angles: there the cable is wound least."""
+    numbers, q = tour
+    nearest = -int(np.abs(q - q_now).max(axis=1).argmin())
+    return np.roll(numbers, nearest).tolist(), np.roll(q, nearest, axis=0)
 
 
 def _numbers(poses: int) -> tuple[int, ...]:

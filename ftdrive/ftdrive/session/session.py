@@ -114,7 +114,8 @@ class Calibrating:
         options = self.options
         if options.mode == "sweep":
             return sweep_for(self.cell, certifier, q_rad, options.seconds)
-        q_rad = from_usual_wrist(certifier, q_rad)
+        # From a tour of one hook, the wrist has no approach to another turn of itself.
+        q_rad = q_rad if certifier.arm.hung else from_usual_wrist(certifier, q_rad)
         plan = plan_for(self.cell, certifier, q_rad, poses, sets=options.sets)
         special = sum(step.number in NUMBERS[24] for step in plan.steps)
         if options.method in SPECIAL and special < 24:

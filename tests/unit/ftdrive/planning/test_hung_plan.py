@@ -1,16 +1,21 @@
 """Tilts with a load on a string: the hook stays, and the load keeps clear wherever it hangs."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import PlanRefused
+from ftdrive.planning.approach import plan_approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import HUNG_POSES, USUAL_POSTURE_RAD, certifier_for, plan_for
+from ftdrive.planning.search.nodes import WRIST_6_RAD
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import Calibrating
 from ftdrivers.ur.kinematics import MODELS, Array
 
 HOOK_M = (0.0, 0.0, 0.2)
@@ -43,6 +48,18 @@ def test_the_arm_turns_about_the_hook() -> None:
     share = np.linspace(0, 1, 50)[:, None, None]
     between = hooks(((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6))
     assert np.linalg.norm(between - hooks(q[:1]), axis=1).max() < 0.065
+
+
+def test_the_tour_begins_at_the_nearest_tilt() -> None:
+    away_rad = np.abs(plan().nodes_rad - USUAL_POSTURE_RAD).max(axis=1)
+    assert away_rad[0] == away_rad.min()
+
+
+def test_the_tilts_are_reached_from_those_about_another_hook() -> None:
+    q_rad = np.radians([-36.0, -59.0, -111.0, -129.0, 17.0, 76.0])
+    tilts_rad = Calibrating(CELL, SessionOptions(Path())).plan(certifier(), q_rad, 24).nodes_rad
+    assert np.abs(tilts_rad[:, 5] - q_rad[5]).max() <= WRIST_6_RAD
+    assert plan_approach(certifier().without_load, q_rad, tilts_rad[0], Speeds()).certified
 
 
 def test_the_tilts_are_spread_around_straight_down() -> None:
