@@ -10,6 +10,7 @@ from pathlib import Path
 from ftmocks.arrays import Array
 from ftmocks.imperfections import Imperfections
 from ftmocks.kinematics import MODELS
+from ftmocks.sensor_errors import CROSS_TALK_PERCENT, GAIN_PERCENT
 from ftmocks.sensors.catalogue import CHOICES, KINDS
 from ftmocks.station import Station, parse_vector
 from ftmocks.workcell import SWING_DEG
@@ -163,13 +164,17 @@ def _parser() -> argparse.ArgumentParser:
     add("--force-bias", type=_vector(3), metavar="x,y,z", help="N")
     add("--torque-bias", type=_vector(3), metavar="x,y,z", help="N·m")
     add("--noise", type=_vector(2), metavar="sF,sT", help="standard deviation of one reading, N and N·m")
-    add("--gain", type=_not_negative, default=0.0, metavar="PERCENT", help="errors of the sensor's gains, one sigma")
+    add(
+        "--gain",
+        type=_not_negative,
+        metavar="PERCENT",
+        help=f"errors of the sensor's gains, one sigma (default {GAIN_PERCENT:g})",
+    )
     add(
         "--cross-talk",
         type=_not_negative,
-        default=0.0,
         metavar="PERCENT",
-        help="cross-talk between its axes, one sigma, of the ranges (150 N, 10 N·m)",
+        help=f"cross-talk between its axes, one sigma, of the ranges (150 N, 10 N·m) (default {CROSS_TALK_PERCENT:g})",
     )
     add(
         "--nonlinear",

@@ -16,6 +16,8 @@ from ftmocks.arrays import Array
 RANGE: Array = np.repeat([150.0, 10.0], 3)
 """N and N·m: a torque of full range is a force of full range with a lever of 67 mm."""
 POWERS: Array = np.array([2, 3])
+GAIN_PERCENT, CROSS_TALK_PERCENT = 2.0, 1.0
+"""Of the sensor of a cell, unless the command line says otherwise: as of mounted sensors."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from ftmocks.imperfections import WRIST_DRIFT_N, Imperfections
 from ftmocks.inertia import inertia_tensor
 from ftmocks.kinematics import MODELS, Dh, Vector6, rotation, vector3, vector6
 from ftmocks.recording import RecordedArm, RecordedWorld, Recording
-from ftmocks.sensor_errors import SensorErrors
+from ftmocks.sensor_errors import CROSS_TALK_PERCENT, GAIN_PERCENT, PERFECT, SensorErrors
 from ftmocks.sensors.catalogue import KINDS, WRIST, Sensor, parse_settings
 from ftmocks.ur.operator import Operator
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot, RobotSettings
@@ -92,12 +92,20 @@ def truth_from(options: Namespace) -> Truth:
         changes["noise_force_N"], changes["noise_torque_Nm"] = options.noise
     if options.sensor == WRIST and options.sensor_rotvec_deg is not None:
         raise ValueError(f"the axes of {WRIST} are those of the flange: leave --sensor-rotvec-deg out")
-    sizes = [options.gain, options.cross_talk, options.nonlinear]
-    if any(sizes):
-        if options.recording is not None:
+    return replace(truth, **changes, sensor_errors=_sensor_errors(options))
+
+
+def _sensor_errors(options: Namespace) -> SensorErrors:
+    """Draw the errors of the sensor; those that a recording has are in its values."""
+    gain, cross_talk, nonlinear = options.gain, options.cross_talk, options.nonlinear
+    if options.recording is not None:
+        if gain or cross_talk or nonlinear:
             raise ValueError("--recording has the errors of its sensor: leave --gain, --cross-talk, --nonlinear out")
-        changes["sensor_errors"] = SensorErrors.drawn(options.seed, *(1e-2 * percent for percent in sizes))
-    return replace(truth, **changes)
+        return PERFECT
+    gain = GAIN_PERCENT if gain is None else gain
+    cross_talk = CROSS_TALK_PERCENT if cross_talk is None else cross_talk
+    sizes = [1e-2 * percent for percent in (gain, cross_talk, nonlinear)]
+    return SensorErrors.drawn(options.seed, *sizes) if any(sizes) else PERFECT
 
 
 def _gyration(inertia: str, mass_kg: float) -> Array | None:

@@ -26,7 +26,7 @@ def test_the_application_knows_all_sensors_of_a_station() -> None:
 def test_a_driver_reads_the_truth_of_the_cell_and_refuses_what_is_none(name: str) -> None:
     """On the emulated wrist: bias, weight, mounting and a push arrive; frozen, saturated and no number are errors."""
     mounting = [] if name == "ur-ft" else ["--sensor-rotvec-deg", "0,0,30"]
-    with Station(name, ["--seed", "5", *mounting]) as station:
+    with Station(name, ["--seed", "5", "--gain", "0", "--cross-talk", "0", *mounting]) as station:
         truth = station.truth
         with build_sensor(station.cell) as sensor:
             samples = sensor.collect(0.3)

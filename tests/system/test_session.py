@@ -115,7 +115,8 @@ def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     assert moves_of(station) == 7
     assert answer["drift_check"]["elapsed_s"] > 1
     assert len(answer["drift_check"]["change"]) == len(answer["drift_check"]["sigma"]) == 6
-    payload, lean = (one["values"] for one in answer["findings"])
+    found = {one["code"]: one["values"] for one in answer["findings"]}
+    payload, lean = found["payload_mismatch"], found["base_leans"]
     assert (answer["verdict"], answer["hints"]) == ("usable", [])
     assert (payload["payload_kg"], payload["load_kg"]) == (1.5, pytest.approx(0.64, abs=0.01))
     assert lean["lean_deg"] == pytest.approx(1.63, abs=0.03)

@@ -16,10 +16,11 @@ ROOT = Path(__file__).parents[2]
 
 
 class StationProcess:
-    """`python -m ftmocks station`, without a sensor and imperfections unless the options say otherwise."""
+    """`python -m ftmocks station`, without sensor, imperfections and sensor errors unless the options say otherwise."""
 
     def __init__(self, *options: str) -> None:
-        self._options = ("--sensor", "none", "--imperfections", "none", *options)
+        perfect = ("--imperfections", "none", "--gain", "0", "--cross-talk", "0")
+        self._options = ("--sensor", "none", *perfect, *options)
         self.host = ""
         self.start()
 

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ftmocks.__main__ import _parser
+from ftmocks.sensor_errors import PERFECT, SensorErrors
 from ftmocks.sensors.catalogue import parse_settings
 from ftmocks.sensors.robotous import MODELS
 from ftmocks.station import truth_from
@@ -64,3 +66,15 @@ def test_biases_are_as_large_as_those_of_real_sensors() -> None:
         assert torque == pytest.approx([torque_scale * value for value in torque_Nm])
     assert biases("robotiq", "--force-bias", "1,2,3")[0] == [1, 2, 3]
     assert biases("both") == biases("none") == (force_N, torque_Nm)
+
+
+def test_a_sensor_has_the_errors_of_a_mounted_one_unless_options_leave_them_out() -> None:
+    parser = _parser()
+
+    def errors(*more: str) -> SensorErrors:
+        return truth_from(parser.parse_args(["station", "--seed", "3", *more])).sensor_errors
+
+    gains = [np.diag(errors("--seed", str(seed)).error) for seed in range(100)]
+    assert np.std(gains) == pytest.approx(0.02, rel=0.1)
+    assert errors("--gain", "0", "--cross-talk", "0") is PERFECT
+    assert not np.any(np.diag(errors("--gain", "0").error))
