@@ -1,13 +1,14 @@
 """An operator who turns the sensor to all sides: by hand, or with a program on the pendant.
 
-Only the wrist turns. The operator holds the arm above the sensor, which does not measure the hand.
+Only the wrist turns. The operator holds the arm above the sensor, which does not measure the hand. A tool from which a
+load hangs is only tilted, and the operator waits longer until the load hangs still.
 """
 
 import math
 from collections.abc import Iterator
 from itertools import cycle
 
-from ftmocks.kinematics import Vector6
+from ftmocks.kinematics import Vector6, forward
 from ftmocks.ur.robot import Robot
 from ftmocks.ur.uploads import Upload
 
@@ -15,8 +16,10 @@ SPEED_RAD_S = 0.6
 ACCELERATION_RAD_S2 = 1.5
 REST_S = 3.5
 """Rest at each orientation on the cell's clock, independent of the speed of the arm."""
+REST_WITH_LOAD_S = 15.0
+TILT_RAD = math.radians(60)
 
-TIPS = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
+TIPS: tuple[tuple[int, int], ...] = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
 """Quarter turns of joints 4 and 5: the tool points in six directions."""
 SPINS = (0, -1, 1, 2)
 """Quarter turns of joint 6."""
@@ -24,15 +27,27 @@ IN_A_PROGRAM = 12
 """Number of orientations in the program: all tips, with two of the spins."""
 
 
-def orientations(q: Vector6) -> list[Vector6]:
-    """Return 24 postures (rad) near `q`: all turns of a cube. The first is `q` with joint 5 at a right angle."""
-    q1, q2, q3, q4, q5, q6 = q
-    right = math.copysign(math.pi / 2, q5)
+def orientations(robot: Robot) -> list[Vector6]:
+    """Return postures (rad) of the wrist: all 24 turns of a cube, or with a load that hangs the tool down and tilted.
+
+    The first has joint 5 at a right angle.
+    """
+    q1, q2, q3, q4, q5, q6 = robot.arm.q
+    right, step, tips = math.copysign(math.pi / 2, q5), math.pi / 2, TIPS
+    if robot.world.hung is not None:
+        axis = forward(robot.world.dh, (q1, q2, q3, q4, right, q6))[:3, 2]
+        right = math.copysign(right, right * float(axis @ robot.world.truth.gravity_m_s2))
+        step, tips = TILT_RAD, tuple(tip for tip in TIPS if abs(sum(tip)) < 2)
     return [
-        (q1, q2, q3, _turned(q4, tip4), _turned(right, tip5), _turned(q6, spin))
+        (q1, q2, q3, _turned(q4, step * tip4), _turned(right, step * tip5), _turned(q6, spin * math.pi / 2))
         for spin in SPINS
-        for tip4, tip5 in TIPS
+        for tip4, tip5 in tips
     ]
+
+
+def usual_rest_s(robot: Robot) -> float:
+    """Return how long the operator rests at each orientation, s."""
+    return REST_S if robot.world.hung is None else REST_WITH_LOAD_S
 
 
 def guided_by_hand(robot: Robot, rest_s: float) -> Iterator[None]:
@@ -40,7 +55,7 @@ def guided_by_hand(robot: Robot, rest_s: float) -> Iterator[None]:
 
     The operator waits while the arm cannot be moved.
     """
-    for q in cycle(orientations(robot.arm.q)):
+    for q in cycle(orientations(robot)):
         while robot.hand_obstacle or robot.arm.busy:
             yield
         robot.hand_move(q, SPEED_RAD_S)
@@ -52,13 +67,13 @@ def guided_by_hand(robot: Robot, rest_s: float) -> Iterator[None]:
 
 def pendant_program(robot: Robot, rest_s: float) -> Upload:
     """Return a program that visits the first `orientations`, returns to the first and rests at each."""
-    first, *others = orientations(robot.arm.q)[:IN_A_PROGRAM]
+    first, *others = orientations(robot)[:IN_A_PROGRAM]
     rest = f"  sleep({rest_s * robot.settings.time_scale})\n"
     moves = [f"  movej({list(q)}, a={ACCELERATION_RAD_S2}, v={SPEED_RAD_S})\n" for q in (first, *others, first)]
     return Upload("turns", "def turns():\n" + "".join(move + rest for move in moves) + "end\n", secondary=False)
 
 
-def _turned(angle: float, quarters: int) -> float:
-    """Turn an angle by quarter turns and keep it within one turn."""
-    turned = angle + quarters * math.pi / 2
+def _turned(angle: float, by: float) -> float:
+    """Turn an angle and keep it within one turn."""
+    turned = angle + by
     return turned if abs(turned) <= 2 * math.pi else math.remainder(turned, 2 * math.pi)

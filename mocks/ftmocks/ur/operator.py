@@ -6,7 +6,7 @@ from typing import Any
 
 from ftmocks.kinematics import ZERO6, vector3, vector6
 from ftmocks.ur import dashboard
-from ftmocks.ur.hand import REST_S, guided_by_hand, pendant_program
+from ftmocks.ur.hand import guided_by_hand, pendant_program, usual_rest_s
 from ftmocks.ur.modes import PERMITTED, RobotMode, Runtime, SafetyMode
 from ftmocks.ur.production import Job, Production
 from ftmocks.ur.robot import INSTALLED_G_M_S2, Robot
@@ -143,12 +143,18 @@ class Operator:
         self._robot.note("operator", "hand-move", q_rad=list(q))
 
     def _hand_guide(self, request: Request) -> None:
-        self._robot.hand = guided_by_hand(self._robot, _rest_s(request)) if _on(request) else None
+        self._robot.hand = guided_by_hand(self._robot, self._rest_s(request)) if _on(request) else None
         self._robot.note("operator", "hand-guide", on=_on(request))
 
     def _pendant_program(self, request: Request) -> dict[str, Any]:
-        accepted = start_upload(self._robot, pendant_program(self._robot, _rest_s(request)), by="operator")
+        accepted = start_upload(self._robot, pendant_program(self._robot, self._rest_s(request)), by="operator")
         return {"accepted": accepted}
+
+    def _rest_s(self, request: Request) -> float:
+        rest_s = float(request.get("rest_s", usual_rest_s(self._robot)))
+        if not 0.0 < rest_s < math.inf:
+            raise ValueError(f"rest_s {rest_s} is no positive time")
+        return rest_s
 
     def _swing(self, request: Request) -> dict[str, Any]:
         robot = self._robot
@@ -224,10 +230,3 @@ def _fraction(request: Request) -> float:
     if not 0.0 <= fraction <= 1.0:
         raise ValueError(f"fraction {fraction} is not between 0 and 1")
     return fraction
-
-
-def _rest_s(request: Request) -> float:
-    rest_s = float(request.get("rest_s", REST_S))
-    if not 0.0 < rest_s < math.inf:
-        raise ValueError(f"rest_s {rest_s} is no positive time")
-    return rest_s

@@ -23,8 +23,8 @@ SCALE = 20.0
 REST_S = 0.2
 
 
-def new_robot() -> Robot:
-    return Robot(World(Truth.drawn(0), UR5E, HOME, 0), RobotSettings(time_scale=SCALE))
+def new_robot(q: Vector6 = HOME) -> Robot:
+    return Robot(World(Truth.drawn(0), UR5E, q, 0), RobotSettings(time_scale=SCALE))
 
 
 def rests(robot: Robot, count: int) -> list[tuple[Vector6, float]]:
@@ -78,8 +78,17 @@ def test_a_hand_moves_smoothly_whatever_the_slider_says() -> None:
 
 def test_the_joints_stay_within_a_turn() -> None:
     q = vector6([*HOME[:5], math.radians(350)])
-    assert all(abs(angle) <= 2 * math.pi for posture in orientations(q) for angle in posture)
-    assert orientations(q)[0] == pytest.approx([*q[:4], math.pi / 2, q[5]])
+    found = orientations(new_robot(q))
+    assert all(abs(angle) <= 2 * math.pi for posture in found for angle in posture)
+    assert found[0] == pytest.approx([*q[:4], math.pi / 2, q[5]])
+
+
+def test_a_tool_with_a_hanging_load_points_down_or_is_tilted() -> None:
+    robot = new_robot()
+    robot.world.hang(2.0, np.array([0.0, 0.0, 0.2]), 0.25, 0.0)
+    axes = np.array([flange(q)[:, 2] for q in orientations(robot)])
+    assert set(np.degrees(np.arccos(-axes[:, 2])).round()) == {0, 60}
+    assert np.abs(axes[:, :2].sum(axis=0)).max() < 1e-6, "to all sides"
 
 
 def test_a_hand_waits_for_a_program_and_for_power() -> None:
@@ -108,7 +117,7 @@ def test_a_program_on_the_pendant_goes_there_once_and_back() -> None:
     assert start_upload(robot, pendant_program(robot, REST_S))
     _, *found = rests(robot, IN_A_PROGRAM + 1)  # before its start too
     assert robot.runtime == Runtime.PLAYING
-    expected = orientations(HOME)[:IN_A_PROGRAM]
+    expected = orientations(new_robot())[:IN_A_PROGRAM]
     np.testing.assert_allclose([q for q, _ in found], expected, atol=0.02)
     assert all(rest_s == pytest.approx(REST_S, abs=0.02) for _, rest_s in found)
     run(robot, 1.0)
