@@ -297,7 +297,9 @@ class HandGuided:
             if stage == "sample":
                 self._show_state(State.SAMPLE)
             elif held.samples is not None:
-                self._note_unrest(stop, held.samples, "Let go of tool and cable.")
+                swings = self._most_swing_N is not None
+                advice = "Let the weight hang still." if swings else "Let go of tool and cable."
+                self._note_unrest(stop, held.samples, advice)
 
         pose = TourPose(number, state.q_rad)
         try:
@@ -407,6 +409,11 @@ class HandGuided:
     def _greet(self, goal: str) -> None:
         if self._listen:
             self._note(f"Start the program at the pendant. Each standstill counts: {self._hold_still()}.")
+        elif self._most_swing_N is not None:
+            self._note(
+                "Move the arm slowly, by hand or with the pendant, to tilts of the tool of 45 to 75° from straight "
+                f"down, to all sides. At each of them {self._hold_still()}, with the weight hanging still."
+            )
         else:
             self._note(
                 "Move the arm by hand or with the pendant to orientations of the tool as different as you can. At each "

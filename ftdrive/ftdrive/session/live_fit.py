@@ -25,12 +25,17 @@ from ftcalib.poses.selection import next_pose
 from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
+from ftdrive.runs.load import Load
 from ftdrive.session.events import Estimated
 
 # As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
 # As within 30 to 45 degrees.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
+# With a known load, the run of the tool alone has what cond9 judges: a hanging load leaves the tool tilted downwards.
+OF_A_LOAD = ("cond_u1",)
+# A hint tilts a tool from which a load hangs no farther, with room for rounding.
+HUNG_TILT_RAD = float(np.radians(76))
 # `RunningFit.predict` returns None if its sigma of the force is more than this share of the weight.
 TRUSTED_SHARE = 0.05
 
@@ -46,14 +51,19 @@ class RunningFit:
     """The calibration so far, and its coverage.
 
     `down_base` (3,), the unit vector down in base, serves the coverage until the fit gives it. With `advise` it
-    suggests the most useful next pose.
+    suggests the most useful next pose. A known `load` is part of what the sensor carries.
     """
 
     def __init__(
-        self, *, g_m_s2: float = STANDARD_GRAVITY_M_S2, down_base: ArrayLike = (0.0, 0.0, -1.0), advise: bool = True
+        self,
+        *,
+        g_m_s2: float = STANDARD_GRAVITY_M_S2,
+        down_base: ArrayLike = (0.0, 0.0, -1.0),
+        advise: bool = True,
+        load: Load | None = None,
     ) -> None:
         self._g_m_s2 = g_m_s2
-        self._advise = advise
+        self._advise, self._load = advise, load
         self._down_base = np.asarray(down_base, dtype=np.float64)
         self._records: dict[int, PoseRecord] = {}
         self.result: CalibrationResult | None = None
@@ -75,7 +85,8 @@ class RunningFit:
         coverage = self._refit()
         R_base_flange, down = self._orientations(), self._down()
         gravity_flange = down @ R_base_flange
-        light = _light(coverage)
+        light = _light(coverage, loaded=self._load is not None)
+        tilt_rad = HUNG_TILT_RAD if self._load is not None and not self._load.gripped else np.pi
         values, sigma = ({}, {}) if self.result is None else _estimates(self.result)
         return Estimated(
             poses=len(R_base_flange),
@@ -88,7 +99,7 @@ class RunningFit:
             cond_u1=coverage.cond_u1,
             empty_cap_deg=float(np.degrees(largest_gap(gravity_flange)[0])),
             light=light,
-            hint=_hint(R_base_flange, self._guess(), down) if self._advise and light != "green" else "",
+            hint=_hint(R_base_flange, self._guess(), down, tilt_rad) if self._advise and light != "green" else "",
         )
 
     def remove(self, stop: int) -> None:
@@ -176,10 +187,16 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
     return a, b, c, d, e, f
 
 
-def _hint(R_base_flange: Array, guess: Guess, down_base: Array) -> str:
-    """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one."""
+def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: float) -> str:
+    """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one.
+
+    It keeps the tool axis within an angle of straight down, if one does.
+    """
     last = R_base_flange[-1]
     words, candidates = _motions(last, down_base)
+    inside = np.flatnonzero(candidates[:, :, 2] @ down_base >= np.cos(most_tilt_rad))
+    if len(inside):
+        words, candidates = [words[i] for i in inside], candidates[inside]
     best = int(next_pose(R_base_flange, candidates, guess)[0])
     before, after = (_pointing_down(down_base @ R) for R in (last, candidates[best]))
     return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
@@ -206,13 +223,15 @@ def _pointing_down(gravity_flange: Array) -> str:
     return f"the middle of the tool's {', '.join(axes[:-1])} and {axes[-1]} axes"
 
 
-def _light(coverage: Prediction) -> str:
+def _light(coverage: Prediction, *, loaded: bool = False) -> str:
     """Judge by conditioning; poses that another solution explains, or that are too few to be checked, are not green."""
     found = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
-    if coverage.second_basin_gap < AMBIGUOUS_GAP or any(found[name] > limit for name, limit in AMBER.items()):
+    if loaded:
+        found = {name: found[name] for name in OF_A_LOAD}
+    if coverage.second_basin_gap < AMBIGUOUS_GAP or any(found[name] > AMBER[name] for name in found):
         return "red"
     few = coverage.n_poses < RECOMMENDED_POSES or coverage.second_basin_gap < WEAK_GAP
-    return "amber" if few or any(found[name] > limit for name, limit in GREEN.items()) else "green"
+    return "amber" if few or any(found[name] > GREEN[name] for name in found) else "green"
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:

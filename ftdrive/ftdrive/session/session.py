@@ -133,7 +133,7 @@ class Calibrating:
     def judge(self, *, by_hand: bool) -> Judge:
         """Return the running fit."""
         down_base = down_of(self.cell.workcell.mounting)
-        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand)
+        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.options.load)
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
         """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""

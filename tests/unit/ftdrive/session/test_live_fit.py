@@ -14,13 +14,14 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import Finding, Parameters, solve
 from ftcalib.model import predict
-from ftcalib.poses.information import T12, Prediction, TOOL_DOWN_R_base_flange, special
-from ftcalib.poses.selection import cone_candidates
+from ftcalib.poses.information import T12, Guess, Prediction, TOOL_DOWN_R_base_flange, special
+from ftcalib.poses.selection import cone_candidates, tilted_candidates
 from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check
 from ftdrive.planning.search.nodes import NUMBERS
+from ftdrive.runs.load import Load
 from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import RunningFit, _light, faces
+from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit, _hint, _light, _motions, faces
 from ftdrive.terminal.report import print_result
 from tests.pose_sets import AMBIGUOUS_6
 
@@ -393,3 +394,19 @@ def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: py
     assert "let the sensor warm up for 15 to 30 min" in " ".join(text.split())
     assert " drift in the fit: " in text
     assert "1.12" in next(line for line in lines if "mass, kg" in line)
+
+
+def test_tilts_with_a_hanging_load_are_enough_for_its_run() -> None:
+    """Alone they would leave the mounting uncertain, which the run of the tool has."""
+    tilts = tilted_candidates(np.radians([45, 75]), 4, 0.0, (0.0, 0.0, -1.0))
+    hung = Load.of("2.0", "tip=0,0,200", gripped=False)
+    assert (run(records(tilts)).light, run(records(tilts), RunningFit(load=hung)).light) == ("amber", "green")
+
+
+def test_a_hint_keeps_a_hanging_load_below_the_tool() -> None:
+    R_base_flange = tilted_candidates(np.radians([60]), 1, 0.0, (0.0, 0.0, -1.0))
+    last, down = R_base_flange[0], np.array([0.0, 0.0, -1.0])
+    words, candidates = _motions(last, down)
+    hint = _hint(R_base_flange, Guess(3.0, 0.05, 0.003), down, HUNG_TILT_RAD)
+    (chosen,) = [R for motion, R in zip(words, candidates, strict=True) if hint.endswith(motion)]
+    assert -chosen[2, 2] >= np.cos(HUNG_TILT_RAD)
