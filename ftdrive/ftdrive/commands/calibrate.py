@@ -148,7 +148,8 @@ def calibrate(
         # A resumed run keeps its cell.
         simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
-            pace = REAL_PACE if sweep or passive else ()
+            # A load swings as slowly as it does on a real arm.
+            pace = REAL_PACE if sweep or passive or (known_load and not known_load.gripped) else ()
             station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
             cell = station.cell
             description = station.description
@@ -206,7 +207,7 @@ def _put_on(station: "Station", load: "Load | None") -> None:
     station.control(do="set-payload", payload_kg=mass_kg + truth["sensor_mass_kg"])
     if load.p_flange_mm is not None:
         place = list(load.p_flange_mm)
-        station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M, swing_deg=0)
+        station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M)
     else:
         # In the middle between the fingers, about: its place is unknown to the solution.
         p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])

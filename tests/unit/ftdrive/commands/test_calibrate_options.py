@@ -12,7 +12,7 @@ from click.testing import CliRunner
 
 from ftcalib.errors import BadDataset, NotObservable
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.cell.emulated import Station
+from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.runs.run import Run
@@ -223,6 +223,13 @@ def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: li
     assert isinstance(call("--resume", str(run.folder), "--robot", "10.0.0.9"), Opened)
     assert stations == []
     assert cells.pop()[1].real
+
+
+@pytest.mark.parametrize(("place", "pace"), [(("--at", "tip=0,0,200"), REAL_PACE), (("--gripped",), ())])
+@pytest.mark.usefixtures("cells")
+def test_a_load_on_a_string_needs_the_pace_of_a_real_arm(place: Any, pace: Any, stations: list[Any]) -> None:
+    call("--simulate", "--load", "2.0", *place)
+    assert stations.pop()[1] == pace
 
 
 @pytest.mark.parametrize("more", [(), ("--redo", "3"), ("--dry-run",), ("--simulate",)])
