@@ -20,6 +20,7 @@ from ftdrivers.errors import ConnectError
 TIME_SCALE = 20
 # Options of a cell whose arm is recorded in motion.
 REAL_PACE = ("--time-scale", "1")
+_PERFECT = ("--gain", "0", "--cross-talk", "0")
 
 # Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm.
 SENSORS = {
@@ -96,7 +97,11 @@ class Station:
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
         path = control_path or made_by.get("control_path", "auto")
         values = {key: check_value("the run", key, value) for key, value in made_by.get("values", {}).items()}
-        return cls(name, (*made_by.get("options", ()), *options), control_path=path, values=values)
+        own = tuple(made_by.get("options", ()))
+        # Emulated sensors were perfect by default before.
+        if "truth" in made_by and not any(map(any, made_by["truth"].get("sensor_error", ()))):
+            own = (*_PERFECT, *own)
+        return cls(name, (*own, *options), control_path=path, values=values)
 
     def __enter__(self) -> Self:
         if sys.platform != "linux":

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ftcalib.loads.solve import LoadSolution
     from ftdrive.runs.source import Outcome
 
-# Of the sensor in a demo with loads, percent: as of mounted sensors.
-_SENSOR_ERRORS = ("--gain", "2", "--cross-talk", "1")
 _LOAD_KG, _LOAD_SIGMA_KG, _PLACE_SIGMA_MM = 2.0, 0.002, 0.5
 _HOOKS_MM = {"side": (100.0, 0.0, 50.0), "tip": (0.0, 0.0, 200.0)}
 _LOAD_POSES = 12
@@ -85,7 +83,7 @@ def demo(
         raise ConfigError("--loads has its own poses: leave out --sweep, --set and --method")
     solved_by = method_of_poses(method)
     options = ["--seed", str(seed), *(["--polyscope", polyscope] if polyscope else [])]
-    options += [*(REAL_PACE if sweep else ()), *(_SENSOR_ERRORS if loads else ())]
+    options += REAL_PACE if sweep else ()
     with Station(sensor, options, control_path=control or "auto") as station:
         truth = station.truth
         messages.print(f"Emulated UR5e, {SENSORS[sensor]}, tool of {truth['mass_kg']:.3f} kg. No real device is used.")

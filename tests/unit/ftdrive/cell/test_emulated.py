@@ -29,3 +29,15 @@ def test_a_station_has_the_tool_and_the_mounting_of_the_configuration(
     values: dict[str, Any], sensor: str, options: str
 ) -> None:
     assert " ".join(_options(values, sensor)) == options
+
+
+@pytest.mark.parametrize(
+    ("truth", "options"),
+    [
+        ({"mass_kg": 1.0}, ("--gain", "0", "--cross-talk", "0", "--seed", "3")),  # made when sensors were perfect
+        ({"sensor_error": [[0.0, 0.0], [0.0, 0.0]]}, ("--gain", "0", "--cross-talk", "0", "--seed", "3")),
+        ({"sensor_error": [[0.0, 0.0], [0.0, 0.02]]}, ("--seed", "3")),
+    ],
+)
+def test_the_station_of_a_run_has_its_sensor_again(truth: dict[str, Any], options: tuple[str, ...]) -> None:
+    assert Station.of({"sensor": "can", "options": ["--seed", "3"], "truth": truth}).options == options
