@@ -93,6 +93,8 @@ class Gate:
         Returns the address of the server for an `Origin`; None is that of a program.
     origins : collection of str
         See `refusal`.
+    token : str
+        A browser must have opened `/?token=` with it once, and keeps it as a cookie; empty: none is needed.
 
     Raises
     ------
@@ -101,9 +103,14 @@ class Gate:
     """
 
     def __init__(
-        self, bound: Address, behind: Callable[[str | None], Address], *, origins: Collection[str] | None = None
+        self,
+        bound: Address,
+        behind: Callable[[str | None], Address],
+        *,
+        origins: Collection[str] | None = None,
+        token: str = "",
     ) -> None:
-        self._host, self._behind, self._origins = bound[0], behind, origins
+        self._host, self._behind, self._origins, self._token = bound[0], behind, origins, token
         self._clients: dict[str, str] = {}
         self._loop = asyncio.new_event_loop()
         try:
@@ -147,9 +154,19 @@ class Gate:
                 if why := refusal(headers, self._host, self._origins):
                     _log.warning("a request was refused: %s", why)
                     await _answer(writer, HTTPStatus.FORBIDDEN, why)
+                elif self._token and head.split(b" ", 2)[1] == f"/?token={self._token}".encode():
+                    cookie = f"Set-Cookie: {self._cookie}; HttpOnly; SameSite=Strict; Path=/"
+                    await _answer(writer, HTTPStatus.SEE_OTHER, "", "Location: /", cookie)
+                elif self._token and self._cookie not in headers.get("Cookie", "").split("; "):
+                    await _answer(writer, HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
                 else:
                     await self._pass_on(reader, writer, head, self._behind(headers.get("Origin")))
         writer.close()
+
+    @property
+    def _cookie(self) -> str:
+        # Browsers send the cookies of one port to all ports of a host.
+        return f"ftdrive-{self.port}={self._token}"
 
     async def _pass_on(
         self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, head: bytes, address: Address
@@ -189,10 +206,11 @@ async def _head(reader: asyncio.StreamReader) -> tuple[bytes, HTTPMessage]:
     return head, headers
 
 
-async def _answer(writer: asyncio.StreamWriter, status: HTTPStatus, text: str) -> None:
+async def _answer(writer: asyncio.StreamWriter, status: HTTPStatus, text: str, *more: str) -> None:
     body = f"{text}\n".encode()
-    head = f"HTTP/1.1 {status} {status.phrase}\r\nContent-Type: text/plain; charset=utf-8\r\n"
-    writer.write(f"{head}Content-Length: {len(body)}\r\nConnection: close\r\n\r\n".encode() + body)
+    head = [f"HTTP/1.1 {status} {status.phrase}", "Content-Type: text/plain; charset=utf-8", *more]
+    head += [f"Content-Length: {len(body)}", "Connection: close"]
+    writer.write("\r\n".join([*head, "", ""]).encode() + body)
     await writer.drain()
 
 

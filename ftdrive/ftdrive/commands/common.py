@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ftdrive.runs.source import Outcome
     from ftdrive.session.options import SessionOptions
     from ftdrive.store.store import Store
+    from ftdrive.view.page import Page
 
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -201,12 +202,52 @@ def require_extra(extra: str, what: str, *modules: str) -> None:
         )
 
 
-def require_viz(png: Path | None, *, view: bool) -> None:
-    """Raise `ConfigError` if a picture or a view of a plan is wanted and its package is missing."""
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """Whether a command has a page in the browser, and where it is served."""
+
+    view: bool
+    address: str | None
+
+    @contextmanager
+    def page(self, title: str) -> Iterator["Page | None"]:
+        """Serve a page while the block runs, and print its address; None where it is not wanted."""
+        from ftdrive.http_gate import host_and_port
+
+        address = None
+        if self.address is not None:
+            address = host_and_port("--view-address", self.address, "0.0.0.0:8080")
+        if not (self.view or address):
+            yield None
+            return
+        require_extra("viz", "--view", "viser", "segno")
+        from ftdrive.view.page import announce, serve
+
+        with serve(title, address) as page:
+            announce(page, address)
+            yield page
+
+
+def view_options(command: F) -> F:
+    """Add the options --view and --view-address, as one argument `view` of type `ViewOptions`."""
+
+    @click.option("--view", is_flag=True, help="Show it in the browser (needs ftdrive[viz]).")
+    @click.option(
+        "--view-address",
+        metavar="HOST:PORT",
+        help="Serve that page to other devices too, such as 0.0.0.0:8080 for a tablet; implies --view.",
+    )
+    @wraps(command)
+    def with_view(view: bool, view_address: str | None, **options: Any) -> None:
+        command(view=ViewOptions(view, view_address), **options)
+
+    return cast("F", with_view)
+
+
+def require_viz(png: Path | None) -> None:
+    """Raise `ConfigError` if a picture is wanted and its package is missing."""
     if png is not None:
         require_extra("viz", "--png", "matplotlib")
-    if view:
-        require_extra("viz", "--view", "viser")
 
 
 class NewFile(click.Path):

@@ -1,7 +1,9 @@
 """`ftdrive plan`: a tour proven clear, without an arm."""
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from threading import Event
 from typing import TYPE_CHECKING
 
 import click
@@ -11,17 +13,20 @@ from ftdrive.commands.common import (
     JSON,
     SETS,
     NewFile,
+    ViewOptions,
     check_simulate,
     numbers,
     require_viz,
     rows,
     simulate,
+    view_options,
     write_json,
 )
 
 if TYPE_CHECKING:
     from ftdrive.planning.geometry.certify import Certifier
     from ftdrive.planning.plan import Plan
+    from ftdrive.view.page import Page
 
 USUAL_POSTURE_DEG = (45, -100, 60)
 
@@ -75,7 +80,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 )
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
-@click.option("--view", is_flag=True, help="Show the plan in the browser, in three dimensions (needs ftdrive[viz]).")
+@view_options
 @simulate("Use arm and tool of an emulated cell instead of the configuration.")
 @JSON
 def plan(
@@ -95,7 +100,7 @@ def plan(
     mass_kg: float | None,
     output: Path | None,
     png: Path | None,
-    view: bool,
+    view: ViewOptions,
     simulate: bool,
     as_json: bool,
 ) -> None:
@@ -118,7 +123,7 @@ def plan(
     if sets is not None and (quick or minimal or cone_deg or box_mm):
         raise ConfigError("--set names the poses: leave out --quick, --minimal, --cone and --free-box")
     check_simulate(simulate, real={"--config": config})
-    require_viz(png, view=view)
+    require_viz(png)
     emulated = None
     if simulate:
         with working("Starting the emulated cell"), Station.of(None) as station:
@@ -172,28 +177,25 @@ def plan(
     if output is not None:
         made.save(output)
     saved = [f" Saved {path}" for path in (png, output) if path is not None]
-    if as_json:
-        write_json({"schema_version": 1} | made.to_dict())
-        messages.print(*saved, sep="\n", end="\n" if saved else "")
-    else:
-        answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
-        same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
-        messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
-    if view:
-        _look(made, certifier)
+    with view.page(f"ftdrive plan, {certifier.arm.name}") as page:
+        if as_json:
+            write_json({"schema_version": 1} | made.to_dict())
+            messages.print(*saved, sep="\n", end="\n" if saved else "")
+        else:
+            answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
+            same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
+            messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
+        if page is not None:
+            _show(page, made, certifier)
 
 
-def _look(made: "Plan", certifier: "Certifier") -> None:
-    import threading
-    from contextlib import suppress
+def _show(page: "Page", plan: "Plan", certifier: "Certifier") -> None:
+    from ftdrive.terminal.console import messages
+    from ftdrive.view.plan_page import PlanPage
 
-    from ftdrive.planning.drawing import open_in_browser, serve_view
-    from ftdrive.terminal.console import print_address
-
-    with serve_view(made, certifier) as url, suppress(KeyboardInterrupt):
-        print_address("The plan is shown until Ctrl-C at ", url)
-        open_in_browser(url)
-        threading.Event().wait()
+    messages.print("Ctrl-C ends.")
+    with suppress(KeyboardInterrupt):
+        PlanPage(page, plan, certifier).play(Event())
 
 
 def _tip_speed(text: str | None) -> float | None:

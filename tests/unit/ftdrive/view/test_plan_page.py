@@ -11,13 +11,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.planning.drawing import describe, path, revolved, serve_view, turned_up
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
+from ftdrive.view.page import serve
+from ftdrive.view.plan_page import describe, path
+from ftdrive.view.scene import line_of_action, revolved, turned_up
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +85,32 @@ def test_straight_down_is_a_direction_too() -> None:
     np.testing.assert_allclose(turned, [0, 0, -1], atol=1e-12)
 
 
-def test_a_page_on_this_computer_or_what_to_install(plan: Plan, certifier: Certifier) -> None:
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.lists(st.floats(0.1, 9), min_size=3, max_size=3))
+def test_a_force_on_its_line_of_action_has_the_torque(p: list[float], force: list[float]) -> None:
+    at, F = np.array([0.3, -0.2, 0.5]), np.array(force)
+    torque = np.cross(np.array(p), F)
+    ((start, end),) = line_of_action(at, np.concatenate([F, torque]))
+    for point in (start, end):
+        np.testing.assert_allclose(np.cross(point - at, F), torque, atol=1e-9)
+
+
+def test_a_page_on_this_computer_or_what_to_install() -> None:
     if find_spec("viser") is None:
-        with pytest.raises(ConfigError, match=r"ftdrive\[viz\]"), serve_view(plan, certifier):
+        with pytest.raises(ConfigError, match=r"ftdrive\[viz\]"), serve("a plan"):
             pass
         return
-    with serve_view(plan, certifier) as url:
-        assert url.startswith("http://127.0.0.1:")
-        with urllib.request.urlopen(url, timeout=10) as page:
-            assert b"<html" in page.read()
-        for name, value in (("Origin", "https://evil.example"), ("Host", "evil.example")):
-            foreign = urllib.request.Request(url, headers={name: value})
+    with serve("a plan") as page:
+        assert page.url.startswith("http://127.0.0.1:")
+        bare = page.url.partition("?")[0]
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        for url, headers in (
+            (bare, {}),
+            (f"{bare}?token=guessed", {}),
+            (page.url, {"Origin": "https://evil.example"}),
+            (page.url, {"Host": "evil.example"}),
+        ):
             with pytest.raises(urllib.error.HTTPError, match="403"):
-                urllib.request.urlopen(foreign, timeout=10)
+                opener.open(urllib.request.Request(url, headers=headers), timeout=10)
+        for url in (page.url, bare):  # the token is needed once
+            with opener.open(url, timeout=10) as answer:
+                assert b"<html" in answer.read()

@@ -1,0 +1,119 @@
+"""The server of a command's page, its address, and who looks at it."""
+
+import os
+import secrets
+import socket
+import sys
+import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout
+from io import StringIO
+from typing import TYPE_CHECKING, Any, Final
+
+from ftcalib.model import Array
+from ftdrive.errors import ConfigError
+from ftdrive.http_gate import Address, Gate, hidden_host, is_loopback, with_port
+
+if TYPE_CHECKING:
+    from viser import GuiEvent, ViserServer
+
+# Only this computer can open the page.
+LOCAL: Final[Address] = ("127.0.0.1", 8080)
+
+
+class Page:
+    """A page that browsers show, with a scene of its own and controls beside it.
+
+    Attributes
+    ----------
+    gui, scene
+        Those of viser.
+    url : str
+        With the token, without which nothing is served.
+    """
+
+    def __init__(self, server: "ViserServer", url: str) -> None:
+        self._server, self.url = server, url
+        self.gui, self.scene = server.gui, server.scene
+
+    def at_once(self) -> AbstractContextManager[None]:
+        """Let browsers show all changes of a `with` block together."""
+        return self._server.atomic()
+
+    def look(self, at_m: Array, from_m: Array) -> None:
+        """Place the camera of browsers that open the page from now on; (3,) each, base axes."""
+        self._server.initial_camera.look_at, self._server.initial_camera.position = at_m, from_m
+
+    @property
+    def viewers(self) -> int:
+        """Number of browsers that show the page."""
+        return len(self._server.get_clients())
+
+    def add_stop(self, stop: Callable[[str], object]) -> None:
+        """Add a Stop button; `stop` is called in another thread, with the name of the viewer who pressed it."""
+        button = self.gui.add_button("Stop", color="red", hint="Stops the arm, as a key in the terminal does.")
+
+        @button.on_click
+        async def _(event: "GuiEvent[Any]") -> None:  # not in the pool of threads, which may be busy
+            stop(f"viewer {event.client_id}")
+
+
+@contextmanager
+def serve(title: str, address: Address | None = None) -> Iterator[Page]:
+    """Serve a page while the block runs. Needs the extra `viz`.
+
+    Parameters
+    ----------
+    title : str
+    address : tuple of str and int, optional
+        Host and port. Without it only this computer is served: at port 8080, or another one if that is taken.
+
+    Raises
+    ------
+    ConfigError
+        The address cannot be used, or viser is missing.
+    """
+    try:
+        from viser import ViserServer
+    except ImportError:
+        raise ConfigError("a view needs viser: install ftdrive with its extra viz, `ftdrive[viz]`") from None
+    behind, token = hidden_host(), secrets.token_urlsafe(12)
+    # It prints a banner; our stdout is data.
+    with redirect_stdout(StringIO()):
+        server = ViserServer(host=behind, label=title, verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False)
+        server.gui.main_panel.dock_right()
+        with closing(_gate(address, (behind, server.get_port()), token)) as gate:
+            host = LOCAL[0] if address is None else address[0]
+            named = socket.gethostname() if host in ("0.0.0.0", "::") else host
+            yield Page(server, f"http://{with_port(named, gate.port)}/?token={token}")
+    finally:
+        with redirect_stdout(StringIO()):
+            server.stop()
+
+
+def _gate(address: Address | None, behind: Address, token: str) -> Gate:
+    bound = address or LOCAL
+    try:
+        return Gate(bound, lambda _: behind, token=token)
+    except OSError as error:
+        if address is not None:
+            raise ConfigError(f"--view-address {with_port(*address)} cannot be used: {error.strerror}") from error
+        return Gate((LOCAL[0], 0), lambda _: behind, token=token)
+
+
+def announce(page: Page, address: Address | None = None) -> None:
+    """Print the address of a page, as a QR code too for another device; open it where this computer has a screen."""
+    from ftdrive.terminal.console import messages, print_address
+
+    print_address("The page is shown until this command ends, at ", page.url)
+    if address is not None and not is_loopback(address[0]):
+        import segno
+
+        code = StringIO()
+        segno.make(page.url, error="l").terminal(code, border=1, compact=True)
+        messages.print(code.getvalue(), end="")
+        messages.print("Who has this address sees the page, and can stop the arm. There is no encryption.")
+    elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        webbrowser.open(page.url)
