@@ -6,7 +6,7 @@ import socket
 import sys
 import webbrowser
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout
+from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout, suppress
 from io import StringIO
 from typing import TYPE_CHECKING, Any, Final
 
@@ -85,12 +85,22 @@ def serve(title: str, address: Address | None = None) -> Iterator[Page]:
         server.gui.configure_theme(show_logo=False, show_share_button=False)
         server.gui.main_panel.dock_right()
         with closing(_gate(address, (behind, server.get_port()), token)) as gate:
-            host = LOCAL[0] if address is None else address[0]
-            named = socket.gethostname() if host in ("0.0.0.0", "::") else host
-            yield Page(server, f"http://{with_port(named, gate.port)}/?token={token}")
+            host = _reached_at((address or LOCAL)[0])
+            yield Page(server, f"http://{with_port(host, gate.port)}/?token={token}")
     finally:
         with redirect_stdout(StringIO()):
             server.stop()
+
+
+def _reached_at(host: str) -> str:
+    """Return the address by which others reach a server that listens at `host`: a tablet may not know our name."""
+    if host not in ("0.0.0.0", "::"):
+        return host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        # Sends nothing: an address for documentation chooses the interface.
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
 
 
 def _gate(address: Address | None, behind: Address, token: str) -> Gate:
