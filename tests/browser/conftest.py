@@ -20,6 +20,7 @@ _DRAWS_BY_SOFTWARE = (
     "--enable-unsafe-swiftshader",
     "--ignore-gpu-blocklist",
 )
+_NAMES = ("chromium", "chromium-browser", "google-chrome")
 WIDTHS = {"phone": (390, 844), "tablet": (1024, 768), "desktop": (1440, 900)}
 
 
@@ -33,7 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="session")
 def browser() -> "Iterator[Browser]":
     """Chromium without a window."""
-    path = shutil.which("chromium")
+    path = next(filter(None, map(shutil.which, _NAMES)), None)
     if path is None:
         pytest.skip("no Chromium here")
     playwright = pytest.importorskip("playwright.sync_api", reason="the group browser is not installed")
