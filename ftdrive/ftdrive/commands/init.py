@@ -1,28 +1,27 @@
 """`ftdrive init`: ask for a description of the cell, and write it to a file. Nothing moves."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing, suppress
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
 from shlex import quote
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, MODEL, NewFile, check_simulate, rows, simulate, write_json
+from ftdrive.commands.common import (
+    JSON,
+    MODEL,
+    NewFile,
+    ViewOptions,
+    check_simulate,
+    simulate,
+    view_options,
+    write_json,
+)
 from ftdrive.terminal.text import echo, visible
-from ftdrivers.clock import Clock
 
-T = TypeVar("T")
-
-# Raises `ConfigError` for rows of an answer.
-Judge = Callable[[Any], None]
-
-# Options that may be repeated.
-_ROWS = ("--tool", "--plane", "--box")
-_SILENT = "did not answer when this was written"
-_LOOK_S = 0.5
+if TYPE_CHECKING:
+    from ftdrive.checks.description import Description, Question
 
 
 @click.command()
@@ -47,14 +46,12 @@ _LOOK_S = 0.5
 )
 @click.option(
     "--plane",
-    "planes",
     multiple=True,
-    metavar="NX:NY:NZ:MM",
-    help="A wall: the arm stays where N·p >= MM, base axes. Repeatable.",
+    metavar="SIDE:MM|NX:NY:NZ:MM",
+    help="A wall: its side (+x, -x, +y, -y, above, below) and distance from the base, or a normal and where it lies: "
+    "the arm stays where N·p >= MM, base axes. Repeatable.",
 )
-@click.option(
-    "--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block: two corners in mm, base axes. Repeatable."
-)
+@click.option("--box", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block: two corners in mm, base axes. Repeatable.")
 @click.option("--speed", metavar="DEG/S", help="Speed of the fastest joint.")
 @click.option(
     "-o",
@@ -64,124 +61,61 @@ _LOOK_S = 0.5
     show_default=True,
     help="Save the configuration as this new file.",
 )
+@view_options
 @simulate("Robot and sensor are emulated, and end with this command; --sensor emulated://NAME chooses the sensor.")
 @click.option("--yes", is_flag=True, help="Ask nothing: take the options and the defaults.")
 @JSON
 def init(
-    robot: str | None,
-    model: str | None,
-    sensor: str | None,
-    height: str | None,
-    sensor_mass: str | None,
-    tool_name: str | None,
-    tool: tuple[str, ...],
-    tool_mass: str | None,
-    mounting: str | None,
-    planes: tuple[str, ...],
-    boxes: tuple[str, ...],
-    speed: str | None,
     output: Path,
     simulate: bool,
     yes: bool,
+    view: ViewOptions,
     as_json: bool,
+    **given: Any,
 ) -> None:
     """Describe a cell: read robot and sensor, ask for the rest, write ftdrive.toml.
 
     The arm is only read and nothing moves. An existing file is never overwritten. Values that must be measured have no
-    default, and `measured = false` stays in the file until you change it.
+    default, and `measured = false` stays in the file until you change it. Lengths are in mm and masses in kg, or have
+    their unit. With --view the questions are a form in the browser, beside the cell as it is described.
     """
     from ftcalib.files import write_new
-    from ftdrive.cell.config import (
-        CellConfig,
-        RobotConfig,
-        SensorConfig,
-        ToolConfig,
-        WorkcellConfig,
-        cell_file,
-        clock_in_force,
-        settings,
-    )
+    from ftdrive.cell.config import clock_in_force, settings
     from ftdrive.cell.emulated import EMULATED, Station, sensor_name
-    from ftdrive.planning.geometry.arm_model import SHAPES
-    from ftdrive.planning.planner import require_possible
+    from ftdrive.checks.description import ROBOT, SENSOR, Description, draft_of
+    from ftdrive.errors import ConfigError
     from ftdrive.terminal.console import beside, messages
-    from ftdrivers.ur.kinematics import model_named
 
-    check_simulate(simulate, real={"--robot": robot})
-    defaults = {key: setting.value for key, setting in settings().items()}
-    emulated = sensor_name(sensor) if simulate else ""
-    with ExitStack() as stack:
-        clock = clock_in_force()
+    if yes and (view.view or view.address):
+        raise ConfigError("--yes and --view exclude one another: leave one of them out")
+    check_simulate(simulate, real={"--robot": given["robot"]})
+    in_force = {key: setting.value for key, setting in settings().items()}
+    described, draft = Description(clock_in_force(), in_force, simulate=simulate), draft_of(output)
+    again = "ftdrive init" + ("" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}")
+    interview = _Interview(described, None if yes else draft, again + " --simulate" * simulate)
+    with view.page(f"ftdrive init, {output}") as page:
+        interview.take_draft(asked=page is None)
         if simulate:
-            station = stack.enter_context(Station(emulated, ["--time-scale", "1"]))
-            robot, sensor, clock = station.cell.robot.host, station.cell.sensor.url, station.clock
-        ask = _Questions(yes, defaults)
-        ask.command += "" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}"
-        ask.command += " --simulate" * simulate
-        host, model, robot_words = _robot(ask, robot, model, clock)
-        if model is not None and model_named(model, controller_major=0) not in SHAPES:
-            _say(f"the {model} has no measured shape, so no motion can be planned: use calibrate --manual", "  ! ")
-        url, sensor_words = _sensor(ask, sensor, clock)
-    if simulate:  # its addresses have ended with it
-        host, url = "emulated", EMULATED + emulated
-    height_mm = ask.number("Sensor height above the flange, mm (measure it)", "sensor.height_mm", height)
-    sensor_kg = ask.number(
-        "Sensor and adapter, kg (scale or datasheet; Enter: unknown)", "sensor.mass_kg", sensor_mass, ""
-    )
-    begun = CellConfig(RobotConfig(host, model), SensorConfig(url, height_mm=height_mm))
+            emulated = sensor_name(given.pop("sensor"))
+            with Station(emulated, ["--time-scale", "1"]) as station:
+                described.clock = station.clock
+                interview.look(ROBOT, station.cell.robot.host)
+                interview.look(SENSOR, station.cell.sensor.url)
+            # The addresses of the station end with it.
+            described.texts |= {ROBOT: ["emulated"], SENSOR: [EMULATED + emulated]}
+        interview.take_options(given)
+        if page is None:
+            interview.run()
+        else:
+            from ftdrive.view.init_page import InitPage
 
-    def require_tool(rows: Any) -> None:
-        require_possible(replace(begun, tool=ToolConfig(cylinders_mm=rows)), model)
-
-    def require_surroundings(**rows: Any) -> None:
-        require_possible(replace(begun, workcell=WorkcellConfig(**rows)), model)
-
-    tool_config = ToolConfig(
-        ask.text("Name of the tool", "tool.name", tool_name),
-        ask.rows(
-            "First cylinder of sensor and tool: FROM:TO:DIAMETER in mm from the flange (such as 0:60:90)",
-            "tool.cylinders_mm",
-            tool,
-            (3, 5),
-            needed=True,
-            whole=require_tool,
-        ),
-        ask.number("Tool, kg, about (Enter: unknown)", "tool.mass_kg", tool_mass, ""),
-    )
-    workcell = WorkcellConfig(
-        ask.text(
-            "Mounting: floor, wall, ceiling or degrees",
-            "workcell.mounting",
-            mounting,
-            ask.defaults["workcell.mounting"] or "floor",
-        ),
-        ask.rows(
-            "First wall or table, NX:NY:NZ:MM; -1:0:0:-800 is 800 mm away towards +x",
-            "workcell.planes_mm",
-            planes,
-            (4,),
-            each=lambda row: require_surroundings(planes_mm=(row,)),
-        ),
-        ask.rows(
-            "First block, two corners X:Y:Z:X:Y:Z in mm",
-            "workcell.boxes_mm",
-            boxes,
-            (6,),
-            each=lambda row: require_surroundings(boxes_mm=(row,)),
-        ),
-    )
-    usual = f"{defaults['robot.speed_deg_s']:g}"
-    speed_deg_s = ask.number("Speed of the fastest joint, deg/s", "robot.speed_deg_s", speed, usual)
-    cell = CellConfig(
-        RobotConfig(host, model, speed_deg_s, simulate=simulate),
-        SensorConfig(url, height_mm=height_mm, mass_kg=sensor_kg),
-        tool_config,
-        workcell,
-    )
-    write_new(output, cell_file(cell, [f"Robot: {robot_words}.", f"Sensor: {sensor_words}."]))
+            messages.print(f"Fill in the form there. Ctrl-C ends, and {draft} keeps the answers.")
+            InitPage(page, described, draft, output.name).run()
+        cell = described.cell()
+        write_new(output, described.file())
+    draft.unlink(missing_ok=True)
     if as_json:
-        devices = {"robot": robot_words, "sensor": sensor_words}
-        write_json({"schema_version": 1, "file": str(output), **devices, "config": cell.to_dict()})
+        write_json({"schema_version": 1, "file": str(output), **described.found(), "config": cell.to_dict()})
     words, end = ". Measure tool, planes and boxes, then set measured = true in it: nothing moves before.", ""
     if simulate:
         words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
@@ -189,209 +123,241 @@ def init(
     messages.print_next(f"ftdrive doctor{end}", f"ftdrive plan{end}")
 
 
-class _Questions:
-    """Asks for each key that is not given as an option; with `yes` it takes the defaults, by key."""
+class _Back(Exception):
+    """The operator wants the question before."""
 
-    def __init__(self, yes: bool, defaults: Mapping[str, Any]) -> None:
-        self.interactive, self.defaults = not yes, defaults
-        self.command = "ftdrive init"
-        self.answers: dict[str, list[str]] = {}
-        """By option, so that a command can repeat them."""
 
-    def to_continue(self) -> str:
-        """Return the command that goes on after these answers."""
-        given = (f"{option} {quote(one)}" for option, answers in self.answers.items() for one in answers)
-        return " ".join([self.command, *given])
+class _Interview:
+    """Asks in the terminal for what is not answered yet; `draft` is None with --yes, which takes the usual answers."""
 
-    def ask(self, words: str, key: str, given: str | None, usual: str | None, read: Callable[[str], T]) -> T:
-        """Return the option or the answer; `usual` is the answer of Enter and --yes, None where there is none."""
-        from ftdrive.cell.config import RULES
+    def __init__(self, described: "Description", draft: Path | None, again: str) -> None:
+        self._described, self._draft, self._again = described, draft, again
+        self._addresses: dict[str, str] = {}
+
+    def take_draft(self, *, asked: bool) -> None:
+        """Take the answers of a draft; if `asked`, only after a yes."""
+        from ftdrive.checks.description import saved_at
+
+        if self._draft is None or not self._draft.exists():
+            return
+        when = saved_at(self._draft)
+        if asked and not self._agrees(f"Go on with the answers of {when}? [yes/no]: "):
+            self._draft.unlink()
+            return
+        self._described.load(self._draft)
+        if not asked:
+            _say(f"The answers of {when} are filled in from {self._draft}. Delete it to begin without them.")
+
+    def take_options(self, given: dict[str, Any]) -> None:
+        """Take the answers that options give; raises `ConfigError` for those that cannot be used."""
+        from ftdrive.checks.description import QUESTIONS, ROBOT, SENSOR
+
+        for question in QUESTIONS:
+            if not (option := given.get(question.name)):
+                continue
+            texts = list(option) if question.repeats else [option]
+            for text in texts:
+                self._described.judge(question, text)
+            self._described.texts[question.key] = texts
+            if question.key in (ROBOT, SENSOR):
+                self._addresses[question.key] = option
+                self._described.answered.discard(question.key)
+            else:
+                self._described.answered.add(question.key)
+
+    def look(self, key: str, text: str) -> None:
+        """Read a device, and print what it reports; raises as `Description.look`."""
+        _say(self._described.look(key, text), "  ✔ ")
+
+    def run(self) -> None:
+        """Ask until everything is answered, and confirmed in a summary."""
+        if self._draft is not None:
+            _say("Numbers may have a unit, such as 3.3 cm or 450 g. The answer back returns to the question before.")
+        while True:
+            questions = self._described.questions
+            at = next((i for i, one in enumerate(questions) if one.key not in self._described.answered), len(questions))
+            try:
+                if at == len(questions):
+                    if self._draft is None or self._confirmed():
+                        return
+                    continue
+                self._answer(questions[at])
+                self._described.answered.add(questions[at].key)
+                self._save()
+            except _Back:
+                self._described.answered.discard(questions[max(0, at - 1)].key)
+
+    def _save(self) -> None:
+        if self._draft is not None:
+            self._described.save(self._draft)
+
+    def _answer(self, question: "Question") -> None:
+        from ftdrive.checks.description import MODEL, ROBOT, SENSOR
+
+        described, key = self._described, question.key
+        if key in (ROBOT, SENSOR):
+            self._find(question)
+        elif question.repeats:
+            self._answer_rows(question)
+        else:
+            usual = self._former(question)
+            words = f"{question.label}, {question.how}" + " (Enter: unknown)" * (usual == "")
+            described.texts[key] = [self._ask(question, words, usual, lambda text: described.judge(question, text))]
+        if key in (ROBOT, MODEL) and described.without_shape:
+            _say(described.without_shape, "  ! ")
+
+    def _former(self, question: "Question") -> str | None:
+        """Return the answer of Enter: the former one, else the usual one."""
+        texts = self._described.texts.get(question.key)
+        return texts[0] if texts else self._described.usual(question)
+
+    def _answer_rows(self, question: "Question") -> None:
+        """Ask for rows until an empty answer; "back" removes the last one."""
+        from ftdrive.checks.description import BASE_AXES, WALLS
+
+        described = self._described
+        rows = described.texts.setdefault(question.key, [])
+        if question.key == WALLS and self._draft is not None:
+            _say(BASE_AXES)
+        for row in rows:
+            _say(row, "  = ")
+
+        def accept(text: str) -> None:
+            if text:
+                described.judge(question, text)
+            else:
+                described.judge_rows(question)
+
+        while True:
+            words = "  next (Enter: no more)" if rows else f"{question.label}, {question.how}"
+            usual = "" if rows else question.usual
+            words += " (Enter: none)" * (usual == "" and not rows)
+            try:
+                text = self._ask(question, words, usual, accept).strip()
+            except _Back:
+                if not rows:
+                    raise
+                _say(f"removed {rows.pop()}", "  = ")
+                continue
+            if not text:
+                return
+            rows.append(text)
+            self._save()
+
+    def _find(self, question: "Question") -> None:
+        """Ask for the address of a device until one answers; the operator may keep one that does not."""
+        from ftcalib.errors import UsageError
+        from ftdrive.checks.description import SENSOR
+        from ftdrive.checks.discovery import is_place, places
+        from ftdrivers.errors import DeviceError
+
+        described, key = self._described, question.key
+        text = self._addresses.pop(key, None)
+        usual = self._former(question)
+        words = f"{question.label}, {question.how}"
+        if key == SENSOR and text is None and self._draft is not None:
+            described.places = places()
+            for i, place in enumerate(described.places, start=1):
+                _say(f"  {i}) {place}")
+            if described.places:
+                words, usual = f"{question.label}: a number, a URL, or a port to probe", usual or "1"
+        failed: str | None = None
+        while True:
+            if text is None:
+                text = self._ask(question, words, usual, lambda answer: described.judge(question, answer))
+            if text == failed:
+                described.keep(key, text)
+                return
+            try:
+                self.look(key, text)
+            except (DeviceError, UsageError) as error:
+                if self._draft is None:
+                    raise
+                _say(str(error), "  ✘ ")
+                keeps = isinstance(error, DeviceError) and not (key == SENSOR and is_place(text))
+                failed = usual = text if keeps else None
+            else:
+                return
+            words = "Another address, or Enter to keep it" if keeps else "Another address"
+            text = None
+
+    def _confirmed(self) -> bool:
+        """Show all answers; return whether they are to be written, False after a number, whose question is open again.
+
+        Raises
+        ------
+        _Back
+            The last question is to be asked again.
+        """
+        from ftdrive.checks.description import ROBOT, SENSOR
+        from ftdrive.errors import ConfigError
+
+        described = self._described
+        questions = described.questions
+        for i, one in enumerate(questions, start=1):
+            texts = "; ".join(filter(None, described.texts.get(one.key, [])))
+            report = described.reports.get(one.key, "not read") if one.key in (ROBOT, SENSOR) else ""
+            _say(f"{texts or 'none'}{report and f' ({report})'}", f"{i:>3}) {one.label}: ")
+        while True:
+            answer = self._prompt("Enter writes the file, a number changes that answer: ", "", "the summary").strip()
+            if not answer:
+                try:
+                    described.cell()
+                except ConfigError as error:
+                    _say(str(error), "  ✘ ")
+                else:
+                    return True
+            elif answer.isdecimal() and 0 < int(answer) <= len(questions):
+                described.answered.discard(questions[int(answer) - 1].key)
+                return False
+            else:
+                _say(f"'{answer}' is not a number of 1 to {len(questions)}", "  ✘ ")
+
+    def _ask(self, question: "Question", words: str, usual: str | None, accept: Callable[[str], None]) -> str:
+        """Return the answer to a question, asked again until it is accepted; Enter and --yes take `usual`."""
+        from ftdrive.errors import ConfigError
+
+        if self._draft is None:
+            if usual is None:
+                raise ConfigError(f"{question.option} is missing and has no default: {words[0].lower()}{words[1:]}")
+            accept(usual)
+            return usual
+        while True:
+            answer = self._prompt(f"{words} [{usual}]: " if usual else f"{words}: ", usual, question.option)
+            try:
+                accept(answer)
+            except ConfigError as error:
+                _say(str(error), "  ✘ ")
+            else:
+                return answer
+
+    def _agrees(self, words: str) -> bool:
+        while (answer := self._prompt(words, None, "an answer").strip().lower()) not in ("yes", "no"):
+            _say(f"'{answer}' is not an answer: enter yes or no", "  ✘ ")
+        return answer == "yes"
+
+    def _prompt(self, words: str, usual: str | None, what: str) -> str:
+        """Ask once; raises `_Back`, `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
         from ftdrive.errors import ConfigError
         from ftdrive.terminal.text import in_whole_words
 
-        option = RULES[key].option
-        if given is None and not self.interactive:
-            if usual is None:
-                raise ConfigError(f"{option} is missing and has no default: {words[0].lower()}{words[1:]}")
-            given = usual
-        if given is not None:
-            value = read(given)
-            self._keep(option, given)
-            return value
-        while True:
-            shown = in_whole_words(f"{words} [{usual}]: " if usual else f"{words}: ", sys.stderr)
-            try:
-                answer = click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True)
-            except click.Abort as abort:
-                # The next message begins a line.
-                echo(err=True)
-                if isinstance(abort.__context__, EOFError):
-                    raise ConfigError(
-                        f"the input ended before {option} was given; the answers so far are kept in this command:\n"
-                        f"{self.to_continue()}"
-                    ) from abort
-                _say(f"The answers so far are kept in this command:\n{self.to_continue()}", "  ! ")
-                raise
-            try:
-                value = read(answer)
-            except ConfigError as error:
-                _say(str(error), "  ✘ ")
-                continue
-            self._keep(option, answer)
-            return value
-
-    def _keep(self, option: str, answer: str) -> None:
-        if answer:
-            self.answers[option] = [*self.answers.get(option, []), answer] if option in _ROWS else [answer]
-
-    def text(self, words: str, key: str, given: str | None, usual: str | None = None) -> str:
-        """Ask for a text; Enter takes `usual`, else the value in force."""
-        return str(self.ask(words, key, given, usual or self.defaults[key], lambda text: _checked(key, text)))
-
-    def number(self, words: str, key: str, given: str | None, usual: str | None = None) -> Any:
-        """Ask for a number; None where the answer may be empty and is."""
-
-        def read(text: str) -> Any:
-            if not text:
-                return None
-            value: Any = text
-            with suppress(ValueError):
-                value = float(text)
-            return _checked(key, value)
-
-        return self.ask(words, key, given, usual, read)
-
-    def rows(
-        self,
-        words: str,
-        key: str,
-        given: Sequence[str],
-        counts: Sequence[int],
-        *,
-        needed: bool = False,
-        each: Judge = lambda _: None,
-        whole: Judge = lambda _: None,
-    ) -> Any:
-        """Ask for rows of numbers until an empty answer; at least one when `needed`. Each and all are judged."""
-        from ftdrive.cell.config import RULES
-
-        found: list[Any] = []
-
-        def read(text: str) -> Any:
-            if not text:
-                whole(tuple(found))
-                return None
-            row = _checked(key, rows(RULES[key].option, [text], counts))[0]
-            each(row)
-            return row
-
-        if given:
-            found += map(read, given)
-            whole(tuple(found))
-            self.answers[RULES[key].option] = list(given)
-            return tuple(found)
-        if not (self.interactive or needed):
-            return ()
-        while True:
-            if found:
-                row = self.ask("  next (Enter: no more)", key, None, "", read)
-            else:
-                row = self.ask(words if needed else f"{words} (Enter: none)", key, None, None if needed else "", read)
-            if row is None:
-                return tuple(found)
-            found.append(row)
-
-
-def _checked(key: str, value: Any) -> Any:
-    from ftdrive.cell.config import RULES, check_value
-
-    return check_value(RULES[key].option, key, value)
-
-
-def _robot(ask: _Questions, given: str | None, model: str | None, clock: Clock) -> tuple[str, str | None, str]:
-    """Return host, model, and what the arm reports; the operator may keep an address that does not answer."""
-    from ftdrivers.errors import DeviceError
-
-    if model is not None:
-        _checked("robot.model", model)
-    host = ask.text("Robot address", "robot.host", given)
-    while True:
+        shown = visible(in_whole_words(words, sys.stderr))
         try:
-            found, words = _identify_robot(host, model, clock)
-        except DeviceError as error:
-            if not ask.interactive:
-                raise
-            _say(str(error), "  ✘ ")
-            other = ask.text("Another address, or Enter to keep it", "robot.host", None, host)
-            if other == host and model is not None:
-                return host, model, _SILENT
-            if other == host:
-                model = ask.text("Model of the arm, such as ur5e", "robot.model", None)
-            host = other
-            continue
-        _say(words, "  ✔ ")
-        return host, found, words
-
-
-def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, str]:
-    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
-    from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-    from ftdrive.cell.devices import build_arm
-    from ftdrive.checks.check import who
-
-    with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
-        arm.open()
-        info, remote = arm.identify(), arm.in_remote_control()
-    switch = "" if remote is None else f", remote control {'ON' if remote else 'OFF'}"
-    return info.model, who(info) + switch
-
-
-def _sensor(ask: _Questions, given: str | None, clock: Clock) -> tuple[str, str]:
-    """Return address and what the sensor reports; the operator may keep an address that does not answer."""
-    from ftcalib.errors import UsageError
-    from ftdrive.checks.discovery import is_place, places, sensor_at
-    from ftdrivers.errors import DeviceError
-
-    found = [] if given or not ask.interactive else places()
-    for number, place in enumerate(found, start=1):
-        _say(f"  {number}) {place}")
-    words = (
-        "Sensor: choose a number, or enter a URL or a port to probe"
-        if found
-        else "Sensor address, such as ati-can://can0?bitrate=250000"
-    )
-    text = ask.text(words, "sensor.url", given, ask.defaults["sensor.url"] or ("1" if found else None))
-    failed: str | None = None
-    while True:
-        url = found[int(text) - 1] if text.isdecimal() and 0 < int(text) <= len(found) else text
-        if url == failed:
-            return url, _SILENT
-        try:
-            url = sensor_at(url, clock) if is_place(url) else url
-            report = _identify_sensor(url, clock)
-        except (DeviceError, UsageError) as error:
-            if not ask.interactive:
-                raise
-            _say(str(error), "  ✘ ")
-            failed = url if isinstance(error, DeviceError) and not is_place(url) else None
-            keep = ", or Enter to keep it" if failed else ""
-            text = ask.text(f"Another address{keep}", "sensor.url", None, failed)
-            continue
-        _say(f"{url}: {report}", "  ✔ ")
-        ask.answers["--sensor"] = [url]  # not the number of a place in a list
-        return url, report
-
-
-def _identify_sensor(url: str, clock: Clock) -> str:
-    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `UsageError`."""
-    from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-    from ftdrive.cell.devices import build_sensor
-    from ftdrive.checks.check import who
-
-    with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
-        info = sensor.identify()
-        rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S
-    return f"{who(info)}, {rate_Hz:.0f} Hz"
+            answer: str = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
+        except click.Abort as abort:
+            # The next message begins a line.
+            echo(err=True)
+            kept = ""
+            if self._draft is not None and self._draft.exists():
+                kept = f"the answers so far are kept in {self._draft}, go on with them:\n{self._again}"
+            if isinstance(abort.__context__, EOFError):
+                raise ConfigError(f"the input ended before {what} was given" + (kept and f"; {kept}")) from abort
+            if kept:
+                _say(kept[0].upper() + kept[1:], "  ! ")
+            raise
+        if answer.strip().lower() == "back":
+            raise _Back
+        return answer
 
 
 def _say(words: str, head: str = "") -> None:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftdrive.cell.units import side_of
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, HungLoad
 from ftdrive.planning.geometry.certify import Certifier, Margins
@@ -481,6 +482,18 @@ def certifier_for(
     ConfigError
         The arm or tool is missing, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
+    certifier = certifier_as_described(cell, model, kinematics, p_flange_hook_m)
+    require_possible(cell, model)
+    return certifier
+
+
+def certifier_as_described(
+    cell: CellConfig,
+    model: str | None,
+    kinematics: Kinematics | None = None,
+    p_flange_hook_m: tuple[float, float, float] | None = None,
+) -> Certifier:
+    """Describe a cell as `certifier_for` does, also one that is impossible."""
     if model is None:
         raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
     if not cell.tool.cylinders_mm:
@@ -490,9 +503,7 @@ def certifier_for(
     x, y, z = scene.down_base.tolist()
     hung = None if p_flange_hook_m is None else HungLoad(p_flange_hook_m, (x, y, z))
     arm = ArmModel(model, [_cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics, hung)
-    certifier = Certifier(arm, scene)
-    require_possible(cell, model)
-    return certifier
+    return Certifier(arm, scene)
 
 
 def require_possible(cell: CellConfig, model: str | None) -> None:
@@ -544,9 +555,9 @@ class _Shoulder:
         if gap_m >= self._margin_m:
             return ""
         meant = (-x, -y, -z, -place), (x, y, z, -place)
-        same, opposite = (_words(one) if self._above_m(one) >= self._margin_m else "" for one in meant)
+        same, opposite = (_plane_words(one) if self._above_m(one) >= self._margin_m else "" for one in meant)
         if gap_m > -self._radius_m or not same:
-            return self._too_near(f"the plane {_words(row)}", gap_m)
+            return self._too_near(f"the plane {_plane_words(row)}", gap_m)
         return (
             f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane {_words(row)}: "
             f"the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
@@ -573,6 +584,10 @@ class _Shoulder:
 
 def _words(row: Sequence[float]) -> str:
     return f"[{', '.join(f'{value + 0.0:g}' for value in row)}]"
+
+
+def _plane_words(row: Sequence[float]) -> str:
+    return f"{_words(row)} ({side})" if (side := side_of(row)) else _words(row)
 
 
 def _cylinder_from_mm(values: Sequence[float]) -> Cylinder:

@@ -1,0 +1,110 @@
+"""Lengths, masses and rows of them as people write them: `33 mm`, `33,5`, `1.3 in`, `0:60:90`, `+x 800`."""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from decimal import Decimal
+from typing import Final
+
+from ftdrive.errors import ConfigError
+
+# The factors are decimal: 1.1 cm are 11 mm, and not 11.000000000000002.
+MM: Final = {"mm": "1", "cm": "10", "m": "1000", "in": "25.4"}
+KG: Final = {"kg": "1", "g": "0.001", "lb": "0.45359237"}
+DEG_S: Final = {"deg/s": "1", "°/s": "1"}
+
+# The normals of walls, which point towards the arm.
+SIDES: Final = {
+    "+x": (-1, 0, 0),
+    "-x": (1, 0, 0),
+    "+y": (0, -1, 0),
+    "-y": (0, 1, 0),
+    "above": (0, 0, -1),
+    "below": (0, 0, 1),
+}
+
+_NUMBER = re.compile(r"([+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+))\s*([a-z°/]*)", re.ASCII)
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}", re.ASCII)
+_BEFORE_UNIT = re.compile(r"(?<=\d)\s+(?=(?:mm|cm|m|in)\b)")
+_BETWEEN = re.compile(r"\s*[:;]\s*|,\s+|\s+")
+_WALL = re.compile(rf"({'|'.join(map(re.escape, SIDES))})[:\s]*(\S.*)")
+
+
+def number(what: str, text: str, units: Mapping[str, str]) -> float:
+    """Read a number with a decimal point or comma, alone or with a unit.
+
+    Parameters
+    ----------
+    what : str
+        An option, for the message.
+    units : mapping
+        Factors; the first unit is the one of the result and of a number alone.
+
+    Raises
+    ------
+    ConfigError
+        It is not a number, or has a comma that may separate thousands.
+    """
+    value = _read(what, text, units)
+    if value is None:
+        unit, *others = units
+        raise ConfigError(
+            f"{what} is '{text}', which is not a number: give one such as 1.5 or 1,5, in {unit} or with its unit, such "
+            f"as {others[0]}"
+        )
+    return value
+
+
+def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
+    """Read lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `number`."""
+    parts = _BETWEEN.split(_BEFORE_UNIT.sub("", text.strip()))
+    values = [_read(what, part, MM) for part in parts]
+    found = [value for value in values if value is not None]
+    if len(found) != len(values) or len(values) not in counts:
+        wanted = " or ".join(map(str, counts))
+        raise ConfigError(f"{what} is '{text}': give {wanted} numbers separated by ':' or spaces, in mm or with a unit")
+    return found
+
+
+def rows_of(*counts: int) -> Callable[[str, str], list[float]]:
+    """Return a reader of rows of so many lengths, as `row`."""
+    return lambda what, text: row(what, text, counts)
+
+
+def wall(what: str, text: str) -> list[float]:
+    """Read a wall as the row of `[workcell] planes_mm`: side and distance from the base, or normal and offset in mm.
+
+    Raises
+    ------
+    ConfigError
+        It is neither, or the distance is negative.
+    """
+    found = _WALL.fullmatch(text.strip().lower())
+    if found is None:
+        try:
+            return row(what, text, (4,))
+        except ConfigError:
+            raise ConfigError(
+                f"{what} is '{text}': give side and distance such as +x 800, the sides are {', '.join(SIDES)}; or "
+                "NX:NY:NZ:MM for a slanting wall"
+            ) from None
+    distance_mm = number(what, found[2], MM)
+    if distance_mm < 0:
+        raise ConfigError(f"{what} is '{text}': give a distance of 0 or more, and the side on which the wall is")
+    return [*map(float, SIDES[found[1]]), 0.0 - distance_mm]
+
+
+def side_of(plane_mm: Sequence[float]) -> str:
+    """Return side and distance of a wall, such as "+x 800 mm"; empty for one that `SIDES` does not have."""
+    *normal, offset_mm = plane_mm
+    side = next((side for side, one in SIDES.items() if list(one) == normal), "")
+    return f"{side} {0.0 - offset_mm:g} mm" if side and offset_mm <= 0 else ""
+
+
+def _read(what: str, text: str, units: Mapping[str, str]) -> float | None:
+    found = _NUMBER.fullmatch(text.strip().lower().replace("−", "-"))
+    if found is None or (found[2] and found[2] not in units):
+        return None
+    if _THOUSANDS.fullmatch(found[1]):
+        whole, point = found[1].replace(",", ""), found[1].replace(",", ".")
+        raise ConfigError(f"{what} is '{text}', where the comma has two meanings: write {whole} or {point}")
+    return float(Decimal(found[1].replace(",", ".")) * Decimal(units.get(found[2], "1")))
