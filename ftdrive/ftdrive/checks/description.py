@@ -83,7 +83,7 @@ QUESTIONS: Final = (
     Question(SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _text, in_force=True),
     Question("sensor.height_mm", "Sensor height", "above the flange face, mm, measure it", _in(MM)),
     Question("sensor.mass_kg", "Sensor mass", "with its adapter, kg, from scale or data sheet", _in(KG), ""),
-    Question("tool.name", "Name of the tool", "results have it", _text, in_force=True),
+    Question("tool.name", "Name of the tool", "results are found by it", _text, in_force=True),
     Question(
         TOOL,
         "Cylinder of sensor and tool",
@@ -188,7 +188,7 @@ class Description:
     def _require_possible(self, key: str, rows: Sequence[Sequence[float]]) -> None:
         section, name = key.split(".")
         height = BY_KEY["sensor.height_mm"]
-        texts = self.texts.get(height.key)
+        texts = self.texts.get(height.key) if key == TOOL else None
         sensor = SensorConfig("", height_mm=self.value(height, texts[0]) if texts else None)
         kind = SECTIONS[section]
         require_possible(CellConfig(RobotConfig(""), sensor, **{section: kind(**{name: rows})}), self.model)

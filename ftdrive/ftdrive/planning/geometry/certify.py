@@ -113,6 +113,12 @@ class Certifier:
         free[row[self._distance(q, row, pair, needed) <= needed]] = False
         return free
 
+    def too_near(self, q_rad: ArrayLike) -> list[list[str]]:
+        """Return the pairs that are nearer than the margins allow at joint angles (6,), such as forearm and plane 2."""
+        q, pair = np.asarray(q_rad, dtype=np.float64).reshape(1, 6), np.arange(len(self._margin_m))
+        distance = self._distance(q, np.zeros_like(pair), pair, self._margin_m)
+        return [self._names[i].split(" - ") for i in np.flatnonzero(distance <= self._margin_m)]
+
     def clear_around(self, q_rad: Array) -> bool:
         """Return whether all moves of a closed tour through joint vectors (n, 6) are proven clear."""
         return bool(self.certify(q_rad, np.roll(q_rad, -1, axis=0), tight=False).clear.all())
