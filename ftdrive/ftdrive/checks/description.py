@@ -33,8 +33,8 @@ ROBOT, MODEL, SENSOR, TOOL, WALLS, BOXES = (
     "workcell.boxes_mm",
 )
 BASE_AXES: Final = (
-    "Sides are along the base axes of the pendant (Move, feature Base): on a UR the cable leaves the base towards +y, "
-    "and z points away from the mounting surface. Jog towards a wall to see its side."
+    "Sides are along the base axes of the pendant (Move, feature Base): on a UR the cable leaves the base towards +y. "
+    "Above is +z, away from the mounting surface, also where the base hangs. Jog towards a wall to see its side."
 )
 _SILENT = "not read when this was written"
 _LOOK_S = 0.5

@@ -48,7 +48,6 @@ _ROWS: Final = {
     WALLS: ("Wall", "Walls and tables"),
     BOXES: ("Box", "Boxes"),
 }
-_LAST: Final = 1e9
 # The last words reach browsers before the server ends.
 _FAREWELL_S: Final = 0.5
 
@@ -123,7 +122,7 @@ class InitPage:
         with gui.add_folder(several) as folder:
             about = f"{BASE_AXES} Slanting: NX:NY:NZ:MM." if question.key == WALLS else question.how
             gui.add_html(_html(about[0].upper() + about[1:]))
-            add = gui.add_button(f"Add {one.lower()}", order=_LAST)
+            add = gui.add_button(f"Add {one.lower()}", order=1e9)
         numbers = count(1)
 
         def add_row(text: str) -> None:
@@ -261,8 +260,11 @@ class InitPage:
             arm.show(USUAL_POSTURE_RAD)
             arm.accuse(bad)
         labels = {"plane 1": "the mounting surface", **{name: field.label for name, field in names.items()}}
-        pairs = "; ".join(f"{one} to {labels.get(other, other)}" for one, other in near)
-        self._near = f"In its usual posture the arm is nearer than allowed: {pairs}." if pairs else ""
+        pairs = [
+            f"{', '.join(dict.fromkeys(one for one, other in near if other == thing))} to {labels.get(thing, thing)}"
+            for thing in dict.fromkeys(other for _, other in near)
+        ]
+        self._near = f"In its usual posture the arm is nearer than allowed: {'; '.join(pairs)}." if pairs else ""
 
 
 class _Field:

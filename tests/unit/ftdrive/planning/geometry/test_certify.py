@@ -372,3 +372,20 @@ def test_distances_from_a_box_by_hand(body: Bodies, distance_m: float) -> None:
     low, high = np.array([0.1, 0.1, 0.1]), np.array([0.3, 0.5, 0.2])
     found = separation_from_box(body, low, high, np.array([np.inf]))[0]
     assert found == pytest.approx(distance_m - 0.02, abs=2e-5) if distance_m > 0 else found <= 0
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_what_is_too_near_is_named_just_where_a_posture_is_not_free(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = Scene(
+        (Plane((0.0, 0.0, 1.0), 0.0), Plane((-1.0, 0.0, 0.0), -0.5)), (Box((0.2, 0.2, 0.0), (0.4, 0.4, 0.4)),)
+    )
+    certifier = Certifier(ArmModel("UR5e", TOOLS[3]), scene)
+    q = rng.uniform(-np.pi, np.pi, 6)
+    pairs = certifier.too_near(q)
+    assert bool(pairs) != certifier.free(q)[0]
+    known = {*certifier.arm.names, "plane 1", "plane 2", "box 1"}
+    assert all(set(pair) <= known for pair in pairs)
+    for name, alone in (("plane 2", Scene((scene.planes[1],))), ("box 1", Scene((), scene.boxes))):
+        own = Certifier(certifier.arm, alone).too_near(q)
+        assert {body for body, thing in pairs if thing == name} == {a for a, b in own if b in ("plane 1", "box 1")}

@@ -1,0 +1,106 @@
+"""Answers about a cell: what makes them wrong, what devices report, and the draft that keeps them."""
+
+from pathlib import Path
+
+import pytest
+
+from ftdrive.cell.config import settings
+from ftdrive.checks import description
+from ftdrive.checks.description import BY_KEY, MODEL, QUESTIONS, ROBOT, TOOL, WALLS, Description, saved_at
+from ftdrive.errors import ConfigError
+from ftdrivers.clock import REAL
+
+ANSWERS = {
+    ROBOT: ["10.0.0.2"],
+    MODEL: ["ur5e"],
+    "sensor.url": ["ati-can://can0"],
+    "sensor.height_mm": ["3.3 cm"],
+    TOOL: ["0:33:80", "33 90 50 45 0"],
+    WALLS: ["+x 80 cm", "0.6:0:0.8:-400"],
+}
+
+
+@pytest.fixture
+def described() -> Description:
+    made = Description(REAL, {key: setting.value for key, setting in settings().items()})
+    made.texts = {key: list(texts) for key, texts in ANSWERS.items()}
+    return made
+
+
+def test_what_is_left_open_has_its_usual_value(described: Description) -> None:
+    cell = described.cell()
+    assert (cell.sensor.height_mm, cell.sensor.mass_kg, cell.tool.name) == (33, None, "tool")
+    assert (cell.workcell.mounting, cell.robot.speed_deg_s, cell.workcell.boxes_mm) == ("floor", 60, ())
+    assert cell.workcell.planes_mm == ((-1, 0, 0, -800), (0.6, 0, 0.8, -400))
+    described.texts["sensor.mass_kg"] = ["unknown"]
+    assert described.cell() == cell
+
+
+@pytest.mark.parametrize("key", [ROBOT, MODEL, "sensor.url", "sensor.height_mm", TOOL])
+def test_what_must_be_answered_is_named(described: Description, key: str) -> None:
+    del described.texts[key]
+    with pytest.raises(ConfigError, match=f"{BY_KEY[key].option} is missing and has no default"):
+        described.cell()
+
+
+def test_a_wall_is_judged_whatever_else_is_wrong(described: Description) -> None:
+    described.texts["sensor.height_mm"] = ["high"]
+    described.judge(BY_KEY[WALLS], "+x 800")
+    with pytest.raises(ConfigError, match="from the arm's shoulder"):
+        described.judge(BY_KEY[WALLS], "+x 20")
+
+
+def test_answers_that_exclude_one_another_are_refused_together(described: Description) -> None:
+    described.texts["sensor.height_mm"] = ["120"]
+    for question in QUESTIONS:
+        for text in described.texts.get(question.key, []):
+            described.judge(question, text)
+    with pytest.raises(ConfigError, match="the tool ends 90 mm"):
+        described.judge_rows(BY_KEY[TOOL])
+    with pytest.raises(ConfigError, match="the tool ends 90 mm"):
+        described.cell()
+
+
+def test_the_model_is_asked_for_where_no_robot_reports_it(
+    described: Description, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    models = {"10.0.0.2": "UR5e", "10.0.0.3": "UR10e"}
+    given = []
+
+    def identify(host: str, model: str | None, _: object) -> tuple[str, str]:
+        given.append(model)
+        return models[host], f"{models[host]}, serial 1"
+
+    monkeypatch.setattr(description, "_identify_robot", identify)
+    assert BY_KEY[MODEL] in described.questions
+    for host, model in models.items():
+        described.look(ROBOT, host)
+        assert (described.model, BY_KEY[MODEL] in described.questions) == (model, False)
+    # The second arm is not expected to be the first one.
+    assert given == ["ur5e", None]
+    assert described.found() == {"robot": "UR10e, serial 1", "sensor": "not read when this was written"}
+    described.keep(ROBOT, "10.0.0.4")
+    assert BY_KEY[MODEL] in described.questions
+    assert MODEL not in described.answered
+    assert "serial" not in described.found()["robot"]
+
+
+def test_a_draft_keeps_everything(described: Description, tmp_path: Path) -> None:
+    described.answered, described.reports = {ROBOT, TOOL}, {ROBOT: "UR5e, serial 1"}
+    draft = tmp_path / "draft"
+    for _ in range(2):
+        described.save(draft)
+    again = Description(REAL, {})
+    again.load(draft)
+    assert (again.texts, again.answered, again.reports) == (described.texts, described.answered, described.reports)
+    assert ":" in saved_at(draft)
+    assert [*tmp_path.iterdir()] == [draft]
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"format": "ftdrive.draft/1"}', '{"format": "ftdrive.draft/9"}'])
+def test_a_broken_draft_is_named(tmp_path: Path, content: str) -> None:
+    draft = tmp_path / "draft"
+    draft.write_text(content)
+    for read in (saved_at, Description(REAL, {}).load):
+        with pytest.raises(ConfigError, match=r"draft .* delete it"):
+            read(draft)
