@@ -172,7 +172,7 @@ class _Interview:
     def run(self) -> None:
         """Ask until everything is answered, and confirmed in a summary."""
         if self._draft is not None:
-            _say("Numbers may have a unit, such as 3.3 cm or 450 g. The answer back returns to the question before.")
+            _say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the question before.")
         while True:
             questions = self._described.questions
             at = next((i for i, one in enumerate(questions) if one.key not in self._described.answered), len(questions))
@@ -341,9 +341,9 @@ class _Interview:
         from ftdrive.errors import ConfigError
         from ftdrive.terminal.text import in_whole_words
 
-        shown = visible(in_whole_words(words, sys.stderr))
+        shown = in_whole_words(words, sys.stderr)
         try:
-            answer: str = click.prompt(shown, default=usual, show_default=False, prompt_suffix="", err=True)
+            answer: str = click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True)
         except click.Abort as abort:
             # The next message begins a line.
             echo(err=True)
