@@ -264,7 +264,8 @@ class Description:
 
     def save(self, draft: Path) -> None:
         """Write the answers to a draft, over the former one."""
-        document = {"format": FORMAT, "saved": datetime.now().astimezone().isoformat(timespec="minutes")}
+        saved = datetime.now().astimezone().isoformat(timespec="minutes")
+        document = {"format": FORMAT, "saved": saved, "simulate": self._simulate}
         answers = {"texts": self.texts, "answered": sorted(self.answered), "reports": self.reports}
         partial = draft.with_name(f"{draft.name}.partial")
         partial.write_text(json.dumps({**document, **answers}, indent=1) + "\n", encoding="utf-8")
@@ -274,10 +275,15 @@ class Description:
         """Take the answers of a draft; raises `ConfigError` if it is none."""
         document = _draft(draft)
         try:
-            self.texts = {key: [*map(str, document["texts"][key])] for key in BY_KEY if key in document["texts"]}
+            texts = dict(document["texts"])
+            if document["simulate"] != self._simulate:
+                # An emulated cell has no address for a real one.
+                for key in (ROBOT, MODEL, SENSOR):
+                    texts.pop(key, None)
+            self.texts = {key: [*map(str, texts[key])] for key in BY_KEY if key in texts}
             self.answered = set(document["answered"]) & self.texts.keys()
-            self.reports = {key: str(words) for key, words in document["reports"].items() if key in (ROBOT, SENSOR)}
-        except (KeyError, TypeError, AttributeError) as error:
+            self.reports = {key: str(words) for key, words in document["reports"].items() if key in texts}
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ConfigError(f"{draft} is incomplete: delete it") from error
 
 

@@ -162,6 +162,7 @@ class _Interview:
             if question.key in (ROBOT, SENSOR):
                 self._addresses[question.key] = option
                 self._described.answered.discard(question.key)
+                self._described.reports.pop(question.key, None)
             else:
                 self._described.answered.add(question.key)
 

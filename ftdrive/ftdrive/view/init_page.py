@@ -7,7 +7,7 @@ from html import escape
 from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -33,9 +33,7 @@ from ftdrive.terminal.console import hanging, messages
 from ftdrive.view.page import Page
 from ftdrive.view.scene import DrawnArm, draw_surroundings, size_of
 from ftdrivers.errors import DeviceError
-
-if TYPE_CHECKING:
-    from viser import GuiApi
+from ftdrivers.ur.kinematics import model_named
 
 _SECTIONS: Final = {"robot": "Robot", "sensor": "Sensor", "tool": "Tool", "workcell": "Surroundings"}
 # Entries of the dropdowns that are no answer by themselves.
@@ -109,10 +107,9 @@ class InitPage:
     def _add_field(self, question: Question, label: str = "", text: str | None = None) -> "_Field":
         if text is None:
             text = self._described.texts.get(question.key, [self._described.usual(question) or ""])[0]
-        note = ""
-        if question.key == SENSOR and (found := places()):
-            note = f"; found here: {', '.join(found)}"
-        field = _Field(self._page.gui, question, label or question.label, text, note)
+        found = places() if question.key == SENSOR else []
+        note = f"; found here: {', '.join(found)}" if found else ""
+        field = _Field(self._page, question, label or question.label, text, note)
         field.on_update(lambda _: self._todo.put(lambda: None))
         self._fields.append(field)
         return field
@@ -208,10 +205,8 @@ class InitPage:
     def _look(self) -> None:
         """Read robot and sensor, and show what they report here and in the terminal."""
         self._read()
-        for field in self._fields:
+        for field in [one for one in self._fields if one.question.key in (ROBOT, SENSOR) and one.text]:
             key = field.question.key
-            if key not in (ROBOT, SENSOR) or not field.text:
-                continue
             field.say("Reading …", _PLAIN)
             try:
                 words = f"✔ {self._described.look(key, field.text)}"
@@ -259,7 +254,7 @@ class InitPage:
             arm = DrawnArm(scene, certifier.arm)
             arm.show(USUAL_POSTURE_RAD)
             arm.accuse(bad)
-        labels = {"plane 1": "the mounting surface", **{name: field.label for name, field in names.items()}}
+        labels = {"plane 1": "the mounting surface"} | {name: field.label for name, field in names.items()}
         pairs = [
             f"{', '.join(dict.fromkeys(one for one, other in near if other == thing))} to {labels.get(thing, thing)}"
             for thing in dict.fromkeys(other for _, other in near)
@@ -270,26 +265,30 @@ class InitPage:
 class _Field:
     """One answer in the form: what is chosen, what is typed, and words about it below."""
 
-    def __init__(self, gui: "GuiApi", question: Question, label: str, text: str, note: str) -> None:
+    def __init__(self, page: Page, question: Question, label: str, text: str, note: str) -> None:
         self.question, self.label = question, label
         self.remove: Any = None
         # Rows have it once, above them.
         self._how = "" if question.repeats else f"{question.how}{note}"
         self._choice: Any = None
         self.typed: Any = None
-        key = question.key
+        gui, key = page.gui, question.key
         if key == WALLS:
             side, _, typed = text.partition(" ")
             choice, text = (side, typed) if side in SIDES else (_SLANTING, text)
             self._choice = gui.add_dropdown(f"{label} at", (*SIDES, _SLANTING), initial_value=choice)
             label = "Distance"
+        elif key == MODEL:
+            text = model_named(text, controller_major=0) or text or _OPEN
+            choices = dict.fromkeys((_OPEN, *question.choices, text))
+            self._choice = gui.add_dropdown(label, tuple(choices), initial_value=text)
         elif question.choices:
-            known = text in question.choices
-            other = _OPEN if key == MODEL else _DEGREES
-            self._choice = gui.add_dropdown(label, (*question.choices, other), initial_value=text if known else other)
-            label, text = "Degrees", "" if known else text
+            choice, text = (text, "") if text in question.choices else (_DEGREES, text)
+            self._choice = gui.add_dropdown(label, (*question.choices, _DEGREES), initial_value=choice)
+            label = "Degrees"
         if key != MODEL:
             self.typed = gui.add_text(label, text)
+        self._inputs = [one for one in (self._choice, self.typed) if one is not None]
         self._words = gui.add_html("")
 
     @property
@@ -304,9 +303,8 @@ class _Field:
 
     def on_update(self, act: Callable[[Any], object]) -> None:
         """Call back after each change."""
-        for one in (self._choice, self.typed):
-            if one is not None:
-                one.on_update(act)
+        for one in self._inputs:
+            one.on_update(act)
 
     def say(self, words: str, colour: str) -> None:
         """Show words below; how to answer if there are none."""
@@ -323,10 +321,9 @@ class _Field:
             self._choice.value = model
 
     def take_away(self) -> None:
-        """Remove it from the form."""
-        for one in (self._choice, self.typed, self._words, self.remove):
-            if one is not None:
-                one.remove()
+        """Remove it from the form, a row."""
+        for one in (*self._inputs, self._words, self.remove):
+            one.remove()
 
 
 def _html(words: str, colour: str = _PLAIN) -> str:

@@ -97,6 +97,17 @@ def test_a_draft_keeps_everything(described: Description, tmp_path: Path) -> Non
     assert [*tmp_path.iterdir()] == [draft]
 
 
+def test_a_draft_of_an_emulated_cell_has_no_addresses_for_a_real_one(described: Description, tmp_path: Path) -> None:
+    emulated = Description(REAL, {}, simulate=True)
+    emulated.texts, emulated.answered = described.texts, set(described.texts)
+    emulated.reports = {ROBOT: "UR5e, serial 1"}
+    emulated.save(tmp_path / "draft")
+    again = Description(REAL, {})
+    again.load(tmp_path / "draft")
+    assert again.texts.keys() == again.answered == ANSWERS.keys() - {ROBOT, MODEL, "sensor.url"}
+    assert again.reports == {}
+
+
 @pytest.mark.parametrize("content", ["", "[]", '{"format": "ftdrive.draft/1"}', '{"format": "ftdrive.draft/9"}'])
 def test_a_broken_draft_is_named(tmp_path: Path, content: str) -> None:
     draft = tmp_path / "draft"
