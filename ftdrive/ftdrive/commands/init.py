@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any
@@ -333,9 +334,11 @@ class _Interview:
                 return answer
 
     def _agrees(self, words: str) -> bool:
-        while (answer := self._prompt(words, None, "an answer").strip().lower()) not in ("yes", "no"):
-            _say(f"'{answer}' is not an answer: enter yes or no", "  ✘ ")
-        return answer == "yes"
+        while True:
+            with suppress(_Back):
+                if (answer := self._prompt(words, None, "an answer").strip().lower()) in ("yes", "no"):
+                    return answer == "yes"
+            _say("Enter yes or no.", "  ✘ ")
 
     def _prompt(self, words: str, usual: str | None, what: str) -> str:
         """Ask once; raises `_Back`, `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""

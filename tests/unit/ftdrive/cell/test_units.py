@@ -66,4 +66,5 @@ def test_what_is_no_wall(text: str) -> None:
 
 def test_a_slanting_wall_is_a_normal() -> None:
     assert wall("--plane", "0.6:0:0.8:-400") == [0.6, 0, 0.8, -400]
+    assert wall("--plane", "+x:800") == wall("--plane", "-1:0:0:-800") == [-1, 0, 0, -800]
     assert side_of((0.6, 0, 0.8, -400)) == side_of((1, 0, 0, 800)) == ""
