@@ -124,6 +124,6 @@ def announce(page: Page, address: Address | None = None) -> None:
         code = StringIO()
         segno.make(page.url, error="l").terminal(code, border=1, compact=True)
         messages.print(code.getvalue(), end="")
-        messages.print("Who has this address sees the page, and can stop the arm. There is no encryption.")
+        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
     elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(page.url)
