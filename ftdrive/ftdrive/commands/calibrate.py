@@ -20,12 +20,15 @@ from ftdrive.commands.common import (
     CellOptions,
     NewFile,
     Number,
+    ViewOptions,
     declined_aborts,
     index_run,
+    on_page,
     require_viz,
     runs,
     simulate,
     stop_unless_accepted,
+    view_options,
     write_json,
 )
 
@@ -87,7 +90,7 @@ if TYPE_CHECKING:
 @click.option("--dry-run", is_flag=True, help="Plan and check without control of the arm; nothing moves.")
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
-@click.option("--view", is_flag=True, help="Show the plan in the browser before the questions (needs ftdrive[viz]).")
+@view_options
 @click.option("--plan", type=FILE, help="Use this plan.")
 @click.option(
     "--resume",
@@ -118,6 +121,7 @@ def calibrate(
     resume: Path | None,
     method: str,
     runs: Path,
+    view: ViewOptions,
     as_json: bool,
     **as_session: Any,
 ) -> None:
@@ -139,10 +143,11 @@ def calibrate(
 
     _refuse_contradictions(click.get_current_context())
     known_load = None if load is None else Load.of(load, at, gripped=gripped)
-    require_viz(as_session["png"], view=as_session["view"])
+    require_viz(as_session["png"])
     chosen: dict[Mode, bool] = {"sweep": sweep, "passive": passive, "step": step, "manual": manual, "listen": listen}
     mode: Mode = next((name for name, given in chosen.items() if given), "auto")
     with ExitStack() as stack:
+        page = stack.enter_context(view.page("ftdrive calibrate"))
         description: dict[str, Any] = {}
         made_by = None if resume is None else Run(resume).header_to_resume().get("station")
         # A resumed run keeps its cell.
@@ -178,8 +183,12 @@ def calibrate(
         if simulate:
             _put_on(station, known_load if resume is None else Load.of_header(Run(resume).header()))
             start_mover(station, options)
-        with declined_aborts(), open_operator(as_json=as_json) as operator:
-            outcome = guide(cell, operator, options)
+        with (
+            declined_aborts(),
+            open_operator(as_json=as_json) as operator,
+            on_page(page, operator, options) as (shown, options),
+        ):
+            outcome = guide(cell, shown, options)
     if outcome is None:
         beside(as_json).print("Dry run: nothing has moved.")
         return

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from os import fsdecode
 from pathlib import Path
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ftdrive.cell.emulated import Station
     from ftdrive.live.samples import Axes, WrenchFrame
     from ftdrive.runs.source import Outcome
+    from ftdrive.session.events import Operator
     from ftdrive.session.options import SessionOptions
     from ftdrive.store.store import Store
     from ftdrive.view.page import Page
@@ -226,6 +227,20 @@ class ViewOptions:
         with serve(title, address) as page:
             announce(page, address)
             yield page
+
+
+@contextmanager
+def on_page(
+    page: "Page | None", operator: "Operator", options: "SessionOptions", command: str = "calibrate"
+) -> Iterator[tuple["Operator", "SessionOptions"]]:
+    """Show a session on a page while the block runs, if there is one; yields the operator and options to use."""
+    if page is None:
+        yield operator, options
+        return
+    from ftdrive.view.session_page import SessionPage
+
+    with SessionPage(page, operator, command) as shown:
+        yield shown, replace(options, watch=shown.watch)
 
 
 def view_options(command: F) -> F:

@@ -15,12 +15,15 @@ from ftdrive.commands.common import (
     YES,
     CellOptions,
     Number,
+    ViewOptions,
     check_simulate,
     declined_aborts,
     index_run,
+    on_page,
     runs,
     simulate,
     stop_unless_accepted,
+    view_options,
     write_json,
 )
 from ftdrive.errors import ConfigError
@@ -31,6 +34,7 @@ if TYPE_CHECKING:
     from ftdrive.runs.run import Mode
     from ftdrive.runs.verification import AcceptanceLimits, Verified
     from ftdrive.session.options import SessionOptions
+    from ftdrive.view.page import Page
 
 Answer = Literal["ask", "no", "yes"]
 
@@ -66,6 +70,7 @@ Answer = Literal["ask", "no", "yes"]
     help="Whether to save the smallest sufficient update as a new calibration if something has changed.",
 )
 @click.option("--resume", type=FOLDER, help="Continue an interrupted verification in its mode.")
+@view_options
 @YES
 @runs()
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result.")
@@ -82,6 +87,7 @@ def verify(
     resume: Path | None,
     yes: bool,
     runs: Path,
+    view: ViewOptions,
     as_json: bool,
 ) -> None:
     """Compare fresh poses, far from those of the calibration, with its prediction.
@@ -99,6 +105,7 @@ def verify(
     options = SessionOptions(runs, "verify", mode=mode, fast=quick, resume=resume, real=not simulate, yes=yes)
     path, limits, options = _with_poses(options, path, poses, AcceptanceLimits(force_N, torque_Nm))
     with ExitStack() as stack:
+        page = stack.enter_context(view.page("ftdrive verify"))
         station = None
         if simulate:
             station, path = _emulated(stack, path, described.sensor, runs)
@@ -106,7 +113,7 @@ def verify(
             raise ConfigError("no calibration: give --calibration PATH, or --simulate")
         cell = described.cell() if station is None else station.cell
         with declined_aborts():
-            verified = verify_cell(cell, path, limits, options, station, update=update, as_json=as_json)
+            verified = verify_cell(cell, path, limits, options, station, page, update=update, as_json=as_json)
     if not verified.passed:
         raise NotAccepted(f"the verification failed: {failure_in_words(verified)}")
 
@@ -117,14 +124,15 @@ def verify_cell(
     limits: "AcceptanceLimits",
     options: "SessionOptions",
     station: "Station | None" = None,
+    page: "Page | None" = None,
     *,
     update: Answer = "ask",
     as_json: bool = False,
 ) -> "Verified":
     """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
 
-    `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes. A verification
-    is quick if `options` are fast. Raises as `ftdrive.session.session.take_poses`.
+    `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes, `page` shows
+    the session. A verification is quick if `options` are fast. Raises as `ftdrive.session.session.take_poses`.
     """
     from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
@@ -146,8 +154,12 @@ def verify_cell(
         description |= station.description
         start_mover(station, options)
     task = Verifying(cell, calibration, path, options.poses, options.runs)
-    with open_operator(as_json=as_json, command=task.command) as operator:
-        run = take_poses(task, operator, replace(options, description=description))
+    options = replace(options, description=description)
+    with (
+        open_operator(as_json=as_json, command=task.command) as operator,
+        on_page(page, operator, options, task.command) as (shown, options),
+    ):
+        run = take_poses(task, shown, options)
     if run is None:
         raise RuntimeError("a verification is never a dry run")
     verified = verify_run(run, calibration, path, limits)

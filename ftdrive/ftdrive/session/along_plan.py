@@ -27,7 +27,7 @@ from ftdrive.planning.planner import certifier_for, speeds_of
 from ftdrive.runs.load import Load
 from ftdrive.runs.run import Run
 from ftdrive.session import guards
-from ftdrive.session.events import GuardTripped, Planned, rms_sigma
+from ftdrive.session.events import GuardTripped, Planned, Question, rms_sigma
 from ftdrive.session.open_session import Judge, PoseBook, Session
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
@@ -152,6 +152,7 @@ class _AlongPlan:
 
     def __init__(self, session: Session) -> None:
         self._session, self.cell, self.task, self.options = session, session.cell, session.task, session.options
+        self._onlookers: tuple[guards.Guard, ...] = ()
 
     def take(self) -> Run | None:
         """As `take_along_plan`. A dry run never takes control of the arm."""
@@ -179,7 +180,11 @@ class _AlongPlan:
                 cell.note(f"control path {path.value}")
             check(before, IN_CONTROL)
         driven = self._choose_pace(before, todo, taken=len(taken))
-        return None if dry_run else self._tour(before, driven, todo, judge)
+        if not dry_run:
+            return self._tour(before, driven, todo, judge)
+        if self._onlookers:
+            cell.journal.ask(Question("The page shows the plan until you press Enter", ("",)))
+        return None
 
     @property
     def _serial(self) -> str:
@@ -225,6 +230,8 @@ class _AlongPlan:
             load=options.load,
         )
         _show_plan(before, options)
+        if options.watch is not None:
+            self._onlookers = (options.watch(certifier, _range_guard(before)),)
         return before
 
     def _choose_pace(self, before: Before, todo: Sequence[int], *, taken: int) -> Before:
@@ -256,7 +263,7 @@ class _AlongPlan:
         `driven` has the speeds and the sampling of this session; later checks repeat those of `before`.
         """
         cell, options, way = self.cell, self.options, before.approach.way_rad
-        load = guards.RangeGuard(cell.limits, before.sensor_range, before.sensor_zero)
+        load = _range_guard(before)
         learner = None
         if options.mode == "sweep":  # no pose shows what the tool weighs while it moves
             learner = FreeTool(before.certifier.scene.down_base, self.task.cell.tool.mass_kg or _HEAVIEST_SWEPT_KG)
@@ -274,6 +281,7 @@ class _AlongPlan:
             guards.StallGuard(cell.limits),
             guards.SliderGuard(),
             *(() if learner is None else (learner,)),  # it learns what the other guards let pass
+            *self._onlookers,
         )
 
         def on_trip(trip: guards.Tripped) -> None:
@@ -341,6 +349,10 @@ class _AlongPlan:
         self.cell.note(f"the next run of this plan is slow again and needs the typed word: {why}")
 
 
+def _range_guard(before: Before) -> guards.RangeGuard:
+    return guards.RangeGuard(before.cell.limits, before.sensor_range, before.sensor_zero)
+
+
 def _quiet_std(driven: Before) -> Array:
     """Return the standard deviation (6,) of the samples of the resting sensor, as in an average of a pose."""
     share = 0.5 if driven.plan.sweep else min(1.0, driven.config.sampling.average_s / LISTEN_S)
@@ -348,7 +360,7 @@ def _quiet_std(driven: Before) -> Array:
 
 
 def _show_plan(before: Before, options: SessionOptions) -> None:
-    """Show every motion to come: in words, and as the options ask in files and in the browser."""
+    """Show every motion to come: in words, and as the options ask in files."""
     cell, plan, way = before.cell, before.plan, before.approach.way_rad
     words = "The arm stands at the first pose."
     if len(way):
@@ -364,12 +376,6 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
 
         draw(plan, before.certifier, options.png, way)
         cell.note(f"plan drawn in {options.png}")
-    if options.view:
-        from ftdrive.planning.drawing import open_in_browser, serve_view
-
-        with serve_view(plan, before.certifier, way) as url:
-            open_in_browser(url)
-            cell.journal.require(f"The plan is shown at {url} until you answer. Go on?", assumed=False)
 
 
 def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:

@@ -334,3 +334,7 @@ class Operator(Protocol):
 
     def pressed(self) -> Key | None:
         """Return the oldest key not yet returned, or None; returns at once."""
+
+    @property
+    def pressed_by(self) -> str:
+        """Who pressed the key that `pressed` returned last: "the operator", or a viewer of the page."""

@@ -389,7 +389,7 @@ class HandGuided:
 
     def _obey(self, key: Key) -> None:
         if key is Key.STOP:
-            self._end("Stopped")
+            self._end(f"Stopped by {self._operator.pressed_by}")
         elif key is Key.KEEP and self._light == "green":
             self._end("Finished")
         elif key is Key.KEEP:

@@ -122,7 +122,12 @@ class Journal:
         assumed = question.assumed if self._yes else None
         with self.recording_absence():  # the arm stands
             self.require_operator()
-            answer = self._operator.ask(question) if assumed is None else assumed
+            try:
+                answer = self._operator.ask(question) if assumed is None else assumed
+            except Declined as declined:  # a viewer of the page may have stopped the session
+                with self._lock:
+                    self._record(Noted(words=str(declined), warning=True), sync=True)
+                raise
         self.show(Asked(question=question.text, answer=answer, by="person" if assumed is None else "--yes"))
         return answer
 
@@ -139,6 +144,11 @@ class Journal:
     def pressed(self) -> Key | None:
         """Return the next key pressed."""
         return self._operator.pressed()
+
+    @property
+    def pressed_by(self) -> str:
+        """As `Operator.pressed_by`."""
+        return self._operator.pressed_by
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,6 +1,6 @@
 """Options of a session, those that exclude one another, and the mode of a resumed run."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, cast, get_args
@@ -8,14 +8,16 @@ from typing import Any, Final, cast, get_args
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.runs.load import Load
 from ftdrive.runs.run import Mode, Run
+from ftdrive.session.guards import Guard, RangeGuard
 
 _BY_HAND: Final = ("manual", "listen", "passive")
 _LONGEST_SWEEP_S: Final = 120
-_SHOWN: Final = ("--output", "--png", "--view")
+_SAVED: Final = ("--output", "--png")
 # Options of a session without a meaning where ftdrive neither plans nor moves.
-_OF_MOTION: Final = ("--plan", "--fast", "--dry-run", "--redo", *_SHOWN)
+_OF_MOTION: Final = ("--plan", "--fast", "--dry-run", "--redo", *_SAVED)
 # Options of `ftdrive calibrate`.
 _EXCLUDE_ONE_ANOTHER: Final = (
     ("--step", "--manual", "--listen", "--sweep", "--passive"),
@@ -29,7 +31,7 @@ _EXCLUDE_ONE_ANOTHER: Final = (
     ("--at", "--gripped"),
     ("--fast", "--sweep", "--passive"),
     ("--from", "--resume", "--passive"),
-    *((f"--{hand}", option) for hand in _BY_HAND for option in ("--quick", "--minimal", "--set", *_SHOWN)),
+    *((f"--{hand}", option) for hand in _BY_HAND for option in ("--quick", "--minimal", "--set", *_SAVED)),
     *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
 )
 
@@ -55,8 +57,8 @@ class SessionOptions:
     """Save the plan as a new file."""
     png: Path | None = None
     """Draw it."""
-    view: bool = False
-    """Show it in the browser until the operator answers."""
+    watch: Callable[[Certifier, RangeGuard], Guard] | None = None
+    """Called before any question; the guard that it returns looks on beside the others, and never trips."""
     resume: Path | None = None
     redo: tuple[int, ...] = ()
     real: bool = True

@@ -112,6 +112,7 @@ class _Recorder:
                         self._save()
                         saved_s = clock.now_s()
                     if cell.journal.pressed() is Key.STOP:
+                        cell.note(f"stopped by {cell.journal.pressed_by}")
                         break
                     if running is not None and running.done() and not is_silent:
                         words, is_good = running.result()

@@ -17,6 +17,7 @@ class NoOperator:
     """Nothing is shown and no key is pressed; a question raises `Declined`."""
 
     has_keys = False
+    pressed_by = "the operator"
 
     def show(self, event: Event) -> None:
         """Do nothing."""
@@ -43,6 +44,10 @@ class _Unkept:
     @property
     def has_keys(self) -> bool:
         return self._operator.has_keys
+
+    @property
+    def pressed_by(self) -> str:
+        return self._operator.pressed_by
 
     def show(self, event: Event) -> None:
         if self._folder not in str(event.to_dict()):

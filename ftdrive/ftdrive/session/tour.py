@@ -284,7 +284,7 @@ class Tour:
         """
         while (key := self._journal.pressed()) is not None:
             if key is Key.STOP:
-                raise _OperatorStop("stopped by the operator", for_good=True)
+                raise _OperatorStop(f"stopped by {self._journal.pressed_by}", for_good=True)
             if key is Key.SKIP and self._now.under_way is not None:
                 raise _Turned(key)
             if key is Key.REDO and self._redoable():

@@ -63,6 +63,7 @@ class _Keyless:
     """An operator without keys: SIGINT stops a session."""
 
     has_keys = False
+    pressed_by = "the operator"
     supervisor: Supervisor
 
     def absence(self) -> str | None:

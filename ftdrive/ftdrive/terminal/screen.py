@@ -53,7 +53,7 @@ REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "quit"}
 
 # Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
-_ROWS = (
+ESTIMATES = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
     ("F bias N", 1.0, "force_bias_N", 2),
@@ -141,7 +141,7 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
     If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
-    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
+    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *state_lines(view, now_s, width)])]
     if view.folder or view.last is not None:
         blocks += [
             (3, _last(view)),
@@ -166,17 +166,26 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
     return Group(*lines)
 
 
-def _title(view: SessionView, now_s: float, width: int) -> Text:
+def _kept_poses(view: SessionView) -> int:
+    return max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
+
+
+def progress_in_words(view: SessionView, now_s: float) -> str:
+    """Return how many poses are kept, and how long the others take, in the clock of `SessionView.since_s`."""
     times_s = sorted(at_s for _, at_s in view.taken.values())
-    kept = max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
-    right = f"{kept} kept"
+    kept = _kept_poses(view)
     left = view.last.stops - kept if view.last else 0
-    if len(times_s) > 2 and left > 0:
-        # a stop with questions takes longer than usual
-        usual_s = median(b - a for a, b in pairwise(times_s))
-        # a hold does not shorten the rest
-        rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
-        right += f", about {_minutes(rest_s)} left"
+    if len(times_s) <= 2 or left <= 0:
+        return f"{kept} kept"
+    # a stop with questions takes longer than usual
+    usual_s = median(b - a for a, b in pairwise(times_s))
+    # a hold does not shorten the rest
+    rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
+    return f"{kept} kept, about {_minutes(rest_s)} left"
+
+
+def _title(view: SessionView, now_s: float, width: int) -> Text:
+    kept, right = _kept_poses(view), progress_in_words(view, now_s)
     name = f"ftdrive {view.command}"
     room = width - len(name) - len(right)
     if view.last is None or room < _NARROWEST_BAR + 4:
@@ -188,7 +197,8 @@ def _title(view: SessionView, now_s: float, width: int) -> Text:
     )
 
 
-def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
+def state_lines(view: SessionView, now_s: float, width: int) -> list[Text]:
+    """Return the state of the session, in lines of at most `width`."""
     now = view.now
     if now is None:
         return [Text("starting")]
@@ -252,7 +262,7 @@ def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[i
 def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
-    rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in _ROWS]
+    rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in ESTIMATES]
     newest = view.last.gravity_flange if view.last else None
     counts = (0,) * 6 if fit is None else fit.faces
     if with_cube:
@@ -264,13 +274,22 @@ def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Te
             row.append_text(picture)
         return [(0, rows)]
     seen = " ".join(f"{name} {count}" for name, count in zip(_FACES, counts, strict=True))
-    each = [(number, [row]) for row, (*_, number) in zip(rows[1:], _ROWS, strict=True)]
+    each = [(number, [row]) for row, (*_, number) in zip(rows[1:], ESTIMATES, strict=True)]
     return [(7, rows[:1]), *each, (4, [Text(f"gravity along {seen}")])]
 
 
 def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
-    if fit is None or name not in fit.values:
+    values, sigma = rounded_estimate(fit, factor, name)
+    if not sigma:
         return Text(f"{label:<13}{'-':>9}")
+    numbers = "".join(f"{one:>{_NUMBER_WIDTH}}" for one in values)
+    return Text(f"{label:<13}{numbers:<27}  ± {sigma}")
+
+
+def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
+    """Return the values of an estimate times `factor`, and their largest sigma; nothing before there is a fit."""
+    if fit is None or name not in fit.values:
+        return [], ""
     value: ArrayLike = fit.values[name]
     if name == "R_flange_sensor":
         value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
@@ -278,8 +297,7 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
     digits = decimals(sigma)
     while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
         digits -= 1
-    numbers = "".join(f"{one:{_NUMBER_WIDTH}.{digits}f}" for one in values)
-    return Text(f"{label:<13}{numbers:<27}  ± {to_place_of(sigma, sigma)}")
+    return [f"{one:.{digits}f}" for one in values], to_place_of(sigma, sigma)
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
@@ -399,6 +417,8 @@ class Screen:
     command : str
         The task: "calibrate" or "verify".
     """
+
+    pressed_by = "the operator"
 
     def __init__(
         self,

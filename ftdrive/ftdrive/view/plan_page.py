@@ -37,7 +37,7 @@ class PlanPage:
         self._arm = draw_plan(page, plan, certifier, self._q)
         gui = page.gui
         self._words = gui.add_markdown("")
-        self._slider = gui.add_slider("along the tour", min=0, max=len(self._q) - 1, step=1, initial_value=0)
+        self._slider: Any = gui.add_slider("along the tour", min=0, max=len(self._q) - 1, step=1, initial_value=0)
         self._plays = gui.add_checkbox("play", initial_value=False)
         self._speed = gui.add_slider("speed", min=0.25, max=8.0, step=0.25, initial_value=1.0)
         swept = gui.add_checkbox("room that the tool sweeps over", initial_value=False)
@@ -87,7 +87,9 @@ def draw_plan(page: Page, plan: Plan, certifier: Certifier, q_rad: Array) -> Dra
     """Draw cell, free ball and the path of the tool's tip along joint vectors (n, 6); return the arm, at the first."""
     arm, size_m = certifier.arm, size_of(certifier)
     draw_surroundings(page.scene, certifier.scene, size_m)
-    page.scene.add_icosphere("/ball", plan.ball_m, GHOST, opacity=0.15, position=plan.ball_centre_m, cast_shadow=False)
+    page.scene.add_icosphere(
+        "/ball", plan.ball_m, GHOST, opacity=0.15, position=np.array(plan.ball_centre_m), cast_shadow=False
+    )
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     tip = tips(arm, q_rad)[:, farthest]
     segments = np.stack([tip[:-1], tip[1:]], axis=1)

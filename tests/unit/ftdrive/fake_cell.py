@@ -294,6 +294,7 @@ class Scripted:
     """What happens while a question with these words waits for its answer."""
     keys: list[Key] = field(default_factory=list)
     has_keys: bool = True
+    pressed_by: str = "the operator"
     shown: list[Event] = field(default_factory=list)
     asked: list[Question] = field(default_factory=list)
     gone: str | None = None

@@ -171,6 +171,7 @@ class Person:
     def __init__(self, cell: Cell, keys: dict[float, Key], *, has_keys: bool = True) -> None:
         self.cell = cell
         self.has_keys = has_keys
+        self.pressed_by = "the operator"
         self.gone: str | None = None
         self.keys = keys | {cell.end_s + 20: Key.STOP}
         self.shown: list[Event] = []
