@@ -124,6 +124,7 @@ def plan(
         raise ConfigError("--set names the poses: leave out --quick, --minimal, --cone and --free-box")
     check_simulate(simulate, real={"--config": config})
     require_viz(png)
+    page = click.get_current_context().with_resource(view.page("ftdrive plan"))
     emulated = None
     if simulate:
         with working("Starting the emulated cell"), Station.of(None) as station:
@@ -177,16 +178,15 @@ def plan(
     if output is not None:
         made.save(output)
     saved = [f" Saved {path}" for path in (png, output) if path is not None]
-    with view.page(f"ftdrive plan, {certifier.arm.name}") as page:
-        if as_json:
-            write_json({"schema_version": 1} | made.to_dict())
-            messages.print(*saved, sep="\n", end="\n" if saved else "")
-        else:
-            answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
-            same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
-            messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
-        if page is not None:
-            _show(page, made, certifier)
+    if as_json:
+        write_json({"schema_version": 1} | made.to_dict())
+        messages.print(*saved, sep="\n", end="\n" if saved else "")
+    else:
+        answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
+        same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
+        messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
+    if page is not None:
+        _show(page, made, certifier)
 
 
 def _show(page: "Page", plan: "Plan", certifier: "Certifier") -> None:

@@ -42,8 +42,9 @@ class Page:
 
     def look(self, at_m: Array, from_m: Array) -> None:
         """Place the camera of every browser, also of those that open the page later; (3,) each, base axes."""
-        for camera in (self._server.initial_camera, *(each.camera for each in self._server.get_clients().values())):
-            camera.look_at, camera.position = at_m, from_m
+        self._server.initial_camera.look_at, self._server.initial_camera.position = at_m, from_m
+        for viewer in self._server.get_clients().values():
+            viewer.camera.look_at, viewer.camera.position = at_m, from_m
 
     @property
     def viewers(self) -> int:

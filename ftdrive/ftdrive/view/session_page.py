@@ -40,6 +40,8 @@ _FRAMES_A_TEXT: Final = 4
 _GOOD, _DOUBTFUL, _UNKNOWN = (40, 160, 70), (230, 150, 20), (120, 120, 130)
 _DOUBTFUL_SIGMA, _BAD_SIGMA = 3.0, 5.0
 _BALL_M: Final = 0.18
+# In these states the stop is not reached yet.
+_TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
 _ALERT: Final = "color:#e03131"
 _QUESTION: Final = "border-left:4px solid #3c82e6;padding-left:.6em"
 
@@ -181,11 +183,13 @@ class SessionPage:
                 if self._texts[part].content != text:
                     self._texts[part].content = text
             if self._scene is not None:
-                stop = now.stop if now is not None else None
+                stop = goes_on_to = None if now is None else now.stop
+                if now is not None and stop is not None and now.state not in _TOWARDS:
+                    goes_on_to = stop + 1
                 if self._slider.visible != (question is not None):
                     self._slider.value = self._scene.index_of(stop)
                     self._slider.visible = question is not None
-                self._scene.show(seen, stop, int(self._slider.value) if question is not None else None)
+                self._scene.show(seen, goes_on_to, int(self._slider.value) if question is not None else None)
             self._draw_downs(downs)
 
     def _draw_downs(self, downs: dict[int, tuple[Array, float | None]]) -> None:
@@ -216,7 +220,7 @@ class SessionPage:
             place, words = "", f"Waits in the terminal: <b>{escape(question.text)}</b>"
             if self._scene is not None:
                 move = int(self._scene.moves[int(self._slider.value)])
-                shown = describe(self._scene.plan, move).replace("**", "").split("\n\n")
+                shown = describe(self._scene.plan, move).replace("**", "").split("\n\n")[:2]
                 place = _paragraph("<br>".join(map(escape, shown)))
             texts["question"] = _paragraph(words, _QUESTION) + place
         texts["guards"] = "" if seen is None else self._guard_values(seen)
@@ -289,19 +293,19 @@ class _Cell:
         nodes = len(self.plan.steps)
         return int(np.flatnonzero(self.moves == ((stop or 1) - 1) % nodes)[0])
 
-    def show(self, seen: Seen | None, stop: int | None, chosen: int | None) -> None:
-        """Draw the arm where it was seen, and as a ghost where it goes next, or at a chosen place of the path."""
+    def show(self, seen: Seen | None, following: int | None, chosen: int | None) -> None:
+        """Draw the arm where it was seen; as a ghost its goal, the following stop, or a chosen place of the path."""
         if seen is not None:
             self._move(self._arm, seen.state.q_rad)
-        self._move(self._ghost, self._next_rad(seen, stop) if chosen is None else self.path_rad[chosen])
+        self._move(self._ghost, self._goal_rad(seen, following) if chosen is None else self.path_rad[chosen])
 
-    def _next_rad(self, seen: Seen | None, stop: int | None) -> Array | None:
+    def _goal_rad(self, seen: Seen | None, following: int | None) -> Array | None:
         if seen is None or seen.motion.curve_rad is not None:
             return None
         if seen.motion.moving:
             return seen.motion.goal_rad
         nodes = self.plan.nodes_rad
-        return None if stop is None or stop >= len(nodes) + 1 else nodes[stop % len(nodes)]
+        return None if following is None or following > len(nodes) + 1 else nodes[(following - 1) % len(nodes)]
 
     def _move(self, arm: DrawnArm, q_rad: Array | None) -> None:
         before = self._drawn[arm]

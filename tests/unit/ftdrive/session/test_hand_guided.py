@@ -386,7 +386,7 @@ def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     last = outcome.person.shown[-1]
     assert isinstance(last, Noted)
     assert last.warning
-    assert last.words.startswith("Stopped: 1 pose is kept")
+    assert last.words.startswith("Stopped by the operator: 1 pose is kept")
     assert "amber" in last.words
 
 

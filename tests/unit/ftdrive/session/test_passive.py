@@ -56,7 +56,7 @@ class FakeCell:
             follow=lambda: self._follow(self._samples, STEP_S), health=lambda: health, temperature_C=lambda: None
         )
         self.arm = SimpleNamespace(follow=lambda: self._follow(self._states, 0.0))
-        operator: Any = SimpleNamespace(pressed=self._pressed, show=self.shown.append)
+        operator: Any = SimpleNamespace(pressed=self._pressed, pressed_by="the operator", show=self.shown.append)
         self.journal = Journal(operator)
 
     @contextmanager

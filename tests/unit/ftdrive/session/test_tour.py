@@ -1,8 +1,6 @@
 """The state machine on the fake cell: states, questions, modes, what is written down."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -14,7 +12,6 @@ from numpy.typing import NDArray
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
 from ftdrive.errors import Declined, NotAccepted
-from ftdrive.planning import drawing
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds, tips
 from ftdrive.planning.plan import Plan
@@ -32,6 +29,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
+from ftdrive.session.guards import Guard, Limits, RangeGuard, Seen, StallGuard
 from ftdrive.terminal.session_text import SessionText, in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
@@ -320,26 +318,30 @@ def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) ->
         assert [question.assumed is not None for question in lab.operator.asked] == [assumed] * 4
 
 
-def test_the_browser_is_waited_for(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    served: list[str] = []
+def test_an_onlooker_sees_every_look_of_the_guards(lab: Lab) -> None:
+    seen: list[Seen] = []
 
-    @contextmanager
-    def shown(plan: Plan, certifier: Certifier, way_rad: Array) -> Iterator[str]:
-        assert len(plan.steps) == 6
+    class Onlooker(Guard):
+        def look(self, seen_now: Seen) -> None:
+            assert lab.guards_look
+            seen.append(seen_now)
+
+    def watch(certifier: Certifier, load: RangeGuard) -> Guard:
         assert certifier.arm.name == "UR5e"
-        assert len(way_rad) == 2
-        served.append("open")
-        yield "http://here"
-        served.append("closed")
+        assert lab.operator.of(Planned)
+        assert not lab.operator.asked
+        assert load.zero.shape == (6,)
+        return Onlooker()
 
-    monkeypatch.setattr(drawing, "serve_view", shown)
-    monkeypatch.setattr(drawing, "open_in_browser", served.append)
-    lab.operator.answers["http://here"] = ["yes", "no"]
-    assert lab.take_poses(dry_run=True, view=True) is None
-    assert served == ["open", "http://here", "closed"]
-    assert [question.assumed for question in lab.operator.asked] == [None]
-    with pytest.raises(Declined):
-        lab.take_poses(view=True)
+    lab.take_poses(watch=watch)
+    assert {one.motion.moving for one in seen} == {True, False}
+    goals = {tuple(one.motion.goal_rad) for one in seen}
+    assert len(goals) == 6
+
+
+def test_the_plan_of_a_dry_run_is_looked_at_until_enter(lab: Lab) -> None:
+    assert lab.take_poses(dry_run=True, watch=lambda *_: StallGuard(Limits())) is None
+    assert [question.answers for question in lab.operator.asked] == [("",)]
     assert lab.arm.moves == []
 
 
