@@ -201,7 +201,7 @@ def state_lines(view: SessionView, now_s: float, width: int) -> list[Text]:
     """Return the state of the session, in lines of at most `width`."""
     now = view.now
     if now is None:
-        return [Text("starting")]
+        return [Text("recording" if view.folder else "starting")]
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
         # the motion before the question is over
         return [Text("WAITS for an answer", "bold cyan")]

@@ -140,8 +140,10 @@ def describe(plan: Plan, move: int) -> str:
         return "From the present posture to the first pose.\n\nIt is confirmed separately."
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]
     turn_deg, speed_deg_s = np.degrees([step.turn_rad, step.speed_rad_s])
+    what = f"Move **{move + 1} of {len(plan.steps)}**, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}°"
+    if plan.sweep is not None:
+        what = f"Sweep of {plan.sweep.duration_s:.0f} s"
     return (
-        f"Move **{move + 1} of {len(plan.steps)}**, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}° at "
-        f"{speed_deg_s:.0f}°/s.\n\nNearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}.\n\n"
+        f"{what} at {speed_deg_s:.0f}°/s.\n\nNearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}.\n\n"
         f"{plan.room_in_words()}"
     )

@@ -4,8 +4,8 @@ import logging
 import threading
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from html import escape
-from types import TracebackType
 from typing import Any, Final, Self
 
 import numpy as np
@@ -20,6 +20,7 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Key,
+    Noted,
     Operator,
     Planned,
     PoseTaken,
@@ -74,6 +75,7 @@ class SessionPage:
         self._view = SessionView(command)
         self._question: Question | None = None
         self._stopped_by = ""
+        self._note = ""
         self._downs: dict[int, tuple[Array, float | None]] = {}
         self._plan: Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
@@ -92,7 +94,7 @@ class SessionPage:
         self._drawer.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self._ended.set()
         self._drawer.join(timeout=2.0)
 
@@ -112,7 +114,10 @@ class SessionPage:
             match event:
                 case Planned():
                     self._plan = event
+                case Noted():
+                    self._note = event.words
                 case PoseTaken():
+                    self._note = ""
                     self._downs[event.stop] = event.gravity_flange, None
                 case Estimated() if self._view.last is not None:
                     stop = self._view.last.stop
@@ -124,11 +129,11 @@ class SessionPage:
     def ask(self, question: Question) -> str:
         """Ask in the terminal; raises `Declined` too if a viewer has stopped the session."""
         self._require_unstopped()
-        self._question = question
+        self._question, self._view.keys = question, "asking"
         try:
             answer = self._operator.ask(question)
         finally:
-            self._question = None
+            self._question, self._view.keys = None, "live"
         self._require_unstopped()
         return answer
 
@@ -164,6 +169,8 @@ class SessionPage:
             # Only a picture: the session goes on.
             except Exception:
                 log.exception("the page cannot be drawn")
+                with suppress(Exception):
+                    self._texts["alert"].content = _paragraph("This page has failed and shows old values.", _ALERT)
                 return
             frames += 1
             if ended:
@@ -232,14 +239,15 @@ class SessionPage:
 
     def _alert(self) -> str:
         view, lines = self._view, []
+        is_stopped = view.now is not None and view.now.state in {State.STOP, State.HOLD}
         if self._stopped_by:
             lines.append(f"Stop was pressed by {self._stopped_by}.")
+        elif is_stopped and not view.tripped:
+            lines.append(view.now.words if view.now else "")
         if view.note is not None:
             lines.append(in_words(view.note))
-        elif view.now is not None and view.now.state in {State.STOP, State.HOLD} and view.now.words:
-            lines.append(view.now.words)
-        is_red = self._stopped_by or isinstance(view.note, GuardTripped) or view.tripped
-        return "".join(_paragraph(escape(line), _ALERT if is_red else "") for line in lines)
+        is_red = bool(lines) and (is_stopped or bool(self._stopped_by) or isinstance(view.note, GuardTripped))
+        return "".join(_paragraph(escape(line), _ALERT if is_red else "") for line in lines or [self._note] if line)
 
     def _guard_values(self, seen: Seen) -> str:
         rows = [
