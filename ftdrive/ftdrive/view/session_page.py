@@ -11,7 +11,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from ftcalib.model import Array
-from ftcalib.rounding import to_place_of, with_sigma
+from ftcalib.rounding import with_sigma
 from ftdrive.errors import Declined
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session.events import (
@@ -37,9 +37,11 @@ from ftdrive.view.scene import BAD, DrawnArm, size_of
 log = logging.getLogger(__name__)
 
 _FRAME_S: Final = 0.05
-_FRAMES_A_TEXT: Final = 4
-_GOOD, _DOUBTFUL, _UNKNOWN = (40, 160, 70), (230, 150, 20), (120, 120, 130)
-_DOUBTFUL_SIGMA, _BAD_SIGMA = 3.0, 5.0
+# Guards that have not looked for so long rest.
+_REST_S: Final = 0.5
+# Colour of a pose by the largest residual that still has it, in sigmas.
+_COLOURS: Final = ((3.0, (40, 160, 70), "≤ 3"), (5.0, (230, 150, 20), "≤ 5"), (np.inf, BAD, "more"))
+_UNKNOWN: Final = (120, 120, 130)
 _BALL_M: Final = 0.18
 # In these states the stop is not reached yet.
 _TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
@@ -52,14 +54,14 @@ class Onlooker(Guard):
 
     def __init__(self) -> None:
         self.seen: Seen | None = None
-        self.fresh_s = 0.0
-        """When the newest sample of the sensor was first seen, on the clock of the guards."""
+        self.fresh_s = self.looked_s = 0.0
+        """When the newest sample was first seen, by `Seen.t_s`; the last look, by the computer's clock."""
 
     def look(self, seen: Seen) -> None:
         """Keep it."""
         if self.seen is None or seen.sample != self.seen.sample:
             self.fresh_s = seen.t_s
-        self.seen = seen
+        self.seen, self.looked_s = seen, time.monotonic()
 
 
 class SessionPage:
@@ -74,8 +76,7 @@ class SessionPage:
         self._lock = threading.Lock()
         self._view = SessionView(command)
         self._question: Question | None = None
-        self._stopped_by = ""
-        self._note = ""
+        self._stopped_by = self._note = ""
         self._downs: dict[int, tuple[Array, float | None]] = {}
         self._plan: Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
@@ -160,23 +161,19 @@ class SessionPage:
             raise Declined(f"stopped by {self._stopped_by}")
 
     def _run(self) -> None:
-        frames = 0
-        while True:
-            ended = self._ended.wait(_FRAME_S)
-            try:
+        ended = False
+        try:
+            while not ended:
+                ended = self._ended.wait(_FRAME_S)
                 if self._page.viewers or self._scene is None:
-                    self.draw(with_text=ended or frames % _FRAMES_A_TEXT == 0)
-            # Only a picture: the session goes on.
-            except Exception:
-                log.exception("the page cannot be drawn")
-                with suppress(Exception):
-                    self._texts["alert"].content = _paragraph("This page has failed and shows old values.", _ALERT)
-                return
-            frames += 1
-            if ended:
-                return
+                    self.draw()
+        # Only a picture: the session goes on.
+        except Exception:
+            log.exception("the page cannot be drawn")
+            with suppress(Exception):
+                self._texts["alert"].content = _paragraph("This page has failed and shows old values.", _ALERT)
 
-    def draw(self, *, with_text: bool = True) -> None:
+    def draw(self) -> None:
         """Show browsers the newest state."""
         plan, cell, question, seen = self._plan, self._cell, self._question, self._onlooker.seen
         if plan is not None and cell is not None and self._scene is None:
@@ -184,7 +181,7 @@ class SessionPage:
             self._slider.max = len(self._scene.path_rad) - 1
         with self._lock:
             downs, now = dict(self._downs), self._view.now
-            texts = self._texts_now(question, seen) if with_text else {}
+            texts = self._texts_now(question, seen)
         with self._page.at_once():
             for part, text in texts.items():
                 if self._texts[part].content != text:
@@ -232,8 +229,8 @@ class SessionPage:
             texts["question"] = _paragraph(words, _QUESTION) + place
         texts["guards"] = "" if seen is None else self._guard_values(seen)
         texts["results"] = self._results()
-        key = ((_GOOD, f"≤ {_DOUBTFUL_SIGMA:g}"), (_DOUBTFUL, f"≤ {_BAD_SIGMA:g}"), (BAD, "more"), (_UNKNOWN, "no fit"))
-        dots = " ".join(f'<span style="color:rgb{colour}">●</span> {words}' for colour, words in key)
+        key = (*_COLOURS, (0.0, _UNKNOWN, "no fit"))
+        dots = " ".join(f'<span style="color:rgb{colour}">●</span> {words}' for _, colour, words in key)
         texts["key"] = _paragraph(f"Poses, residual in sigmas: {dots}") if self._downs else ""
         return texts
 
@@ -250,6 +247,8 @@ class SessionPage:
         return "".join(_paragraph(escape(line), _ALERT if is_red else "") for line in lines or [self._note] if line)
 
     def _guard_values(self, seen: Seen) -> str:
+        if time.monotonic() - self._onlooker.looked_s > _REST_S:
+            return _paragraph("The guards rest: the arm is drawn where they saw it last.")
         rows = [
             ["joint speed", f"{np.degrees(np.abs(seen.state.qd_rad_s).max()):.0f} °/s"],
             ["age of the sample", f"{1e3 * (seen.t_s - self._onlooker.fresh_s):.0f} ms"],
@@ -262,21 +261,15 @@ class SessionPage:
     def _results(self) -> str:
         view = self._view
         if view.compared:
-            rows = [
-                [
-                    f"R{one.number:02d}",
-                    *(
-                        with_sigma(np.linalg.norm(one.residual[part]), float(np.linalg.norm(one.sigma[part])))
-                        for part in (slice(3), slice(3, 6))
-                    ),
-                    to_place_of(sigmas_of(one), 0.1),
-                ]
-                for one in view.compared.values()
-            ]
-            newest = next(reversed(view.compared.values()))
-            return _table([["", "N off", "N·m off", "sigmas"], *rows]) + _paragraph(escape(in_words(newest).strip()))
-        fit = view.estimated
-        if fit is None:
+            table = [["", "N off", "N·m off", "sigmas"]]
+            for one in view.compared.values():
+                force, torque = (
+                    with_sigma(np.linalg.norm(one.residual[part]), float(np.linalg.norm(one.sigma[part])))
+                    for part in (slice(3), slice(3, 6))
+                )
+                table.append([f"R{one.number:02d}", force, torque, f"{sigmas_of(one):.1f}"])
+            return _table(table) + _paragraph(escape(in_words(one).strip()))
+        if (fit := view.estimated) is None:
             return ""
         found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
         rows = [[label, "<br>".join(values), f"± {sigma}"] for label, values, sigma in found if sigma]
@@ -298,8 +291,7 @@ class _Cell:
 
     def index_of(self, stop: int | None) -> int:
         """Return where the path is at a stop, from 1; at the first where there is none."""
-        nodes = len(self.plan.steps)
-        return int(np.flatnonzero(self.moves == ((stop or 1) - 1) % nodes)[0])
+        return int(np.flatnonzero(self.moves == ((stop or 1) - 1) % len(self.plan.steps))[0])
 
     def show(self, seen: Seen | None, following: int | None, chosen: int | None) -> None:
         """Draw the arm where it was seen; as a ghost its goal, the following stop, or a chosen place of the path."""
@@ -308,9 +300,7 @@ class _Cell:
         self._move(self._ghost, self._goal_rad(seen, following) if chosen is None else self.path_rad[chosen])
 
     def _goal_rad(self, seen: Seen | None, following: int | None) -> Array | None:
-        if seen is None or seen.motion.curve_rad is not None:
-            return None
-        if seen.motion.moving:
+        if seen is not None and seen.motion.moving:
             return seen.motion.goal_rad
         nodes = self.plan.nodes_rad
         return None if following is None or following > len(nodes) + 1 else nodes[(following - 1) % len(nodes)]
@@ -328,9 +318,7 @@ class _Cell:
 
 
 def _colour(sigmas: float | None) -> tuple[int, int, int]:
-    if sigmas is None:
-        return _UNKNOWN
-    return _GOOD if sigmas <= _DOUBTFUL_SIGMA else _DOUBTFUL if sigmas <= _BAD_SIGMA else BAD
+    return _UNKNOWN if sigmas is None else next((colour for most, colour, _ in _COLOURS if sigmas <= most), BAD)
 
 
 def _paragraph(html: str, style: str = "") -> str:
