@@ -88,7 +88,7 @@ class SessionPage:
         self._slider: Any = page.gui.add_slider("along the plan", min=0, max=1, step=1, initial_value=0, visible=False)
         self._texts |= {part: page.gui.add_html("") for part in ("guards", "results", "key")}
         self._scene: _Cell | None = None
-        self._drawn_downs = 0
+        self._poses: Any = None
         page.look(np.zeros(3), np.array([0.4, 0.4, 0.25]))
 
     def __enter__(self) -> Self:
@@ -198,22 +198,20 @@ class SessionPage:
 
     def _draw_downs(self, downs: dict[int, tuple[Array, float | None]]) -> None:
         """Draw the directions of gravity so far on a sphere, above the arm where there is one."""
-        drawn = hash(tuple((stop, *down, sigmas) for stop, (down, sigmas) in downs.items()))
-        if not downs or drawn == self._drawn_downs:
+        if not downs:
             return
-        self._drawn_downs = drawn
-        centre_m = np.zeros(3) if self._scene is None else self._scene.ball_m
-        scene = self._page.scene
-        scene.add_icosphere("/gravity", _BALL_M, _UNKNOWN, wireframe=True, opacity=0.3, position=centre_m)
-        scene.add_frame("/gravity/flange", axes_length=1.3 * _BALL_M, axes_radius=0.004)
-        scene.add_point_cloud(
-            "/gravity/poses",
-            _BALL_M * np.array([down for down, _ in downs.values()]),
-            np.array([_colour(sigmas) for _, sigmas in downs.values()], dtype=np.uint8),
-            point_size=0.03,
-            point_shape="circle",
-        )
-        scene.add_label("/gravity/name", "gravity in flange axes", position=(0.0, 0.0, 1.5 * _BALL_M))
+        points_m = _BALL_M * np.array([down for down, _ in downs.values()], dtype=np.float32)
+        colours = np.array([_colour(sigmas) for _, sigmas in downs.values()], dtype=np.uint8)
+        if self._poses is None:
+            centre_m, scene = np.zeros(3) if self._scene is None else self._scene.ball_m, self._page.scene
+            scene.add_icosphere("/gravity", _BALL_M, _UNKNOWN, wireframe=True, opacity=0.3, position=centre_m)
+            scene.add_frame("/gravity/flange", axes_length=1.3 * _BALL_M, axes_radius=0.004)
+            scene.add_label("/gravity/name", "gravity in flange axes", position=(0.0, 0.0, 1.5 * _BALL_M))
+            self._poses = scene.add_point_cloud(
+                "/gravity/poses", points_m, colours, point_size=0.03, point_shape="circle", precision="float32"
+            )
+        elif not (np.array_equal(points_m, self._poses.points) and np.array_equal(colours, self._poses.colors)):
+            self._poses.points, self._poses.colors = points_m, colours
 
     def _texts_now(self, question: Question | None, seen: Seen | None) -> dict[str, str]:
         view, now_s = self._view, time.monotonic()

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -172,7 +171,7 @@ def test_poses_have_the_colour_of_their_residual(page: Page) -> None:
     watched.show(pose(2, (1.0, 0.0, 0.0)))
     watched.show(Compared(stop=2, number=2, residual=np.ones(6), sigma=np.full(6, 0.1), poses=4, light="green"))
     watched.draw()
-    cloud: Any = page._server.scene._handle_from_node_name["/gravity/poses"]
+    cloud = watched._poses
     assert len({tuple(colour) for colour in cloud.colors}) == 3
     np.testing.assert_array_equal(cloud.colors[1], cloud.colors[3])
     np.testing.assert_allclose(cloud.points[1] / np.linalg.norm(cloud.points[1]), np.eye(3)[0], atol=1e-3)
