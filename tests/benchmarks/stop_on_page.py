@@ -57,7 +57,7 @@ def stop_once(
     Returns seconds from the click to the callback, from there to braking, and the run; None if the session ended before
     a move was fast.
     """
-    cell = replace(station.cell, sampling=replace(station.cell.sampling, average_s=0.3, noise_record_s=0.0))
+    cell = replace(station.cell, sampling=replace(station.cell.sampling, average_s=0.1, noise_record_s=0.0))
     since = len(station.control(do="state")["events"])
     shown = TimedPage(page, NoOperator(), "calibrate")
     shown.clock = station.clock

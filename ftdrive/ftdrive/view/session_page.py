@@ -285,7 +285,7 @@ class _Cell:
         self._drawn: dict[DrawnArm, Array | None] = {self._arm: self.path_rad[0], self._ghost: None}
         self._ghost.hide()
         wrist_m = certifier.arm.frames(self.path_rad[:1]).wrist_m[0]
-        self.ball_m = wrist_m + np.array([0.0, 0.0, 0.3 * size_of(certifier)])
+        self.ball_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_of(certifier)])
 
     def index_of(self, stop: int | None) -> int:
         """Return where the path is at a stop, from 1; at the first where there is none."""
