@@ -43,7 +43,7 @@ class PlanPage:
         swept = gui.add_checkbox("room that the tool sweeps over", initial_value=False)
         largest = gui.add_button("largest move")
         self._slider.on_update(lambda _: self.show())
-        volumes = _swept(page, certifier, self._q)
+        volumes = _swept(page, certifier, self._q[::3])
 
         @swept.on_update
         def _(_: object) -> None:
@@ -111,7 +111,7 @@ def _swept(page: Page, certifier: Certifier, q_rad: Array) -> list[Any]:
         turns, places = turned_up(bodies.axis[:, i]), bodies.centre_m[:, i]
         drawn.append(
             page.scene.add_batched_meshes_simple(
-                f"/swept/{arm.names[i]}", *shape, turns, places, batched_colors=TOOL, opacity=0.08, cast_shadow=False
+                f"/swept/{arm.names[i]}", *shape, turns, places, batched_colors=TOOL, opacity=0.15, cast_shadow=False
             )
         )
         drawn[-1].visible = False

@@ -110,6 +110,7 @@ def test_q_and_the_time_end_it_and_too_little_is_not_kept(free: Recorded, tmp_pa
     by_key, by_time = FakeCell(free, stop_s=6.0), FakeCell(free)
     assert passively(by_key, tmp_path, SECONDS).in_motion
     assert by_key.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
+    assert "stopped by the operator" in by_key.shown
     passively(by_time, tmp_path, 6.0)
     assert by_time.shown[-1].duration_s == pytest.approx(6.0, abs=STEP_S)
     with pytest.raises(Declined, match="record 10 s"):

@@ -19,6 +19,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
+from ftdrive.session.options import SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrive.view.page import Page, serve
 from ftdrive.view.session_page import SessionPage
@@ -196,3 +197,23 @@ def test_a_trip_is_red_until_the_next_pose(page: Page) -> None:
     assert "color:" in alert
     watched.show(pose(1, (0.0, 0.0, 1.0)))
     assert shown(watched)["alert"] == ""
+
+
+@pytest.mark.slow
+def test_a_sweep_is_one_motion(lab: Lab, page: Page) -> None:
+    watched = SessionPage(page, lab.operator, "calibrate")
+    seen: list[str] = []
+    lab.operator.at_question = [("Type MOVE", lambda: seen.append(shown(watched)["question"]))]
+
+    def look(event: object) -> None:
+        if isinstance(event, StateChanged) and event.state is State.SWEEP:
+            watched.stop("viewer 0")
+
+    lab.operator.on_event = look
+    chosen = SessionOptions(lab.folder / "runs", mode="sweep", seconds=10.0, watch=watched.watch)
+    with pytest.raises(Declined, match="stopped by viewer 0"):
+        session.take_poses(Calibrating(lab.cell, chosen), watched, chosen)
+    assert "Sweep of 10 s" in seen[0]
+    assert watched._scene is not None
+    assert len(watched._scene.path_rad) > 100
+    assert lab.operator.states()[-1] is State.STOP
