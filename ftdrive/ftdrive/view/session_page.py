@@ -165,7 +165,7 @@ class SessionPage:
         try:
             while not ended:
                 ended = self._ended.wait(_FRAME_S)
-                if self._page.viewers or self._scene is None:
+                if self._page.viewers or (self._scene is None and self._cell is not None):
                     self.draw()
         # Only a picture: the session goes on.
         except Exception:
