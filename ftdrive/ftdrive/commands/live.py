@@ -6,13 +6,15 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
 from rich.console import Group
 from rich.live import Live
 
+from ftcalib.errors import FtdriveError
+from ftdrive.cell.config import SECTIONS, CellConfig
 from ftdrive.checks.arm import check_weighed_payload
 from ftdrive.checks.check import Check
 from ftdrive.commands.common import (
@@ -22,16 +24,18 @@ from ftdrive.commands.common import (
     TRACK,
     Number,
     Source,
+    ViewOptions,
     check_simulate,
     read_frame,
+    view_options,
     write_json,
 )
-from ftdrive.commands.live_source import open_source
+from ftdrive.commands.live_source import check_view, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, Paired, StreamInfo, Tracking, WrenchFrame
-from ftdrive.live.stream import RECOVER_S, CompensatedStream, ProcessedStream
-from ftdrive.recording import Recorder, read_recording
+from ftdrive.live.stream import RECOVER_S, CompensatedStream
+from ftdrive.recording import Recorder, RecordingReader, read_recording
 from ftdrive.recording.foreign import tables_of
 from ftdrive.recording.recording import with_calibration
 from ftdrive.recording.table_pair import TablePair
@@ -44,6 +48,9 @@ from ftdrive.terminal.live_panels import plain as plain_lines
 from ftdrive.terminal.live_view import Summary, View
 from ftdrive.terminal.text import echo
 from ftdrivers.interfaces import Array
+
+if TYPE_CHECKING:
+    from ftdrive.planning.geometry.certify import Certifier
 
 # N and N·m, sensor axes, on the tool of an emulated cell.
 _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
@@ -62,6 +69,8 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 @FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
 @click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")
+@click.option("--allow-control", is_flag=True, help="With --view: the page may tare.")
+@view_options
 @JSON
 def live(
     source: Source,
@@ -72,6 +81,8 @@ def live(
     about: str,
     once: bool,
     plain: bool,
+    allow_control: bool,
+    view: ViewOptions,
     as_json: bool,
 ) -> None:
     """Show the raw and the compensated wrench, refreshed ten times a second.
@@ -85,6 +96,7 @@ def live(
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
     if replay is not None and source.tool:
         raise ConfigError("--tool does not go with --replay: leave one of the two out")
+    check_view(view, once=once, allow_control=allow_control)
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
@@ -100,14 +112,22 @@ def live(
             if source.simulate:
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
+        feed = Feed(stream, recorder, push)
+        if (page := stack.enter_context(view.page("ftdrive live"))) is not None:
+            from ftdrive.view.live_page import LivePage, drawing
+
+            cell = stream.cell if isinstance(stream, CompensatedStream) else _recorded_cell(replay or Path())
+            certifier = None if cell is None else _certifier(cell, stream.info.arm.model)
+            shown = LivePage(page, feed, checks, certifier, controls=allow_control)
+            stack.enter_context(drawing(shown.draw))
         if once or as_json or not sys.stdout.isatty():
-            _print(stream, once=once, as_json=as_json)
+            _print(feed, once=once, as_json=as_json)
         elif plain or not (messages.is_terminal and sys.stdin.isatty()):
-            _show_table(stream, checks)
+            _show_table(feed, checks)
         else:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(stream, recorder=recorder, push=push, checks=checks)
+            run_live(feed, checks)
 
 
 def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
@@ -129,40 +149,63 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
+def _recorded_cell(path: Path) -> CellConfig | None:
+    """Return the cell of a run or a recording, where its files describe it."""
+    try:
+        if path.is_dir() and path.suffix != ".partial":
+            recorded = Run(path).header()["config"]
+        else:
+            recorded = RecordingReader(path).header.configuration
+        return CellConfig(**{name: kind(**recorded[name]) for name, kind in SECTIONS.items()})
+    except (FtdriveError, KeyError, TypeError):  # such as a table of another program
+        return None
+
+
+def _certifier(cell: CellConfig, model: str) -> "Certifier | None":
+    """Describe arm and tool of a cell; None where it does not describe them."""
+    from ftdrive.planning.planner import certifier_for
+
+    try:
+        return certifier_for(cell, model)
+    except ConfigError as error:
+        messages.print(f" The page shows no arm: {error}")
+        return None
+
+
 def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Recorder:
     return Recorder([path], info, configuration)
 
 
-def _print(stream: ProcessedStream, *, once: bool = False, as_json: bool = False) -> None:
-    for view in _views(stream, raises=once):
+def _print(feed: Feed, *, once: bool = False, as_json: bool = False) -> None:
+    for view in _views(feed, raises=once):
         reading = _reading(view)
         if as_json:
             write_json(reading)
         elif once:
-            echo(_line(reading, stream.frame))
+            echo(_line(reading, feed.stream.frame))
         else:
             contact = "   contact" if reading["contact"] else ""
-            echo(f"{reading['t_s']:.1f} s   {_line(reading, stream.frame)}{contact}")
+            echo(f"{reading['t_s']:.1f} s   {_line(reading, feed.stream.frame)}{contact}")
         if once:
             break
 
 
-def _show_table(stream: ProcessedStream, checks: Sequence[Check]) -> None:
+def _show_table(feed: Feed, checks: Sequence[Check]) -> None:
     shown = Group()
     with (
         # Enter would break the screen
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),
         Live(console=answer, refresh_per_second=10) as screen,
     ):
-        for view in _views(stream, checks):
+        for view in _views(feed, checks):
             shown = Group(*(line.as_text() for line in plain_lines(view, answer.width)))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))
 
 
-def _views(stream: ProcessedStream, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
+def _views(feed: Feed, checks: Sequence[Check] = (), *, raises: bool = False) -> Iterator[View]:
     """Yield the state each `MEAN_S` from when the noise is known; raise a failure at once or when it lasts."""
-    feed = Feed(stream)
+    stream = feed.stream
     summary = Summary(feed, checks)
     begin_ns: int | None = None
     is_known, ended = False, False

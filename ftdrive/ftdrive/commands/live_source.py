@@ -6,7 +6,7 @@ from socket import gethostname
 
 from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
-from ftdrive.commands.common import Source, store_url
+from ftdrive.commands.common import Source, ViewOptions, store_url
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import Tracking, WrenchFrame
@@ -64,6 +64,15 @@ def build_stream(
         raise no_calibration()
     name = "temporary calibration" if source.path is None else str(source.path)
     return CompensatedStream(place, chosen, name=name, frame=frame, force=source.force)
+
+
+def check_view(view: ViewOptions, *, once: bool, allow_control: bool) -> None:
+    """Raise `ConfigError` for options of a page that would be ignored."""
+    wanted = view.view or view.address is not None
+    if once and wanted:
+        raise ConfigError("--view does not go with --once: leave one of the two out")
+    if allow_control and not wanted:
+        raise ConfigError("--allow-control goes only with --view: add it, or leave --allow-control out")
 
 
 def no_calibration() -> ConfigError:

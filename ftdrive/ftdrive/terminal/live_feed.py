@@ -1,11 +1,11 @@
-"""The thread that reads a stream for the live screen."""
+"""The thread that reads a stream for the live screen and the page in the browser."""
 
 import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from queue import SimpleQueue
@@ -30,8 +30,8 @@ _RETRY_S = 0.05
 _SEEK_S = 5.0
 # Cut-off of the low-pass that key 4 switches on.
 _LOWPASS_HZ = 40.0
-# A screen that does not draw for many seconds misses the oldest ones; a recording never does.
-_MOST_BLOCKS = 2000
+# A reader that takes nothing for many seconds misses the oldest ones; a recording never does.
+_MOST_BLOCKS, _MOST_NOTES = 2000, 200
 # Events whose time the plots show; contact has a colour, and a change of frame clears them.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
 _STYLES = {
@@ -61,8 +61,6 @@ class Feed:
 
     Attributes
     ----------
-    blocks, notes : deque
-        What is new; the screen takes it.
     status : StreamStatus
     sigma : array, shape (6,)
         Standard deviation of a mean over `MEAN_S`, under the present contact. Like the status it is at most 50 ms of
@@ -89,8 +87,6 @@ class Feed:
     ) -> None:
         self.stream = stream
         self.push = push
-        self.blocks: deque[Block] = deque(maxlen=_MOST_BLOCKS)
-        self.notes: deque[Note] = deque()
         self.status = stream.status()
         self.sigma = self.rest_sigma = self.sample_sigma = np.full(6, np.nan)
         self.reader = BlockReader(stream, math.inf)
@@ -98,6 +94,7 @@ class Feed:
         self.newest_ns: int | None = None
         self.recording_since_ns: int | None = None
         self.recorded: list[Path] = []
+        self._news: list[News] = []
         self._recorder = recorder
         self._sink: Sink | None = None
         self._status_ns = 0
@@ -115,13 +112,18 @@ class Feed:
         self._thread.join()
         self._stop_recording()
 
+    def subscribe(self) -> "News":
+        """Return the queues of one more reader; what is read from now on is in them."""
+        self._news.append(news := News())
+        return news
+
     def request(self, key: str, text: str = "") -> None:
-        """Let the reading thread do what a key stands for; the text is that of a mark."""
+        """Let the reading thread do what a key stands for; the text is its mark, time or speed."""
         self._requests.put((key, text))
 
     def note(self, text: str, style: str = "") -> None:
-        """Add a line to the events of the screen."""
-        self.notes.append(Note(self.newest_ns, text, style))
+        """Add a line to the events."""
+        self._add_note(Note(self.newest_ns, text, style))
 
     def step(self) -> None:
         """Do what was requested, read once, and take the events."""
@@ -137,14 +139,15 @@ class Feed:
                 # the screen has a place for it
                 continue
             text = f'mark "{event.text}"' if event.kind == "mark" else event.text
-            self.notes.append(Note(event.t_host_ns, text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
+            self._add_note(Note(event.t_host_ns, text, _STYLES.get(event.kind, ""), event.kind in _MARKS))
 
     def take(self, block: Block) -> None:
         """Hand samples on, if there are any."""
         if not len(block):
             return
         self.newest_ns = int(block.t_host_ns[-1])
-        self.blocks.append(block)
+        for news in self._news:
+            news.blocks.append(block)
         self._record(block)
         if abs(self.newest_ns - self._status_ns) > _STATUS_NS:
             self._status_ns = self.newest_ns
@@ -153,6 +156,10 @@ class Feed:
             self.sigma = self.stream.sigma_of_mean(R_base_flange, MEAN_S)
             self.rest_sigma = self.stream.sigma_of_mean(R_base_flange, MEAN_S, loaded=False)
             self.sample_sigma = self.stream.sigma_of_mean(R_base_flange, loaded=False)
+
+    def _add_note(self, note: "Note") -> None:
+        for news in self._news:
+            news.notes.append(note)
 
     def _switch_recording(self) -> None:
         """Start a recording, or complete the one that runs."""
@@ -238,10 +245,14 @@ class Feed:
             highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
             stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
         elif isinstance(stream, ReplayedStream):
-            self._press_of_replay(stream, key)
+            self._press_of_replay(stream, key, text)
 
-    def _press_of_replay(self, stream: ReplayedStream, key: str) -> None:
-        if key == "space":
+    def _press_of_replay(self, stream: ReplayedStream, key: str, text: str) -> None:
+        if key == "seek":
+            stream.seek(float(text))
+        elif key == "speed":
+            stream.speed = float(text)
+        elif key == "space":
             (stream.resume if stream.is_paused else stream.pause)()
         elif key == "left":
             stream.seek(stream.at_s - _SEEK_S)
@@ -282,3 +293,16 @@ class Note:
     """Whether the plots show its time."""
     times: int = 1
     """How often it came in a row."""
+
+    @property
+    def words(self) -> str:
+        """The text, with how often it came."""
+        return self.text if self.times == 1 else f"{self.text} ({self.times} times)"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class News:
+    """What one reader of a `Feed` has not taken yet."""
+
+    blocks: deque[Block] = field(default_factory=lambda: deque(maxlen=_MOST_BLOCKS))
+    notes: deque[Note] = field(default_factory=lambda: deque(maxlen=_MOST_NOTES))

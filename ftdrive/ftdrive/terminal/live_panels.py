@@ -82,8 +82,7 @@ def provenance(view: View, width: int) -> Line:
     for number, (name, is_on) in enumerate(_stages(stages), 1):
         text = f"{number} {name}" if is_on else f"{number} {name}(off)"
         chain.append(Part(text, "" if is_on else FAINT, str(number)))
-    what = "contact wrench" if stages.bias and stages.gravity else _uncompensated(stages)
-    right = Line(what, STRONG if stages.bias and stages.gravity else WARNING).add(", ")
+    right = Line(meaning(stages), STRONG if stages.bias and stages.gravity else WARNING).add(", ")
     right.add(frame.axes, STRONG, "x").add(" @ ").add(_point(frame), STRONG, "a").add(" ")
     room = width - right.width - 2 - sum(cell_len(part.text) for part in chain)
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
@@ -107,9 +106,10 @@ def _stages(stages: Stages) -> list[tuple[str, bool]]:
     return found
 
 
-def _uncompensated(stages: Stages) -> str:
+def meaning(stages: Stages) -> str:
+    """Return what the wrench is after these stages."""
     if stages.bias:
-        return "weight included"
+        return "contact wrench" if stages.gravity else "weight included"
     return "bias included" if stages.gravity else "as measured"
 
 
@@ -129,7 +129,7 @@ def state(view: View, width: int) -> Line:
     line.add(_age(view)).add(", ").add(*_verified(view))
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
-        line.add(f"  tare {_time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
+        line.add(f"  tare {time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
     elif status.tracked is None:
         line.add("  tare ").add("none", FAINT)
     if status.tracked is not None:
@@ -259,9 +259,7 @@ def _size(view: View, first: int, places: int) -> Line:
     line = Line("|T| " if first else "|F| ", STRONG)
     if reading is None or view.silent:
         return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT)
-    part, sigma = reading.wrench[first : first + 3], reading.sigma[first : first + 3]
-    size = float(np.linalg.norm(part))
-    along = float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
+    size, along = reading.size(first)
     line.add(f"{size:8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
     return line.add(f"{digits(along, places):>8}", FAINT).add(" " * 8).add(f"{peak:8.{places - 1}f}", "", "p")
 
@@ -532,9 +530,8 @@ def newest_rows(view: View, width: int) -> int:
 def _event(view: View, note: Note, width: int) -> list[Line]:
     head = Line(" ")
     if note.t_host_ns is not None:
-        head.add(f"{_time_of_day(view.info, note.t_host_ns)} ", FAINT)
-    text = note.text if note.times == 1 else f"{note.text} ({note.times} times)"
-    return _hanging(head, [Part(text, note.style)], width)
+        head.add(f"{time_of_day(view.info, note.t_host_ns)} ", FAINT)
+    return _hanging(head, [Part(note.words, note.style)], width)
 
 
 def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
@@ -578,7 +575,8 @@ def _named(info: DeviceInfo) -> str:
     return info.model if info.serial == NOT_REPORTED else f"{info.model} {info.serial}"
 
 
-def _time_of_day(info: StreamInfo, t_host_ns: int) -> str:
+def time_of_day(info: StreamInfo, t_host_ns: int) -> str:
+    """Return a time of the stream as that of a clock on the wall."""
     return datetime.fromtimestamp((t_host_ns + info.utc_offset_ns) * 1e-9, UTC).astimezone().strftime("%H:%M:%S")
 
 

@@ -4,7 +4,7 @@
 and only the lines that changed are sent to the terminal.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import ClassVar
@@ -21,8 +21,6 @@ from textual.widgets import Input
 
 from ftdrive.checks.check import Check, check_calibration
 from ftdrive.checks.sensor import AXES
-from ftdrive.live.samples import Sink
-from ftdrive.live.stream import ProcessedStream
 from ftdrive.runs.verification import fitted_dataset
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
@@ -56,23 +54,13 @@ _HELP = """\
  Any key returns."""
 
 
-def run_live(
-    stream: ProcessedStream,
-    *,
-    recorder: Callable[[Path], Sink] | None = None,
-    push: Callable[[], object] | None = None,
-    checks: Sequence[Check] = (),
-) -> None:
+def run_live(feed: Feed, checks: Sequence[Check] = ()) -> None:
     """Show a stream until the user quits.
 
     Parameters
     ----------
-    stream : CompensatedStream or ReplayedStream
-        Open; it is read here, and closed by the caller.
-    recorder : callable, optional
-        Opens a recording in a new file; the key r starts and completes one.
-    push : callable, optional
-        Pushes the tool of an emulated cell, by the key f.
+    feed : Feed
+        Of an open stream, which is read here and closed by the caller.
     checks : sequence of Check
         Findings about the cell that the stream does not know, such as "robot.payload".
 
@@ -81,9 +69,8 @@ def run_live(
     DeviceError
         The stream had failed when the user quit.
     """
-    info = stream.info
+    info = feed.stream.info
     devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
-    feed = Feed(stream, recorder, push)
     dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
     app = LiveApp(feed, Summary(feed, [devices, *checks], dataset))
     feed.start()

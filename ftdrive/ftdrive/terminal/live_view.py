@@ -1,4 +1,4 @@
-"""The state that the live screen draws: means, peaks and the recent past of a stream, in memory of fixed size."""
+"""The state that screen and page draw: means, peaks and the recent past of a stream, in memory of fixed size."""
 
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -142,8 +142,18 @@ class ShownWrench:
     """Squared distance of the newest sample from a free tool."""
     in_contact: bool
     R_base_flange: Array
+    p_base_flange_m: Array
+    """(3,) NaN where unknown."""
+    q_rad: Array
+    """(6,) NaN where unknown."""
     frame: WrenchFrame
     stages: Stages
+
+    def size(self, first: int) -> tuple[float, float]:
+        """Return the size of the force (`first` 0) or the torque (3), and its sigma: that along its direction."""
+        part, sigma = self.wrench[first : first + 3], self.sigma[first : first + 3]
+        size = float(np.linalg.norm(part))
+        return size, float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
 
 
 @dataclass(slots=True, eq=False)
@@ -215,7 +225,7 @@ class Summary:
     def __init__(self, feed: Feed, checks: Sequence[Check] = (), dataset: CalibrationDataset | None = None) -> None:
         self.span_s = SPANS_S[1]
         self.is_frozen = False
-        self._feed = feed
+        self._feed, self._news = feed, feed.subscribe()
         self._checks = list(checks)
         self._dataset = dataset
         # Samples of the free tool, until its noise has been compared.
@@ -241,12 +251,12 @@ class Summary:
     def view(self) -> View:
         """Take what is new and return the state to draw."""
         feed, status = self._feed, self._feed.status
-        for note in _taken(feed.notes):
+        for note in _taken(self._news.notes):
             times = 1
             if self._notes and self._notes[0].text == note.text:
                 times += self._notes.popleft().times
             self._notes.appendleft(replace(note, times=times))
-        blocks = _taken(feed.blocks)
+        blocks = _taken(self._news.blocks)
         if not self.is_frozen:
             for _, alike in groupby(blocks, lambda block: (block.frame, block.stages)):
                 self._add(list(alike))
@@ -301,6 +311,8 @@ class Summary:
             chi2=float(newest.chi2[-1]),
             in_contact=bool(newest.in_contact[-1]),
             R_base_flange=newest.R_base_flange[-1],
+            p_base_flange_m=newest.p_base_flange_m[-1],
+            q_rad=newest.q_rad[-1],
             frame=newest.frame,
             stages=newest.stages,
         )

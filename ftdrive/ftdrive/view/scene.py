@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
@@ -92,21 +93,29 @@ class DrawnWrench:
     """Force and torque at a point as arrows, and the line of action of the force."""
 
     def __init__(self, scene: "SceneApi", m_per_N: float = 0.01, m_per_Nm: float = 0.1) -> None:
-        self._scene, self._scale = scene, (m_per_N, m_per_Nm)
+        nowhere = np.zeros((1, 2, 3))
+        self._scales = m_per_N, m_per_Nm
+        self._arrows: list[Any] = [
+            scene.add_arrows(f"/wrench/{name}", nowhere, colour, shaft_radius=0.008, head_radius=0.02, head_length=0.04)
+            for name, colour in (("force", BAD), ("torque", _TORQUE))
+        ]
+        self._line: Any = scene.add_line_segments("/wrench/line of action", nowhere, BAD, thickness=0.003)
+        self.hide()
 
     def show(self, p_base_m: Array, wrench_base: Array) -> None:
-        """Draw a wrench (6,) about a point (3,), N and N·m, base axes."""
-        for name, colour, vector, scale in (
-            ("force", BAD, wrench_base[:3], self._scale[0]),
-            ("torque", _TORQUE, wrench_base[3:], self._scale[1]),
-        ):
-            ends = np.array([[p_base_m, p_base_m + scale * vector]])
-            self._scene.add_arrows(
-                f"/wrench/{name}", ends, colour, shaft_radius=0.008, head_radius=0.02, head_length=0.04
-            )
-        self._scene.add_line_segments(
-            "/wrench/line of action", line_of_action(p_base_m, wrench_base), BAD, thickness=0.003
-        )
+        """Draw a wrench (6,) about a point (3,), N and N·m, base axes; a force or a torque of zero is not drawn."""
+        for arrow, vector, scale in zip(self._arrows, wrench_base.reshape(2, 3), self._scales, strict=True):
+            arrow.visible = bool(vector.any())
+            if arrow.visible:
+                arrow.points = np.array([[p_base_m, p_base_m + scale * vector]])
+        self._line.visible = self._arrows[0].visible
+        if self._line.visible:
+            self._line.points = line_of_action(p_base_m, wrench_base)
+
+    def hide(self) -> None:
+        """Draw nothing until it is shown again."""
+        for drawn in (*self._arrows, self._line):
+            drawn.visible = False
 
 
 def line_of_action(p_m: Array, wrench: Array, half_m: float = 0.5) -> Array:
@@ -151,6 +160,11 @@ def turned_up(axis: Array) -> Array:
     half = np.where(down, np.array([1.0, 0.0, 0.0]), half / np.where(down, 1.0, length))
     x, y, z = np.moveaxis(half, -1, 0)
     return np.stack([z, -y, x, np.zeros_like(x)], axis=-1)
+
+
+def turned(R: Array) -> Array:
+    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
+    return np.asarray(Rotation.from_matrix(R).as_quat(scalar_first=True))
 
 
 def _foot(plane: Plane) -> Array:

@@ -22,6 +22,7 @@ from ftdrive.live.processing import Processor
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Block, Stages, WrenchFrame
 from ftdrive.terminal import live_feed
+from ftdrive.terminal.live_feed import Feed
 from ftdrive.terminal.live_panels import plain
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
@@ -134,7 +135,7 @@ class Quiet:
 def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
     console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
     monkeypatch.setattr(live, "answer", console)
-    live._show_table(stream, [Check("robot.payload", "ok", "robot 1.44 kg")])
+    live._show_table(Feed(stream), [Check("robot.payload", "ok", "robot 1.44 kg")])
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
@@ -173,7 +174,7 @@ class Interrupted:
 
 def test_a_silent_device_is_shown_and_no_old_number() -> None:
     stream: Any = Interrupted(2)
-    views = list(islice(live._views(stream), 12))
+    views = list(islice(live._views(Feed(stream)), 12))
     readings = [live._reading(view) for view in views]
     stale = [reading for reading in readings if reading["stale"]]
     assert len(stale) == 2
@@ -194,7 +195,7 @@ def test_a_failure_that_lasts_ends_the_command(monkeypatch: pytest.MonkeyPatch) 
     for failures, raises in ((1000, False), (1, True)):
         stream: Any = Interrupted(failures)
         with pytest.raises(DeviceTimeout):
-            list(live._views(stream, raises=raises))
+            list(live._views(Feed(stream), raises=raises))
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:

@@ -36,6 +36,7 @@ class Tape:
 def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
     tape = Tape()
     feed = Feed(FakeStream(), lambda path: tape if path.name == "live-2026-11-16T150000Z.mcap" else Tape(0))
+    news = feed.subscribe()
     feed.step()
     feed.request("r")
     feed.step()
@@ -44,7 +45,7 @@ def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
     assert feed.recording_since_ns is not None
     feed.request("r")
     feed.step()
-    assert feed.notes[0].text.endswith("live-2026-11-16T150000Z.mcap")
+    assert news.notes[0].text.endswith("live-2026-11-16T150000Z.mcap")
     assert (len(tape.blocks), [event.kind for event in tape.events], tape.closed) == (2, ["mark"], 1)
     assert feed.recording_since_ns is None
 
@@ -52,20 +53,22 @@ def test_a_recording_has_all_blocks_and_events_from_key_to_key() -> None:
 def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
     tape = Tape(full_after=2)
     feed = Feed(FakeStream(), lambda _: tape)
+    news = feed.subscribe()
     feed.request("r")
     for _ in range(5):
         feed.step()
-    assert len(feed.blocks) == 5
+    assert len(news.blocks) == 5
     assert tape.closed == 1
     assert feed.recording_since_ns is None
-    assert "recording ended: [Errno 28] No space left on device" in [note.text for note in feed.notes]
+    assert "recording ended: [Errno 28] No space left on device" in [note.text for note in news.notes]
 
 
 def test_without_a_recorder_the_key_says_what_to_do() -> None:
     feed = Feed(FakeStream())
+    news = feed.subscribe()
     feed.request("r")
     feed.step()
-    assert "ftdrive record" in feed.notes[-1].text
+    assert "ftdrive record" in news.notes[-1].text
 
 
 def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:
@@ -74,15 +77,17 @@ def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:
             raise ConfigError("a torque about the tcp needs [sensor] height_mm")
 
     feed = Feed(Refusing())
+    news = feed.subscribe()
     feed.request("t")
     feed.step()
-    assert feed.notes[0].text == "a torque about the tcp needs [sensor] height_mm"
-    assert len(feed.blocks) == 1
+    assert news.notes[0].text == "a torque about the tcp needs [sensor] height_mm"
+    assert len(news.blocks) == 1
 
 
 def test_a_failure_lasts_until_samples_arrive() -> None:
     stream = FakeStream(silent_after=3)
     feed = Feed(stream)
+    news = feed.subscribe()
     for _ in range(4):
         feed.step()
     assert isinstance(feed.reader.failure, DeviceTimeout)
@@ -90,7 +95,7 @@ def test_a_failure_lasts_until_samples_arrive() -> None:
     stream.wake()
     feed.step()
     assert feed.reader.failure is None
-    assert len(feed.blocks) == 4
+    assert len(news.blocks) == 4
 
 
 def test_the_thread_reads_until_it_is_stopped_and_completes_the_recording() -> None:
@@ -126,6 +131,7 @@ def test_what_ends_the_thread_is_kept() -> None:
 def test_a_screen_that_does_not_draw_costs_no_more_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ftdrive.terminal.live_feed._MOST_BLOCKS", 20)
     feed = Feed(FakeStream())
+    news = feed.subscribe()
     for _ in range(30):
         feed.step()
-    assert len(feed.blocks) == 20
+    assert len(news.blocks) == 20

@@ -304,7 +304,7 @@ def no_app(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_app")
 def test_a_stream_that_has_failed_is_the_end_of_the_command() -> None:
     with pytest.raises(DeviceTimeout, match="sent no sample"):
-        run_live(FakeStream(silent_after=3))
+        run_live(Feed(FakeStream(silent_after=3)))
 
 
 def test_recordings_are_named_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -318,7 +318,7 @@ def test_recordings_are_named_at_the_end(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(LiveApp, "draw", lambda _: None)
     tape = MagicMock()
     with messages.capture() as said:
-        run_live(FakeStream(), recorder=lambda _: tape)
+        run_live(Feed(FakeStream(), lambda _: tape))
     assert f"Recorded: {tmp_path}/live-" in said.get().replace("\n", "")
     tape.close.assert_called_once()
 
@@ -330,7 +330,7 @@ def test_an_error_of_the_reading_thread_is_raised() -> None:
             raise ConfigError("another device answers: start again")
 
     with pytest.raises(ConfigError, match="another device"):
-        run_live(Other())
+        run_live(Feed(Other()))
 
 
 def styles(screen: Screen) -> set[Any]:
