@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, write_json
+from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, ViewOptions, view_options, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 @click.option("--count", "part_kg", type=Number(0, min_open=True), metavar="KG", help="Mass of one part: count parts.")
 @click.option("--once", is_flag=True, help="Print one weight, then end; with --zero wait for a part.")
 @click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
+@click.option("--allow-control", is_flag=True, help="With --view: the page may tare the empty gripper.")
+@view_options
 @JSON
 def weigh(
     source: Source,
@@ -36,6 +38,8 @@ def weigh(
     part_kg: float | None,
     once: bool,
     output: Path | None,
+    allow_control: bool,
+    view: ViewOptions,
     as_json: bool,
 ) -> None:
     """Weigh what the gripper holds beyond its calibrated tool, in half a second at rest.
@@ -45,7 +49,7 @@ def weigh(
     --moving, the load is weighed while the arm carries it, and has its whole centre of mass. The arm is only read,
     never moved. Ctrl-C ends.
     """
-    from ftdrive.commands.live_source import open_log, open_source
+    from ftdrive.commands.live_source import check_view, open_log, open_source
     from ftdrive.live.processing import SENSOR_FRAME
     from ftdrive.live.weighing import Weighing
     from ftdrive.recording import Recorder
@@ -53,6 +57,7 @@ def weigh(
 
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
+    check_view(view, once=once, allow_control=allow_control)
     with ExitStack() as stack:
         stream = open_source(source, SENSOR_FRAME, stack, "show" if moving else "off")
         recorder = None
@@ -68,6 +73,11 @@ def weigh(
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
+        if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
+            from ftdrive.view.live_page import drawing
+            from ftdrive.view.weigh_page import WeighPage
+
+            stack.enter_context(drawing(WeighPage(page, weighing, controls=allow_control).draw))
         if on_screen:
             from ftdrive.terminal.weigh_screen import run_weigh
 

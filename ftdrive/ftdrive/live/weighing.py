@@ -16,7 +16,7 @@ from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_stationary, mean
 from ftcalib.errors import AcceptanceError
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
-from ftcalib.rounding import counted, with_sigma
+from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.live.noise import unexplained_variance
 from ftdrive.live.replay import ReplayedStream
@@ -333,6 +333,11 @@ class ScaleState:
     count: int | None = None
     stale: str = ""
 
+    @property
+    def measured(self) -> Weight | None:
+        """The weight that is a mass to show: what cannot be counted has one too."""
+        return self.weight if self.refusal in {None, "count"} else None
+
 
 class Weighing:
     """Reads a stream, records it, and weighs ten times a second.
@@ -349,7 +354,18 @@ class Weighing:
         Mass of one part.
     log : WeighingLog, optional
         Keeps each new weight or fault.
+
+    Attributes
+    ----------
+    shown : ScaleState
+        The present state.
+    note : str
+        What has become of the last requested zero.
     """
+
+    shown = ScaleState(None, "samples")
+    note = ""
+    _zero_requested = False
 
     def __init__(
         self,
@@ -383,6 +399,22 @@ class Weighing:
                 self._last = None
                 return
 
+    def request_zero(self) -> None:
+        """Let the thread that takes the states tare the empty gripper."""
+        self.note = "zero: waits for half a second at rest …"
+        self._zero_requested = True
+
+    def _zero_as_requested(self) -> None:
+        self._zero_requested = False
+        # the number of before would look live
+        self.shown = ScaleState(None, "samples")
+        try:
+            self.zero()
+        except NotAccepted as error:
+            self.note = str(error)
+        else:
+            self.note = "zero: the empty gripper was tared"
+
     def _read_for(self, seconds: float) -> None:
         end_s = self.stream.clock.now_s() + seconds
         while self.stream.clock.now_s() < end_s:
@@ -397,8 +429,16 @@ class Weighing:
     def states(self, *, raises: bool = False) -> Iterator[tuple[ScaleState, bool]]:
         """Yield the state ten times a second, and whether it is a new weight or fault.
 
-        Raises `DeviceError` if a device has failed for some seconds, or at once with `raises`.
+        Between two of them a requested zero is done. Raises `DeviceError` if a device has failed for some seconds, or
+        at once with `raises`.
         """
+        for shown, is_new in self._states(raises=raises):
+            self.shown = shown
+            yield shown, is_new
+            if self._zero_requested:
+                self._zero_as_requested()
+
+    def _states(self, *, raises: bool) -> Iterator[tuple[ScaleState, bool]]:
         clock, reader = self.stream.clock, BlockReader(self.stream, 0.0 if raises else RECOVER_S)
         fault_since_s = 0.0
         fault: str | None = None
@@ -458,6 +498,12 @@ class Weighing:
         if self._log is not None and code not in (*FAULTS, "count"):
             self._log.refused(code)
         return CannotWeigh(code, shown.weight)
+
+
+def worth_of(weight: Weight) -> str:
+    """Return the sigma and the smallest mass of a weight as words."""
+    sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
+    return f"sigma {sigma_g} g, smallest mass {least_g} g"
 
 
 def line_of(shown: ScaleState) -> str:

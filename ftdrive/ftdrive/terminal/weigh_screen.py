@@ -8,8 +8,7 @@ from textual.widgets import Digits, Static
 
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
-from ftdrive.errors import NotAccepted
-from ftdrive.live.weighing import ScaleState, Weighing, line_of
+from ftdrive.live.weighing import Weighing, line_of, worth_of
 from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
 
 # With a larger smallest mass the drift since the calibration decides, and a zero helps.
@@ -22,32 +21,16 @@ class _Reader(threading.Thread):
     def __init__(self, weighing: Weighing) -> None:
         super().__init__(daemon=True)
         self._weighing = weighing
-        self.shown = ScaleState(None, "samples")
-        self.note = ""
         self.failure: BaseException | None = None
-        self.zero_requested = False
         self.ends = False
 
     def run(self) -> None:
         try:
-            for shown, _ in self._weighing.states():
-                self.shown = shown
+            for _ in self._weighing.states():
                 if self.ends:
                     return
-                if self.zero_requested:
-                    self.zero_requested = False
-                    # the number of before would look live
-                    self.shown = ScaleState(None, "samples")
-                    self.note = self._zero()
         except BaseException as error:  # the main thread raises it
             self.failure = error
-
-    def _zero(self) -> str:
-        try:
-            self._weighing.zero()
-        except NotAccepted as error:
-            return str(error)
-        return "zero: the empty gripper was tared"
 
 
 class WeighApp(ClosableApp):
@@ -96,21 +79,19 @@ class WeighApp(ClosableApp):
         if self.reader.failure is not None:
             self.exit()
             return
-        shown = self.reader.shown
-        # what cannot be counted has a mass
-        weight = shown.weight if shown.refusal in {None, "count"} else None
+        shown = self._weighing.shown
+        weight = shown.measured
         self.query_one("#mass", Digits).update(
             "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
         )
         self.query_one("#sigma", Static).update("" if weight is None else self._sigma_line(weight, shown.count))
         self.query_one("#line", Static).update(line_of(shown))
-        self.query_one("#note", Static).update(self.reader.note)
+        self.query_one("#note", Static).update(self._weighing.note)
 
     def action_zero(self) -> None:
         """Tare the empty gripper."""
         if not self._weighing.moving:
-            self.reader.note = "zero: waits for half a second at rest …"
-            self.reader.zero_requested = True
+            self._weighing.request_zero()
 
     def action_poses(self) -> None:
         """Join the poses of one load from now on, or stop that."""
@@ -118,9 +99,8 @@ class WeighApp(ClosableApp):
             self._weighing.joins = not self._weighing.joins
 
     def _sigma_line(self, weight: Weight, count: int | None) -> str:
-        sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
         parts = "" if count is None else f"{counted(count, 'part')}   "
-        words = f"{parts}sigma {sigma_g} g, smallest mass {least_g} g"
+        words = f"{parts}{worth_of(weight)}"
         if self._weighing.moving:
             return words
         if self._weighing.joins:

@@ -225,20 +225,20 @@ def head(view: View) -> str:
     else:
         stages = stages_in_words(reading.stages)
         parts.append(f"{meaning(reading.stages)}, {escape(str(reading.frame))}. Stages: {escape(stages)}.")
-    return _lines(parts, _SMALL)
+    return lines(parts)
 
 
 def numbers(view: View) -> str:
     """Show force and torque with their sigmas, and contact; HTML."""
     reading = view.reading
     if reading is None or view.silent:
-        return _lines(["-- N"], _LARGE) + _lines(["-- N·m"], _MIDDLE)
+        return lines(["-- N"], _LARGE) + lines(["-- N·m"], _MIDDLE)
     force, torque = (number(reading, first) for first in (0, 3))
     state = f'<span style="color: {_ORANGE}">contact, {view.contact_s:.1f} s</span>' if reading.in_contact else "free"
     line = str(line_of_force(reading))
     found = ((force, _LARGE), (torque, _MIDDLE))
-    shown = "".join(_lines([size], px) + _lines([rest], _SMALL) for (size, rest), px in found)
-    return shown + _lines([state, escape(line)], "14px")
+    shown = "".join(lines([size], px) + lines([rest]) for (size, rest), px in found)
+    return shown + lines([state, escape(line)], "14px")
 
 
 def number(reading: ShownWrench, first: int) -> tuple[str, str]:
@@ -255,14 +255,15 @@ def number(reading: ShownWrench, first: int) -> tuple[str, str]:
 
 def events(view: View) -> str:
     """List the newest events first; HTML."""
-    lines = []
+    found = []
     for note, _ in zip(view.notes, range(_EVENTS), strict=False):
         at = "" if note.t_host_ns is None else f"{time_of_day(view.info, note.t_host_ns)} "
-        lines.append(f"{at}{escape(note.words)}")
-    return _lines(lines, _SMALL)
+        found.append(f"{at}{escape(note.words)}")
+    return lines(found)
 
 
-def _lines(texts: Sequence[str], size: str) -> str:
+def lines(texts: Sequence[str], size: str = _SMALL) -> str:
+    """Return texts below each other; HTML."""
     inside = "".join(f"<div>{text}</div>" for text in texts if text)
     return f'<div style="font-size: {size}; padding: 0 8px; overflow-wrap: anywhere">{inside}</div>'
 

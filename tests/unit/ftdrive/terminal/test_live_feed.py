@@ -135,3 +135,14 @@ def test_a_screen_that_does_not_draw_costs_no_more_memory(monkeypatch: pytest.Mo
     for _ in range(30):
         feed.step()
     assert len(news.blocks) == 20
+
+
+def test_each_reader_gets_every_block_and_note() -> None:
+    feed = Feed(FakeStream())
+    screen, page = feed.subscribe(), feed.subscribe()
+    for _ in range(3):
+        feed.step()
+        page.blocks.clear()
+    feed.note("pushed")
+    assert len(screen.blocks) == 3
+    assert [note.text for note in screen.notes] == [note.text for note in page.notes] == ["pushed"]

@@ -13,7 +13,7 @@ from textual.widgets import Digits, Static
 
 from ftcalib.after.weighing import Weight
 from ftdrive.errors import NotAccepted
-from ftdrive.live.weighing import WORDS, ScaleState, line_of
+from ftdrive.live.weighing import WORDS, ScaleState, Weighing, line_of
 from ftdrive.terminal.weigh_screen import WeighApp, run_weigh
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.terminal.fake_stream import INFO
@@ -34,20 +34,21 @@ PART = Weight(
 NOTHING = replace(PART, mass_kg=-0.00021, mass_sigma_kg=0.1, least_kg=0.4)
 
 
-class FakeWeighing:
+class FakeWeighing(Weighing):
     """A scale that stays in the state it is given."""
 
     def __init__(self, shown: ScaleState, *, moving: bool = False, fails: Exception | None = None) -> None:
-        self.stream = SimpleNamespace(info=replace(INFO, emulated=True))
-        self.shown, self.moving, self.joins, self.fails = shown, moving, False, fails
+        self.stream = cast("Any", SimpleNamespace(info=replace(INFO, emulated=True)))
+        self.given, self.moving, self.joins, self.fails = shown, moving, False, fails
         self.zeros = 0
         self.refuses = False
         self.in_zero, self.may_zero = threading.Event(), threading.Event()
         self.ends = threading.Event()
 
-    def states(self) -> Iterator[tuple[ScaleState, bool]]:
+    def _states(self, *, raises: bool) -> Iterator[tuple[ScaleState, bool]]:
+        assert not raises
         while not self.ends.wait(0.001):
-            yield self.shown, False
+            yield self.given, False
             if self.fails is not None:
                 raise self.fails
 
@@ -71,14 +72,14 @@ class Scale:
         async with self.app.run_test(size=(90, 20)) as pilot:
             for key in keys:
                 await pilot.press(key)
-                if self.app.reader.zero_requested or self.weighing.in_zero.is_set():
+                if self.weighing._zero_requested or self.weighing.in_zero.is_set():
                     assert self.weighing.in_zero.wait(10)
                     self._read()
                     self.during_zero = self.mass
                     self.weighing.may_zero.set()
-                    while not self.app.reader.note.startswith(("zero: the", "no zero")):
+                    while not self.weighing.note.startswith(("zero: the", "no zero")):
                         await pilot.pause(0.001)
-            while self.app.reader.shown != self.weighing.shown:
+            while self.weighing.shown != self.weighing.given:
                 await pilot.pause(0.001)
             self._read()
             self.weighing.ends.set()
