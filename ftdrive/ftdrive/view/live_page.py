@@ -31,6 +31,8 @@ _COLUMNS, _PLOT_PX = 256, 110
 _EVENTS: Final = 12
 # An arrow that noise alone explains is not drawn.
 _SIGNIFICANT: Final = 4.0
+# An arm that moves less is not drawn again.
+_STILL_RAD: Final = 1e-4
 _SPEEDS: Final = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 # Sizes of letters: a force of six digits fits a phone in the large one, a torque in the one below.
 _LARGE, _MIDDLE, _SMALL = "26px", "19px", "13px"
@@ -78,7 +80,7 @@ class LivePage:
 
     def _scene(self) -> None:
         scene, certifier = self._page.scene, self._certifier
-        self._arm = None
+        self._arm, self._q_rad = None, np.full(6, np.inf)
         if certifier is None:
             scene.add_frame("/base", axes_length=0.2, axes_radius=0.004)
             self._page.look(np.array([0.0, 0.0, 0.3]), np.array([1.5, 1.5, 1.2]))
@@ -113,7 +115,7 @@ class LivePage:
         series = [{"width": 1, "stroke": stroke, "points": {"show": False}} for stroke in _STROKES]
         gui: Any = self._page.gui
         return gui.add_uplot(
-            data=tuple(np.zeros((7, 2))),
+            data=(np.array([-1.0, 0.0]), *np.zeros((6, 2))),
             series=({}, *series),
             bands=tuple({"series": pair, "fill": fill} for pair, fill in _BANDS),
             scales=_scales(1.0),
@@ -149,7 +151,10 @@ class LivePage:
             return
         p_base_flange_m = reading.p_base_flange_m
         if self._arm is not None and self._certifier is not None and np.isfinite(reading.q_rad).all():
-            self._arm.show(reading.q_rad)
+            # half of the time of a drawing
+            if np.abs(reading.q_rad - self._q_rad).max() > _STILL_RAD:
+                self._arm.show(reading.q_rad)
+                self._q_rad = reading.q_rad
             if not np.isfinite(p_base_flange_m).all():
                 p_base_flange_m = forward(self._certifier.arm.kinematics, reading.q_rad).p_m
         p_base_flange_m = np.nan_to_num(p_base_flange_m)
