@@ -74,7 +74,6 @@ class LivePage:
         self._replay_controls()
         span = gui.add_dropdown("span of the plots", [f"{span_s} s" for span_s in SPANS_S], initial_value="10 s")
         span.on_update(lambda _: setattr(self._summary, "span_s", int(span.value.split()[0])))
-        self._full = [0.0, 0.0]
         self._plots = [self._add_plot(i) for i in range(6)]
         with gui.add_folder("events"):
             self._events = gui.add_html("")
@@ -89,6 +88,7 @@ class LivePage:
             draw_surroundings(scene, certifier.scene, size_of(certifier))
             self._arm = DrawnArm(scene, certifier.arm)
             self._arm.hide()
+            self._arm.reveal()
             self._page.look(np.array([0.0, 0.0, 0.4]), size_of(certifier) * np.array([0.5, 0.5, 0.5]))
         self._flange = scene.add_frame("/flange", axes_length=0.1, axes_radius=0.003)
         self._wrench = DrawnWrench(scene)
@@ -119,7 +119,7 @@ class LivePage:
             data=(np.array([-1.0, 0.0]), *np.zeros((6, 2))),
             series=({}, *series),
             bands=tuple({"series": pair, "fill": fill} for pair, fill in _BANDS),
-            scales=_scales(1.0),
+            scales=_scales(1.0, 1.0),
             axes=({"size": 26, "space": 40}, {"size": 46, "space": 18}),
             title=f"{AXES[i]}, {'N' if i < 3 else 'N·m'}",
             legend={"show": False},
@@ -165,13 +165,14 @@ class LivePage:
 
     def _draw_plots(self, view: View, reading: ShownWrench) -> None:
         columns = view.columns(_COLUMNS)
-        full = [full_scale(columns, reading, first) for first in (0, 3)]
+        fulls = [full_scale(columns, reading, first) for first in (0, 3)]
         with self._page.at_once():
             for i, plot in enumerate(self._plots):
-                if full[i // 3] != self._full[i // 3]:
-                    plot.scales = _scales(full[i // 3])
-                plot.data = plot_data(columns, i, full[i // 3], float(reading.sample_sigma[i]))
-        self._full = full
+                full = fulls[i // 3]
+                # else a browser makes the plot again, and a zoom is lost
+                if plot.scales != (scales := _scales(columns.span_s, full)):
+                    plot.scales = scales
+                plot.data = plot_data(columns, i, full, float(reading.sample_sigma[i]))
 
 
 # Smallest and largest value, ± sigma, contact and the lower edge.
@@ -183,8 +184,8 @@ _BANDS: Final = (
 )
 
 
-def _scales(full: float) -> dict[str, Any]:
-    return {"x": {"time": False}, "y": {"range": (-full, full)}}
+def _scales(span_s: float, full: float) -> dict[str, Any]:
+    return {"x": {"time": False, "range": (-span_s, 0.0)}, "y": {"range": (-full, full)}}
 
 
 def plot_data(columns: PlotColumns, i: int, full: float, sigma: float) -> tuple[Array, ...]:
@@ -250,13 +251,13 @@ def numbers(view: View) -> str:
 def number(reading: ShownWrench, first: int) -> tuple[str, str]:
     """Return the size of the force (`first` 0) or the torque (3), and its sigma without contact, as words.
 
-    Such as "98.0 ± 2.1 N" and "0.05 N at rest".
+    Such as "98.0 ± 2.1 N" and "sigma 0.050 N at rest".
     """
     (size, sigma), unit = reading.size(first), "N·m" if first else "N"
     if not np.isfinite(sigma):
         return f"{size:.2f} {unit}", "the noise is not known yet"
     rest = float(reading.rest_sigma[first : first + 3].max())
-    return f"{with_sigma(size, sigma)} {unit}", f"{to_place_of(rest, rest)} {unit} at rest"
+    return f"{with_sigma(size, sigma)} {unit}", f"sigma {to_place_of(rest, rest)} {unit} at rest"
 
 
 def events(view: View) -> str:

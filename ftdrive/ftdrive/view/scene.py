@@ -64,6 +64,12 @@ class DrawnArm:
         for mesh in self._meshes:
             mesh.visible = False
 
+    def reveal(self) -> None:
+        """Draw the tool transparent, so that a wrench inside it is seen."""
+        for mesh, colour in zip(self._meshes, self._colours, strict=True):
+            if colour == TOOL:
+                mesh.opacity = 0.45
+
     def accuse(self, names: Collection[str]) -> None:
         """Draw these bodies red, the others as they are."""
         for mesh, name, colour in zip(self._meshes, self._arm.names, self._colours, strict=True):

@@ -78,8 +78,8 @@ def test_numbers_end_where_their_sigmas_do() -> None:
     rest = np.array([0.05, 0.04, 0.03, 0.002, 0.002, 0.001])
     wrench = np.array([0.0, 98.04, 0.0, 0.0, 0.0, 1.234])
     reading = replace(reading, wrench=wrench, sigma=sigma, rest_sigma=rest)
-    assert number(reading, 0) == ("98.0 ± 2.1 N", "0.050 N at rest")
-    assert number(reading, 3) == ("1.234 ± 0.030 N·m", "0.0020 N·m at rest")
+    assert number(reading, 0) == ("98.0 ± 2.1 N", "sigma 0.050 N at rest")
+    assert number(reading, 3) == ("1.234 ± 0.030 N·m", "sigma 0.0020 N·m at rest")
     unknown = replace(reading, sigma=np.full(6, np.nan))
     assert number(unknown, 0) == ("98.04 N", "the noise is not known yet")
     assert [is_significant(one, 0) for one in (reading, unknown, replace(reading, wrench=wrench / 100))] == [1, 0, 0]
