@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 PUSH = {"do": "push", "wrench": [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]}
-# Software draws a small page several times a second.
-SMALL = {"width": 390, "height": 320}
 
 
 def force_N(page: "Page") -> float:
@@ -36,7 +34,8 @@ def test_a_push_is_seen_and_viewers_change_nothing(
             command = ftdrive.start("live", *options, "--json", "--view", stdout=out)
             url = address_of(command)
             page = open_page(url)
-            page.set_viewport_size(SMALL)
+            # software draws a small page several times a second
+            page.set_viewport_size({"width": 390, "height": 320})
             page.get_by_text("free", exact=True).wait_for()
             assert force_N(page) < 2
             station.control(**PUSH)
