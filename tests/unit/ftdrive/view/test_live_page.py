@@ -2,18 +2,22 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.commands.common import ViewOptions
+from ftdrive.commands.live import _certifier, _recorded_cell
 from ftdrive.commands.live_source import check_view
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import FrameTransform, WrenchFrame
 from ftdrive.live.weighing import WORDS, ScaleState
+from ftdrive.recording import Recorder
 from ftdrive.terminal.live_feed import Feed
 from ftdrive.view.live_page import LivePage, events, head, in_base, is_significant, number, numbers, plot_data
 from ftdrive.view.scene import turned
@@ -209,3 +213,20 @@ def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
         for press in buttons(page).values():
             press(None)
         assert weighing.request_zero.called == (controls and not moving)
+
+
+def test_a_recording_brings_its_arm_and_tool(tmp_path: Path) -> None:
+    cell = CellConfig(
+        RobotConfig(host="10.0.0.2"), SensorConfig(url="x"), ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),))
+    )
+    recorder = Recorder([path := tmp_path / "peg.mcap"], INFO, cell.to_dict())
+    recorder.write(FakeStream().read())
+    recorder.close()
+    found = _recorded_cell(path)
+    assert found is not None
+    certifier = _certifier(found, INFO.arm.model)
+    assert certifier is not None
+    assert [part.to_m for part in certifier.arm.tool] == [0.2]
+    assert _certifier(replace(found, tool=ToolConfig()), INFO.arm.model) is None
+    (table := tmp_path / "table.csv").write_text("t,fx\n0,1\n")
+    assert _recorded_cell(table) is None
