@@ -1,5 +1,9 @@
-"""A real browser for the pages of --view: Chromium of the system, drawing by software."""
+"""A real browser for the pages of --view: Chromium of the system, drawing by software.
 
+With `PICTURES=docs/pictures` in the environment, the tests also draw the pictures of the documentation.
+"""
+
+import os
 import re
 import shutil
 import subprocess
@@ -81,6 +85,20 @@ def address_of(process: "subprocess.Popen[str]") -> str:
     found = re.search(r"http://\S+", said)
     assert found is not None, said
     return found[0]
+
+
+FOLDER = os.environ.get("PICTURES", "")
+"""Where pictures are drawn; empty: they are not."""
+
+
+def picture(page: "Page", name: str, after_s: float = 3.0) -> None:
+    """Save a picture for the documentation, if any are drawn."""
+    if not FOLDER:
+        return
+    page.set_viewport_size({"width": 1100, "height": 720})
+    page.add_style_tag(content=".mantine-Notification-root { display: none; }")  # that software draws
+    page.wait_for_timeout(1e3 * after_s)
+    page.screenshot(path=Path(FOLDER) / f"{name}.png")
 
 
 def nothing_is_cut(page: "Page") -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from tests.browser.conftest import address_of, nothing_is_cut
+from tests.browser.conftest import address_of, nothing_is_cut, picture
 from tests.system.command_line import CommandLine
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ def test_a_cell_is_described(ftdrive: CommandLine, open_page: "Callable[..., Pag
     enter(page, "Box 1", "400 400 0 800 800 300")
     page.get_by_text("ftdrive.toml can be written").wait_for()
     nothing_is_cut(page)
+    picture(page, "view-init")
     page.get_by_role("button", name="Write ftdrive.toml").click()
     assert command.wait(60) == 0
     answers = [HOST, "", "UR10e", SENSOR, "", "33,5", "", "", "0 33.5 80", "33 90 50 45 0", "", "", ""]

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ftdrive.cell.emulated import REAL_PACE, Station
-from tests.browser.conftest import address_of, nothing_is_cut
+from tests.browser.conftest import FOLDER, address_of, nothing_is_cut, picture
 from tests.system.command_line import CommandLine, end_of, say, wait_until
 
 if TYPE_CHECKING:
@@ -22,6 +22,9 @@ def test_a_viewer_stops_the_arm_in_mid_move(ftdrive: CommandLine, open_page: "Ca
         # The approach takes 12 s, the tour a minute.
         say(command, "yes\nyes\nyes\nMOVE\nyes\n")
         wait_until(lambda: bool(station.control(do="state")["moving"]), command)
+        if FOLDER:
+            ftdrive.wait_for_poses(command, 4)
+            picture(page, "view-session", after_s=1.5)
         stop.dispatch_event("click")
         code, printed = end_of(command)
         page.close()

@@ -44,7 +44,8 @@ class Page:
         """Place the camera of every browser, also of those that open the page later; (3,) each, base axes."""
         self._server.initial_camera.look_at, self._server.initial_camera.position = at_m, from_m
         for viewer in self._server.get_clients().values():
-            viewer.camera.look_at, viewer.camera.position = at_m, from_m
+            # A new position takes the point with it.
+            viewer.camera.position, viewer.camera.look_at = from_m, at_m
 
     @property
     def viewers(self) -> int:

@@ -92,7 +92,8 @@ def draw_surroundings(scene: "SceneApi", surroundings: Scene, size_m: float, bad
     for i, box in enumerate(surroundings.boxes, start=1):
         low, high = np.array(box.low_m), np.array(box.high_m)
         colour = BAD if f"box {i}" in bad else OBSTACLE
-        scene.add_box(f"/surroundings/box {i}", colour, high - low, opacity=0.6, position=(low + high) / 2)
+        # Not transparent: a transparent plane before it would hide it.
+        scene.add_box(f"/surroundings/box {i}", colour, high - low, position=(low + high) / 2)
 
 
 class DrawnWrench:

@@ -212,7 +212,7 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
 
 
 def test_an_emulated_run_goes_on_in_the_same_cell(cells: list[Any], stations: list[Any], tmp_path: Path) -> None:
-    station = {"sensor": "serial", "options": ["--seed", "7"], "truth": {}}
+    station = {"sensor": "serial", "options": ["--seed", "7"], "truth": {"sensor_error": [[0.01]]}}
     config = CellConfig(RobotConfig("127.0.0.1"), SensorConfig("ati-serial:///dev/pts/9")).to_dict()
     run = Run.create(tmp_path, "demo", {"station": station, "config": config})
     run.plan_path.touch()
