@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ftdrive.cell.emulated import Station
-from tests.browser.conftest import address_of, nothing_is_cut, picture
+from tests.browser.conftest import address_of, nothing_is_cut
 from tests.system.command_line import CommandLine, wait_until
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
@@ -40,7 +40,6 @@ def test_a_push_is_seen_and_viewers_change_nothing(
             station.control(**PUSH)
             page.get_by_text(re.compile(r"^contact, \d+\.\d s$")).wait_for()
             page.wait_for_function("/(^|\\n)[78]\\.\\d+ ± [\\d.]+ N/.test(document.body.innerText)")
-            picture(page, "view-live", after_s=20.0)
             station.control(do="push", wrench=[0.0] * 6)
             page.get_by_text("free", exact=True).wait_for()
             page.get_by_text(re.compile(r"contact 8\.\d N")).wait_for()
