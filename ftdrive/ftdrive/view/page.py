@@ -38,7 +38,8 @@ class Page:
 
     def at_once(self) -> AbstractContextManager[None]:
         """Let browsers show all changes of a `with` block together."""
-        return self._server.atomic()
+        changes: AbstractContextManager[None] = self._server.atomic()
+        return changes
 
     def look(self, at_m: Array, from_m: Array) -> None:
         """Place the camera of every browser, also of those that open the page later; (3,) each, base axes."""
@@ -56,9 +57,11 @@ class Page:
         """Add a Stop button; `stop` is called in another thread, with the name of the viewer who pressed it."""
         button = self.gui.add_button("Stop", color="red", hint="Stops the arm, as a key in the terminal does.")
 
-        @button.on_click
-        async def _(event: "GuiEvent[Any]") -> None:  # not in the pool of threads, which may be busy
+        # Not in the pool of threads, which may be busy.
+        async def pressed(event: "GuiEvent[Any]") -> None:
             stop(f"viewer {event.client_id}")
+
+        button.on_click(pressed)
 
 
 @contextmanager

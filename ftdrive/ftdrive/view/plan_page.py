@@ -45,10 +45,11 @@ class PlanPage:
         self._slider.on_update(lambda _: self.show())
         volumes = _swept(page, certifier, self._q[::3])
 
-        @swept.on_update
-        def _(_: object) -> None:
+        def show_swept(_: object) -> None:
             for volume in volumes:
                 volume.visible = swept.value
+
+        swept.on_update(show_swept)
 
         largest.on_click(lambda _: self._go_to(self._largest))
         self.show()
