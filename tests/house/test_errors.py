@@ -14,8 +14,8 @@ from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, U
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHONS_OWN = {name for name, kind in vars(builtins).items() if isinstance(kind, type) and issubclass(kind, Exception)}
-INSIDE = {"Tripped", "_OperatorStop", "_Turned", "_Interrupted", "_Moved"}
-"""The session catches these itself."""
+INSIDE = {"Tripped", "_OperatorStop", "_Turned", "_Interrupted", "_Moved", "_Back"}
+"""The session and `init` catch these themselves."""
 
 
 @pytest.mark.slow
