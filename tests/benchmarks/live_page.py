@@ -1,11 +1,12 @@
-"""What the page of `live --view` costs beside `live`, with one viewer.
+"""What the page of `live --view` costs beside `live`, with one viewer or more.
 
-    python -m tests.benchmarks.live_page [--seconds 60] [--sensor bota]
+    python -m tests.benchmarks.live_page [--seconds 60] [--sensor bota] [--viewers 5] [--suspended 1]
 
 Reads an emulated sensor with 1 kHz by `live --json`, first alone, then with --view and a viewer that takes all that the
 server sends and draws nothing, so that a browser on this computer does not take the time that is measured. Prints the
 share of a core, the resident memory after 10 s and at the end, how often a second the numbers were drawn, and the age
-of the samples. The last lines compare both with the targets.
+of the samples. The last lines compare both with the targets. A suspended viewer opens the page and reads nothing more,
+as a browser that sleeps.
 """
 
 import argparse
@@ -66,6 +67,7 @@ class Viewer:
     """Takes what a browser would take, and counts the drawings of the numbers."""
 
     url: str
+    suspended: bool = False
     drawn: int = 0
     received: int = 0
     ended: threading.Event = field(default_factory=threading.Event)
@@ -82,6 +84,8 @@ class Viewer:
         ) as socket:
             # a viewer counts from its first camera on
             socket.send(msgspec.msgpack.encode(_CAMERA))
+            if self.suspended:
+                self.ended.wait()
             while not self.ended.is_set():
                 try:
                     window = socket.recv()
@@ -125,25 +129,28 @@ def measure(process: "subprocess.Popen[str]", seconds: float, viewer: Viewer) ->
     )
 
 
-def run(folder: Path, station: Station, seconds: float, *, view: bool) -> Figures:
-    """Measure `live` with or without its page."""
+def run(folder: Path, station: Station, seconds: float, *, viewers: int = 0, suspended: int = 0) -> Figures:
+    """Measure `live` without viewers, or its page with some, of which the last ones are suspended."""
     command_line = CommandLine(folder)
     config = command_line.connect(station)
     # the computer's time, in which the age of a sample is measured
     command_line = CommandLine(folder)
     options = ("--config", config, "--calibration", folder / "calibration.json", "--force", "--json")
     try:
-        process = command_line.start("live", *options, *(["--view"] if view else []))
-        if not view:
+        process = command_line.start("live", *options, *(["--view"] if viewers else []))
+        if not viewers:
             return measure(process, seconds, Viewer(""))
         said = listen_for(process, "/?token=")
         assert process.stderr is not None
         while not said.endswith(("\n", " ")):
             said += process.stderr.read(1)
-        viewer = Viewer(re.findall(r"http://\S+", said)[0])
-        threading.Thread(target=viewer.run, daemon=True).start()
-        figures = measure(process, seconds, viewer)
-        viewer.ended.set()
+        url = re.findall(r"http://\S+", said)[0]
+        opened = [Viewer(url, suspended=i >= viewers - suspended) for i in range(viewers)]
+        for viewer in opened:
+            threading.Thread(target=viewer.run, daemon=True).start()
+        figures = measure(process, seconds, opened[0])
+        for viewer in opened:
+            viewer.ended.set()
         return figures
     finally:
         command_line.end()
@@ -153,6 +160,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--sensor", default="bota")
+    parser.add_argument("--viewers", type=int, default=1)
+    parser.add_argument("--suspended", type=int, default=0)
     options = parser.parse_args()
     with (
         tempfile.TemporaryDirectory(prefix="ftdrive-") as folder,
@@ -160,10 +169,12 @@ def main() -> None:
     ):
         calibrated_from(station.truth).save(Path(folder) / "calibration.json")
         found = []
-        for view in (False, True):
-            figures = run(Path(folder), station, options.seconds, view=view)
+        for viewers in (0, options.viewers):
+            figures = run(
+                Path(folder), station, options.seconds, viewers=viewers, suspended=min(viewers, options.suspended)
+            )
             show(
-                f"{'live --view' if view else 'live':12} {100 * figures.core:5.1f} % of a core, memory "
+                f"{'live --view' if viewers else 'live':12} {100 * figures.core:5.1f} % of a core, memory "
                 f"{figures.begin_MB:.0f} to {figures.end_MB:.0f} MB, drawn {figures.drawn_Hz:.1f} Hz, "
                 f"{figures.received_kB_s:.0f} kB/s, "
                 f"95 % of the samples younger than {figures.age_ms:.1f} ms"
