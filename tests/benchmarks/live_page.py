@@ -81,6 +81,7 @@ class Viewer:
             subprotocols=[Subprotocol(f"viser-v{viser_version}")],
             additional_headers={"Cookie": f"{cookie.name}={cookie.value}"},
             max_size=None,
+            ping_interval=None,
         ) as socket:
             # a viewer counts from its first camera on
             socket.send(msgspec.msgpack.encode(_CAMERA))
