@@ -210,6 +210,11 @@ class ViewOptions:
     view: bool
     address: str | None
 
+    @property
+    def wanted(self) -> bool:
+        """Whether there is one: an address implies it."""
+        return self.view or self.address is not None
+
     @contextmanager
     def page(self, title: str) -> Iterator["Page | None"]:
         """Serve a page while the block runs, and print its address; None where it is not wanted."""
@@ -218,7 +223,7 @@ class ViewOptions:
         address = None
         if self.address is not None:
             address = host_and_port("--view-address", self.address, "0.0.0.0:8080")
-        if not (self.view or address):
+        if not self.wanted:
             yield None
             return
         require_extra("viz", "--view", "viser", "segno")

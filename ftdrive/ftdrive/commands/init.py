@@ -87,7 +87,7 @@ def init(
     from ftdrive.errors import ConfigError
     from ftdrive.terminal.console import beside, messages
 
-    if yes and (view.view or view.address):
+    if yes and view.wanted:
         raise ConfigError("--yes and --view exclude one another: leave one of them out")
     check_simulate(simulate, real={"--robot": given["robot"]})
     in_force = {key: setting.value for key, setting in settings().items()}

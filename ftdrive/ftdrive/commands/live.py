@@ -14,7 +14,7 @@ from rich.console import Group
 from rich.live import Live
 
 from ftcalib.errors import FtdriveError
-from ftdrive.cell.config import SECTIONS, CellConfig
+from ftdrive.cell.config import CellConfig, read_recorded, recorded_cell
 from ftdrive.checks.arm import check_weighed_payload
 from ftdrive.checks.check import Check
 from ftdrive.commands.common import (
@@ -114,7 +114,8 @@ def live(
             recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         feed = Feed(stream, recorder, push)
         if (page := stack.enter_context(view.page("ftdrive live"))) is not None:
-            from ftdrive.view.live_page import LivePage, drawing
+            from ftdrive.view.live_page import LivePage
+            from ftdrive.view.page import drawing
 
             cell = stream.cell if isinstance(stream, CompensatedStream) else _recorded_cell(replay or Path())
             certifier = None if cell is None else _certifier(cell, stream.info.arm.model)
@@ -133,7 +134,7 @@ def live(
 def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:
     """Replay a run folder, a recording with its own calibration unless another one is given, or another program's."""
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
-    if path.is_dir() and path.suffix != ".partial":
+    if _is_run(path):
         if loaded is None:
             raise ConfigError("no calibration: give --calibration PATH")
         return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
@@ -149,14 +150,16 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
     return ReplayedStream(recording.header.info, recording.paired(), frame=frame, speed=speed)
 
 
+def _is_run(path: Path) -> bool:
+    return path.is_dir() and path.suffix != ".partial"
+
+
 def _recorded_cell(path: Path) -> CellConfig | None:
     """Return the cell of a run or a recording, where its files describe it."""
     try:
-        if path.is_dir() and path.suffix != ".partial":
-            recorded = Run(path).header()["config"]
-        else:
-            recorded = RecordingReader(path).header.configuration
-        return CellConfig(**{name: kind(**recorded[name]) for name, kind in SECTIONS.items()})
+        if _is_run(path):
+            return recorded_cell(Run(path).header()["config"])
+        return recorded_cell(read_recorded(RecordingReader(path).header.configuration))
     except (FtdriveError, KeyError, TypeError):  # such as a table of another program
         return None
 

@@ -68,10 +68,9 @@ def build_stream(
 
 def check_view(view: ViewOptions, *, once: bool, allow_control: bool) -> None:
     """Raise `ConfigError` for options of a page that would be ignored."""
-    wanted = view.view or view.address is not None
-    if once and wanted:
+    if once and view.wanted:
         raise ConfigError("--view does not go with --once: leave one of the two out")
-    if allow_control and not wanted:
+    if allow_control and not view.wanted:
         raise ConfigError("--allow-control goes only with --view: add it, or leave --allow-control out")
 
 

@@ -74,7 +74,7 @@ def weigh(
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
-            from ftdrive.view.live_page import drawing
+            from ftdrive.view.page import drawing
             from ftdrive.view.weigh_page import WeighPage
 
             stack.enter_context(drawing(WeighPage(page, weighing, controls=allow_control).draw))

@@ -1,10 +1,7 @@
 """The page of the live wrench: the tool with force and torque, large numbers, six plots, events."""
 
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from html import escape
-from time import monotonic
 from typing import Any, Final
 
 import numpy as np
@@ -23,8 +20,6 @@ from ftdrive.view.scene import DrawnArm, DrawnWrench, draw_surroundings, size_of
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 
-# A busy computer, which is late at times, still draws 20 times a second.
-_PERIOD_S: Final = 0.045
 # The plots follow each so many drawings of the rest.
 _PLOT_EACH: Final = 5
 # A plot of a page is about 300 pixels wide; 256 columns cut the history without a rest.
@@ -224,7 +219,7 @@ def nearest_speed(speed: float) -> str:
 def head(view: View) -> str:
     """Name the devices, what the numbers are, and in red a silent device; HTML."""
     info, reading = view.info, view.reading
-    parts = [escape(" · ".join(filter(None, [info.arm.model, info.sensor.model, info.tool, *info.marks])))]
+    parts = [devices(info)]
     if view.silent:
         parts.append(f'<b style="color: {_RED}">{escape(view.silent)}</b>')
     if reading is None:
@@ -233,6 +228,11 @@ def head(view: View) -> str:
         stages = stages_in_words(reading.stages)
         parts.append(f"{meaning(reading.stages)}, {escape(str(reading.frame))}. Stages: {escape(stages)}.")
     return lines(parts)
+
+
+def devices(info: StreamInfo) -> str:
+    """Name arm, sensor and tool, and whether they are emulated; HTML."""
+    return escape(" · ".join(filter(None, [info.arm.model, info.sensor.model, info.tool, *info.marks])))
 
 
 def numbers(view: View) -> str:
@@ -273,24 +273,3 @@ def lines(texts: Sequence[str], size: str = _SMALL) -> str:
     """Return texts below each other; HTML."""
     inside = "".join(f"<div>{text}</div>" for text in texts if text)
     return f'<div style="font-size: {size}; padding: 0 8px; overflow-wrap: anywhere">{inside}</div>'
-
-
-@contextmanager
-def drawing(draw: Callable[[], None]) -> Iterator[None]:
-    """Call `draw` 22 times a second in a thread of its own while the block runs."""
-    ended = threading.Event()
-
-    def run() -> None:
-        due_s = monotonic()
-        # after a pause of the computer nothing is made up for
-        while not ended.wait(max(0.0, due_s - monotonic())):
-            due_s = max(due_s + _PERIOD_S, monotonic())
-            draw()
-
-    thread = threading.Thread(target=run, name="page", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()

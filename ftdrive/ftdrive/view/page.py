@@ -1,13 +1,16 @@
 """The server of a command's page, its address, and who looks at it."""
 
+import logging
 import os
 import secrets
 import socket
 import sys
+import threading
 import webbrowser
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout, suppress
 from io import StringIO
+from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
 
 from ftcalib.model import Array
@@ -17,8 +20,14 @@ from ftdrive.http_gate import Address, Gate, hidden_host, is_loopback, with_port
 if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
 
+log = logging.getLogger(__name__)
+
 # Only this computer can open the page.
 LOCAL: Final[Address] = ("127.0.0.1", 8080)
+
+
+# A busy computer, which is late at times, still draws 20 times a second.
+_PERIOD_S: Final = 0.045
 
 
 class Page:
@@ -133,3 +142,27 @@ def announce(page: Page, address: Address | None = None) -> None:
         messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
     elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         webbrowser.open(page.url)
+
+
+@contextmanager
+def drawing(draw: Callable[[], None]) -> Iterator[None]:
+    """Call `draw` 22 times a second in a thread of its own while the block runs."""
+    ended = threading.Event()
+
+    def run() -> None:
+        due_s = monotonic()
+        try:
+            # after a pause of the computer nothing is made up for
+            while not ended.wait(max(0.0, due_s - monotonic())):
+                due_s = max(due_s + _PERIOD_S, monotonic())
+                draw()
+        except Exception:  # only a picture: the stream goes on
+            log.exception("the page cannot be drawn")
+
+    thread = threading.Thread(target=run, name="page", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()

@@ -12,7 +12,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import tips
 from ftdrive.planning.plan import Plan
 from ftdrive.view.page import Page
-from ftdrive.view.scene import GHOST, TOOL, DrawnArm, draw_surroundings, revolved, size_of, turned_up
+from ftdrive.view.scene import GHOST, TOOL, DrawnArm, carried, draw_surroundings, revolved, size_of, turned_up
 from ftdrivers.ur.kinematics import Array
 
 _FRAME_RAD: Final = np.radians(3)
@@ -107,7 +107,7 @@ def _swept(page: Page, certifier: Certifier, q_rad: Array) -> list[Any]:
     arm = certifier.arm
     bodies = arm.bodies(q_rad)
     drawn = []
-    for i in range(len(arm.names) - len(arm.tool), len(arm.names)):
+    for i in carried(arm):
         shape = revolved(bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i])
         turns, places = turned_up(bodies.axis[:, i]), bodies.centre_m[:, i]
         drawn.append(

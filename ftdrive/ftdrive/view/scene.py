@@ -40,8 +40,8 @@ class DrawnArm:
     def __init__(self, scene: "SceneApi", arm: ArmModel, name: str = "/arm", *, ghost: bool = False) -> None:
         self._arm = arm
         bodies = arm.bodies(np.zeros((1, 6)))
-        n_arm = len(arm.names) - len(arm.tool)
-        self._colours = [GHOST if ghost else ARM if i < n_arm else TOOL for i in range(len(arm.names))]
+        beyond = carried(arm)
+        self._colours = [GHOST if ghost else TOOL if i in beyond else ARM for i in range(len(arm.names))]
         self._meshes = [
             scene.add_mesh_simple(
                 f"{name}/{i} {body}",
@@ -74,6 +74,11 @@ class DrawnArm:
         """Draw these bodies red, the others as they are."""
         for mesh, name, colour in zip(self._meshes, self._arm.names, self._colours, strict=True):
             mesh.color = BAD if name in names else colour
+
+
+def carried(arm: ArmModel) -> range:
+    """Return the bodies beyond the flange by their place in `names`: the tool, and a load that hangs from it."""
+    return range(arm.names.index("tool 1"), len(arm.names))
 
 
 def draw_surroundings(scene: "SceneApi", surroundings: Scene, size_m: float, bad: Collection[str] = ()) -> None:

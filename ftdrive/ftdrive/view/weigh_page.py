@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.live.weighing import ScaleState, Weighing, line_of, worth_of
-from ftdrive.view.live_page import lines
+from ftdrive.view.live_page import devices, lines
 from ftdrive.view.page import Page
 
 _HUGE: Final = "34px"
@@ -30,9 +30,8 @@ class WeighPage:
     def draw(self) -> None:
         """Draw the present state if there is a viewer."""
         if self._page.viewers:
-            info = self._weighing.stream.info
-            head = " · ".join(filter(None, [info.arm.model, info.sensor.model, info.tool, *info.marks]))
-            self._shown.content = lines([escape(head)]) + scale(self._weighing.shown, self._weighing.note)
+            head = devices(self._weighing.stream.info)
+            self._shown.content = lines([head]) + scale(self._weighing.shown, self._weighing.note)
 
 
 def scale(shown: ScaleState, note: str = "") -> str:
