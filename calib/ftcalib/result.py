@@ -20,6 +20,7 @@ from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
 from ftcalib.likelihood.response import (
     COMMON_GAIN,
+    LEAST_COMMON_GAIN,
     LEVER_M,
     SIZE,
     SQUARES,
@@ -43,9 +44,6 @@ from ftcalib.published.yu import weight_and_tilt
 from ftcalib.sensor_matrix import ContactResponse, SensorMatrix
 
 FORMAT = "ftdrive.calibration/1"
-
-# Sigma of the gain common to all axes, where no gain was found: no orientation shows it, and no sensor is better.
-LEAST_COMMON_GAIN = 0.002
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
 CONTRADICTS = 4.0

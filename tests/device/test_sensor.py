@@ -32,7 +32,7 @@ def test_rate_losses_and_status(stream: tuple[FtSamples, Health], url: str) -> N
 
 def test_noise(stream: tuple[FtSamples, Health]) -> None:
     samples, _ = stream
-    checks = check_noise(samples.wrench, DURATION_S, average_s=2.0, mass_kg=1.0)
+    checks = check_noise(samples.wrench, DURATION_S, average_s=2.0, mass_kg=1.0, gain_sigma=0.02)
     assert [check for check in checks if check.state != "ok"] == []
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.judge.observability import second_minimum
+from ftcalib.likelihood.response import expected_hidden_covariance
 from ftcalib.likelihood.rotation_minima import given_rotation
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
@@ -41,6 +42,8 @@ class Guess:
     tilt_alpha_rad: float = 0.0
     tilt_beta_rad: float = 0.0
     g_m_s2: float = STANDARD_GRAVITY_M_S2
+    gain_sigma: float = 0.0
+    """Of the gain of one axis of the sensor. 0: predicted from noise alone, as for a perfect sensor."""
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
@@ -79,7 +82,7 @@ class Guess:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Expected accuracy of a calibration from given poses, from noise alone."""
+    """Expected accuracy of a calibration from given poses, as `CalibrationResult` will state it."""
 
     n_poses: int
     sigma: Mapping[str, Array | float]
@@ -108,6 +111,8 @@ def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
 def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
 
+    Mounting, weight and centre of mass have what errors of the sensor hide in them, if those are guessed too.
+
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
@@ -121,8 +126,12 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     J = whitened_jacobian(R_base_flange, guess).reshape(-1, 15)
     variance = _Variance(J.T @ J, guess.scale)
 
-    std = np.sqrt(variance(np.eye(15)))
-    weight, alpha, beta = np.sqrt(variance(_weight_and_tilt_rows(guess))).tolist()
+    rows = np.concatenate([np.eye(15), _weight_and_tilt_rows(guess)])
+    total = variance(rows)
+    if guess.gain_sigma:
+        hidden = expected_hidden_covariance(guess.parameters, guess.gain_sigma)
+        total = total + np.einsum("ki,ij,kj->k", rows, hidden, rows)
+    std, (weight, alpha, beta) = np.sqrt(total[:15]), np.sqrt(total[15:]).tolist()
     everywhere = jacobian(guess.parameters, special(range(1, 25)))
     force, torque = (variance(everywhere[:, k].reshape(-1, 15)).sum() / 24 for k in (slice(3), slice(3, 6)))
     u = predict(guess.parameters, R_base_flange)[:, :3] / guess.weight_N

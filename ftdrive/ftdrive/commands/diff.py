@@ -83,6 +83,8 @@ def diff(first: str, second: str, as_json: bool) -> None:
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
             echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
+    if found.joint.dof:
+        echo("Sigma from noise: what gain and cross-talk of one sensor hide in these values is the same in A and B.")
     echo(_describe_difference(found, sensors))
 
 

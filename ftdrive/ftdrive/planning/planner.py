@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from ftcalib.known import Setup
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftdrive.cell.config import USUAL_KG, CellConfig
@@ -49,10 +50,21 @@ Found = tuple[Sequence[int], Array]
 Attempt = tuple[str, Sequence[str], Found | None]
 
 
-def guess_of(certifier: Certifier, mass_kg: float | None = None) -> Guess:
-    """Return a prior: this tool mass, centre of mass at half the tool length, usual noise, gravity as mounted."""
+def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
+    """Return a prior: mass of tool and accuracy of sensor as described, centre of mass at half the tool length.
+
+    Noise, and what is not described, as usual.
+    """
     length_m = max(part.to_m for part in certifier.arm.tool)
-    return Guess(mass_kg or USUAL_KG, 0.05, 0.003, (0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
+    mass_kg, accuracy_percent = (None, None) if cell is None else (cell.tool.mass_kg, cell.sensor.accuracy_percent)
+    return Guess(
+        mass_kg or USUAL_KG,
+        0.05,
+        0.003,
+        (0.0, 0.0, length_m / 2),
+        tilt_beta_rad=certifier.scene.lean_rad,
+        gain_sigma=Setup(sensor_accuracy_percent=accuracy_percent).gain_sigma,
+    )
 
 
 def plan_tour(
@@ -425,7 +437,7 @@ def plan_for(
     Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, `plan_sets` with `sets`, `plan_tool` for four
     poses, else `plan_tour`.
     """
-    speeds, guess = speeds_of(cell), guess_of(certifier, cell.tool.mass_kg)
+    speeds, guess = speeds_of(cell), guess_of(certifier, cell)
     if tip_unlimited:
         speeds = replace(speeds, tip_m_s=None)
     if cone_deg is not None:
@@ -454,7 +466,7 @@ def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds:
         seconds,
         speeds=speeds_of(cell),
         stop_rad_s2=float(np.radians(cell.robot.stop_deceleration_deg_s2)),
-        guess=guess_of(certifier, cell.tool.mass_kg),
+        guess=guess_of(certifier, cell),
     )
     return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 

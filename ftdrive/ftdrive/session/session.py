@@ -11,7 +11,6 @@ from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.poses.information import predicted_sigma
 from ftcalib.published.methods import SPECIAL
-from ftcalib.result import LEAST_COMMON_GAIN
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.check import compare_devices
@@ -139,14 +138,13 @@ class Calibrating:
         """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
         if plan.kind == "tool" or self.options.load is not None:
             return ""
-        mass_kg = self.cell.tool.mass_kg
         force_N, torque_Nm = rms_sigma(sigma)
-        guess = replace(guess_of(certifier, mass_kg), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
+        guess = replace(guess_of(certifier, self.cell), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
         found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
-        mass_g = 1e3 * np.hypot(found.sigma["mass_kg"], LEAST_COMMON_GAIN * guess.mass_kg)
-        assumed = " (assumed: [tool] mass_kg is not set)" if self.options.real and not mass_kg else ""
+        assumed = " (assumed: [tool] mass_kg is not set)" if self.options.real and not self.cell.tool.mass_kg else ""
         return (
-            f"predicted from that for {guess.mass_kg:g} kg{assumed}, one sigma: mass {mass_g:.2g} g, "
+            f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor whose gain is {100 * guess.gain_sigma:.2g} % off, "
+            f"one sigma: mass {1e3 * found.sigma['mass_kg']:.2g} g, "
             f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
             f"{found.torque_rms_Nm:.2g} N·m"
         )

@@ -72,7 +72,7 @@ class Verifying:
         earlier = self._earlier(certifier, q_rad, poses)
         if earlier is not None:
             return earlier
-        guess = guess_of(certifier, self.cell.tool.mass_kg)
+        guess = guess_of(certifier, self.cell)
         plan = plan_verification(certifier, q_rad, poses, self.R_fitted, speeds=speeds_of(self.cell), guess=guess)
         return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
 

@@ -378,3 +378,22 @@ def test_published_greedy_against_random() -> None:
         ranked = next_pose(R, candidates, guess)
         R = np.concatenate([R, candidates[ranked[:1]]])
     assert_allclose(predicted_sigma(R, guess).force_rms_N, 0.0788, rtol=0.03)
+
+
+def test_prediction_with_errors_of_the_sensor_is_the_spread_of_what_they_hide() -> None:
+    rng, gain_sigma, lever_m = np.random.default_rng(5), 0.02, 0.05
+    guess = Guess(1.3, 0.05, 0.003, p_sensor_com_m=(0.01, -0.02, 0.08), gain_sigma=gain_sigma)
+    p, errors = guess.parameters, []
+    for _ in range(4000):
+        E = rng.normal(size=(6, 3)) * gain_sigma * (0.5 + 0.5 * np.eye(6, 3))
+        E[3:] *= 0.5 * lever_m / (0.5 + 0.5 * np.eye(3))  # all torques from a force are cross-talk
+        force, torque = E[:3], E[3:]
+        turn, shift = (np.array([M[2, 1] - M[1, 2], M[0, 2] - M[2, 0], M[1, 0] - M[0, 1]]) / 2 for M in (force, torque))
+        gain = np.trace(force) / 3
+        errors.append([*turn, gain * guess.mass_kg, *(shift - gain * p.p_sensor_com_m)])
+    spread = np.std(errors, axis=0)
+    noisy, whole = predicted_sigma(ALL, replace(guess, gain_sigma=0.0)).sigma, predicted_sigma(ALL, guess).sigma
+    for name, found in (("R_flange_sensor", spread[:3]), ("mass_kg", spread[3]), ("p_sensor_com_m", spread[4:])):
+        assert_allclose(np.sqrt(np.square(whole[name]) - np.square(noisy[name])), found, rtol=0.05, err_msg=name)
+    for name in ("force_bias_N", "torque_bias_Nm", "tilt_alpha_rad"):  # errors of the sensor do not hide in these
+        assert_allclose(whole[name], noisy[name], rtol=1e-9, err_msg=name)

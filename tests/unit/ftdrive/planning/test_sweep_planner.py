@@ -1,5 +1,6 @@
 """A sweep: its limits, its proof beside brute force, its file."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ def certifier_of(*boxes: Box, tool_m: float = 0.2) -> Certifier:
 
 
 def planned(certifier: Certifier, seconds: float = 10.0) -> Plan:
-    guess = guess_of(certifier, 1.2)
+    guess = replace(guess_of(certifier), mass_kg=1.2)
     return plan_sweep(certifier, USUAL_POSTURE_RAD, seconds, speeds=SPEEDS, stop_rad_s2=STOP_RAD_S2, guess=guess)
 
 
@@ -114,7 +115,8 @@ def test_a_curve_is_better_if_any_error_is_smaller(
     scores = []
     for errors in ((2.0, 3.0, 5.0), (2.0 * better[0], 3.0 * better[1], 5.0 * better[2]), (0.2, 0.3, 0.5)):
         monkeypatch.setattr(sweep_planner, "predicted", lambda *_, errors=errors: errors)
-        scores.append(sweep_planner._score(certifier_of().arm, plan.sweep, guess_of(certifier_of(), 1.2)))
+        guess = replace(guess_of(certifier_of()), mass_kg=1.2)
+        scores.append(sweep_planner._score(certifier_of().arm, plan.sweep, guess))
     assert scores[2] < scores[1] < scores[0]
 
 

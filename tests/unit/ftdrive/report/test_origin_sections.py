@@ -37,6 +37,9 @@ def test_a_run_is_described_by_its_plan_and_what_came_of_it() -> None:
         "Run 2026-11-23T075825Z-gripper, started 2026-11-23T07:58:25 UTC, mode auto, 25 stops.",
         "24 poses were asked for.",
         "24 poses, 57 s of motion, no move above 89°, all proven clear, nearest 23 mm.",
+        "Larger sigma than predicted: mass (1.1 times), centre of mass (1.3 times), force bias (1.5 times), "
+        "torque bias (1.5 times), force compensation (1.2 times), torque compensation (1.5 times). "
+        "Noise or errors of this sensor are larger than the plan assumed.",
     ]
     sigmas, devices, settings = section.tables
     assert sigmas.rows == [
@@ -44,13 +47,20 @@ def test_a_run_is_described_by_its_plan_and_what_came_of_it() -> None:
         ("centre of mass, mm", "0.30", "0.40"),
         ("force bias, N", "0.0040", "0.0060"),
         ("torque bias, N·m", "0.00020", "0.00030"),
-        ("compensation, N", "0.0050", "0.0061"),
-        ("compensation, N·m", "0.00020", "0.00031"),
+        ("force compensation, N", "0.0050", "0.0061"),
+        ("torque compensation, N·m", "0.00020", "0.00031"),
     ]
     assert devices.rows == [("arm", "UR5e", "1", "5.15"), ("sensor", "Mini45", "-", "-")]
     assert settings.rows == [("robot.host", "10.0.0.2"), ("robot.speed", "1 2"), ("sign", "-")]
     other = tour({"tour": {**RUN, "plan": {**PLAN, "certified": False}}, "result": RESULT})
-    assert "NOT all proven clear" in other.text[-1]
+    assert "NOT all proven clear" in other.text[2]
+    as_good = tour(
+        {
+            "tour": {**RUN, "plan": {**PLAN, "predicted_sigma": dict.fromkeys(PLAN["predicted_sigma"], 1.0)}},
+            "result": RESULT,
+        }
+    )
+    assert as_good.text[-1] == "No sigma is more than 5 % larger than predicted."
 
 
 @pytest.mark.parametrize(
