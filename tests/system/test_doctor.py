@@ -124,7 +124,7 @@ def test_an_old_controller_needs_its_model(ftdrive: CommandLine) -> None:
 def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     # Not the path of an unplugged pseudo-terminal: the next one opened on this machine would take its name.
     cell.write_text(cell.read_text().replace(station.cell.sensor.url, "ati-serial:///dev/unplugged"))
-    outcome = ftdrive.run("doctor", "--config", cell, "--push")
+    outcome = ftdrive.run("doctor", "--config", cell, "--push", "--all")
     assert outcome.returncode == 7
     assert "the port does not open" in outcome.stdout
     assert "fix: plug it in" in outcome.stdout

@@ -35,7 +35,7 @@ def test_the_table_is_the_answer_and_the_file_is_the_plan(tmp_path: Path) -> Non
     path = tmp_path / "plan.json"
     outcome = run(*UR5E, "--mounting", "ceiling", "--box", "600:600:0:800:800:200", "--output", str(path))
     assert outcome.exit_code == 0, outcome.output
-    for word in ("wrist 3", "ball of 0.35 m", "proven clear", "Predicted"):
+    for word in ("wrist 3", "within 0.35 m", "proven clear", "Predicted"):
         assert word in outcome.stdout
     assert len(Plan.load(path).steps) == 24
 

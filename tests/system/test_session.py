@@ -80,7 +80,7 @@ def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: 
     outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
     assert outcome.returncode == 0, outcome.stderr
     assert Plan.load(path).measured
-    for words in ("24 moves proven clear", "ball of 0.3", "wrist 3"):
+    for words in ("24 moves proven clear", "within 0.3", "wrist 3"):
         assert words in outcome.stderr
     assert outcome.stdout == "Dry run: nothing has moved.\n"
     again = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)

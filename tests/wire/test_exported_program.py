@@ -54,7 +54,7 @@ def events(state: dict[str, Any], what: str) -> list[str]:
 def test_it_asks_and_then_visits_every_pose_at_rest(plan: Plan, start: Callable[[float], Station]) -> None:
     station = start(25.0)
     asked = station.ask("state")
-    assert "Keep a ball of 0.35 m" in asked["popup"]
+    assert "Keep the space within 0.35 m" in asked["popup"]
     assert not asked["moving"]
     assert asked["q_rad"][5] == pytest.approx(plan.steps[0].q_rad[5] + radians(25), abs=1e-3)
 

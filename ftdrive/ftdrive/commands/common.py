@@ -453,13 +453,13 @@ def store_url(config: Path | None = None) -> str | None:
 
 
 def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
-    """Raise `NotAccepted` for a rejected result; its message mentions the missing file if one was requested."""
+    """Raise `NotAccepted` for a rejected result that was shown; it mentions the missing file if one was requested."""
     from ftdrive.errors import NotAccepted
 
     if result.verdict == "rejected":
         unsaved = " and was not saved" if to_be_saved else ""
-        reasons = [one.words for one in result.findings if one.severity != "note"]
-        raise NotAccepted(f"the result is rejected{unsaved}: {'; '.join(reasons)}")
+        codes = ", ".join(one.code for one in result.findings if one.severity != "note")
+        raise NotAccepted(f"the result is rejected{unsaved}: its findings say what to fix ({codes})")
 
 
 def stop_unless(passed: bool, words: str) -> None:

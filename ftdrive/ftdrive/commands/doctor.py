@@ -5,6 +5,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from rich.text import Text
 
 from ftcalib import CalibrationResult
+from ftcalib.known import Setup
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_reached
@@ -70,6 +72,8 @@ _LOOK_S = 2.0
 _PUSH_S = 3.0
 _PUSH_WINDOW_S = 0.2
 _SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
+# What a summary shows of the checks of robot, sensor and noise; of the others the first that passed.
+_HEADLINES = ("robot.identity", "sensor.identity", "noise.accuracy")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
 
@@ -83,6 +87,7 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
 @runs("Folder of the runs, whose disk is checked.")
+@click.option("--all", "every", is_flag=True, help="Print the checks that passed or do not apply too, a line each.")
 @JSON
 def doctor(
     described: CellOptions,
@@ -92,6 +97,7 @@ def doctor(
     mass_kg: float | None,
     push: bool,
     runs: Path,
+    every: bool,
     as_json: bool,
 ) -> None:
     """Check robot, sensor, noise, clocks, disk and permissions; print a fix for each finding.
@@ -137,7 +143,7 @@ def doctor(
         answer = {"schema_version": 1, "checks": [asdict(check) for check in found], "verdict": verdict(found)}
         write_json({**answer, "push": pushed} if push else answer)
     else:
-        _print(found)
+        _print(found, every=every)
         again = " --simulate" if simulate else ""
         if failed:
             messages.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
@@ -224,6 +230,7 @@ def _examine_sensor(
     except DeviceError as error:
         return [*found, blame(name, error)], False
     fact = info.facts.get("range")
+    gain_sigma = Setup(sensor_accuracy_percent=cell.sensor.accuracy_percent).gain_sigma
     limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
         *found,
@@ -231,7 +238,7 @@ def _examine_sensor(
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *check_stream(samples, health, address, _LOOK_S),
-        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, gain_sigma),
     ], True
 
 
@@ -270,14 +277,25 @@ def _examine_push(
     return check_push(largest, R_base_flange, R_flange_sensor, sign)
 
 
-def _print(found: list[Check]) -> None:
-    subject = ""
-    for check in found:
-        first, _, _ = check.name.partition(".")
-        head = Text.assemble(f" {'' if first == subject else first:<12}", _MARK[check.state], " ")
-        answer.print(hanging(head, check.found, answer))
-        if check.fix is not None and check.state in {"warning", "failed"}:
-            answer.print(hanging(f"{'':15}fix: ", check.fix, answer))
-        subject = first
-    words = {"ok": " All checks passed.", "warning": " Usable; see the lines with !", "failed": " Not ready."}
-    answer.print(words[verdict(found)])
+def _print(found: list[Check], *, every: bool) -> None:
+    for subject, group in groupby(found, lambda check: check.name.partition(".")[0]):
+        checks = list(group)
+        for i, check in enumerate(checks if every else _in_brief(checks)):
+            head = Text.assemble(f" {'' if i else subject:<12}", _MARK[check.state], " ")
+            answer.print(hanging(head, check.found, answer))
+            if check.fix is not None and check.state in {"warning", "failed"}:
+                answer.print(hanging(f"{'':15}fix: ", check.fix, answer))
+    words = {"ok": "All checks passed", "warning": "Usable; see the lines with !", "failed": "Not ready"}
+    passed, skipped = (sum(check.state == state for check in found) for state in ("ok", "skipped"))
+    count = "" if every else f" ({passed} passed, {skipped} skipped; --all shows each)"
+    answer.print(f" {words[verdict(found)]}{count}.")
+
+
+def _in_brief(checks: list[Check]) -> list[Check]:
+    """Return what needs attention, behind the one check that names the subject, with the number of the others."""
+    passed = [check for check in checks if check.state == "ok"]
+    first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]
+    if first[0].state == "ok" and len(passed) > 1:
+        more = f" ({len(passed) - 1} more check{'s' * (len(passed) > 2)} passed)"
+        first = [replace(first[0], found=first[0].found + more)]
+    return first + [check for check in checks if check.state in {"warning", "failed"} and check not in first]

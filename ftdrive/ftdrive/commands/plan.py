@@ -80,6 +80,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 )
 @click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
 @click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
+@click.option("--all", "every", is_flag=True, help="Print each pose and move too.")
 @view_options
 @simulate("Use arm and tool of an emulated cell instead of the configuration.")
 @JSON
@@ -100,6 +101,7 @@ def plan(
     mass_kg: float | None,
     output: Path | None,
     png: Path | None,
+    every: bool,
     view: ViewOptions,
     simulate: bool,
     as_json: bool,
@@ -107,7 +109,7 @@ def plan(
     """Plan a tour proven clear of the arm itself, the tool, planes and boxes. Needs no robot.
 
     Arm, tool and surroundings come from the configuration; options replace its values. Cables, fixtures and people are
-    not in the model: look at the ball that must be free before anything moves.
+    not in the model: look at the space that must be clear before anything moves.
     """
     import numpy as np
 
@@ -182,7 +184,7 @@ def plan(
         write_json({"schema_version": 1} | made.to_dict())
         messages.print(*saved, sep="\n", end="\n" if saved else "")
     else:
-        answer.print(*filter(None, (made.in_words(), made.stop_in_words(cell.robot))), *saved, sep="\n")
+        answer.print(*filter(None, (made.in_words(table=every), made.stop_in_words(cell.robot))), *saved, sep="\n")
         same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
         messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
     if page is not None:

@@ -27,7 +27,7 @@ from ftdrive.runs.push_receipt import Receipt
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.events import Question
 from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
-from ftdrive.terminal.console import answer, beside, messages
+from ftdrive.terminal.console import answer, beside
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.text import echo
@@ -42,7 +42,7 @@ _PATH = click.Path(exists=True, path_type=Path)
 @click.option("--gravity", is_flag=True, help="Push the direction of gravity in the base.")
 @click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=_PATH, help="Send the values before a push back.")
 @click.option("--dry-run", is_flag=True, help="Compare only; nothing is sent.")
-@simulate("Push to an emulated cell, without a typed word; it is calibrated first if no result is given.")
+@simulate("Push to an emulated cell; it is calibrated first if no result is given.")
 @JSON
 def push(
     source: Path | None,
@@ -79,13 +79,12 @@ def push(
             device = stack.enter_context(build_sensor(cell))
             proposal = propose(cell, arm, device, of, payload=payload or not gravity, gravity=gravity, name=str(path))
         sends = bool(proposal.settings) and not dry_run
-        asks = sends and not simulate
-        if as_json and (asks or not sends):
+        if as_json:
             values = {"old": asdict(proposal.old), "new": asdict(proposal.new)}
             write_json({"schema_version": 1, "event": "proposal", **proposal.reason, **values})
-        elif not (as_json or sends):
+        elif not sends:
             answer.print("\n".join(proposal_in_lines(proposal)))
-        elif not as_json and (asks or not messages.quiet):
+        else:
             echo("\n".join(proposal_in_lines(proposal)), err=True)
         if not sends:
             beside(as_json).print(
@@ -94,8 +93,7 @@ def push(
             return
 
         def ask(name: str) -> None:
-            if not simulate:
-                operator.ask(Question(EFFECTS[name], (WORDS[name],)))
+            operator.ask(Question(EFFECTS[name], (WORDS[name],)))
 
         def require_supervisor() -> None:
             if why := operator.absence():

@@ -58,7 +58,7 @@ DEFAULT = Path("report.html")
     "-o",
     "--output",
     type=NewFile(),
-    help=f"New file. [default: {DEFAULT}, or {DEFAULT.stem}-2 and so on; stdout for md and json]",
+    help=f"New file. [default: {DEFAULT} in the run or beside SOURCE, or {DEFAULT.stem}-2; stdout for md and json]",
 )
 @click.option(
     "--format",
@@ -106,7 +106,7 @@ def report(
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
     chosen = output
     if output is None and form == "html":
-        output = unused_path(DEFAULT)
+        output = unused_path(_folder_of(source) / DEFAULT)
         try:
             require_new(output)
         except OSError as error:
@@ -136,7 +136,7 @@ def report(
         except FileExistsError:
             if chosen is not None:
                 raise
-            write_new(output := unused_path(DEFAULT), text)
+            write_new(output := unused_path(_folder_of(source) / DEFAULT), text)
         say = beside(as_json)
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
@@ -144,6 +144,13 @@ def report(
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
         echo(text, nl=False, fold=False)
+
+
+def _folder_of(source: Path | None) -> Path:
+    """Return where a report is kept: in its run, or beside its source."""
+    if source is None:
+        return Path()
+    return source if (source / "run.json").is_file() else source.parent
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

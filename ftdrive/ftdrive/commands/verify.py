@@ -93,8 +93,8 @@ def verify(
     """Compare fresh poses, far from those of the calibration, with its prediction.
 
     The session is that of `calibrate`: a certified plan, checks, safety questions, guards. Without --max-force and
-    --max-torque, 1 % of unchanged cells fail near the poses of the fit, more far from them. If it fails, it names what
-    has changed, offers the smallest sufficient update, and ends with exit code 7.
+    --max-torque, 1 of 100 verifications near the poses of the fit is a false alarm, more far from them. A
+    verification that fails names what has changed, offers the smallest sufficient update, and ends with exit code 7.
     """
     from ftdrive.errors import NotAccepted
     from ftdrive.runs.verification import AcceptanceLimits
@@ -210,7 +210,7 @@ def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: b
         write_json({**verified.to_dict(), "file": str(verified.path), "saved": None if saved is None else str(saved)})
         return
     if saved is not None:
-        answer.print(f" Saved {saved}: {verified.update_name} updated, parent {verified.calibration.id[:6]}")
+        answer.print(f" Saved {saved}: {_updated(verified)} updated, parent {verified.calibration.id[:6]}")
     again = " --simulate" if simulated else ""
     if saved is not None:
         messages.print_next(f"ftdrive live --calibration {quote(str(saved))}{again}")
@@ -246,8 +246,12 @@ def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> boo
     if update == "yes":
         return True
     operator = JsonOperator() if as_json else PlainOperator(quiet=messages.quiet)
-    text = f"An update of the {verified.update_name} is sufficient. Save it as a new calibration?"
+    text = f"An update of {_updated(verified)} is sufficient. Save it as a new calibration?"
     try:
         return operator.ask(Question(text)) == "yes"
     except Declined:
         return False
+
+
+def _updated(verified: "Verified") -> str:
+    return "all values" if verified.update_name == "all" else f"the {verified.update_name}"

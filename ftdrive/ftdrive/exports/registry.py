@@ -175,16 +175,29 @@ def export(
             if force_N > max_force_error_N:
                 raise NotAccepted(
                     f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
-                    f"({', '.join(_lossless(calibration, target))}), or raise --max-force-error"
+                    f"({', '.join(_lossless(calibration, target))}), or accept it: --max-force-error {_above(force_N)}"
                 )
             notes.insert(0, f"{words}.")
         if "response" not in target.expresses:
             notes += _undecoded(name, calibration)
     notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
-    notes += [f"Also set {place} = {_describe_value(value)}." for place, value in exported.elsewhere.items()]
+    # The file has every digit.
+    shown, exact = (
+        [
+            *notes,
+            *(f"Also set {place} = {_describe_value(value, form)}." for place, value in exported.elsewhere.items()),
+        ]
+        for form in (".6g", "")
+    )
     origin = _made_by(calibration, settings.verification)
-    text = _with_header(exported.text, target.comment, [origin, target.description, *notes])
-    return Exported(text, tuple(notes), exported.elsewhere, force_N, torque_Nm)
+    text = _with_header(exported.text, target.comment, [origin, target.description, *exact])
+    return Exported(text, tuple(shown), exported.elsewhere, force_N, torque_Nm)
+
+
+def _above(value: float) -> str:
+    """Write the next larger number of two digits."""
+    step = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return f"{np.ceil(value / step) * step:.2g}"
 
 
 def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
@@ -222,12 +235,12 @@ def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
             yield name
 
 
-def _describe_value(value: JSON) -> str:
+def _describe_value(value: JSON, form: str) -> str:
     if isinstance(value, Mapping):
-        return f"({', '.join(f'{name} {_describe_value(one)}' for name, one in value.items())})"
+        return f"({', '.join(f'{name} {_describe_value(one, form)}' for name, one in value.items())})"
     if isinstance(value, list):
-        return f"[{', '.join(map(_describe_value, value))}]"
-    return str(value)  # of a float every digit
+        return f"[{', '.join(_describe_value(one, form) for one in value)}]"
+    return format(value, form) if isinstance(value, float) else str(value)
 
 
 def _made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:

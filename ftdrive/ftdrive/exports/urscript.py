@@ -83,8 +83,8 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield ""
     yield f'textmsg("{name}: {len(steps)} poses")'
     yield (
-        f'popup("{emulated}Only for a {model} with the tool of {name}. Keep a ball of {plan.ball_m:.2f} m around '
-        f"{plan.centre_in_words()} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
+        f'popup("{emulated}Only for a {model} with the tool of {name}. Keep the space '
+        f"{plan.ball_in_words()} (the wrist){'' if plan.arm_rests else ' and the room of the whole arm'} free, "
         f"cables slack, hand on the emergency stop. Speed: {_speeds(plan)}. "
         'First time: speed slider at 30 percent. Continue moves the arm.", '
         f'title="ftdrive", warning=True, blocking=True)'

@@ -104,7 +104,7 @@ def _joints(axes: Any, sweep: Sweep) -> None:
 
 def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
     """Say what is seen, and what is not."""
-    ball = f"ball of {plan.ball_m:.2f} m"
+    ball = f"sphere of {plan.ball_m:.2f} m"
     moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
     name = f"EMULATED {certifier.arm.name}" if plan.emulated else certifier.arm.name
     motion = f"{len(plan.steps)} poses" if plan.sweep is None else f"sweep of {plan.sweep.duration_s:.0f} s"

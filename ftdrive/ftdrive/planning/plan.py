@@ -158,16 +158,17 @@ class Plan:
             return self
         return replace(self, sweep=self.sweep.slower(share), acceleration_rad_s2=self.acceleration_rad_s2 * share**2)
 
-    def in_words(self) -> str:
+    def in_words(self, *, table: bool = True) -> str:
         """Return the reason for the plan, its moves, joint ranges, clearances, time, space and predicted accuracy.
 
         The table is at most 72 columns wide; each sentence is one line.
         """
         still = ", ".join(f"{angle:.0f}" for angle in np.degrees(self.steps[0].q_rad[:3]))
         rest = [f"Base, shoulder and elbow stay at {still} degrees."] if self.arm_rests else []
-        if self.sweep is not None:
-            return "\n".join([*self.why, *rest, *_sweep_table(self.sweep), "", *_sweep_summary(self)])
-        return "\n".join([*self.why, *rest, *_table(self), "", *_summary(self)])
+        rows, summary = (
+            (_table(self), _summary(self)) if self.sweep is None else (_sweep_table(self.sweep), _sweep_summary(self))
+        )
+        return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *summary])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
         """Return time and angle of a stop until rest, at the plan's highest speed; empty for other drivers."""
@@ -181,16 +182,16 @@ class Plan:
 
     def room_in_words(self) -> str:
         """Return which space must be clear."""
-        ball = f"ball of {self.ball_m:.2f} m around {self.centre_in_words()}"
+        ball = self.ball_in_words()
         if self.arm_rests:
             crossing = "where the axes of wrist 1 and 2 cross"
-            return f"All moving parts stay in a {ball}, {crossing}: keep it clear, cables slack."
-        return f"Wrist and tool stay in a {ball}, and the whole arm moves: keep the space of both clear, cables slack."
+            return f"All moving parts stay {ball}, {crossing}: keep that space clear, cables slack."
+        return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear, cables slack."
 
-    def centre_in_words(self) -> str:
-        """Return the centre of the ball as text."""
+    def ball_in_words(self) -> str:
+        """Return radius and centre of the ball as text."""
         x, y, z = (f"{value:.2f}" for value in self.ball_centre_m)
-        return f"x {x}, y {y}, z {z} m in base"
+        return f"within {self.ball_m:.2f} m of x {x}, y {y}, z {z} m in base"
 
     @property
     def sha256(self) -> str:
@@ -389,6 +390,7 @@ def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[s
             "mass_kg": guess.mass_kg,
             "sigma_force_N": guess.sigma_force_N,
             "sigma_torque_Nm": guess.sigma_torque_Nm,
+            "gain_sigma": guess.gain_sigma,
         },
     }
 
@@ -489,7 +491,7 @@ def _sweep_summary(plan: Plan) -> list[str]:
     proven = "proven clear along its whole length" if plan.certified else "NOT PROVEN CLEAR"
     return [
         f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included.",
-        f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
+        f"Least clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         plan.room_in_words(),
     ]
 
@@ -501,7 +503,7 @@ def _summary(plan: Plan) -> list[str]:
     return [
         f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
         f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
-        f"Nearest: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
+        f"Least clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         plan.room_in_words(),
         *([] if plan.kind in ("verification", "tool", "hung") else [_accuracy(plan)]),
     ]
@@ -509,11 +511,13 @@ def _summary(plan: Plan) -> list[str]:
 
 def _accuracy(plan: Plan) -> str:
     sigma, guess = plan.predicted, plan.description["guess"]
+    # Plans of version 0.1.0 have no gain.
+    gain = f", a sensor whose gain is {100 * guess['gain_sigma']:.2g} % off" if "gain_sigma" in guess else ""
     tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return (
-        f"Predicted for {guess['mass_kg']:g} kg and averages good to {guess['sigma_force_N']} N, "
-        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest(sigma['mass_kg']):.1f} g, "
-        f"centre of mass {1e3 * _largest(sigma['p_sensor_com_m']):.2f} mm, "
+        f"Predicted for {guess['mass_kg']:g} kg{gain}, and averages good to {guess['sigma_force_N']} N, "
+        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest(sigma['mass_kg']):.2g} g, "
+        f"centre of mass {1e3 * _largest(sigma['p_sensor_com_m']):.2g} mm, "
         f"force bias {_largest(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
         f"compensation {_largest(sigma['force_rms_N']):.3f} N, {_largest(sigma['torque_rms_Nm']):.4f} N·m."
     )

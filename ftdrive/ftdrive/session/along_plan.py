@@ -95,8 +95,7 @@ class _SafetyQuestions:
         for text in (
             *_load_questions(self._load),
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",
-            f"Is the ball of {self._plan.ball_m:.2f} m around {self._plan.centre_in_words()} (the wrist){room} free of "
-            "obstacles and people?",
+            f"Is the space {self._plan.ball_in_words()} (the wrist){room} free of obstacles and people?",
             "Is the emergency stop in reach, and tested?",
         ):
             self._journal.require(text, assumed=assumed)

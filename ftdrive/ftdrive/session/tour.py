@@ -273,7 +273,7 @@ class Tour:
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
             drives = ", and drives it where --yes may confirm it" if self._trusted and self._options.yes else ""
-            return f"Enter plans the way and shows it{drives}, {joints}, {largest}"
+            return f"Enter plans the approach and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
 
     def _obey_keys(self) -> None:
@@ -403,13 +403,13 @@ class Tour:
         passed = self._passed(way, index)
         most_rad_s = BACK_RAD_S if back else APPROACH_RAD_S
         words = (
-            f"the way {'back ' if back else ''}to pose {stop} at {np.degrees(most_rad_s):.0f}°/s at most: "
+            f"{'back ' if back else ''}to pose {stop}, at most {np.degrees(most_rad_s):.0f} °/s: "
             f"{way_in_words(way, approach.clearance_m)}"
         )
         if passed:
             words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
         self._show_state(State.APPROACH, stop, words)
-        self._confirm(f"The arm goes {words}.", by_operator=back or bool(passed) or arm_moves(way))
+        self._confirm(f"Approach {words}.", by_operator=back or bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
             self._move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
             q = goal

@@ -458,7 +458,7 @@ def verdict_in_words(verified: Verified) -> str:
         given = ((limits.force_N, "N"), (limits.torque_Nm, "N·m"))
         return f"{words}; limit {', '.join(f'{limit:g} {unit}' for limit, unit in given if limit is not None)}"
     found = verified.verification
-    alarms = f"{100 * FALSE_ALARMS:g} % of unchanged cells fail near the poses of the fit"
+    alarms = f"false alarms: {100 * FALSE_ALARMS:g} in 100, near the poses of the fit"
     return f"{words}; chi2 {found.chi2:.0f} for {found.dof} degrees of freedom, p {found.p_value:.2g} ({alarms})"
 
 

@@ -120,7 +120,7 @@ class SessionText:
 
 
 def _plan_in_brief(plan: Plan) -> tuple[str, str]:
-    """Describe a plan in two lines: its motion and clearance, and the room to keep free."""
+    """Describe a plan in two lines: its motion and clearance, and the room to keep clear."""
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     count = len(plan.steps)
     clear = f"{1e3 * nearest.clearance_m:.0f} mm"
@@ -132,7 +132,7 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
         motion = f"sweep of {plan.sweep.duration_s:.0f} s,"
     return (
         f"{motion} {proven}; {moving}",
-        f"keep free: ball of {plan.ball_m:.2f} m around {plan.centre_in_words()}{room}",
+        f"keep clear: {plan.ball_in_words()}{room}",
     )
 
 

@@ -129,14 +129,36 @@ def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(capsys: pyte
         Check("robot.speed", "warning", "slider at 30 %", "raise it"),
         Check("sensor.noise", "failed", "saturated", "take the load off"),
     ]
-    _print(checks)
+    _print(checks, every=True)
     lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert [line.split()[0] for line in lines] == ["robot", "!", "fix:", "sensor", "fix:", "Not"]
     assert lines[2].split("fix: ")[1] == "raise it"
-    _print(checks[:2])
-    assert capsys.readouterr().out.endswith(" Usable; see the lines with !\n")
-    _print(checks[:1])
+    _print(checks[:2], every=True)
+    assert capsys.readouterr().out.endswith(" Usable; see the lines with !.\n")
+    _print(checks[:1], every=True)
     assert capsys.readouterr().out.endswith(" All checks passed.\n")
+
+
+def test_a_summary_has_each_subject_and_all_that_needs_attention(capsys: pytest.CaptureFixture[str]) -> None:
+    checks = [
+        Check("robot.reachable", "ok", "it answers"),
+        Check("robot.identity", "ok", "UR5e"),
+        Check("robot.remote", "ok", "remote control on"),
+        Check("robot.speed", "warning", "slider at 30 %", "raise it"),
+        Check("noise.level", "failed", "saturated", "take the load off"),
+        Check("noise.change", "skipped", "not known"),
+        Check("push.sign", "skipped", "no push"),
+    ]
+    _print(checks, every=False)
+    assert [line.strip() for line in capsys.readouterr().out.splitlines()] == [
+        "robot       ✔ UR5e (2 more checks passed)",
+        "! slider at 30 %",
+        "fix: raise it",
+        "noise       ✘ saturated",
+        "fix: take the load off",
+        "push        - no push",
+        "Not ready (3 passed, 2 skipped; --all shows each).",
+    ]
 
 
 def test_a_sensor_alone_is_checked_without_a_robot(

@@ -69,7 +69,7 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
 
 
 def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
-    assert "p 1e-09 (1 % of unchanged cells fail near the poses of the fit)" in verdict_in_words(
+    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in verdict_in_words(
         failed(tmp_path, AcceptanceLimits())
     )
     given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))

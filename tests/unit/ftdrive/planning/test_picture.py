@@ -35,7 +35,7 @@ def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
     first, second, *others = plan.steps
     moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
     title = title_of(plan, certifier_of(), on_its_way=False)
-    assert "stays in this ball" in title
+    assert "stays in this sphere" in title
     assert "WHOLE ARM" not in title
     assert "grey: arm, orange: tool" in title
     title = title_of(moving, certifier_of(), on_its_way=True)

@@ -34,12 +34,12 @@ def test_every_pose_range_and_figure_is_there(plan: Plan) -> None:
     words = "\n".join(lines)
     for figure in (
         "stay at 45, -100, 60",
-        "ball of 0.35 m around x -0.07, y -0.25, z 0.83 m",
+        "within 0.35 m of x -0.07, y -0.25, z 0.83 m",
         "57 s of motion",
-        "Nearest: ",
+        "Least clearance: ",
     ):
         assert figure in words
-    assert f"mass {1e3 * plan.predicted['mass_kg']:.1f} g" in words
+    assert f"mass {1e3 * plan.predicted['mass_kg']:.2g} g" in words
 
 
 def test_where_base_shoulder_and_elbow_move_the_room_is_that_of_the_whole_arm(plan: Plan) -> None:

@@ -9,7 +9,7 @@ from ftdrive.session.events import GuardTripped, Key, Noted, State, StateChanged
 from ftdrivers.errors import ConnectError, DeviceFault
 from tests.unit.ftdrive.fake_cell import Lab
 
-QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
+QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop in reach")
 
 
 def when_asked(lab: Lab, words: str, do: Callable[[], None]) -> None:
@@ -55,14 +55,14 @@ def holds(lab: Lab) -> list[str]:
 def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume", answer]
-    lab.operator.answers["the way to pose 4"] = ["no"]
+    lab.operator.answers["Approach to pose 4"] = ["no"]
     moves: list[int] = []
     when_asked(lab, "resume:", lambda: moves.append(len(lab.arm.moves)))
     assert lab.take_poses() is not None
     assert moves == [4, 4]
     first, second = holds(lab)
     assert first == "paused by the operator"
-    assert second.startswith("not confirmed: The arm goes")
+    assert second.startswith("not confirmed: Approach")
     assert lab.operator.of(GuardTripped) == []
     assert lab.stops() == [1, 2, 3, *([4] if answer == "resume" else []), 5, 6, 7]
 
@@ -70,8 +70,8 @@ def test_a_way_that_is_not_confirmed_leads_back_to_the_hold(answer: str, lab: La
 def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: Lab) -> None:
     pause_on_the_way(lab, 4)
     lab.operator.answers["resume:"] = ["resume", "quit"]
-    lab.operator.answers["the way to pose 4"] = ["no"]
-    with pytest.raises(Declined, match="not confirmed: The arm goes"):
+    lab.operator.answers["Approach to pose 4"] = ["no"]
+    with pytest.raises(Declined, match="not confirmed: Approach"):
         lab.take_poses()
     assert len(lab.arm.moves) == 4
     assert lab.stops() == [1, 2, 3]
@@ -81,7 +81,7 @@ def test_who_does_not_confirm_a_way_can_end_it_there_and_keeps_the_poses(lab: La
 def test_the_way_back_that_is_not_confirmed_is_not_gone_but_offered_again(lab: Lab) -> None:
     lab.push_on_the_way(4)
     lab.operator.answers["resume:"] = ["back", "resume"]
-    lab.operator.answers["the way back to pose 3"] = ["no"]
+    lab.operator.answers["Approach back to pose 3"] = ["no"]
     assert lab.take_poses() is not None
     assert len(holds(lab)) == 2
     assert all("back" in answers for answers in lab.holds())
@@ -152,7 +152,7 @@ def test_an_emergency_stop_that_is_still_pressed_is_refused_and_asked_about_once
     assert len(lab.arm.moves) == 8
 
 
-@pytest.mark.parametrize("words", ["Is the tool free", "the way to pose 4"])
+@pytest.mark.parametrize("words", ["Is the tool free", "Approach to pose 4"])
 def test_an_emergency_stop_that_is_pressed_at_a_question_counts_too(words: str, lab: Lab) -> None:
     lab.arm.at_move[4] = lambda: lab.arm.set_status(fault=DeviceFault("a stop"), safety_mode="safeguard stop")
     lab.operator.answers["resume:"] = ["resume", "resume"]

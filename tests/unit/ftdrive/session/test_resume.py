@@ -68,7 +68,7 @@ def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> Non
     assert lab.arm.stops == 1
     fourth = np.array(Plan.load(lab.run().plan_path).steps[3].q_rad)
     assert [np.abs(goal - fourth).max() < 1e-9 for goal, *_ in lab.arm.moves].count(True) == 1  # the one broken off
-    assert [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert [question for question in lab.operator.asked if "Approach to pose 5" in question.text]
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
     assert State.HOLD not in lab.operator.states()
     assert "skipped: pose 4, the arm" in lab.said()
@@ -84,7 +84,7 @@ def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
     lab.sensor.collecting = skip
     lab.take_poses()
     assert lab.taken() == [1, 2, 3, 5, 6, 7]
-    assert not [question for question in lab.operator.asked if "the way to pose 5" in question.text]
+    assert not [question for question in lab.operator.asked if "Approach to pose 5" in question.text]
     assert len(lab.arm.moves) == 7
 
 
@@ -115,7 +115,7 @@ def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> Non
     assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 5, 6, 7]
     assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
     assert lab.arm.stops == 1  # on its way to pose 4
-    ways = [question.text for question in lab.operator.asked if "the way to pose" in question.text]
+    ways = [question.text for question in lab.operator.asked if "Approach to pose" in question.text]
     assert len(ways) == 1  # the first approach: it was stopped before it had left pose 3
 
 
@@ -124,7 +124,7 @@ def test_redo_on_the_way_stops_the_arm_and_goes_back_from_there(lab: Lab) -> Non
     lab.take_poses()
     assert lab.arm.stops == 1
     assert lab.taken() == [1, 2, 3, 3, 4, 5, 6, 7]
-    assert [question for question in lab.operator.asked if "the way to pose 3" in question.text]
+    assert [question for question in lab.operator.asked if "Approach to pose 3" in question.text]
     assert lab.holds() == []
 
 
@@ -239,7 +239,7 @@ def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     lab.take_poses(mode="step")
     monkeypatch.setattr(tour, "_NEAR_RAD", np.pi)
     lab.take_poses(mode="step")
-    ways = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
+    ways = [question for question in lab.operator.asked if "Approach to pose 4" in question.text]
     assert ["skipped pose 3" in question.text for question in ways] == [False, True]
     assert [question.assumed for question in ways] == ["yes", None]
 

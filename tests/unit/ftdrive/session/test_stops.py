@@ -140,7 +140,7 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     assert states[stop : stop + 3] == [State.STOP, State.HOLD, State.APPROACH]
     assert outcome.result.mass_kg == pytest.approx(1.2, abs=0.01)
     # The way on was asked for, planned from where the arm stood, and slow.
-    assert any("the way to pose 4" in question.text for question in lab.operator.asked)
+    assert any("Approach to pose 4" in question.text for question in lab.operator.asked)
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
 
 
@@ -211,8 +211,8 @@ def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(la
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [14, 14, 14]
     assert goals(lab) == [1, 2, 3, 4, 3, 3, 4, 5, 6, 1]
     assert max(speed for _, speed, _ in lab.arm.moves[4:6]) <= np.radians(10) + 1e-9
-    ways = [question.text for question in lab.operator.asked if question.text.startswith("The arm goes the way")]
-    assert [text.split(" at ")[0].split("way ")[1] for text in ways] == [
+    ways = [question.text for question in lab.operator.asked if question.text.startswith("Approach ")]
+    assert [text.split(",")[0].removeprefix("Approach ") for text in ways] == [
         "to pose 1",
         "back to pose 3",
         "back to pose 3",
@@ -227,12 +227,12 @@ def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(la
 
 def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
     lab.take_poses()  # trusted from here on
-    for answer, words in (("resume", "the way to pose 4"), ("back", "the way back to pose 3")):
+    for answer, words in (("resume", "Approach to pose 4"), ("back", "Approach back to pose 3")):
         lab.operator.asked.clear()
         lab.arm.moves.clear()
         lab.push_on_the_way(3)
         lab.operator.answers["resume:"] = [answer, "quit"]
-        lab.operator.answers["the way back"] = ["no"]
+        lab.operator.answers["Approach back"] = ["no"]
         with suppress(Declined):
             lab.take_poses()
         (way,) = [question for question in lab.operator.asked if words in question.text]
@@ -349,7 +349,7 @@ def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
 
 
 @pytest.mark.parametrize(
-    ("way", "moves", "answers"), [("way to pose 1", 0, []), ("way to pose 4", 4, ["resume"]), ("way back", 4, ["back"])]
+    ("way", "moves", "answers"), [("to pose 1", 0, []), ("to pose 4", 4, ["resume"]), ("back", 4, ["back"])]
 )
 def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
     way: str, moves: int, answers: list[str], lab: Lab
@@ -359,7 +359,7 @@ def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
 
     lab.push_on_the_way(4)
     lab.operator.answers["resume:"] = answers
-    lab.operator.at_question.append((f"The arm goes the {way}", move))
+    lab.operator.at_question.append((f"Approach {way}", move))
     with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° from"):
         lab.take_poses()
     assert lab.operator.of(GuardTripped)[-1].hazard == 21
@@ -429,7 +429,7 @@ def test_saturated_samples_discard_the_pose(lab: Lab, monkeypatch: pytest.Monkey
     assert lab.stops() == [1, 2, 3]
 
 
-QUESTIONS = ("Is the tool free", "Is the ball of", "Is the emergency stop in reach")
+QUESTIONS = ("Is the tool free", "Is the space within", "Is the emergency stop in reach")
 
 
 def hold_and_resume(lab: Lab, fault: Callable[[], None], repair: Callable[[], None]) -> None:

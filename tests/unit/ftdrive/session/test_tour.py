@@ -56,7 +56,7 @@ def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None
 def test_questions_come_in_order_and_the_first_motion_wants_a_word(lab: Lab) -> None:
     lab.take_poses()
     texts = [question.text for question in lab.operator.asked]
-    order = ["tool free", "ball of 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
+    order = ["tool free", "within 0.3", "emergency stop in reach", "Type MOVE", "Begin"]
     assert [next(word for word in order if word in text) for text in texts] == order
     assert all(question.assumed is None for question in lab.operator.asked)
     assert len(lab.operator.of(Asked)) == 5
@@ -130,11 +130,13 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     "sampling", [pytest.param(Sampling(), marks=pytest.mark.slow), Sampling(average_s=0.3, noise_record_s=0.0)]
 )
 def test_what_is_predicted_before_it_moves_comes_true(sampling: Sampling, lab: Lab) -> None:
-    lab.cell = replace(lab.cell, sampling=sampling, tool=replace(lab.cell.tool, mass_kg=1.2))
+    # The fake sensor is perfect, which its data sheet must say.
+    tool, sensor = replace(lab.cell.tool, mass_kg=1.2), replace(lab.cell.sensor, accuracy_percent=0.1)
+    lab.cell = replace(lab.cell, sampling=sampling, tool=tool, sensor=sensor)
     outcome = lab.calibrate()
     assert outcome is not None
     (words,) = [
-        note.words for note in lab.operator.of(Noted) if "predicted from that for 1.2 kg, one sigma" in note.words
+        note.words for note in lab.operator.of(Noted) if "predicted for 1.2 kg, a sensor whose gain" in note.words
     ]
     told_g = float(words.split("mass ")[1].split(" g")[0])
     assert told_g == pytest.approx(1e3 * float(outcome.result.sigma["mass_kg"]), rel=0.7)
@@ -262,7 +264,7 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     (shown,) = lab.operator.of(Planned)
     assert lab.operator.shown.index(shown) < lab.operator.shown.index(lab.operator.of(Checked)[0])
     words = in_words(shown)
-    for figure in ("wrist 3", "Nearest", "ball of 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
+    for figure in ("wrist 3", "Least clearance", "within 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
         assert figure in words
     assert "whole arm" not in words
     written = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
@@ -285,7 +287,7 @@ def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
     texts = [question.text for question in lab.operator.asked]
     assert all(
         any(word in text and "base 20°" in text and "whole arm" in text for text in texts)
-        for word in ("Is the ball of", "Type MOVE")
+        for word in ("Is the space within", "Type MOVE")
     )
 
 
@@ -351,8 +353,8 @@ def test_step_mode_waits_for_enter_before_each_move(lab: Lab) -> None:
     lab.take_poses(mode="step")
     third = np.array(Plan.load(lab.run().plan_path).steps[2].q_rad)
     assert min(np.abs(goal - third).max() for goal, *_ in lab.arm.moves) > np.radians(5)  # never sent there
-    (way,) = [question for question in lab.operator.asked if "the way to pose 4" in question.text]
-    assert way.text.startswith("The arm goes")  # certified again, shown, and confirmed
+    (way,) = [question for question in lab.operator.asked if "Approach to pose 4" in question.text]
+    assert way.text.startswith("Approach to")  # certified again, shown, and confirmed
     assert lab.arm.moves[2][1] <= np.radians(15) + 1e-9
     asked = [question.text.split(",")[0] for question in lab.operator.asked if question.text.startswith("Pose")]
     assert asked == [f"Pose {stop} of 7" for stop in (1, 2, 3, 4, 5, 4, 5, 6, 7)]
@@ -374,7 +376,7 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
     lab.take_poses(mode="step")
     steps = Plan.load(lab.run().plan_path).steps
     asked = [question.text for question in lab.operator.asked if question.text.startswith("Pose")]
-    assert "Enter plans the way" in asked[0]
+    assert "Enter plans the approach" in asked[0]
     for text, start, goal in ((asked[1], 0, 1), (asked[4], 1, 2), (asked[5], 2, 3)):
         turn_deg = np.degrees(np.abs(np.subtract(steps[goal].q_rad, steps[start].q_rad)))
         joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))

@@ -86,7 +86,7 @@ def test_findings_of_doctor_and_their_cures_are_indented(
 ) -> None:
     monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
     monkeypatch.setattr(answer, "soft_wrap", False)  # as in a terminal
-    _print([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)])
+    _print([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)], every=True)
     first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
     assert first.startswith(" robot       ✘ found [1]")
     cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: fix"))

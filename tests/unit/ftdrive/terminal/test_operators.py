@@ -177,7 +177,7 @@ def test_a_terminal_gets_whole_words_and_a_file_whole_lines() -> None:
     with os.fdopen(program, "w", encoding="utf-8") as file:
         folded = in_whole_words(text, file)
         operator = PlainOperator(stdin=io.StringIO("MOVE\n"), stderr=file)
-        assert operator.ask(Question("The arm goes the way to pose 1. Type MOVE", ("MOVE",))) == "MOVE"
+        assert operator.ask(Question("Approach to pose 1. Type MOVE", ("MOVE",))) == "MOVE"
     os.close(person)
     lines = folded.split("\n")
     assert all(len(line) <= 40 or line == path for line in lines)

@@ -69,7 +69,7 @@ def test_each_pose_has_what_was_measured_predicted_and_the_difference(printed: A
         "R12 N 0.000 0.000 -10.000 0.000 0.000 -9.500 0.500 0.030",
         "N·m 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0030",
         "PASS largest difference 0.500 N, 0.0050 N·m; chi2 14 for 12 degrees of freedom, p 0.29 "
-        "(1 % of unchanged cells fail near the poses of the fit)",
+        "(false alarms: 1 in 100, near the poses of the fit)",
         "? R03 was not steady",
         "Saved run/verification.json",
     ]
