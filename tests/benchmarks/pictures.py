@@ -1,7 +1,8 @@
-"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [demo] [live]`.
+"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [demo] [live] [drawings]`.
 
 demo  runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
 live  runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
+drawings  frames, signs, what to measure, files and data flow, from `drawings.py`
 """
 
 import asyncio
@@ -23,6 +24,7 @@ from ftdrive.terminal.live_feed import Feed
 from ftdrive.terminal.live_screen import LiveApp
 from ftdrive.terminal.live_view import Summary
 from tests.benchmarks.common import show
+from tests.benchmarks.drawings import DRAWINGS
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
 
 FOLDER = Path(__file__).parents[2] / "docs/pictures"
@@ -163,6 +165,9 @@ def main(wanted: list[str]) -> None:
     if "live" in wanted or not wanted:
         for scenario in get_args(Scenario):
             write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
+    if "drawings" in wanted or not wanted:
+        for name, draw in DRAWINGS.items():
+            write(f"{name}.svg", draw().svg())
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import pytest
 
 import ftdrive
 from ftdrive.cli import cli
+from tests.benchmarks.drawings import DRAWINGS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")]
@@ -80,6 +81,15 @@ def test_links_of_pages_exist() -> None:
         links = re.findall(r"\]\((?!https?:|mailto:|#)([^)#\s]+)", text)
         missing += [f"{page.relative_to(ROOT)}: {link}" for link in links if not (page.parent / link).exists()]
     assert missing == []
+
+
+def test_drawings_are_those_of_the_code() -> None:
+    pictures = ROOT / "docs/pictures"
+    assert [
+        name
+        for name, draw in DRAWINGS.items()
+        if (pictures / f"{name}.svg").read_text(encoding="utf-8") != draw().svg()
+    ] == []
 
 
 def test_pages_that_the_code_names_exist() -> None:

@@ -1,0 +1,314 @@
+"""The line drawings of the documentation: `uv run python -m tests.benchmarks.pictures drawings`.
+
+Colours are of middle brightness, so that a drawing is readable on a white and on a dark page. Lengths are px.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from html import escape
+from math import atan2, cos, radians, sin
+from types import MappingProxyType
+from typing import Literal
+
+GREY, BLUE, ORANGE, GREEN = "#7a7f87", "#2f7fd0", "#c8791e", "#2f9e5f"
+Point = tuple[float, float]
+Anchor = Literal["start", "middle", "end"]
+
+
+class Drawing:
+    """Lines, arrows and words of one picture."""
+
+    def __init__(self, width: int, height: int, title: str) -> None:
+        self._head = (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" '
+            f'font-family="sans-serif" font-size="13">\n<title>{escape(title)}</title>'
+        )
+        self._shapes: list[str] = []
+
+    def svg(self) -> str:
+        return "\n".join([self._head, *self._shapes, "</svg>", ""])
+
+    def path(self, d: str, colour: str = GREY, *, width: float = 2, dashed: bool = False, filled: bool = False) -> None:
+        dashes = ' stroke-dasharray="5 4"' if dashed else ""
+        fill = colour if filled else "none"
+        self._shapes.append(
+            f'<path d="{d}" fill="{fill}" stroke="{colour}" stroke-width="{width:g}" stroke-linejoin="round"{dashes}/>'
+        )
+
+    def line(self, *points: Point, colour: str = GREY, width: float = 2, dashed: bool = False) -> None:
+        self.path("M" + " L".join(f"{x:g},{y:g}" for x, y in points), colour, width=width, dashed=dashed)
+
+    def arrow(self, start: Point, end: Point, colour: str = GREY, *, width: float = 2, dashed: bool = False) -> None:
+        at, (x, y) = atan2(end[1] - start[1], end[0] - start[0]), end
+        self.line(start, (x - 7 * cos(at), y - 7 * sin(at)), colour=colour, width=width, dashed=dashed)
+        left, right = ((x - 11 * cos(at + turn), y - 11 * sin(at + turn)) for turn in (0.4, -0.4))
+        self.path(
+            f"M{x:g},{y:g} L{left[0]:.1f},{left[1]:.1f} L{right[0]:.1f},{right[1]:.1f} Z", colour, width=1, filled=True
+        )
+
+    def box(self, x: float, y: float, width: float, height: float, colour: str = GREY, *, round_px: float = 4) -> None:
+        self._shapes.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="{round_px:g}" fill="none" '
+            f'stroke="{colour}" stroke-width="2"/>'
+        )
+
+    def dot(self, at: Point, colour: str = GREY, *, filled: bool = True) -> None:
+        fill = colour if filled else "none"
+        self._shapes.append(
+            f'<circle cx="{at[0]:g}" cy="{at[1]:g}" r="5" fill="{fill}" stroke="{colour}" stroke-width="2"/>'
+        )
+
+    def text(
+        self, x: float, y: float, *lines: str, colour: str = GREY, anchor: Anchor = "start", bold: bool = False
+    ) -> None:
+        """Write lines below one another; the first may be bold."""
+        for i, line in enumerate(lines):
+            weight = ' font-weight="bold"' if bold and i == 0 else ""
+            style = f'fill="{colour}" text-anchor="{anchor}"{weight}'
+            self._shapes.append(f'<text x="{x:g}" y="{y + 18 * i:g}" {style}>{escape(line)}</text>')
+
+    def axes(self, at: Point, directions: Iterable[tuple[str, float]], colour: str, length: float = 34) -> None:
+        """Draw the axes of a frame by name and direction in degrees, 0 to the right and 90 up."""
+        for name, degrees in directions:
+            turn = radians(degrees)
+            tip = (at[0] + length * cos(turn), at[1] - length * sin(turn))
+            self.arrow(at, tip, colour)
+            self.text(tip[0] + 9 * cos(turn), tip[1] - 9 * sin(turn) + 5, name, colour=colour, anchor="middle")
+
+    def size(self, start: Point, end: Point, colour: str = GREY) -> None:
+        """Draw the line of a dimension, level or upright, with a mark at each end."""
+        (x, y), (u, v) = start, end
+        ends = f"M{x:g},{y - 5:g} v10 M{u:g},{v - 5:g} v10" if y == v else f"M{x - 5:g},{y:g} h10 M{u - 5:g},{v:g} h10"
+        self.path(f"M{x:g},{y:g} L{u:g},{v:g} {ends}", colour, width=1)
+
+
+def _wrist(on: Drawing, x: float, y: float, *, up: bool = False) -> None:
+    """Draw flange, sensor and tool around the axis x; y is the flange face. The tip is 170 px away."""
+    s = -1 if up else 1
+    on.path(f"M{x - 26:g},{y - s * 46:g} V{y - s * 12:g} M{x + 26:g},{y - s * 46:g} V{y - s * 12:g}")
+    on.box(x - 42, min(y, y - s * 12), 84, 12, round_px=2)
+    on.box(x - 34, min(y, y + s * 34), 68, 34, BLUE)
+    on.text(x, y + s * 17 + 5, "sensor", colour=BLUE, anchor="middle")
+    on.path(f"M{x - 22:g},{y + s * 34:g} v{s * 76} h15 v{s * 60} h14 v{-s * 60} h15 v{-s * 76}")
+
+
+def _hatched(x: float, y: float, right: float, down: float, count: int = 4) -> str:
+    """Return the strokes that mark the solid side of a surface."""
+    return "".join(f" M{x + i * right:g},{y + i * down:g} l10,-10" for i in range(count))
+
+
+def frames() -> Drawing:
+    """Draw base, flange, sensor, tool and every vector of a calibration and of its exports."""
+    on = Drawing(880, 500, "Frames of base, flange, sensor and TCP, and the vectors between them")
+    on.path("M40,450 H120 M56,450 V420 H104 V450 M68,420 V230 L180,92 H268 M92,420 V238 L192,116 H268")
+    on.path("M268,84 V124 M332,84 V124 M268,84 H332", width=2)
+    on.box(252, 124, 96, 12, round_px=2)
+    on.box(262, 136, 76, 62, BLUE)
+    on.path("M278,198 V300 H292 V380 H308 V300 H322 V270 H366 V222 H322 V198")
+    on.axes((80, 420), (("x", 0), ("z", 90)), GREY, 44)
+    on.text(80, 474, "base", anchor="middle", bold=True)
+    on.arrow((80, 420), (297, 140), GREY, dashed=True, width=1.5)
+    flange, sensor, com, load, tcp = (300.0, 136.0), (300.0, 180.0), (330.0, 252.0), (318.0, 216.0), (300.0, 380.0)
+    on.arrow(flange, load, ORANGE)
+    on.arrow(sensor, com, BLUE)
+    on.arrow(com, (330, 330), GREEN)
+    for at, colour in ((load, ORANGE), (com, BLUE)):
+        on.dot(at, colour)
+    on.dot(flange, filled=False)
+    on.dot(sensor, BLUE, filled=False)
+    on.dot(tcp)
+    on.axes((214, 158), (("x", 0), ("z", -90)), GREY, 26)
+    on.axes((214, 216), (("x", 25), ("z", -65)), BLUE, 26)
+    on.size((244, 136), (244, 180), BLUE)
+    on.size((200, 270), (200, 380))
+    on.text(192, 330, "TCP", anchor="end")
+    on.line((200, 136), (290, 136), width=1, dashed=True)
+    on.line((200, 136), (200, 270), width=1, dashed=True)
+    on.line((200, 380), (292, 380), width=1, dashed=True)
+    rows = (
+        (348, 130, 44, GREY, ("flange: z out of the face",
+            "R_base_flange: orientation of the flange in base",
+            "A UR pose is that of the TCP: ftdrive removes the TCP offset.")),
+        (338, 166, 122, BLUE, ("sensor: its origin is [sensor] height_mm below the face",
+            "R_flange_sensor: how the sensor is turned on the flange",
+            "force_bias_N, torque_bias_Nm: sensor axes, about its origin")),
+        (324, 216, 200, ORANGE, ("centre of mass of all that hangs below the flange",
+            "ur-payload cog, franka center_of_mass, push:",
+            "flange axes, from the flange; sensor and adapter included")),
+        (336, 252, 278, BLUE, ("centre of mass of the tool: p_sensor_com_m",
+            "ros2-control, admittance, kth, kit, ft-tools, urdf, mujoco:",
+            "sensor axes, from the sensor",
+            "xarm: flange axes, from the sensor; mc-rtc: from the flange")),
+        (330, 322, 374, GREEN, ("weight of the tool: gravity_force_base_N, base axes",
+            "tilt_alpha_rad, tilt_beta_rad: how it leans from the base's z")),
+        (306, 380, 434, GREY, ("TCP: the tool's working point, as the controller has it",
+            "a reference point of live, record and compensate (--about tcp)")),
+    )  # fmt: skip
+    for x, y, row, colour, lines in rows:
+        on.line((x, y), (392, row - 5), (404, row - 5), colour=colour, width=1)
+        on.text(408, row, *lines, colour=colour, bold=True)
+    return on
+
+
+def wrench_sign() -> Drawing:
+    """Draw what the sensor reads: hanging, upside down, pushed, and as the reaction."""
+    on = Drawing(860, 366, "Sign of the wrench: what hangs on the sensor or pushes against it")
+    for x, up in ((120, False), (330, True), (540, False), (750, False)):
+        y = 220 if up else 62
+        _wrist(on, x, y, up=up)
+        on.axes((x - 96, y + (-17 if up else 17)), (("z", 90 if up else -90), ("x", 0)), BLUE, 28)
+    for x, y in ((120, 124), (330, 104)):
+        on.dot((x, y), GREEN)
+        on.arrow((x, y), (x, y + 66), GREEN, width=3)
+        on.text(x + 30, y + 54, "1 kg", colour=GREEN)
+    for x in (540, 750):
+        on.path(f"M{x - 60},234 H{x + 60}" + _hatched(x - 55, 244, 30, 0))
+    on.arrow((580, 234), (580, 176), ORANGE, width=3)
+    on.text(590, 200, "10 N", colour=ORANGE)
+    on.arrow((750, 236), (750, 292), GREY, width=3)
+    on.text(762, 276, "10 N")
+    on.text(120, 318, "The tool hangs:", "Fz = +9.81 N", colour=GREEN, anchor="middle", bold=True)
+    on.text(330, 318, "The tool stands:", "Fz = -9.81 N", colour=GREEN, anchor="middle", bold=True)
+    on.text(540, 318, "A table pushes the tool:", "Fz = -10 N, compensated", colour=ORANGE, anchor="middle", bold=True)
+    on.text(
+        750,
+        318,
+        "The tool pushes the table:",
+        "a sensor that reports this",
+        "needs sign = -1",
+        anchor="middle",
+        bold=True,
+    )
+    return on
+
+
+def measure() -> Drawing:
+    """Draw what `init` asks to measure with ruler and scale."""
+    on = Drawing(860, 470, "What to measure for init: sensor, tool and surroundings")
+    _wrist(on, 270, 60)
+    on.box(322, 122, 56, 50)
+    on.line((292, 142), (322, 142))
+    on.line((172, 60), (228, 60), width=1, dashed=True)
+    on.line((190, 88), (304, 88), colour=BLUE, width=1, dashed=True)
+    on.size((204, 60), (204, 88), BLUE)
+    on.text(190, 24, "1. sensor height: from the", "flange face to its origin", colour=BLUE, anchor="end")
+    on.line((172, 230), (262, 230), width=1, dashed=True)
+    on.size((182, 60), (182, 230), ORANGE)
+    on.text(170, 150, "3. tool:", "FROM 0", "TO 200", colour=ORANGE, anchor="end")
+    on.size((220, 250), (320, 250), ORANGE)
+    on.text(270, 270, "DIAMETER 100, with screws and cables", colour=ORANGE, anchor="middle")
+    on.text(270, 290, "--tool 0:200:100", colour=ORANGE, anchor="middle", bold=True)
+    on.size((270, 112), (350, 112), ORANGE)
+    words = ("4. a camera beside it is a cylinder of its own:", "from 60 to 110, 50 thick, axis 45 mm towards +x")
+    on.text(400, 130, *words, colour=ORANGE)
+    on.text(400, 168, "--tool 60:110:50:45:0", colour=ORANGE, bold=True)
+    on.line((310, 70), (390, 52), colour=BLUE, width=1)
+    on.text(400, 56, "2. scale: mass of sensor and adapter, about that of the tool", colour=BLUE)
+    on.text(20, 352, "5. room: from the centre of the base, along its axes", colour=GREEN, bold=True)
+    on.text(20, 374, "walls and tables: side and distance, such as", "+x 800 mm, or below 20", colour=GREEN)
+    on.text(20, 414, "boxes: two opposite corners", colour=GREEN)
+    on.path("M520,424 V396 H560 V424 M530,396 V330 L590,270 L640,300 M550,396 V338 L592,294 L632,316")
+    on.axes((540, 396), (("x", 0), ("z", 90)), BLUE, 40)
+    on.path("M780,230 V436" + _hatched(780, 250, 0, 30, 7), GREEN)
+    on.size((540, 380), (780, 380), GREEN)
+    on.text(690, 372, "+x 800 mm", colour=GREEN, anchor="middle")
+    on.path("M430,436 H780" + _hatched(440, 446, 40, 0, 9), GREEN)
+    on.size((470, 424), (470, 436), GREEN)
+    on.line((464, 424), (560, 424), width=1, dashed=True)
+    on.text(460, 426, "below 20", colour=GREEN, anchor="end")
+    return on
+
+
+def run_folder() -> Drawing:
+    """Draw the files of a run in the order in which they appear."""
+    on = Drawing(860, 400, "The files of a run folder")
+    on.text(20, 28, "runs/2026-11-20T211503Z-gripper/", bold=True)
+    on.text(330, 28, "a folder for each run; nothing is overwritten")
+    groups = (
+        (GREY, "before the arm moves", (
+            ("run.json", "devices, configuration, command line, versions"),
+            ("plan.json", "joint targets, speeds, clearances"))),
+        (ORANGE, "at each pose", (
+            ("events.ndjson", "what happened, and who answered each question"),
+            ("poses/01.npz … 25.npz", "raw samples, on disk before the next move"))),
+        (BLUE, "after the last pose", (
+            ("dataset.json", "means and covariances of the poses, as solved"),
+            ("calibration.json", "the result: live, verify, export, push take the folder"))),
+        (GREEN, "later", (
+            ("report.html", "ftdrive report"),
+            ("push.json", "receipt of ftdrive push, for --restore"),
+            ("runs/…-verify/", "a verification has its own folder: verification.json"))),
+    )  # fmt: skip
+    y = 62
+    for colour, when, files in groups:
+        top = y - 14
+        for name, content in files:
+            on.line((34, y - 5), (52, y - 5), colour=colour)
+            on.text(58, y, name, colour=colour, bold=True)
+            on.text(250, y, content)
+            y += 30
+        on.line((34, top), (34, y - 35), colour=colour)
+        on.path(f"M640,{top} h12 V{y - 22} h-12", colour)
+        on.text(664, (top + y - 22) / 2 + 5, when, colour=colour)
+        y += 16
+    return on
+
+
+def data_flow() -> Drawing:
+    """Draw how samples become a calibration, and a calibration contact forces."""
+    on = Drawing(860, 400, "From the devices to a calibration, and from a calibration to contact forces")
+
+    def box(x: float, y: float, width: float, colour: str, *lines: str) -> None:
+        on.box(x, y, width, 24 + 18 * (len(lines) - 1) + 12, colour)
+        on.text(x + width / 2, y + 23, *lines, colour=colour, anchor="middle", bold=True)
+
+    on.text(20, 28, "once: calibrate", colour=BLUE, bold=True)
+    box(20, 50, 130, GREY, "arm", "pose, 500 Hz")
+    box(20, 120, 130, GREY, "sensor", "raw wrench")
+    box(210, 85, 130, BLUE, "calibrate", "24 poses")
+    box(400, 85, 130, BLUE, "run folder", "poses, result")
+    box(400, 12, 130, GREY, "poses.csv", "a file of yours")
+    box(600, 12, 240, BLUE, "report, verify, history, diff", "is it good, does it still hold?")
+    box(600, 85, 240, GREEN, "export", "ROS 2, URDF, URScript, JSON, …")
+    box(600, 158, 240, GREEN, "push", "payload, gravity: to the controller")
+    on.arrow((150, 71), (206, 98))
+    on.arrow((150, 141), (206, 114))
+    on.arrow((340, 106), (396, 106), BLUE)
+    on.arrow((465, 66), (465, 82))
+    on.text(473, 79, "solve")
+    on.arrow((530, 96), (596, 46), BLUE)
+    on.arrow((530, 106), (596, 106), BLUE)
+    on.arrow((530, 116), (596, 170), BLUE)
+    on.text(20, 236, "then: all day", colour=ORANGE, bold=True)
+    box(20, 256, 130, GREY, "arm", "pose, 500 Hz")
+    box(20, 326, 130, GREY, "sensor", "raw wrench")
+    box(
+        210,
+        282,
+        320,
+        ORANGE,
+        "contact = raw - bias - weight",
+        "pairing, low-pass, axes and point,",
+        "sigma, test for contact",
+    )
+    on.line((465, 139), (465, 278), colour=BLUE, dashed=True)
+    on.arrow((465, 262), (465, 279), BLUE)
+    on.text(455, 208, "calibration", colour=BLUE, anchor="end")
+    on.arrow((150, 277), (206, 300))
+    on.arrow((150, 347), (206, 324))
+    box(600, 226, 240, ORANGE, "live, weigh, record", "screen, browser, files")
+    box(600, 290, 240, ORANGE, "stream, ros2, serve-load", "Foxglove, topics, UR programs")
+    box(600, 354, 240, ORANGE, "open_stream()")
+    for y in (247, 311, 372):
+        on.arrow((530, 314), (596, y), ORANGE)
+    return on
+
+
+DRAWINGS: Mapping[str, Callable[[], Drawing]] = MappingProxyType(
+    {
+        "frames": frames,
+        "wrench-sign": wrench_sign,
+        "measure": measure,
+        "run-folder": run_folder,
+        "data-flow": data_flow,
+    }
+)
