@@ -11,8 +11,6 @@ PAGE = Path(__file__).parents[2] / "docs/reference/finding-codes.md"
 _HEAD = """\
 # Finding codes
 
-This page is generated: run `uv run python tests/house/codes_page.py` after a change of `ftcalib.findings.CODES`.
-
 A finding is a code, a severity and values: `result.findings` in Python, `findings` in a calibration file and with
 `--json`, where `words` has the sentence. `hints` of `calibrate`, `solve` and `report` are findings about single poses.
 The worst severity gives the verdict:
@@ -30,10 +28,14 @@ Values stand as their names, which end with their units. A value that is not kno
 | code | severity | found | fix |
 |---|---|---|---|"""
 
+_END = """
+This page is generated: run `uv run python tests/house/codes_page.py` after a change of `ftcalib.findings.CODES`.
+"""
+
 
 def page() -> str:
     """Return the page in Markdown."""
-    return "\n".join([_HEAD, *_rows(), ""])
+    return "\n".join([_HEAD, *_rows(), _END])
 
 
 def _rows() -> Iterator[str]:

@@ -261,17 +261,20 @@ def files() -> dict[Path, str]:
         made[PICTURES / name] = picture(title, steps)
         modules = len({step.module for step in steps})
         page.append(f"## {title}\n\n{len(steps)} steps in {modules} modules.\n\n![{title}](../pictures/{name})\n")
-    made[PAGE] = "\n".join(page)
+    made[PAGE] = "\n".join([*page, _END])
     return made
 
 
 _HEAD = """# Four walks through the code
 
 Each picture follows one thing through the program. The line of a row begins at the row that calls it. A dashed line is
-a queue between two threads. Not every call is shown, but every shown call exists: `tests/house/test_walks.py` compares
-the rows with the code. After a change of the table in `tests/house/walks.py`, run `uv run python tests/house/walks.py`.
+a queue between two threads. Not every call is shown, but every shown call exists.
 
 [Architecture](../explanation/architecture.md) has the packages and what each may import.
+"""
+
+_END = """`tests/house/test_walks.py` compares the rows with the code. After a change of the table in `tests/house/walks.py`, run
+`uv run python tests/house/walks.py`.
 """
 
 if __name__ == "__main__":
