@@ -2,6 +2,7 @@
 
 import os
 from importlib.metadata import version as installed
+from pathlib import Path
 
 import click
 from sphinx.application import Sphinx
@@ -45,6 +46,7 @@ html_theme = "furo"
 html_title = f"ftdrive {release}"
 html_static_path = ["_static"]
 html_css_files = ["wide.css"]
+html_search_scorer = str(Path(__file__).with_name("search.js"))  # headings that share most of the words typed
 copybutton_exclude = ".linenos, .gp, .go"  # prompts and output are not copied
 
 
