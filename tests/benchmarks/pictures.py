@@ -1,19 +1,27 @@
-"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [demo] [live] [drawings]`.
+"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [NAME]...`, all without a name.
 
-demo  runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
-live  runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
+demo      runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
+live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
+report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
+tour      stick figures of `ftdrive plan`
 drawings  frames, signs, what to measure, files and data flow, from `drawings.py`
+
+Tests of the browser draw the pages of --view: `PICTURES=docs/pictures uv run pytest -m browser tests/browser`.
 """
 
 import asyncio
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Mapping
 from html import unescape
 from io import StringIO
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from types import MappingProxyType
 from typing import get_args
 
 from rich.console import Console
@@ -157,17 +165,76 @@ def write(name: str, svg: str) -> None:
     show(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
+def draw_demo() -> None:
+    write("demo.svg", animated(chosen(screens())))
+
+
+def draw_live() -> None:
+    for scenario in get_args(Scenario):
+        write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
+
+
+# What commands write into files
+
+REPORT_PX = 900
+
+
+def draw_report() -> None:
+    from PIL import Image
+    from playwright.sync_api import sync_playwright
+
+    with TemporaryDirectory() as folder:
+        _run(folder, "demo")
+        (run,) = Path(folder, "runs").iterdir()
+        _run(folder, "report", str(run), "-o", "report.html")
+        with sync_playwright() as driver:
+            browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": REPORT_PX, "height": 1000})
+            page.goto(Path(folder, "report.html").as_uri())
+            second_px = "document.querySelectorAll('section')[1].getBoundingClientRect().top"
+            page.screenshot(
+                path=FOLDER / "report.png",
+                full_page=True,
+                # The head and the estimates.
+                clip={"x": 0, "y": 0, "width": REPORT_PX, "height": page.evaluate(second_px)},
+            )
+            browser.close()
+    Image.open(FOLDER / "report.png").quantize(128).save(FOLDER / "report.png", optimize=True)
+
+
+def draw_tour() -> None:
+    with TemporaryDirectory() as folder:
+        tool, room = "--tool 0:60:90 --tool 60:200:60", "--plane=-1:0:0:-800 --box 350:-700:0:600:-300:250"
+        _run(folder, "plan", "--model", "ur5e", *tool.split(), *room.split(), "--png", "tour.png")
+        shutil.copy(Path(folder, "tour.png"), FOLDER / "tour.png")
+
+
+def _run(folder: str, *command: str) -> None:
+    here = {**os.environ, "XDG_DATA_HOME": folder}  # not the history of who draws
+    subprocess.run([sys.executable, "-m", "ftdrive", *command], cwd=folder, env=here, check=True)
+
+
+def draw_drawings() -> None:
+    for name, draw in DRAWINGS.items():
+        write(f"{name}.svg", draw().svg())
+
+
+PICTURES: Mapping[str, Callable[[], None]] = MappingProxyType(
+    {
+        "demo": draw_demo,
+        "live": draw_live,
+        "report": draw_report,
+        "tour": draw_tour,
+        "drawings": draw_drawings,
+    }
+)
+
+
 def main(wanted: list[str]) -> None:
     """Write the pictures asked for, or all."""
     FOLDER.mkdir(exist_ok=True)
-    if "demo" in wanted or not wanted:
-        write("demo.svg", animated(chosen(screens())))
-    if "live" in wanted or not wanted:
-        for scenario in get_args(Scenario):
-            write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
-    if "drawings" in wanted or not wanted:
-        for name, draw in DRAWINGS.items():
-            write(f"{name}.svg", draw().svg())
+    for name in wanted or PICTURES:
+        PICTURES[name]()
 
 
 if __name__ == "__main__":

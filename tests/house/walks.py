@@ -273,8 +273,8 @@ a queue between two threads. Not every call is shown, but every shown call exist
 [Architecture](../explanation/architecture.md) has the packages and what each may import.
 """
 
-_END = """`tests/house/test_walks.py` compares the rows with the code. After a change of the table in `tests/house/walks.py`, run
-`uv run python tests/house/walks.py`.
+_END = """`tests/house/test_walks.py` compares the rows with the code. After a change of the table in
+`tests/house/walks.py`, run `uv run python tests/house/walks.py`.
 """
 
 if __name__ == "__main__":
