@@ -3,9 +3,11 @@
 Colours are of middle brightness, so that a drawing is readable on a white and on a dark page. Lengths are px.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
-from math import atan2, cos, radians, sin
+from math import atan2, cos, log10, radians, sin
+from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
 
@@ -303,6 +305,117 @@ def data_flow() -> Drawing:
     return on
 
 
+# Figures: the numbers of a table of the page, so that picture and table cannot differ
+
+ROOT = Path(__file__).parents[2]
+FIGURES = "docs/contributing/figures"
+NUMBER = re.compile(r"(?<![\w.])\d*\.?\d+")
+
+
+def _rows(page: str, heading: str) -> list[list[str]]:
+    """Return the cells of the first table below a heading, without its head."""
+    text = (ROOT / page).read_text(encoding="utf-8").split(f"\n## {heading}\n", 1)[1]
+    table = re.search(r"(?:^\|.*\n)+", text, re.MULTILINE)
+    assert table is not None
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[0].splitlines()[2:]]
+
+
+def _numbers(cell: str) -> list[float]:
+    return [float(number) for number in NUMBER.findall(cell)]
+
+
+Row = tuple[str, Sequence[tuple[str, Sequence[float]]]]
+"""Label, and the values of each colour; a line joins the values of one colour."""
+
+
+def _dots(
+    title: str, rows: Sequence[Row], ticks: Sequence[float], key: Mapping[str, str], *, logarithmic: bool
+) -> Drawing:
+    """Draw a line of dots for each row above a common axis; `key` has the words of each colour."""
+    left, right, row_px = 350, 840, 24
+    on = Drawing(880, 90 + row_px * len(rows), title)
+    scale = log10 if logarithmic else float
+    start, end = scale(ticks[0]), scale(ticks[-1])
+
+    def x(value: float) -> float:
+        return round(left + (right - left) * (scale(value) - start) / (end - start), 1)
+
+    on.text(20, 20, title, bold=True)
+    bottom = 40 + row_px * len(rows)
+    for tick in ticks:
+        on.line((x(tick), 34), (x(tick), bottom), width=0.5)
+        on.text(x(tick), bottom + 18, f"{tick:g}", anchor="middle")
+    for i, (label, series) in enumerate(rows):
+        y = 52 + row_px * i
+        on.text(left - 16, y + 5, label, anchor="end")
+        for colour, values in series:
+            if len(values) > 1:
+                on.line((x(min(values)), y), (x(max(values)), y), colour=colour)
+            for value in values:
+                on.dot((x(value), y), colour)
+    width = 20.0
+    for colour, words in key.items():
+        on.dot((width + 5, bottom + 32), colour)
+        on.text(width + 16, bottom + 36, words, colour=colour)
+        width += 40 + 7.5 * len(words)
+    return on
+
+
+def figure_calibration() -> Drawing:
+    """Draw the force error of five methods in each session."""
+    colours = (GREY, GREY, GREEN, ORANGE, BLUE)
+    rows: list[Row] = []
+    for session, *cells in _rows("README.md", "Accuracy"):
+        found = [(colour, _numbers(cell)[:1]) for colour, cell in zip(colours, cells, strict=True) if _numbers(cell)]
+        rows.append((session, found))
+    key = {GREY: "10-parameter LS; Carlson", GREEN: "LROM", ORANGE: "SROM", BLUE: "ftdrive"}
+    title = "Force error in poses that were not used, rms, mN"
+    return _dots(title, rows, (50, 100, 1000, 10000, 30000), key, logarithmic=True)
+
+
+def figure_motion() -> Drawing:
+    """Draw error over sigma of calibrations from motion."""
+    rows = _rows(f"{FIGURES}/motion.md", "Calibration from motion")
+    found: list[Row] = [(label.partition(", which")[0], [(BLUE, sorted(_numbers(cell)))]) for label, cell, _ in rows]
+    key = {BLUE: "smallest, overall and largest of 23 parameters; 1 is right"}
+    return _dots("Error over sigma, 200 runs a row", found, (0.5, 1, 1.5, 2, 2.5, 3, 3.5), key, logarithmic=False)
+
+
+def figure_planning() -> Drawing:
+    """Draw the distances of the tours: certified, between hulls, between meshes."""
+    rows: list[Row] = [
+        (arm, [(BLUE, _numbers(certified)), (ORANGE, _numbers(hulls)[:1]), (GREEN, _numbers(meshes))])
+        for arm, certified, hulls, meshes in _rows(f"{FIGURES}/planning.md", "Tours against meshes")
+    ]
+    key = {BLUE: "certified, of each tour", ORANGE: "smallest between hulls", GREEN: "smallest between meshes"}
+    title = "Distance of the moving parts on all tours, mm; target 15 between hulls"
+    return _dots(title, rows, (0, 15, 20, 25, 30, 35), key, logarithmic=False)
+
+
+def figure_devices() -> Drawing:
+    """Draw how soon a failure of arm or link is reported, and how soon the arm rests."""
+    rows: list[Row] = []
+    for event, reported, arm, _ in _rows(f"{FIGURES}/devices.md", "Failures of the arm"):
+        if reported and _numbers(arm):
+            label = event.partition(";")[0].partition(" (")[0].partition(", or")[0]
+            rows.append((label, [(ORANGE, _numbers(arm)), (BLUE, _numbers(reported))]))
+    key = {BLUE: "reported, target 0.5 s", ORANGE: "the arm rests, target 1 s where a stop can reach it"}
+    return _dots(
+        "Failures of the arm: seconds after the event", rows, (0, 0.25, 0.5, 0.75, 1, 1.25), key, logarithmic=False
+    )
+
+
+def figure_fleet() -> Drawing:
+    """Draw after how many days a drift is found."""
+    rows: list[Row] = [
+        (case, [(BLUE, _numbers(days))]) for case, days, _ in _rows(f"{FIGURES}/fleet.md", "Drift") if _numbers(days)
+    ]
+    key = {BLUE: "median, 90 % and 99 % of 200 cells"}
+    return _dots(
+        "A drift of the bias is found after, days", rows, (0, 10, 20, 30, 40, 50, 60, 70, 80), key, logarithmic=False
+    )
+
+
 DRAWINGS: Mapping[str, Callable[[], Drawing]] = MappingProxyType(
     {
         "frames": frames,
@@ -310,5 +423,10 @@ DRAWINGS: Mapping[str, Callable[[], Drawing]] = MappingProxyType(
         "measure": measure,
         "run-folder": run_folder,
         "data-flow": data_flow,
+        "figure-calibration": figure_calibration,
+        "figure-motion": figure_motion,
+        "figure-planning": figure_planning,
+        "figure-devices": figure_devices,
+        "figure-fleet": figure_fleet,
     }
 )

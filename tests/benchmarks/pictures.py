@@ -4,7 +4,7 @@ demo      runs `ftdrive demo` in tmux at 80x24, copies its screen about once a s
 live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
 tour      stick figures of `ftdrive plan`
-drawings  frames, signs, what to measure, files and data flow, from `drawings.py`
+drawings  frames, signs, what to measure, files, data flow, and plots of tables of the figures, from `drawings.py`
 
 Tests of the browser draw the pages of --view: `PICTURES=docs/pictures uv run pytest -m browser tests/browser`.
 """
