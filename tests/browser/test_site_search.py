@@ -68,7 +68,7 @@ SYMPTOMS = {
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The address of the site: that of the folder in `SITE`, else it is built."""
+    """Address of the site in the folder `SITE`, or of one built here; Sphinx loses index entries in a partial build."""
     pytest.importorskip("furo", reason="the group docs is not installed")
     folder = os.environ.get("SITE") or str(tmp_path_factory.mktemp("site"))
     if "SITE" not in os.environ:
