@@ -3,7 +3,7 @@
 demo      runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
 live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
-tour      stick figures of `ftdrive plan`
+tour      stick figures of `ftdrive plan`, and the sweep of `ftdrive demo --sweep`
 drawings  frames, signs, what to measure, files, data flow, and plots of tables of the figures, from `drawings.py`
 
 Tests of the browser draw the pages of --view: `PICTURES=docs/pictures uv run pytest -m browser tests/browser`.
@@ -203,10 +203,14 @@ def draw_report() -> None:
 
 
 def draw_tour() -> None:
+    from PIL import Image
+
     with TemporaryDirectory() as folder:
         tool, room = "--tool 0:60:90 --tool 60:200:60", "--plane=-1:0:0:-800 --box 350:-700:0:600:-300:250"
         _run(folder, "plan", "--model", "ur5e", *tool.split(), *room.split(), "--png", "tour.png")
-        shutil.copy(Path(folder, "tour.png"), FOLDER / "tour.png")
+        _run(folder, "demo", "--sweep")
+        for figure in Path(folder).rglob("*.png"):
+            Image.open(figure).quantize(128).save(FOLDER / figure.name, optimize=True)
 
 
 def _run(folder: str, *command: str) -> None:
