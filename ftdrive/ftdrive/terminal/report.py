@@ -175,7 +175,7 @@ def error_in_words(result: CalibrationResult) -> str:
         error = result.likely_error(where)
         if error[0] > _WORSE * result.likely_error()[0]:
             sources.append("{} {:.2g} N, {:.2g} N·m".format(words, *error))
-    return f"{likely} rms ({'; '.join(sources)}; predicted: {predicted})"
+    return f"{likely} rms ({'; '.join([*sources, f'predicted: {predicted}'])})"
 
 
 def tip_of(result: CalibrationResult) -> Array:
