@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.display import Displayed, Summary
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
 from ftcalib.known import NOTHING, Known, Setup
@@ -23,8 +24,8 @@ from ftcalib.solver import estimator_of, solve
 _MOST_FOLDS = 50
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MethodResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MethodResult(Displayed):
     """Result of one method, or the reason why it has none."""
 
     method: Method
@@ -45,6 +46,10 @@ class MethodResult:
     centre_error: float = np.nan
     """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor; NaN
     if that is zero."""
+
+    def _summary(self) -> Summary:
+        words = f"force {self.force_rms_N:.4f} N, torque {self.torque_rms_Nm:.5f} N·m rms of the residuals"
+        return Summary(f"{self.method}: {words if self.reason is None else self.reason}")
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the JSON object that `ftdrive solve --method all --json` prints for a method."""

@@ -13,6 +13,7 @@ from math import isfinite
 from types import MappingProxyType
 from typing import Any, Final, Literal, Self
 
+from ftcalib.display import Displayed, Summary
 from ftcalib.rounding import decimals
 
 # What a finding does to the result: rejected, usable at best, or not worse for it.
@@ -46,8 +47,8 @@ class Code:
         return {place[1] for place in _PLACE.finditer(self.found + self.fix) if place[2] not in _OPTIONAL}
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
+@dataclass(frozen=True, slots=True, repr=False)
+class Finding(Displayed):
     """One finding. A code that this version does not know, from a file of a later one, has no sentence.
 
     Raises
@@ -107,6 +108,9 @@ class Finding:
     def words(self) -> str:
         """The sentence: what was found, and what to do about it."""
         return f"{self.found}: {self.fix}" if self.fix else self.found
+
+    def _summary(self) -> Summary:
+        return Summary(f"{self.code} ({self.severity}): {self.words}")
 
     def to_dict(self) -> dict[str, Any]:
         """Return what files and `--json` have of it."""

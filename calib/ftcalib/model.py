@@ -15,6 +15,8 @@ import numpy as np
 import scipy  # its parts are imported at their first use, so that commands that need none start fast
 from numpy.typing import ArrayLike, NDArray
 
+from ftcalib.display import Displayed
+
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
@@ -37,8 +39,8 @@ BIASES = np.r_[6:9, 12:15]
 """Where force and torque bias stand in `PARAMETER_NAMES`."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Parameters:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Parameters(Displayed):
     """The estimated quantities.
 
     Examples

@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike
 from scipy.special import expit
 
 from ftcalib.compensation import Compensator
+from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadCalibration
+from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
@@ -40,7 +42,9 @@ from ftcalib.model import (
     matrices_of,
     read_only,
 )
+from ftcalib.notebook import figure_of, frame_of
 from ftcalib.published.yu import weight_and_tilt
+from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.sensor_matrix import ContactResponse, SensorMatrix
 
 FORMAT = "ftdrive.calibration/1"
@@ -50,6 +54,11 @@ CONTRADICTS = 4.0
 
 # Eigenvalues of a correlation matrix below this are no rounding.
 INDEFINITE = -1e-6
+
+# Unit by the end of a name; the rotation vector of the mounting is in rad.
+_SI: Mapping[str, str] = {
+    "kg": "kg", "m": "m", "N": "N", "Nm": "N·m", "rad": "rad", "sensor": "rad", "m2": "kg·m²", "s": "s",
+}  # fmt: skip
 
 Method = Literal[
     "ml",
@@ -71,8 +80,8 @@ Method = Literal[
 NoiseSource = Literal["measured", "residuals"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionResult:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class MotionResult(Displayed):
     """What a recording in motion gives beside the static model; arrays are read-only."""
 
     inertia_kg_m2: Array
@@ -123,8 +132,8 @@ class MotionResult:
         return cls(*(document[name] for name in names))
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationResult(Displayed):
     """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
 
     Examples
@@ -516,6 +525,81 @@ class CalibrationResult:
             "torque_rms_Nm": float(np.sqrt(np.mean(torque**2))),
             "torque_max_Nm": float(torque.max()),
         }
+
+    def _summary(self) -> Summary:
+        amount = counted(self.n_poses, "pose") if self.motion is None else f"{100 * self.motion.used_share:.0f} % used"
+        rows = list[Row]()
+        for label, scale, unit, key, values, sigmas in self._estimates():
+            if key == "gravity_force_base_N":  # follows from mass and tilt
+                continue
+            cells = [
+                with_sigma(scale * value, scale * sigma) if sigma else f"{to_place_of(scale * value, 0.0)} fixed"
+                for value, sigma in zip(values, sigmas, strict=True)
+            ]
+            if key == "tilt_beta_rad":  # beside alpha
+                rows[-1] = Row("base tilt alpha, beta", [*rows[-1].cells, *cells], unit)
+            elif key == "inertia_kg_m2":
+                rows += [Row("inertia xx, yy, zz", cells[:3], unit), Row("inertia xy, xz, yz", cells[3:], unit)]
+            else:
+                rows.append(Row(f"{label} x, y, z" if len(cells) == 3 else label, cells, unit))
+        force_N, torque_Nm = self.likely_error()
+        rows.insert(6, Row("error of a free tool, rms", [f"{force_N:.4f} N", f"{torque_Nm:.5f} N·m"]))
+        title = f"Calibration {self.id}, {amount}, method {self.method}, estimates ± 1 sigma"
+        return Summary(title, rows, self.reasons, self.verdict)
+
+    def _estimates(self) -> Iterator[tuple[str, float, str, str, Array, Array]]:
+        """Give each quantity as in `QUANTITIES`, with its elements and their sigmas, which are 0 if it was known."""
+        sigma = self.sigma
+        fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(self.covariance).max()))
+        for label, scale, unit, key in quantities_of(sigma):
+            value = getattr(self if hasattr(self, key) else self.motion, key)
+            sigmas = values_of(sigma[key], key)
+            yield label, scale, unit, key, values_of(value, key), np.where(sigmas <= fixed_below, 0.0, sigmas)
+
+    def to_frame(self) -> Any:
+        """Return the estimates as a DataFrame of pandas, else of Polars.
+
+        Returns
+        -------
+        DataFrame
+            A row for each number: `name`, such as ``p_sensor_com_m.x``, `value`, `sigma` and `unit`, SI. The mounting
+            `R_flange_sensor` is its rotation vector. Sigma is 0 for what was known.
+
+        Raises
+        ------
+        UsageError
+            Neither package is installed.
+        """
+        rows = [
+            (f"{key}.{axis}" if axis else key, float(value), float(sigma), _SI[key.rpartition("_")[2]])
+            for _, _, _, key, values, sigmas in self._estimates()
+            for axis, value, sigma in zip(axes_of(len(values)), values, sigmas, strict=True)
+        ]
+        return frame_of(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
+
+    def plot(self) -> Any:
+        """Draw what the fit leaves of each pose, or row of a recording in motion: measured minus predicted.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Forces above torques, in sensor axes. The band is one sigma of the measured noise, where it is known.
+
+        Raises
+        ------
+        UsageError
+            matplotlib is not installed.
+        """
+        rejected = None if self.weights is None else self.weights == 0
+        return figure_of(
+            np.arange(1.0, len(self.residuals) + 1),
+            self.residuals,
+            label="pose" if self.motion is None else "row of the recording",
+            title=f"Measured minus predicted, {self.verdict.upper()}; band: one sigma",
+            sigma=self.measured_sigma,
+            marked=rejected,
+            points=True,
+        )
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a calibration file."""

@@ -25,6 +25,7 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 from scipy.linalg import block_diag
 
+from ftcalib.display import Displayed
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Setup
@@ -48,8 +49,8 @@ def ranges(lever_m: float) -> Array:
     return np.repeat([1.0, lever_m], 3)
 
 
-@dataclass(frozen=True, eq=False)
-class SensorMatrix:
+@dataclass(frozen=True, eq=False, repr=False)
+class SensorMatrix(Displayed):
     """Errors of a sensor's matrix before a tool shows some of them; arrays are read-only.
 
     Examples

@@ -24,6 +24,7 @@ from ftcalib.after.cell_errors import LOAD, known_response, sensor_error_columns
 from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
+from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
 from ftcalib.likelihood.response import (
     joint_covariance,
@@ -33,6 +34,7 @@ from ftcalib.likelihood.response import (
 )
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
+from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.sensor_matrix import ContactResponse, ranges
 
 # A part is held so near to the given point, one standard deviation an axis.
@@ -52,8 +54,8 @@ _PASSES = 4
 Fault = Literal["contact", "cable", "changed", "lifted"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Weight:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Weight(Displayed):
     """What is held beyond the tool. Arrays are read-only, sensor axes, from the sensor origin.
 
     Examples
@@ -92,6 +94,16 @@ class Weight:
     def __post_init__(self) -> None:
         for name in ("p_sensor_com_m", "com_covariance"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
+
+    def _summary(self) -> Summary:
+        mass = with_sigma(self.mass_kg, self.mass_sigma_kg)
+        rows = [Row("least mass that differs from 0", [to_place_of(self.least_kg, self.mass_sigma_kg)], "kg")]
+        if self.is_something:
+            pairs = zip(1e3 * self.p_sensor_com_m, 1e3 * self.com_sigma_m, strict=True)
+            rows.append(Row("centre of mass x, y, z", [with_sigma(*pair) for pair in pairs], "mm in sensor axes"))
+        return Summary(
+            f"Weight {mass} kg (1 sigma)", rows, [] if self.fault is None else [f"not one weight: {self.fault}"]
+        )
 
     @property
     def is_something(self) -> bool:

@@ -13,9 +13,12 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.data.dwell_mean import CHANNELS
+from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
+from ftcalib.notebook import frame_of
+from ftcalib.rounding import counted
 
 FORMAT = "ftdrive.dataset/1"
 
@@ -35,8 +38,8 @@ _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
 _ROUNDED_LENGTH = 0.01
 
 
-@dataclass(frozen=True, eq=False)
-class CalibrationDataset:
+@dataclass(frozen=True, eq=False, repr=False)
+class CalibrationDataset(Displayed):
     """n poses, one row each. Arrays are read-only copies.
 
     Orientations rounded to three or more decimals are projected onto SO(3).
@@ -138,6 +141,46 @@ class CalibrationDataset:
     def __len__(self) -> int:
         """Count the poses."""
         return len(self.wrench)
+
+    def _summary(self) -> Summary:
+        least, most = self.wrench.min(axis=0), self.wrench.max(axis=0)
+        ranges = [f"{low:.6g} to {high:.6g}" for low, high in zip(least, most, strict=True)]
+        noise = "unknown"
+        if self.wrench_cov is not None:
+            force, torque = np.sqrt(
+                np.diagonal(self.wrench_cov, axis1=1, axis2=2).mean(axis=0).reshape(2, 3).mean(axis=1)
+            )
+            noise = f"{force:.2g} N, {torque:.2g} N·m rms"
+        rows = [
+            Row("force x, y, z", ranges[:3], "N"),
+            Row("torque x, y, z", ranges[3:], "N·m"),
+            Row("sigma of a mean", [noise]),
+            Row("duration", [f"{np.ptp(self.t_s):.6g} s" if np.isfinite(self.t_s).all() else "unknown"]),
+            *([Row("source", [str(self.meta["source"])])] if "source" in self.meta else []),
+        ]
+        return Summary(f"Dataset of {counted(len(self), 'pose')}, wrenches as measured, in the sensor frame", rows)
+
+    def to_frame(self) -> Any:
+        """Return a DataFrame of pandas, else of Polars, which `ftdrive.read_dataset` reads again.
+
+        Returns
+        -------
+        DataFrame
+            A row for each pose: `t` in s, the rotation matrix R_base_flange `r11` to `r33`, `fx` to `tz` in N and N·m,
+            and where they are known the standard errors `sigma_fx` to `sigma_tz`.
+
+        Raises
+        ------
+        UsageError
+            Neither package is installed.
+        """
+        columns = {"t": self.t_s} if np.isfinite(self.t_s).all() else {}
+        columns |= dict(zip(MATRIX_COLUMNS, self.R_base_flange.reshape(-1, 9).T, strict=True))
+        columns |= dict(zip(CHANNELS, self.wrench.T, strict=True))
+        if self.wrench_cov is not None:
+            sigma = np.sqrt(np.diagonal(self.wrench_cov, axis1=1, axis2=2))
+            columns |= {f"sigma_{name}": values for name, values in zip(CHANNELS, sigma.T, strict=True)}
+        return frame_of(columns)
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a dataset file."""

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from ftcalib.data.dataset import CalibrationDataset
+from ftcalib.display import Displayed
 from ftcalib.model import Array, cross, rotation_of, skew
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 
@@ -59,8 +60,8 @@ class KnownLoad:
     place_sigma_m: float = 0.0005
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadRun:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoadRun(Displayed):
     """Poses at rest with one load on the tool, or with the tool alone.
 
     Examples

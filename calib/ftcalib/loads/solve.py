@@ -13,6 +13,7 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import minimize
 
+from ftcalib.display import Displayed
 from ftcalib.errors import NotObservable
 from ftcalib.files import JSON
 from ftcalib.findings import Finding, Verdict, ordered, verdict_of
@@ -36,8 +37,8 @@ _POUND_KG = 0.45359237
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadSolution:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class LoadSolution(Displayed):
     """What runs with known loads give."""
 
     sensor: SensorMatrix

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
+from ftcalib.display import Displayed
 from ftcalib.files import JSON
 from ftcalib.model import skew
 from ftcalib.motion.model import HEIGHT
@@ -139,8 +140,8 @@ class Block(Paired):
             )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sample:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Sample(Displayed):
     """One compensated sample."""
 
     t_s: float
@@ -214,8 +215,8 @@ Tracking = Literal["off", "show", "apply"]
 """Whether bias and held part are followed beside the calibration, and whether they are applied."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Tracked:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Tracked(Displayed):
     """Bias and held part, as followed while the arm works.
 
     Examples
@@ -268,8 +269,8 @@ class Tracked:
         return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamInfo:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StreamInfo(Displayed):
     """What does not change while a stream runs with one calibration; every file and every client gets it."""
 
     calibration: CalibrationResult
@@ -320,8 +321,8 @@ class LinkStatus:
     """Why it is silent or has failed; empty while it delivers."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class StreamStatus:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StreamStatus(Displayed):
     """The state of a stream beside its samples."""
 
     sensor: LinkStatus

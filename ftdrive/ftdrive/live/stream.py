@@ -12,7 +12,7 @@ from contextlib import ExitStack, closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import NoReturn, Self
+from typing import Any, NoReturn, Self
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,6 +20,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.after.series import BiasTemperature
 from ftcalib.after.state import Calibrated
+from ftcalib.display import Displayed, Row, Summary
+from ftcalib.notebook import figure_of
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
@@ -43,7 +45,7 @@ from ftdrive.live.samples import (
     mean_rate_Hz,
     sensor_origin_m,
 )
-from ftdrive.live.stages import TARE_S, try_tare
+from ftdrive.live.stages import TARE_S, stages_in_words, try_tare
 from ftdrive.runs.run import versions
 from ftdrive.runs.verification import VerificationRecord, calibration_in_words, marks_of, verification_near
 from ftdrivers.clock import Clock
@@ -64,7 +66,7 @@ _RATE_S = 0.5
 _RATE_WINDOW_NS = 1_000_000_000
 
 
-class ProcessedStream(Processor, ABC):
+class ProcessedStream(Displayed, Processor, ABC):
     """A processor that reads its own samples: of a cell, or of a recording that replaces it."""
 
     clock: Clock
@@ -83,6 +85,23 @@ class ProcessedStream(Processor, ABC):
         block = self.process(paired, last=last)
         self._call_on_contact()
         return block
+
+    def _summary(self) -> Summary:
+        name = type(self).__name__
+        if not hasattr(self, "info"):
+            return Summary(f"{name}, not open: use it in a with block")
+        info, now = self.info, self.contact_reading()
+        sigma = self.rest_sigma
+        noise = "unknown yet" if sigma is None else f"{sigma[:3].max():.2g} N, {sigma[3:].max():.2g} N·m"
+        rows = [
+            Row("arm", [f"{info.arm.model} {info.arm.serial}, {info.arm_rate_Hz:.4g} Hz"]),
+            Row("sensor", [f"{info.sensor.model} {info.sensor.serial}, {info.sensor_rate_Hz:.4g} Hz"]),
+            Row("wrench", [str(self.frame)]),
+            Row("stages", [stages_in_words(self.stages)]),
+            Row("force now x, y, z", [f"{value:.3g}" for value in now[:3]], "N in sensor axes"),
+            Row("sigma of a sample at rest", [noise]),
+        ]
+        return Summary(f"{name}: {info.calibration_state or info.calibration.id}", rows)
 
     def take_contacts(self) -> list[Contact]:
         """Return the contacts that have begun or ended since the last call."""
@@ -449,6 +468,42 @@ class CompensatedStream(ProcessedStream):
     def __iter__(self) -> Iterator[Sample]:
         while True:
             yield from self.read()
+
+    def plot(self, duration_s: float = 2.0) -> Any:
+        """Read for so long, and draw what was read: the wrench in `frame`, after `stages`.
+
+        Parameters
+        ----------
+        duration_s : float
+            A loop over the stream does not get the samples of this time.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+            Forces above torques. The band is one sigma: noise, calibration, and errors of the sensor under contact.
+
+        Raises
+        ------
+        UsageError
+            matplotlib is not installed.
+        DeviceError
+            As `read`.
+        """
+        begin_ns, blocks = self.clock.now_ns(), list[Block]()
+        while not blocks or blocks[-1].t_host_ns[-1] < begin_ns + 1e9 * duration_s:
+            block = self.read()
+            # what a pause between reads left is older
+            if block.t_host_ns[-1] >= begin_ns:
+                blocks.append(block)
+        t_ns = np.concatenate([block.t_host_ns for block in blocks])
+        drawn = t_ns >= begin_ns
+        return figure_of(
+            (t_ns[drawn] - begin_ns) * 1e-9,
+            np.concatenate([block.wrench for block in blocks])[drawn],
+            label="time, s",
+            title=f"Contact wrench, {blocks[-1].frame}; band: one sigma",
+            sigma=np.concatenate([np.broadcast_to(block.sigma, block.wrench.shape) for block in blocks])[drawn],
+        )
 
     # ---------------------------------------------------------------------------------------------------- interruption
 

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ftcalib.display import Displayed, Summary
 from ftcalib.files import check_format, read_object, write_new
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma, special
+from ftcalib.rounding import counted
 from ftdrive.cell.config import RobotConfig
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
@@ -47,8 +49,8 @@ class Step:
     """The two bodies that come closest to their margin."""
 
 
-@dataclass(frozen=True, slots=True)
-class Plan:
+@dataclass(frozen=True, slots=True, repr=False)
+class Plan(Displayed):
     """A closed tour of poses; `to_dict` defines the file."""
 
     kind: str
@@ -70,6 +72,10 @@ class Plan:
     """The curve that the arm follows through the steps, which are points of it."""
     off_curve_m: float = 0.0
     """How much nearer to anything the arm can be on the curve than on the moves between the steps."""
+
+    def _summary(self) -> Summary:
+        words = _summary(self) if self.sweep is None else _sweep_summary(self)
+        return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=words)
 
     @property
     def certified(self) -> bool:

@@ -13,9 +13,11 @@ from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib import CalibrationResult
+from ftcalib import CalibrationResult, notebook
+from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, parsed_json
+from ftcalib.rounding import counted
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import (
     Block,
@@ -242,8 +244,8 @@ def with_calibration(header: Header, calibration: CalibrationResult, name: str) 
     return replace(header, info=info)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Recording(Displayed):
     """A recording in memory.
 
     An event of the kind "frame" or "stages" stands where those of the samples change; `values` holds the new ones.
@@ -260,6 +262,42 @@ class Recording:
         """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
         names = self.rows.dtype.names or ()
         return self.rows.view([(one, COLUMNS[one]) for name in names for one in NUMBERS[name]])
+
+    def to_frame(self) -> Any:
+        """Return the samples as a DataFrame of pandas, else of Polars.
+
+        Returns
+        -------
+        DataFrame
+            The columns of the CSV format: `t_s` from the first sample, `t_utc_s` since 1970, then those of `table`.
+
+        Raises
+        ------
+        UsageError
+            Neither package is installed.
+        """
+        names = self.table.dtype.names or ()
+        columns = {name: self.table[name] for name in names}
+        if "t_host_ns" in columns and len(self.rows):
+            t_ns = columns["t_host_ns"]
+            times = {"t_s": (t_ns - t_ns[0]) * 1e-9, "t_utc_s": (t_ns + self.header.info.utc_offset_ns) * 1e-9}
+            columns = times | columns
+        return notebook.frame_of(columns)
+
+    def _summary(self) -> Summary:
+        info = self.header.info
+        rows = [
+            Row("sensor", [f"{info.sensor.model} {info.sensor.serial}, {info.sensor_rate_Hz:.4g} Hz"]),
+            Row("arm", [f"{info.arm.model} {info.arm.serial}"]),
+            Row("wrench", [f"{self.header.frame}, N and N·m"]),
+            Row("calibration", [info.calibration_state or f"{info.calibration.id}, {info.calibration.verdict}"]),
+            Row("gaps", [str(self.gaps)] if "seq" in (self.rows.dtype.names or ()) else ["unknown"]),
+            Row("events", [str(len(self.events))]),
+        ]
+        amount = counted(len(self.rows), "sample")
+        if "t_host_ns" in (self.rows.dtype.names or ()):
+            amount += f" in {self.duration_s:.4g} s"
+        return Summary(f"Recording of {amount}", rows, [self.cut] if self.cut else [])
 
     @property
     def duration_s(self) -> float:

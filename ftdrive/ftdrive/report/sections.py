@@ -6,16 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.rounding import to_place_of, with_sigma
 from ftdrive.report.document import Figure, Section, Table, capital, label_of, rounded, shown_poses
-from ftdrive.terminal.report import SIGMA_OF_THE_TOOL, axes_of, quantities_of, values_of
+from ftdrive.terminal.report import SIGMA_OF_THE_TOOL
 
 Facts = Mapping[str, Any]
 
 # One good pose in 1000 deviates more, in root mean square over the six channels.
 SUSPICIOUS_SIGMAS = 1.9
-# A sigma below this share of the largest one belongs to a known value.
-_ROUNDED = 1e-9
 _AXES = "xyz"
 
 
@@ -44,7 +43,7 @@ def estimates(facts: Facts) -> Section:
 
 
 def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
-    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result["covariance"]).max()))
+    fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(result["covariance"]).max()))
     for label, scale, unit, key in quantities_of(result):
         values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
         fixed = sigmas <= fixed_below * scale
@@ -262,7 +261,7 @@ def drift(facts: Facts) -> Section:
             to_place_of(scale * sigma, scale * sigma),
             f"{change / sigma:+.1f}",
         )
-        if sigma > _ROUNDED
+        if sigma > FIXED_BELOW
         else (f"{name}, {unit}", "-", "-", "-")
         for name, unit, scale, change, sigma in (
             ()

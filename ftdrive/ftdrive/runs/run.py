@@ -34,6 +34,7 @@ from typing import Any, Final, Literal, Self, get_args
 
 import numpy as np
 
+from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
 from ftcalib.files import check_format, read_file, read_object, write_object
 from ftcalib.model import Array
@@ -73,7 +74,7 @@ class Reading:
     R_base_flange: Array
 
 
-class Run:
+class Run(Displayed):
     """A run folder on disk. In a `with` block no other process can add poses.
 
     Parameters
@@ -126,6 +127,22 @@ class Run:
 
     def __exit__(self, *_: object) -> None:
         self._held.close()
+
+    def _summary(self) -> Summary:
+        title = f"Run {self.folder}"
+        try:
+            header = self.header()
+        except (BadDataset, OSError) as error:
+            return Summary(title, notes=[str(error)])
+        taken = "a recording in motion" if self.in_motion else f"poses {len(self.stops())}"
+        devices = header.get("devices", {})
+        rows = [
+            Row("made by", [f"{self.command}, {header.get('created_utc', 'at an unknown time')}"]),
+            *(Row(name, [f"{one.get('model')} {one.get('serial')}"]) for name, one in devices.items()),
+            Row("data", [taken]),
+            Row("calibration", [self.calibration_path.name if self.calibration_path.exists() else "none"]),
+        ]
+        return Summary(title, rows)
 
     @classmethod
     def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.compare import MethodResult
+from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import find_moved, hints, names_of
@@ -19,8 +20,6 @@ from ftdrive.terminal.console import answer, hanging, messages
 from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
-# A standard deviation below this share of the largest one is one of rounding: its value was taken as known.
-_ROUNDED = 1e-9
 _NO_LIMIT = 10_000
 # An error elsewhere or later is named if it is larger by this.
 _WORSE = 1.2
@@ -103,7 +102,7 @@ def print_result(
 def _table(result: CalibrationResult, truth: Mapping[str, Any] | None) -> Table:
     data = result.to_dict()
     errors = {} if truth is None else errors_in_sigma(result, truth)
-    fixed_below = _ROUNDED * float(np.sqrt(np.diag(result.covariance).max()))
+    fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(result.covariance).max()))
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
@@ -245,46 +244,6 @@ def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str 
         f"{worst}, {quality['residual_sigma'][row - 1]:.1f} sigma; each pose predicted by the others: "
         f"{quality['loo_force_rms_N']:.4f} N, {quality['loo_torque_rms_Nm']:.5f} N·m rms"
     )
-
-
-QUANTITIES: Sequence[tuple[str, float, str, str]] = (
-    ("mass", 1.0, "kg", "mass_kg"),
-    ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
-    ("force bias", 1.0, "N", "force_bias_N"),
-    ("torque bias", 1.0, "N·m", "torque_bias_Nm"),
-    ("flange to sensor", 180 / np.pi, "deg", "R_flange_sensor"),
-    ("gravity in base", 1.0, "N", "gravity_force_base_N"),
-    ("base tilt alpha", 180 / np.pi, "deg", "tilt_alpha_rad"),
-    ("base tilt beta", 180 / np.pi, "deg", "tilt_beta_rad"),
-)
-"""Label, factor from the unit of the file to that of the screen, unit on the screen, key in the file."""
-_IN_MOTION: Sequence[tuple[str, float, str, str]] = (
-    ("inertia", 1e3, "g·m²", "inertia_kg_m2"),
-    ("wrench after pose", 1e3, "ms", "delay_s"),
-    ("sensor above flange", 1e3, "mm", "height_m"),
-)
-_INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
-
-
-def quantities_of(document: Mapping[str, Any]) -> Sequence[tuple[str, float, str, str]]:
-    """Return the quantities of the content of a calibration file as `QUANTITIES`, those of a motion included."""
-    return [*QUANTITIES, *_IN_MOTION] if "inertia_kg_m2" in document else QUANTITIES
-
-
-def axes_of(count: int) -> Sequence[str]:
-    """Return the names of the elements of a number, a vector, or a symmetric tensor."""
-    return {1: ("",), 3: tuple("xyz"), 6: _INERTIA}[count]
-
-
-def values_of(value: Any, key: str) -> Array:
-    """Return a quantity or its sigma as numbers; a mounting as its rotation vector, rad."""
-    values = np.asarray(value, dtype=np.float64)
-    # shown as a rotation vector
-    if key == "R_flange_sensor" and values.ndim == 2:
-        values = Rotation.from_matrix(values).as_rotvec()
-    if key == "inertia_kg_m2":
-        values = values[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    return np.atleast_1d(values)
 
 
 def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
