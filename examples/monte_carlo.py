@@ -2,10 +2,11 @@
 
 import numpy as np
 
+import ftcalib
 import ftdrive
 
 plan = ftdrive.plan_tour("ur5e", [(0, 200, 100)], 12)
-truth = ftdrive.Parameters(
+truth = ftcalib.Parameters(
     R_flange_sensor=np.eye(3),
     gravity_force_base_N=np.array([0.0, 0.0, -1.2 * 9.80665]),
     force_bias_N=np.array([5.0, -3.0, 8.0]),
@@ -17,7 +18,7 @@ rng = np.random.default_rng(0)
 
 errors, stated = [], []
 for _ in range(50):
-    wrench = ftdrive.predict(truth, plan.R_base_flange) + rng.normal(0, sigma, (len(plan.steps), 6))
+    wrench = ftcalib.predict(truth, plan.R_base_flange) + rng.normal(0, sigma, (len(plan.steps), 6))
     dataset = ftdrive.CalibrationDataset.of(plan.R_base_flange, wrench, wrench_cov=np.diag(sigma**2), n_samples=500)
     result = ftdrive.solve(dataset)
     errors.append(result.force_bias_N - truth.force_bias_N)

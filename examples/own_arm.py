@@ -6,22 +6,22 @@ from collections.abc import Callable
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import ftdrive
+import ftdrivers
 
 
-class PanTilt(ftdrive.ReadOnlyArm):
+class PanTilt(ftdrivers.ReadOnlyArm):
     """Pan about the vertical, then tilt; `read_deg` stands for the client library of the encoders."""
 
     def __init__(self, read_deg: Callable[[], tuple[float, float]]) -> None:
         self._read_deg = read_deg
 
-    def identify(self) -> ftdrive.DeviceInfo:
-        return ftdrive.DeviceInfo(model="pan-tilt unit", serial="P1", firmware="none")
+    def identify(self) -> ftdrivers.DeviceInfo:
+        return ftdrivers.DeviceInfo(model="pan-tilt unit", serial="P1", firmware="none")
 
-    def state(self) -> ftdrive.ArmState:
+    def state(self) -> ftdrivers.ArmState:
         pan_deg, tilt_deg = self._read_deg()
         t_ns = time.monotonic_ns()
-        return ftdrive.ArmState(
+        return ftdrivers.ArmState(
             t_host_ns=t_ns,
             t_device_s=t_ns * 1e-9,
             q_rad=np.radians([pan_deg, tilt_deg, 0, 0, 0, 0]),

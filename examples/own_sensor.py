@@ -6,22 +6,22 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike
 
-import ftdrive
+import ftdrivers
 
 
-class AcmeSensor(ftdrive.StreamingSensor):
+class AcmeSensor(ftdrivers.StreamingSensor):
     """Reads one wrench after the other; `read_wrench` stands for the client library of the sensor."""
 
     def __init__(self, read_wrench: Callable[[], ArrayLike]) -> None:
         super().__init__("Acme sensor")  # begins every error message
         self._read_wrench, self._seq = read_wrench, 0
 
-    def _connect(self) -> ftdrive.DeviceInfo:
-        return ftdrive.DeviceInfo(model="Acme FT", serial="A1", firmware="1.0")
+    def _connect(self) -> ftdrivers.DeviceInfo:
+        return ftdrivers.DeviceInfo(model="Acme FT", serial="A1", firmware="1.0")
 
-    def _read_block(self) -> ftdrive.FtSamples:
+    def _read_block(self) -> ftdrivers.FtSamples:
         self._seq += 1  # counts every sample that the device sent, so that a lost one is a gap
-        return ftdrive.FtSamples.of(time.monotonic_ns(), self._seq, np.atleast_2d(self._read_wrench()))
+        return ftdrivers.FtSamples.of(time.monotonic_ns(), self._seq, np.atleast_2d(self._read_wrench()))
 
     def _disconnect(self) -> None:
         """Close the port here."""

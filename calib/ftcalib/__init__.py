@@ -8,13 +8,18 @@ from importlib import import_module
 # Type checkers take it for that of `typing`.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from ftcalib.after.weighing import Weight
+    from ftcalib.compensation import Compensator
     from ftcalib.data.dataset import CalibrationDataset
     from ftcalib.data.dwell_mean import PoseMean, is_stationary, mean_and_covariance
     from ftcalib.errors import BadCalibration, BadDataset, NotObservable
     from ftcalib.findings import Finding
     from ftcalib.known import Known, Setup
-    from ftcalib.model import PARAMETER_NAMES, Parameters
+    from ftcalib.loads.model import KnownLoad, LoadRun
+    from ftcalib.loads.solve import solve_loads
+    from ftcalib.model import PARAMETER_NAMES, Parameters, predict
     from ftcalib.result import CalibrationResult
+    from ftcalib.sensor_matrix import SensorMatrix
     from ftcalib.solver import solve
 
 __all__ = [
@@ -23,27 +28,44 @@ __all__ = [
     "BadDataset",
     "CalibrationDataset",
     "CalibrationResult",
+    "Compensator",
     "Finding",
     "Known",
+    "KnownLoad",
+    "LoadRun",
     "NotObservable",
     "Parameters",
     "PoseMean",
+    "SensorMatrix",
     "Setup",
+    "Weight",
     "is_stationary",
     "mean_and_covariance",
+    "predict",
     "solve",
+    "solve_loads",
 ]
 
 _MODULES = {
+    "ftcalib.after.weighing": ("Weight",),
+    "ftcalib.compensation": ("Compensator",),
     "ftcalib.data.dataset": ("CalibrationDataset",),
     "ftcalib.data.dwell_mean": ("PoseMean", "is_stationary", "mean_and_covariance"),
     "ftcalib.errors": ("BadCalibration", "BadDataset", "NotObservable"),
     "ftcalib.findings": ("Finding",),
     "ftcalib.known": ("Known", "Setup"),
-    "ftcalib.model": ("PARAMETER_NAMES", "Parameters"),
+    "ftcalib.loads.model": ("KnownLoad", "LoadRun"),
+    "ftcalib.loads.solve": ("solve_loads",),
+    "ftcalib.model": ("PARAMETER_NAMES", "Parameters", "predict"),
     "ftcalib.result": ("CalibrationResult",),
+    "ftcalib.sensor_matrix": ("SensorMatrix",),
     "ftcalib.solver": ("solve",),
 }
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 if not TYPE_CHECKING:  # a type checker would accept any name
 

@@ -53,10 +53,10 @@ class Compensator:
 
     Examples
     --------
-    >>> import ftdrive, numpy as np
+    >>> import ftcalib, ftdrive, numpy as np
     >>> calibration = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
-    >>> compensate = ftdrive.Compensator(calibration.parameters, response=calibration.response)
-    >>> free = ftdrive.predict(calibration.parameters, np.eye(3))
+    >>> compensate = ftcalib.Compensator(calibration.parameters, response=calibration.response)
+    >>> free = ftcalib.predict(calibration.parameters, np.eye(3))
     >>> bool(np.abs(compensate(free, np.eye(3))).max() < 0.01)
     True
     """

@@ -58,8 +58,8 @@ class Finding(Displayed):
 
     Examples
     --------
-    >>> import ftdrive
-    >>> finding = ftdrive.Finding.of("few_poses", n_poses=5, recommended=6)
+    >>> import ftcalib
+    >>> finding = ftcalib.Finding.of("few_poses", n_poses=5, recommended=6)
     >>> finding.severity, finding.values["n_poses"]
     ('limit', 5)
     >>> finding.words

@@ -164,16 +164,16 @@ def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
     --------
     1 kg below a sensor whose z axis points down:
 
-    >>> import ftdrive
+    >>> import ftcalib
     >>> from scipy.spatial.transform import Rotation
-    >>> parameters = ftdrive.Parameters(
+    >>> parameters = ftcalib.Parameters(
     ...     R_flange_sensor=[[1, 0, 0], [0, 1, 0], [0, 0, 1]],
     ...     gravity_force_base_N=[0, 0, -9.80665],
     ...     force_bias_N=[0, 0, 0],
     ...     p_sensor_com_m=[0, 0, 0.05],
     ...     torque_bias_Nm=[0, 0, 0],
     ... )
-    >>> ftdrive.predict(parameters, Rotation.from_euler("x", 180, degrees=True)).round(3) + 0.0
+    >>> ftcalib.predict(parameters, Rotation.from_euler("x", 180, degrees=True)).round(3) + 0.0
     array([0.   , 0.   , 9.807, 0.   , 0.   , 0.   ])
     """
     R_base_flange = matrices_of(R_base_flange)

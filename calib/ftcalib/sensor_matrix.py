@@ -55,8 +55,8 @@ class SensorMatrix(Displayed):
 
     Examples
     --------
-    >>> import ftdrive
-    >>> sensor = ftdrive.SensorMatrix.usual(0.02)
+    >>> import ftcalib
+    >>> sensor = ftcalib.SensorMatrix.usual(0.02)
     >>> sensor.source, sensor.sigma.diagonal().round(3)
     ('assumed', array([0.02, 0.02, 0.02, 0.02, 0.02, 0.02]))
     """

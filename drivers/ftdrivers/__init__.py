@@ -1,1 +1,41 @@
-"""Adapters for arms and force/torque sensors behind two abstract interfaces."""
+"""Adapters for arms and force/torque sensors behind two abstract interfaces.
+
+The names are what a driver of your own needs. They are imported at their first use.
+"""
+
+from importlib import import_module
+
+# Type checkers take it for that of `typing`.
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, ReadOnlyArm, RobotArm
+    from ftdrivers.streaming.sensor import StreamingSensor
+
+__all__ = [
+    "ArmState",
+    "DeviceInfo",
+    "ForceTorqueSensor",
+    "FtSamples",
+    "ReadOnlyArm",
+    "RobotArm",
+    "StreamingSensor",
+]
+
+_MODULES = {
+    "ftdrivers.interfaces": ("ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm"),
+    "ftdrivers.streaming.sensor": ("StreamingSensor",),
+}
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+if not TYPE_CHECKING:  # a type checker would accept any name
+
+    def __getattr__(name: str) -> object:
+        for module, names in _MODULES.items():
+            if name in names:
+                value = globals()[name] = getattr(import_module(module), name)
+                return value
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

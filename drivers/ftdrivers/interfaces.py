@@ -46,8 +46,8 @@ class DeviceInfo:
 
     Examples
     --------
-    >>> import ftdrive
-    >>> ftdrive.DeviceInfo("Acme FT", "A1", "1.0").serial
+    >>> import ftdrivers
+    >>> ftdrivers.DeviceInfo("Acme FT", "A1", "1.0").serial
     'A1'
     """
 
@@ -118,8 +118,8 @@ class FtSamples(Columns):
 
     Examples
     --------
-    >>> import ftdrive
-    >>> samples = ftdrive.FtSamples.of(t_host_ns=[0, 10**6], seq=[0, 1], wrench=[[0, 0, 9.8, 0, 0, 0]] * 2)
+    >>> import ftdrivers
+    >>> samples = ftdrivers.FtSamples.of(t_host_ns=[0, 10**6], seq=[0, 1], wrench=[[0, 0, 9.8, 0, 0, 0]] * 2)
     >>> len(samples), samples.wrench[:, 2]
     (2, array([9.8, 9.8]))
     """
@@ -194,8 +194,8 @@ class ArmState:
 
     Examples
     --------
-    >>> import ftdrive, time, numpy as np
-    >>> state = ftdrive.ArmState(
+    >>> import ftdrivers, time, numpy as np
+    >>> state = ftdrivers.ArmState(
     ...     t_host_ns=time.monotonic_ns(),
     ...     t_device_s=0.0,
     ...     q_rad=np.zeros(6),
@@ -495,13 +495,13 @@ class ReadOnlyArm(RobotArm):
 
     Examples
     --------
-    >>> import ftdrive, numpy as np
-    >>> class Fixed(ftdrive.ReadOnlyArm):
+    >>> import ftdrivers, numpy as np
+    >>> class Fixed(ftdrivers.ReadOnlyArm):
     ...     def identify(self):
-    ...         return ftdrive.DeviceInfo("bench", "1", "none")
+    ...         return ftdrivers.DeviceInfo("bench", "1", "none")
     ...
     ...     def state(self):
-    ...         return ftdrive.ArmState(0, 0.0, np.zeros(6), np.zeros(6), np.eye(3), np.zeros(3))
+    ...         return ftdrivers.ArmState(0, 0.0, np.zeros(6), np.zeros(6), np.eye(3), np.zeros(3))
     >>> with Fixed() as arm:
     ...     print(arm.status().safety_mode)
     not reported

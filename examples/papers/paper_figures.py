@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import ftdrive
+import ftcalib
 from ftcalib.model import Array
 from ftcalib.poses.selection import paper_set
 from ftcalib.published.methods import Estimator, published
@@ -31,7 +31,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 SENSOR_NOISE = np.repeat([0.2, 0.01], 3)
 """Amplitude, N and N m. With it and `ORIENTATION_NOISE_RAD` the errors are as large as those of Table III."""
 ORIENTATION_NOISE_RAD = 0.04
-HARDWARE = ftdrive.Parameters(  # Yu, Table II, with the weight and the centre of Table III
+HARDWARE = ftcalib.Parameters(  # Yu, Table II, with the weight and the centre of Table III
     R_flange_sensor=Rotation.from_matrix(
         [[-0.4433, -0.8963, -0.0017], [0.8963, -0.4433, -0.0056], [0.0043, -0.0040, 0.9999]]
     ).as_matrix().T,
@@ -47,10 +47,10 @@ HARDWARE = ftdrive.Parameters(  # Yu, Table II, with the weight and the centre o
 
 def tool(
     weight_N: float = 19.75, com_m: Sequence[float] = (0, 0, 0.08), R: Array = HARDWARE.R_flange_sensor
-) -> ftdrive.Parameters:
+) -> ftcalib.Parameters:
     """Another tool, or another mounting, on the cell of Yu's experiments."""
     direction = HARDWARE.gravity_force_base_N / np.linalg.norm(HARDWARE.gravity_force_base_N)
-    return ftdrive.Parameters(R, weight_N * direction, HARDWARE.force_bias_N, np.array(com_m), HARDWARE.torque_bias_Nm)
+    return ftcalib.Parameters(R, weight_N * direction, HARDWARE.force_bias_N, np.array(com_m), HARDWARE.torque_bias_Nm)
 
 
 def zyx(degrees: Sequence[float]) -> Array:
@@ -68,14 +68,14 @@ def turned(R_base_flange: Array, amplitude_rad: float, rng: np.random.Generator)
 
 
 def measured(
-    truth: ftdrive.Parameters,
+    truth: ftcalib.Parameters,
     R_base_flange: Array,
     rng: np.random.Generator,
     sensor: Array | float = SENSOR_NOISE,
     orientation_rad: float = ORIENTATION_NOISE_RAD,
 ) -> Array:
     """Return wrenches (n, 6) with uniform noise, at orientations that are not exactly those reported."""
-    wrench = ftdrive.predict(truth, turned(R_base_flange, orientation_rad, rng))
+    wrench = ftcalib.predict(truth, turned(R_base_flange, orientation_rad, rng))
     return wrench + rng.uniform(-1, 1, wrench.shape) * sensor
 
 
@@ -84,9 +84,9 @@ def method(name: str, R_base_flange: Array, **known: Any) -> Estimator:
     return published(name, R_base_flange, gravity_direction_base=DOWN, **known)
 
 
-def worst(estimate: ftdrive.Parameters, R_base_flange: Array, wrench: Array) -> Array:
+def worst(estimate: ftcalib.Parameters, R_base_flange: Array, wrench: Array) -> Array:
     """Return the largest compensation errors: Fx, Fy, Fz, |F|, Tx, Ty, Tz, |T|."""
-    error = wrench - ftdrive.predict(estimate, R_base_flange)
+    error = wrench - ftcalib.predict(estimate, R_base_flange)
     force, torque = error[:, :3], error[:, 3:]
     norms = np.linalg.norm(force, axis=1, keepdims=True), np.linalg.norm(torque, axis=1, keepdims=True)
     return np.asarray(np.abs(np.hstack([force, norms[0], torque, norms[1]])).max(axis=0))
@@ -125,11 +125,11 @@ def yu_fig4(rng: np.random.Generator) -> Drawing:
     estimate = method("srom", special)
     errors = []
     for angles, F_b, P, F0, T0 in SETUPS:
-        truth = ftdrive.Parameters(zyx(angles), *(np.array(v, dtype=float) for v in (F_b, F0, P, T0)))
-        found = estimate(ftdrive.predict(truth, special))
+        truth = ftcalib.Parameters(zyx(angles), *(np.array(v, dtype=float) for v in (F_b, F0, P, T0)))
+        found = estimate(ftcalib.predict(truth, special))
         poses = Rotation.random(200, rng=rng).as_matrix()
         contact = np.repeat([1, 0.5], 3) / np.sqrt(3)  # 1 N and 0.5 N m
-        wrench = ftdrive.predict(truth, poses) + contact
+        wrench = ftcalib.predict(truth, poses) + contact
         compensation = worst(found, poses, wrench - contact)
         names = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
         errors.append([length(getattr(found, n) - getattr(truth, n)) for n in names] + list(compensation[[3, 7]]))
@@ -169,7 +169,7 @@ def yu_fig9(rng: np.random.Generator) -> Drawing:
     ]
 
 
-def against_tool(truths: Sequence[ftdrive.Parameters], rng: np.random.Generator, runs: int = 20) -> tuple[Array, Array]:
+def against_tool(truths: Sequence[ftcalib.Parameters], rng: np.random.Generator, runs: int = 20) -> tuple[Array, Array]:
     """Return the mean of `worst` on D (k, 8), and the errors of weight and centre (k, 2), of LROM on A and E."""
     poses, D = np.concatenate([paper_set("A"), paper_set("E")]), paper_set("D")
     estimate = method("lrom", poses)
@@ -263,7 +263,7 @@ def coefficients(
     F_b, shares = np.array([1.0, 3.0, -40.0]), np.linspace(0.1, 1, 8)
     errors = np.zeros((len(shares), 8))
     for k, share in enumerate(np.tile(shares, runs)):
-        truth = ftdrive.Parameters(
+        truth = ftcalib.Parameters(
             zyx([45, 7, 3]), share * F_b, np.array([63.0, 5, 21]), com_m, np.array([87.0, 45, 6])
         )
         found = estimate(measured(truth, special, rng, sensor, orientation_rad))
@@ -352,7 +352,7 @@ def carlson_fig1(rng: np.random.Generator) -> Drawing:
     error = np.zeros((3, len(sigmas), runs))
     for run in range(runs):
         poses = Rotation.random(100, rng=rng).as_matrix()
-        truth = ftdrive.Parameters(Rotation.random(rng=rng).as_matrix(), 9.80665 * DOWN, *np.zeros((3, 3)))
+        truth = ftcalib.Parameters(Rotation.random(rng=rng).as_matrix(), 9.80665 * DOWN, *np.zeros((3, 3)))
         one = {"as_published": True}
         methods = [
             method("carlson-relaxation", poses, **one),
@@ -360,7 +360,7 @@ def carlson_fig1(rng: np.random.Generator) -> Drawing:
         ]
         noise = rng.normal(size=(100, 6)) * np.repeat([1, 0], 3)
         for k, sigma in enumerate(sigmas):
-            wrench = ftdrive.predict(truth, poses) + sigma * noise
+            wrench = ftcalib.predict(truth, poses) + sigma * noise
             error[:, k, run] = [length(m(wrench).R_flange_sensor - truth.R_flange_sensor) ** 2 for m in methods]
     relaxation, right, wrong = np.median(error, axis=2)
     figure, both = canvas(2)

@@ -13,6 +13,7 @@ import pytest
 
 import ftcalib
 import ftdrive
+import ftdrivers
 from ftcalib.model import predict
 from ftcalib.poses.information import special
 from ftcalib.routine import PoseRecord, TourPose
@@ -24,21 +25,33 @@ from tests.house.example_data import EXAMPLES, TRUTH
 from tests.unit.ftdrive.recorded import block, info
 
 ERRORS = ["AcceptanceError", "DataError", "DeviceError", "FtdriveError", "UsageError"]
-RESULTS = ["CalibrationDataset", "CalibrationResult", "Compensator", "Finding", "Known", "Parameters", "Run", "Setup"]
-FUNCTIONS = ["compare", "predict", "read_calibration", "read_dataset", "read_recording", "solve", "write_recording"]
-DEVICES = ["ArmState", "DeviceInfo", "ForceTorqueSensor", "FtSamples", "ReadOnlyArm", "RobotArm", "StreamingSensor"]
-LIVE = ["CannotWeigh", "Contact", "Stages", "Weight", "WrenchFrame", "weigh"]
-LOADS = ["KnownLoad", "LoadRun", "SensorMatrix", "solve_loads"]
-OPENED = ["TableOptions", "open_arm", "open_sensor", "open_stream", "plan_tour"]
+RESULTS = ["CalibrationDataset", "CalibrationResult", "Known", "Run", "Setup", "TableOptions"]
+FUNCTIONS = ["compare", "plan_tour", "read_calibration", "read_dataset", "read_recording", "solve", "write_recording"]
+LIVE = ["Contact", "Stages", "WrenchFrame", "open_arm", "open_sensor", "open_stream", "weigh"]
 EMULATED = {"ForceTorqueSensor", "RobotArm", "Weight", "open_arm", "open_sensor", "open_stream", "weigh"}
 SLOW = EMULATED | {"compare"}  # every method of estimation
+PACKAGES = [ftdrive, ftcalib, ftdrivers]
+EXAMPLES_OF = [
+    (package, name)
+    for package in PACKAGES
+    for name in package.__all__
+    if package is ftdrive or (name not in ftdrive.__all__ and ">>>" in (getattr(package, name).__doc__ or ""))
+]
 
 
-def test_the_names_are_these() -> None:
-    assert sorted(ftdrive.__all__) == sorted(ERRORS + RESULTS + FUNCTIONS + DEVICES + LIVE + LOADS + OPENED)
-    assert set(ftdrive.__all__) < set(dir(ftdrive))
-    with pytest.raises(AttributeError, match="module 'ftdrive' has no attribute 'sovle'"):
+def test_completion_shows_25_names() -> None:
+    assert sorted(ftdrive.__all__) == sorted(ERRORS + RESULTS + FUNCTIONS + LIVE)
+    assert len(ftdrive.__all__) == 25
+    for package in PACKAGES:
+        assert dir(package) == sorted(package.__all__)
+
+
+def test_a_name_that_is_elsewhere_is_an_error_that_says_where() -> None:
+    with pytest.raises(AttributeError, match=r"module 'ftdrive' has no attribute 'sovle'$"):
         _ = ftdrive.sovle  # type: ignore[attr-defined]  # the point of the test
+    for name, package in (("RobotArm", "ftdrivers"), ("solve_loads", "ftcalib")):
+        with pytest.raises(AttributeError, match=rf"has no attribute '{name}': from {package} import {name}$"):
+            getattr(ftdrive, name)
 
 
 def test_import_ftdrive_loads_only_itself() -> None:
@@ -47,7 +60,7 @@ def test_import_ftdrive_loads_only_itself() -> None:
     assert {name.partition(".")[0] for name in outcome.stdout.split()} <= {"ftdrive", "importlib", "warnings"}
 
 
-@pytest.mark.parametrize("package", [ftdrive, ftcalib])
+@pytest.mark.parametrize("package", PACKAGES)
 def test_type_checkers_see_the_objects_that_are_imported(package: ModuleType) -> None:
     tree = ast.parse(Path(str(package.__file__)).read_text(encoding="utf-8"))
     seen = {
@@ -83,13 +96,14 @@ def user_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in ftdrive.__all__]
+    ("package", "name"),
+    [pytest.param(*one, id=one[1], marks=[pytest.mark.slow] * (one[1] in SLOW)) for one in EXAMPLES_OF],
 )
 def test_each_name_has_an_example_that_runs(
-    name: str, user_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    package: ModuleType, name: str, user_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(shutil.copytree(user_folder, tmp_path / "user"))
-    text = getattr(ftdrive, name).__doc__
+    text = getattr(package, name).__doc__
     example = doctest.DocTestParser().get_doctest(text, {}, name, name, 0)
     assert example.examples
     shown = list[str]()

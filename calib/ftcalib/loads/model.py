@@ -47,8 +47,8 @@ class KnownLoad:
 
     Examples
     --------
-    >>> import ftdrive
-    >>> ftdrive.KnownLoad("tip", 2.0, 0.002, (0.0, 0.0, 0.2)).place_sigma_m
+    >>> import ftcalib
+    >>> ftcalib.KnownLoad("tip", 2.0, 0.002, (0.0, 0.0, 0.2)).place_sigma_m
     0.0005
     """
 
@@ -66,8 +66,8 @@ class LoadRun(Displayed):
 
     Examples
     --------
-    >>> import ftdrive
-    >>> ftdrive.LoadRun("tool", ftdrive.read_dataset("poses.csv")).load is None
+    >>> import ftcalib, ftdrive
+    >>> ftcalib.LoadRun("tool", ftdrive.read_dataset("poses.csv")).load is None
     True
     """
 

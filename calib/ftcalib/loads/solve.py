@@ -96,10 +96,10 @@ def solve_loads(
     --------
     The poses of one tool, which we here pretend to be of two bodies: a tool of 1.035 kg, and 0.2 kg that hang on it.
 
-    >>> import ftdrive
+    >>> import ftcalib, ftdrive
     >>> poses = ftdrive.read_dataset("poses.csv")
-    >>> load = ftdrive.KnownLoad("tip", 0.2, 0.01)
-    >>> solution = ftdrive.solve_loads([ftdrive.LoadRun("with load", poses, load)])
+    >>> load = ftcalib.KnownLoad("tip", 0.2, 0.01)
+    >>> solution = ftcalib.solve_loads([ftcalib.LoadRun("with load", poses, load)])
     >>> solution.sensor.source
     'loads'
     """

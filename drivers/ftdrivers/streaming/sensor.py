@@ -86,16 +86,16 @@ class StreamingSensor(ForceTorqueSensor):
 
     Examples
     --------
-    >>> import ftdrive, time, numpy as np
-    >>> class Acme(ftdrive.StreamingSensor):
+    >>> import ftdrivers, time, numpy as np
+    >>> class Acme(ftdrivers.StreamingSensor):
     ...     def _connect(self):
     ...         self._seq = 0
-    ...         return ftdrive.DeviceInfo("Acme", "A1", "1.0")
+    ...         return ftdrivers.DeviceInfo("Acme", "A1", "1.0")
     ...
     ...     def _read_block(self):
     ...         time.sleep(0.002)
     ...         self._seq += 1
-    ...         return ftdrive.FtSamples.of(time.monotonic_ns(), self._seq, np.random.normal(0, 0.1, (1, 6)))
+    ...         return ftdrivers.FtSamples.of(time.monotonic_ns(), self._seq, np.random.normal(0, 0.1, (1, 6)))
     ...
     ...     def _disconnect(self): ...
     >>> with Acme("Acme on /dev/acme0") as sensor:

@@ -73,8 +73,7 @@ class CannotWeigh(AcceptanceError):
 
     Examples
     --------
-    >>> import ftdrive
-    >>> print(ftdrive.CannotWeigh("moving"))
+    >>> print(CannotWeigh("moving"))
     not weighed: the arm moves: weigh when it has rested for half a second
     """
 
