@@ -11,7 +11,7 @@ from ftcalib import solve as solve_dataset
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.result import Method
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, cell_of, load, settings
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, cell_of, settings
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import EMULATED, Station, emulated_cell
 from ftdrive.errors import ConfigError
@@ -25,13 +25,13 @@ from ftdrive.recording.files import is_recording
 from ftdrive.recording.files import read_recording as read_ours
 from ftdrive.recording.foreign import moving_source, tables_of
 from ftdrive.recording.recording import ROW, Recording, rows_of
-from ftdrive.runs.source import SolveOptions, read_calibration, read_dataset
+from ftdrive.runs.source import SolveOptions, as_source, read_calibration, read_dataset
 from ftdrive.tables.table import TableOptions
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 
 
 def solve(
-    source: CalibrationDataset | Any,
+    source: Any,
     method: Method = "ml",
     *,
     table: TableOptions | None = None,
@@ -46,9 +46,10 @@ def solve(
 
     Parameters
     ----------
-    source : CalibrationDataset, str, Path, DataFrame or mapping
-        Poses, or what `read_dataset` takes. A table whose rows follow one another quickly, a bag and a file of
-        `ftdrive record` are recordings in motion.
+    source : str, Path, Run, DataFrame, mapping, pair of arrays, CalibrationDataset or Recording
+        What `read_dataset` takes and gives, such as a pair (R_base_flange, wrench) of shapes (n, 3, 3) and (n, 6). A
+        table whose rows follow one another quickly, a bag, a file of `ftdrive record` and what `read_recording` gives
+        are recordings in motion.
     method : Method
         "ml": maximum likelihood, from 4 poses on; or one of the published methods, for comparison.
     table : TableOptions, optional
@@ -64,6 +65,8 @@ def solve(
         The poses do not determine the parameters; the message names what is missing and what to add.
     ValueError
         An unknown method, known values that the method cannot use, or `as_published` for another method.
+    TypeError
+        The source is nothing of this; the message names the call that helps.
 
     Examples
     --------
@@ -76,9 +79,10 @@ def solve(
     (24, 6)
     """
     setup = setup or Setup()
+    source = as_source(source)
     if not isinstance(source, CalibrationDataset):
-        source = Path(source) if isinstance(source, str) else source
-        moving = moving_source(source, SolveOptions(table=table))
+        in_memory = isinstance(source, Recording)
+        moving = source if in_memory else moving_source(source, SolveOptions(table=table))
         if moving is not None:
             if method != "ml":
                 raise ValueError(f"method {method} is for poses at rest: leave it out for a recording")
@@ -248,8 +252,8 @@ def open_stream(
         Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
         store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
     simulate : bool
-        An emulated cell instead of `config`: that of `calibration`, or one that is calibrated with six poses first,
-        which takes about 10 s. `CompensatedStream.station` controls it.
+        An emulated cell instead of `config`: that of `calibration`, or the one that ./ftdrive.toml describes, which is
+        calibrated with six poses first, in about 10 s. `CompensatedStream.station` controls it.
     sensor, arm : ForceTorqueSensor, RobotArm, optional
         Devices of your own, used in place of those in the configuration. With both no configuration is read.
     frame : WrenchFrame
@@ -310,7 +314,9 @@ def _only_one(calibration: CalibrationResult | None, tool: str | None) -> Calibr
     if tool is not None and calibration is None:
         return tool
     found = "no calibration" if tool is None else "both a calibration and a tool"
-    raise ConfigError(f"{found}: give the path of a calibration.json or of its run folder, or the name of a tool")
+    raise ConfigError(
+        f"{found}: give the path of a calibration.json or of its run folder, the name of a tool, or simulate=True"
+    )
 
 
 def _cell(config: str | Path | CellConfig | None, sensor: ForceTorqueSensor | None, arm: RobotArm | None) -> CellConfig:
@@ -318,7 +324,10 @@ def _cell(config: str | Path | CellConfig | None, sensor: ForceTorqueSensor | No
         return config
     if config is None and sensor is not None and arm is not None:
         return _NOT_CONFIGURED
-    return load(None if config is None else Path(config), devices=sensor is None and arm is None)
+    found, devices = settings(None if config is None else Path(config)), sensor is None and arm is None
+    if devices and (simulated := found["robot.simulate"]).value:
+        raise ConfigError(f"{simulated.origin} describes an emulated cell: open it with simulate=True")
+    return cell_of(found, devices=devices)
 
 
 def plan_tour(

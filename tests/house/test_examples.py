@@ -3,6 +3,8 @@
 import os
 import re
 import runpy
+import shlex
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +69,21 @@ def test_there_are_eight_short_examples_each_with_a_page_that_the_index_names() 
             f"../../examples/output/{name}.txt",
         ]
         assert f"\n{name}\n" in index
+
+
+@pytest.mark.slow
+def test_the_stream_of_the_readme_runs_with_the_file_of_its_first_step(tmp_path: Path) -> None:
+    readme = (EXAMPLES.parent / "README.md").read_text(encoding="utf-8")
+    (init,) = re.findall(r"^\$ uv run ftdrive (init .*)$", readme, re.MULTILINE)
+    (snippet,) = re.findall(r"```python\n(.*?)```", readme, re.DOTALL)
+    subprocess.run([sys.executable, "-m", "ftdrive", *shlex.split(init)], cwd=tmp_path, check=True, capture_output=True)
+    command = [sys.executable, "-u", "-W", "error", "-c", snippet]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, encoding="utf-8") as process:
+        assert process.stdout is not None
+        lines = [process.stdout.readline() for _ in range(3)]
+        process.send_signal(signal.SIGINT)  # as Ctrl-C
+        process.communicate()
+    assert all(line.endswith("sensor axes, about the sensor origin\n") for line in lines), lines
 
 
 @pytest.mark.parametrize("name", example_data.FILES)

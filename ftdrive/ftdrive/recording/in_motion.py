@@ -12,17 +12,18 @@ from ftcalib import CalibrationResult, Known, Setup
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
+from ftdrive.errors import BadRecording
 from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.foreign import table_words
-from ftdrive.recording.recording import Header
+from ftdrive.recording.recording import Header, Recording
 from ftdrive.runs.run import made_now
 from ftdrive.runs.source import require_same_cell
 from ftdrive.tables.table import Rows, Table
 
 
 def solve_recording(
-    source: Path | tuple[Table, Table],
+    source: Path | Recording | tuple[Table, Table],
     *,
     known: Known | None,
     point_mass: bool,
@@ -33,9 +34,9 @@ def solve_recording(
 
     Parameters
     ----------
-    source : Path or tuple of Table
-        A recording of `ftdrive record`, or the wrench and the poses of another program on one clock, in two tables or
-        in one.
+    source : Path, Recording or tuple of Table
+        A recording of `ftdrive record`, as a file or in memory, or the wrench and the poses of another program on one
+        clock, in two tables or in one.
     known : Known, optional
         A known direction of gravity means a base that is level with respect to `up_in_base`.
     point_mass : bool
@@ -53,10 +54,10 @@ def solve_recording(
         The motion does not determine the parameters, or contradicts the earlier result.
     """
     provenance, height_m, g_m_s2, any_zero = made_now(), None, STANDARD_GRAVITY_M_S2, False
-    if isinstance(source, Path):
+    if isinstance(source, Path | Recording):
         wrench, poses, header = _read_in_motion(source)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
-        provenance |= {"recording": source.name, "devices": devices}
+        provenance |= {"recording": getattr(source, "name", "in memory"), "devices": devices}
         g_m_s2 = header.info.calibration.g_m_s2
         height_m = float(header.info.p_flange_sensor_m[2])
         any_zero = header.info.sensor.has_arbitrary_zero
@@ -83,9 +84,12 @@ def solve_recording(
     )
 
 
-def _read_in_motion(path: Path) -> tuple[Means, Means, Header]:
+def _read_in_motion(source: Path | Recording) -> tuple[Means, Means, Header]:
     """Read a recording of `ftdrive record`; without positions where it has none. Raises as `RecordingReader.pieces`."""
-    reader, wrench, poses = RecordingReader(path, NEEDED), Means(), Means()
+    reader = source if isinstance(source, Recording) else RecordingReader(source, NEEDED)
+    wrench, poses = Means(), Means()
+    if isinstance(source, Recording) and (missing := {*NEEDED} - {*(source.rows.dtype.names or ())}):
+        raise BadRecording(f"the recording was read without {', '.join(sorted(missing))}: read it with all columns")
     start_ns, with_position = None, False
     for rows in (piece.rows for piece in reader.pieces() if len(piece.rows)):
         if start_ns is None:

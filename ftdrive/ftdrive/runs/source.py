@@ -150,6 +150,42 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
     return replace(found, known=known)
 
 
+_TAKEN: Final = "give a path, a DataFrame, arrays by name, or a pair (R_base_flange, wrench)"
+
+
+def as_source(source: Any) -> Any:
+    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either.
+
+    Parameters
+    ----------
+    source : str, Path, Run, DataFrame, mapping, Recording, CalibrationDataset or pair of arrays
+        A pair is R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m.
+
+    Raises
+    ------
+    BadDataset
+        The arrays of a pair have other shapes, or are none of rotations and wrenches.
+    TypeError
+        Anything else; the message names the call that helps.
+    """
+    if isinstance(source, str):
+        return Path(source)
+    if isinstance(source, Run):
+        return source.folder
+    if isinstance(source, CalibrationResult):
+        raise TypeError("this is a result, which is solved already: print it, or solve the data that it was made of")
+    if isinstance(source, tuple | list) and len(source) == 2 and not any(isinstance(one, Mapping) for one in source):
+        try:
+            return CalibrationDataset.of(*source)
+        except (BadDataset, ValueError) as error:
+            raise BadDataset(f"{error} Give (R_base_flange, wrench), of shapes (n, 3, 3) and (n, 6)") from error
+    is_table = isinstance(source, Mapping) or hasattr(source, "columns")
+    if is_table or isinstance(source, Path | CalibrationDataset) or hasattr(source, "pieces"):
+        return source
+    found = f"an array of shape {source.shape}" if isinstance(source, np.ndarray) else type(source).__name__
+    raise TypeError(f"{found} has no names of columns: {_TAKEN}")
+
+
 def read_dataset(
     source: Any, orientation: Orientation = "R_base_flange", table: TableOptions | None = None
 ) -> CalibrationDataset:
@@ -157,8 +193,9 @@ def read_dataset(
 
     Parameters
     ----------
-    source : str, Path, DataFrame or mapping
-        A run folder, a dataset.json, or a table of any program: text, DataFrame of pandas or Polars, arrays by name.
+    source : str, Path, Run, DataFrame, mapping or pair of arrays
+        A run folder, a dataset.json, a table of any program (text, DataFrame of pandas or Polars, arrays by name), or
+        R_base_flange (n, 3, 3) and the wrenches (n, 6).
     orientation : {"R_base_flange", "R_flange_base"}
         Of the rotations in a table: flange to base coordinates, like a robot pose, or the inverse.
     table : TableOptions, optional
@@ -170,6 +207,8 @@ def read_dataset(
         The message names the file, and the row or the field.
     OSError
         It cannot be read.
+    TypeError
+        The source is nothing of this; the message names the call that helps.
 
     Examples
     --------
@@ -178,9 +217,14 @@ def read_dataset(
     >>> dataset.wrench.shape
     (24, 6)
     """
-    if not isinstance(source, str | Path):
+    source = as_source(source)
+    if isinstance(source, CalibrationDataset):
+        return source
+    if hasattr(source, "pieces"):
+        raise TypeError("this is a recording in motion, which has no poses at rest: ftdrive.solve(recording) solves it")
+    if not isinstance(source, Path):
         return Table(source, table).dataset(orientation)
-    return read_source(Path(source), SolveOptions(orientation=orientation, table=table)).dataset
+    return read_source(source, SolveOptions(orientation=orientation, table=table)).dataset
 
 
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:

@@ -156,6 +156,8 @@ class Columns:
         Of the header; an empty unit may stand in the name.
     given : mapping, optional
         Column of the file, by the names of ftdrive's own layout: ``{"fx": "Force X [N]", "t": "1"}``.
+    in_memory : bool
+        Whether a program has the table, and a message shows its line instead of the option of a command.
 
     Raises
     ------
@@ -163,8 +165,16 @@ class Columns:
         A given column does not exist.
     """
 
-    def __init__(self, names: Sequence[str], units: Sequence[str], given: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        names: Sequence[str],
+        units: Sequence[str],
+        given: Mapping[str, str] | None = None,
+        *,
+        in_memory: bool = False,
+    ) -> None:
         self.names = names
+        self._in_memory = in_memory
         self._keys: dict[str, list[tuple[int, str]]] = {}
         taken = set[int]()
         for key, column in (given or {}).items():
@@ -209,14 +219,16 @@ class Columns:
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:
-        """Return the option that names the columns of a signal, those filled in that are found."""
-        parts = []
+        """Return the option or argument that names the columns of a signal, those filled in that are found."""
+        parts = {}
         for key in OWN_NAMES[signal].split():
             found = self._keys.get(key) or self._keys.get(_OTHER_NAMES.get(key, key))
             close = get_close_matches(key, self._keys, 1, 0.9)
             index = (found or (self._keys[close[0]] if close else [(-1, "")]))[0][0]
-            parts.append(f"{key}={self.names[index] if index >= 0 else '…'}")
-        return f'--columns "{",".join(parts)}"'
+            parts[key] = self.names[index] if index >= 0 else "…"
+        if self._in_memory:
+            return f"table=ftdrive.TableOptions(columns={parts})"
+        return f'--columns "{",".join(f"{key}={name}" for key, name in parts.items())}"'
 
     def _find(self, key: str, column: str) -> tuple[int, str]:
         """Return the index of a given column and the unit behind it."""

@@ -132,7 +132,7 @@ class Frame:
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
         """Give all rows. Raises `BadDataset`."""
         try:
-            columns = [np.asarray(self._frame[self.names[i]]) for i in use]
+            columns = [np.asarray(self._frame[self.names[i]]) for i in use] or [np.empty((0, 0))]
             numbers = [seconds_of(one) if one.dtype.kind == "M" else one.astype(np.float64) for one in columns]
             yield np.column_stack(numbers), 1.0
         except (TypeError, ValueError) as error:
@@ -177,7 +177,8 @@ class Table:
         with self._named():
             text = self.options.separator, self.options.decimal
             self.source: Source = TextTable(source, *text) if isinstance(source, Path) else Frame(source)
-            self._columns = Columns(self.source.names, self.source.units, self.options.columns)
+            in_memory = isinstance(self.source, Frame)
+            self._columns = Columns(self.source.names, self.source.units, self.options.columns, in_memory=in_memory)
             self._find()
 
     def _find(self) -> None:
