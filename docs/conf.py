@@ -14,7 +14,7 @@ copyright = "the ftdrive authors"
 version = release = installed("ftdrive")
 
 extensions = [
-    "myst_parser",
+    "myst_nb",  # Markdown, of which notebooks are a part
     "sphinx.ext.autodoc",
     "sphinx.ext.doctest",
     "sphinx.ext.intersphinx",
@@ -25,6 +25,10 @@ extensions = [
 exclude_patterns = ["_build"]
 default_role = "code"  # `name` in docstrings and in help texts, as in Markdown
 smartquotes = False  # they turn --option into –option
+
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 120  # the live one calibrates an emulated cell first
 
 myst_heading_anchors = 3  # links to headings, as repositories make them
 

@@ -50,12 +50,14 @@ class Summary(NamedTuple):
     def html(self) -> str:
         """Return an element that takes its colours from the page; every text is escaped."""
         most = max((len(row.cells) for row in self.rows), default=0)
+        pad = 'style="text-align:left;padding-right:1.5em"'
         lines = []
-        for name, cells, unit in self.rows:
-            filled = "".join(f"<td>{escape(one)}</td>" for one in [*cells, *[""] * (most - len(cells))])
-            lines.append(
-                f'<tr><th scope="row" style="text-align:left">{escape(name)}</th>{filled}<td>{escape(unit)}</td></tr>'
-            )
+        for name, (*first, last), unit in self.rows:
+            filled = "".join(f"<td {pad}>{escape(one)}</td>" for one in first)
+            # the last one is as wide as the rest of the row
+            filled += f'<td colspan="{most - len(first) + (not unit)}" {pad}>{escape(last)}</td>'
+            filled += f"<td {pad}>{escape(unit)}</td>" if unit else ""
+            lines.append(f'<tr><th scope="row" {pad}>{escape(name)}</th>{filled}</tr>')
         head = f"<strong>{escape(self.title)}</strong>"
         if self.verdict:
             colour = _COLOURS.get(self.verdict, "inherit")

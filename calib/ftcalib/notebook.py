@@ -87,7 +87,7 @@ def figure_of(
         axes.axhline(0, color="gray", linewidth=0.8)
         axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
-    both[0].legend(ncols=4, loc="lower right", bbox_to_anchor=(1, 1), frameon=False)
+    both[0].legend(loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
     both[0].set_title(title, loc="left", fontsize="medium")
     both[1].set_xlabel(label)
     return figure

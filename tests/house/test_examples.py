@@ -18,6 +18,16 @@ PAGES = EXAMPLES.parent / "docs/examples"
 SLOW = {"live_contact", "monte_carlo", "plan_without_robot"}
 """`test_wheel.py` runs these, and no others."""
 NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+NOTEBOOKS = sorted(
+    path.stem for path in PAGES.glob("*.md") if "file_format: mystnb" in path.read_text(encoding="utf-8")
+)
+"""The pages are built with what they show, and `test_wheel.py` runs them."""
+
+
+def cells_of(notebook: str) -> list[str]:
+    """Return the code of the cells of a notebook."""
+    text = (PAGES / f"{notebook}.md").read_text(encoding="utf-8")
+    return re.findall(r"```\{code-cell\} python\n(.*?)```", text, re.DOTALL)
 
 
 @pytest.mark.slow
@@ -69,6 +79,13 @@ def test_there_are_eight_short_examples_each_with_a_page_that_the_index_names() 
             f"../../examples/output/{name}.txt",
         ]
         assert f"\n{name}\n" in index
+
+
+def test_there_are_two_notebooks_of_short_cells_that_the_index_names() -> None:
+    assert NOTEBOOKS == ["csv_to_contact_forces", "live_contact_and_a_push"]
+    for name in NOTEBOOKS:
+        assert f"\n{name}\n" in (PAGES / "index.md").read_text(encoding="utf-8")
+        assert max(len(cell.splitlines()) for cell in cells_of(name)) <= 10
 
 
 @pytest.mark.slow

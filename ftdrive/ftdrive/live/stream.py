@@ -89,7 +89,7 @@ class ProcessedStream(Displayed, Processor, ABC):
     def _summary(self) -> Summary:
         name = type(self).__name__
         if not hasattr(self, "info"):
-            return Summary(f"{name}, not open: use it in a with block")
+            return Summary(f"{name}, not open: use it in a with block, or call open")
         info, now = self.info, self.contact_reading()
         sigma = self.rest_sigma
         noise = "unknown yet" if sigma is None else f"{sigma[:3].max():.2g} N, {sigma[3:].max():.2g} N·m"
@@ -272,7 +272,11 @@ class CompensatedStream(ProcessedStream):
         self._arm_newest: tuple[int, float] | None = None
         self._next_ns = 0
 
-    def __enter__(self) -> Self:
+    def open(self) -> Self:
+        """Open the devices and return the stream; `close` or the end of a `with` block closes them.
+
+        For a notebook, where one `with` block cannot span several cells.
+        """
         with ExitStack() as stack:
             self.cell = self._given if isinstance(self._given, CellConfig) else stack.enter_context(self._given).cell
             self.clock: Clock = self.cell.clock
@@ -307,8 +311,15 @@ class CompensatedStream(ProcessedStream):
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Close the devices, and end an emulated cell; safe twice."""
         self._stack.close()
+
+    def __enter__(self) -> Self:
+        return self.open()
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     @property
     def station(self) -> Station:
