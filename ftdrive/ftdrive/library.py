@@ -136,7 +136,7 @@ def read_recording(
     --------
     >>> import ftdrive
     >>> recording = ftdrive.read_recording("peg.csv")
-    >>> table = recording.table  # a DataFrame: pandas.DataFrame(table)
+    >>> table = recording.table  # a DataFrame: recording.to_frame()
     >>> table["fz"].shape, table["raw_fz"].shape
     ((3000,), (3000,))
     """

@@ -144,7 +144,7 @@ class CalibrationDataset(Displayed):
 
     def _summary(self) -> Summary:
         least, most = self.wrench.min(axis=0), self.wrench.max(axis=0)
-        ranges = [f"{low:.6g} to {high:.6g}" for low, high in zip(least, most, strict=True)]
+        ranges = [f"{low:.4g} to {high:.4g}" for low, high in zip(least, most, strict=True)]
         noise = "unknown"
         if self.wrench_cov is not None:
             force, torque = np.sqrt(

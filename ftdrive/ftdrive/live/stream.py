@@ -90,15 +90,19 @@ class ProcessedStream(Displayed, Processor, ABC):
         name = type(self).__name__
         if not hasattr(self, "info"):
             return Summary(f"{name}, not open: use it in a with block, or call open")
-        info, now = self.info, self.contact_reading()
+        info = self.info
         sigma = self.rest_sigma
         noise = "unknown yet" if sigma is None else f"{sigma[:3].max():.2g} N, {sigma[3:].max():.2g} N·m"
+        now = Row("force now", ["no sample was read yet"])
+        if self._newest_ns:
+            force_N = self.contact_reading()[:3]
+            now = Row("force now x, y, z", [f"{value:.2f}" for value in force_N], "N in sensor axes")
         rows = [
             Row("arm", [f"{info.arm.model} {info.arm.serial}, {info.arm_rate_Hz:.4g} Hz"]),
             Row("sensor", [f"{info.sensor.model} {info.sensor.serial}, {info.sensor_rate_Hz:.4g} Hz"]),
             Row("wrench", [str(self.frame)]),
             Row("stages", [stages_in_words(self.stages)]),
-            Row("force now x, y, z", [f"{value:.3g}" for value in now[:3]], "N in sensor axes"),
+            now,
             Row("sigma of a sample at rest", [noise]),
         ]
         return Summary(f"{name}: {info.calibration_state or info.calibration.id}", rows)

@@ -1,5 +1,6 @@
 """The stream of a cell: what it opens and refuses, gaps and silence, recovery, and what it reports."""
 
+import re
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
@@ -12,6 +13,7 @@ import pytest
 
 from ftcalib import CalibrationResult
 from ftcalib.after.series import BiasTemperature
+from ftcalib.display import MOST_LINES
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream
@@ -157,6 +159,34 @@ def test_every_sample_arrives_once_with_its_pose(cell: Cell) -> None:
     assert stream.info.sensor_rate_Hz == pytest.approx(1000, rel=0.01)
     assert stream.info.arm_rate_Hz == pytest.approx(500, rel=0.01)
     assert [event.kind for event in stream.take_events()] == []
+
+
+def test_a_stream_is_shown_before_it_is_open_read_and_closed(cell: Cell) -> None:
+    stream = cell.stream()
+    assert "not open" in repr(stream)
+    stream.open()
+    assert "no sample was read yet" in repr(stream)
+    stream.read()
+    assert re.search(r"force now x, y, z +-?0\.\d\d, -?0\.\d\d, -?0\.\d\d N in sensor axes", repr(stream))
+    assert len(repr(stream).splitlines()) <= MOST_LINES
+    assert "<table>" in stream._repr_html_()
+    stream.close()
+    stream.close()
+
+
+def test_a_plot_has_the_samples_from_its_call_on(cell: Cell) -> None:
+    pytest.importorskip("matplotlib")
+    with cell.stream() as stream:
+        stream.read()
+        cell.clock.sleep(0.2)  # samples of a pause wait in the links
+        figure = stream.plot(0.5)
+    lines = [line for line in figure.axes[0].lines if len(line.get_xdata()) > 2]
+    assert len(lines) == 3
+    for line in lines:
+        t_s = line.get_xdata()
+        assert t_s[0] == pytest.approx(0, abs=2e-3)
+        assert t_s[-1] == pytest.approx(0.5, abs=0.02)
+        assert np.std(line.get_ydata()) == pytest.approx(NOISE[0], rel=0.2)
 
 
 def test_samples_name_axes_point_and_uncertainty(cell: Cell) -> None:
