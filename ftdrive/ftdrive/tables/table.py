@@ -323,7 +323,8 @@ class Table:
     def _require_time(self) -> None:
         if self._found["time"] is None and not self.options.rate_Hz:
             words = self._columns.missing("time", "time")
-            raise BadDataset(f"{self.name}: {words}, or add --rate HZ if the samples are evenly spaced")
+            rate = "rate_Hz=…" if isinstance(self.source, Frame) else "--rate HZ"
+            raise BadDataset(f"{self.name}: {words}, or add {rate} if the samples are evenly spaced")
 
     def _require(self, signal: str) -> Signal:
         """Return a signal. Raises `BadDataset` with the line to type."""

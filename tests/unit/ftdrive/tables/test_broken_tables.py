@@ -263,7 +263,7 @@ def recording(**changes: object) -> dict[str, np.ndarray]:
 MOTION: dict[str, tuple[dict[str, np.ndarray], str, Callable[[Table], object]]] = {
     "no time": (
         wrench(RECORDING),
-        r"no time among .*--columns \"t=…\", or add --rate HZ",
+        r"no time among .*TableOptions\(columns={'t': '…'}\), or add rate_Hz=",
         lambda table: list(table.wrenches()),
     ),
     "ms or µs": (
