@@ -11,6 +11,7 @@ where the class has a `from_url` like those of this project, and ``name = "packa
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.metadata import EntryPoint, entry_points
 from math import isfinite
 from typing import Any, cast
@@ -183,8 +184,12 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     parts = split_url(url)
     entry = _find("ftdrive.sensors", SENSORS, parts.scheme)
     if entry is None:
-        known = ", ".join(_names("ftdrive.sensors", SENSORS))
-        raise BadUrl(f"{url}: unknown sensor '{parts.scheme}'; known: {known}, as in {_EXAMPLES[0]}")
+        known = ", ".join(names := _names("ftdrive.sensors", SENSORS))
+        if not parts.scheme:
+            raise BadUrl(f"{url} is no address of a sensor: write it like {', '.join(_EXAMPLES)}")
+        close = [f"did you mean {name}://?" for name in get_close_matches(parts.scheme, names, 1)]
+        fix = close[0] if close else f"install the package of its driver, or give one of {known}"
+        raise BadUrl(f"{url}: unknown sensor '{parts.scheme}': {fix}")
     begins = (f"{parts.scheme}://", "ros2:/")  # a topic is a path, without a host
     if not parts.address.strip("/") or parts.fragment or not url.lower().startswith(begins):
         raise BadUrl(f"{url}: names no device; write it like {', '.join(_EXAMPLES)}")

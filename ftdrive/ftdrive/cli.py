@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from ftcalib.errors import DeviceError
+from ftcalib.errors import DataError, DeviceError
 from ftdrive import __version__
 from ftdrive.errors import SupervisorGone, exit_code
 from ftdrive.terminal.text import COMMANDS, echo, in_one_line
@@ -57,6 +57,20 @@ class _LazyGroup(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(COMMANDS)
 
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if args[0] == "help":
+            if not args[1:]:
+                click.echo(ctx.get_help())
+                ctx.exit()
+            return self.resolve_command(ctx, [*args[1:], "--help"])
+        if args[0] not in COMMANDS and not args[0].startswith("-") and not ctx.resilient_parsing:
+            from ftdrive.mistakes import close_command
+
+            ctx.fail(f"No such command '{args[0]}'.{close_command(args[0])}")
+        return super().resolve_command(ctx, args)
+
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
@@ -75,11 +89,11 @@ class _LazyGroup(click.Group):
 @click.option(
     "-q", "--quiet", is_flag=True, help="Print only answers, errors and, before a question, what it is about."
 )
-@click.version_option(__version__, prog_name="ftdrive")
+@click.version_option(__version__, "-V", "--version", prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
 
-    New here? `ftdrive demo` needs no hardware.
+    New here? `ftdrive demo` needs no hardware. `ftdrive help COMMAND` explains a command.
     """
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, format="%(levelname)s %(name)s: %(message)s", handlers=[_MessageHandler()])
@@ -176,8 +190,7 @@ def _run(arguments: Sequence[str]) -> int:
     try:
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
-        error.show(message := StringIO())
-        echo(message.getvalue(), err=True, nl=False)
+        _explain(error, arguments)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -186,8 +199,36 @@ def _run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None or _closed_terminals:
             raise
-        _say(f"error: {in_one_line(in_a_sentence(error))}")
+        # a file of another kind is the cause of whatever it lacks
+        other = _other_command(arguments) if isinstance(error, DataError | OSError) else ""
+        _say(f"error: {in_one_line(other or in_a_sentence(error))}")
         return code
+
+
+def _explain(error: click.ClickException, arguments: Sequence[str]) -> None:
+    """Print an error of the line itself, and what to type."""
+    from ftdrive.mistakes import existing, missing
+
+    if isinstance(error, click.MissingParameter):
+        error = click.UsageError(missing(error, arguments), error.ctx)
+    elif isinstance(error, click.UsageError):
+        if other := _other_command(arguments, error.format_message()):
+            _say(f"error: {in_one_line(other)}")
+            return
+        if (
+            isinstance(error, click.BadParameter)
+            and error.param is not None
+            and isinstance(error.param.type, click.Path)
+        ):
+            error = click.UsageError(error.format_message() + existing(cli, arguments), error.ctx)
+    error.show(message := StringIO())
+    echo(message.getvalue(), err=True, nl=False)
+
+
+def _other_command(arguments: Sequence[str], about: str = "") -> str:
+    from ftdrive.mistakes import other_command
+
+    return other_command(cli, arguments, about)
 
 
 def _say(text: str) -> None:

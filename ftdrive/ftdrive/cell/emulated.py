@@ -252,7 +252,10 @@ def sensor_name(url: str | None) -> str:
     name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
     if name not in SENSORS:
         known = ", ".join(EMULATED + name for name in SENSORS)
-        raise ConfigError(f"{url} is not an emulated sensor: leave --sensor out, or give one of {known}")
+        real = (
+            "" if (url or "").startswith(EMULATED) else f"; a real one is shown by\nftdrive live --sensor {url} --raw"
+        )
+        raise ConfigError(f"{url} is not an emulated sensor: leave --sensor out, or give one of {known}{real}")
     return name
 
 

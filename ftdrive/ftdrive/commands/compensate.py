@@ -73,8 +73,10 @@ def compensate(
 
     if output is not None:
         format_of(output)
-    if (wrench is None) != (orientation_file is None) or (wrench is None) == (path is None):
-        raise ConfigError("no recording: give its file, or --wrench and --orientation-file")
+    if path is not None and (wrench is not None or orientation_file is not None):
+        raise ConfigError("RECORDING does not go with --wrench and --orientation-file: leave one of the two out")
+    if path is None and (wrench is None or orientation_file is None):
+        raise ConfigError(_missing(wrench, orientation_file, calibration))
     if (wrench_topic or pose_topic) and not (path and is_bag(path)):
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
     frame = read_frame(axes, about)
@@ -106,6 +108,20 @@ def compensate(
         raise failure
 
 
+def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Path | None) -> str:
+    """Return the error of a line without a whole recording: it names all that is missing."""
+    if wrench is None and orientation_file is None:
+        own = "" if calibration is None else f" --calibration {calibration}"
+        missing, line = "the file of the recording", f"RECORDING{own}"
+        if calibration is None:
+            missing += ", and --calibration PATH if another program recorded it"
+    else:
+        given = {"--wrench": wrench, "--orientation-file": orientation_file, "--calibration": calibration}
+        missing = " and ".join(option for option, path in given.items() if path is None)
+        line = " ".join(f"{option} {path or 'FILE'}" for option, path in given.items())
+    return f"missing: {missing}. Type\nftdrive compensate {line}"
+
+
 def _open(
     path: Path,
     options: "SolveOptions",
@@ -116,6 +132,7 @@ def _open(
     everything: bool,
 ) -> tuple["Source", dict[str, float] | None]:
     """Return the recording with the calibration, and the delay of one of another program with one sigma."""
+    from ftcalib.errors import BadDataset
     from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.foreign import table_words, tables_of
@@ -123,7 +140,12 @@ def _open(
     from ftdrive.recording.table_pair import TablePair
     from ftdrive.terminal.console import messages
 
-    tables = tables_of(path, options)
+    try:
+        tables = tables_of(path, options)
+    except (BadDataset, ConfigError) as error:
+        if calibration is None:
+            raise type(error)(f"{error}. Give --calibration PATH too") from error
+        raise
     if tables is None:
         if delay_s is not None or options.table is not None:
             raise ConfigError("--delay and --columns describe another program's recording: leave them out")

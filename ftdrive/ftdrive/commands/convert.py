@@ -8,23 +8,26 @@ from ftdrive.commands.common import JSON, NewFile, write_json
 
 
 @click.command()
-@click.argument("source", metavar="IN", type=click.Path(exists=True, path_type=Path))
-@click.argument("target", metavar="OUT", type=NewFile())
+@click.argument("source", metavar="IN", required=False, type=click.Path(exists=True, path_type=Path))
+@click.argument("target", metavar="OUT", required=False, type=NewFile())
+@click.option("-o", "--output", type=NewFile(), help="The same as OUT.")
 @JSON
-def convert(source: Path, target: Path, as_json: bool) -> None:
+def convert(source: Path | None, target: Path | None, output: Path | None, as_json: bool) -> None:
     """Convert a recording between .mcap, .csv and .parquet, without loss.
 
     IN may also be the .partial of a recording that was interrupted; OUT is complete then.
     """
-    from ftdrive.errors import BadRecording
+    from ftdrive.errors import BadRecording, ConfigError
     from ftdrive.recording.files import RecordingReader, format_of, is_recording
     from ftdrive.recording.recorder import converted
     from ftdrive.terminal.console import beside, messages, working
 
+    if source is None or (target is None) is (output is None):
+        raise ConfigError(f"give one recording and one new file. Type\nftdrive convert {source or 'IN'} -o NEW.csv")
+    target = target or output or Path()
     format_of(target)
     if not is_recording(source):
-        line = f"ftdrive compensate {source} --calibration PATH -o {target}"
-        raise BadRecording(f"it is another program's: `{line}` converts tables and bags", source)
+        raise BadRecording("it is not a recording of `ftdrive record`: `ftdrive compensate` reads other ones", source)
     with working("Converting") as show:
         reader = RecordingReader(source)
         found, failure = converted(reader, target, show)

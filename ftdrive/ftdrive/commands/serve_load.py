@@ -54,4 +54,8 @@ def serve_load(
         messages.print(
             f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
         )
+        registers = "" if first == FIRST_REGISTER else f" --first {first}"
+        messages.print(
+            f"For the program on the controller: `ftdrive export urscript{registers} -o FILE` writes functions."
+        )
         service.run()

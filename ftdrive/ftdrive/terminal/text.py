@@ -40,9 +40,10 @@ COMMANDS: Final[Mapping[str, str]] = {
     "bundle": "Write a run into one file for a bug report, without addresses.",
     "export": "Write a plan or a calibration for another program.",
     "transcript": "Record or play the bytes on a sensor's wire.",
+    "completion": "Print the completion of a shell: bash, zsh or fish.",
 }
 """A command, whose module is `ftdrive.commands.NAME`, and its line in the help."""
-_COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMANDS)})\b)")
+_COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMANDS)}|help)\b|--)")
 
 
 def as_typed(text: str) -> str:

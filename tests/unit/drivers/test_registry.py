@@ -112,8 +112,9 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
 @pytest.mark.parametrize(
     ("url", "message"),
     [
-        ("can0", "unknown sensor ''; known: ati-can, ati-serial"),
-        ("kms40://dev", "unknown sensor 'kms40'"),
+        ("can0", "write it like ati-can://can0"),
+        ("kms40://dev", "unknown sensor 'kms40': install .* one of ati-can, ati-serial"),
+        ("ati-cam://dev", "unknown sensor 'ati-cam': did you mean ati-can://?"),
         ("ati-can://", "names no device"),
         ("ati-can:can0", "names no device"),
         ("ati-can://can0#1", "names no device"),
@@ -243,8 +244,8 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
         assert (sensor.collect(0.05).wrench == -3).all()
     with pytest.raises(BadUrl, match=r"gian.* gain, range, recover, serial"):
         sensor_from_url("acme-usb:///dev/acme0?gian=3")
-    with pytest.raises(BadUrl, match=r"known: ati-can, .*, acme-usb"):
-        sensor_from_url("acme:///dev/acme0")
+    with pytest.raises(BadUrl, match=r"one of ati-can, .*, acme-usb"):
+        sensor_from_url("kms40:///dev/acme0")
     assert issubclass(arm_class("acme"), UrArm)
     assert arm_class("acme") is not UrArm
     anything = SensorConfig("acme-usb:///dev/acme0")

@@ -387,8 +387,9 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ([], "no recording"),
-        (["--wrench", "c.json"], "--orientation-file"),
+        ([], "RECORDING"),
+        (["--wrench", "c.json"], "--orientation-file and --calibration"),
+        (["a.mcap", "--wrench", "c.json"], "RECORDING does not go with --wrench"),
         (["a.mcap", "--delay", "auto"], "describe another program"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
         (["a.mcap", "--wrench-topic", "/w"], "go with a bag of ROS"),

@@ -1,0 +1,213 @@
+"""What to type instead of a line that cannot be run: another command for this file, or a name that exists."""
+
+import re
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import click
+
+from ftcalib.files import open_file
+from ftdrive.terminal.text import COMMANDS
+
+
+class _Kind(NamedTuple):
+    words: str
+    lines: tuple[str, ...]
+    """What a user wants with such a file, to type."""
+    others: tuple[str, ...] = ()
+    """What takes it too."""
+
+    @property
+    def places(self) -> set[str]:
+        """Where it may stand: options, and commands that have it as an argument."""
+        heads = (line.partition(" {}")[0] for line in (*self.lines, *self.others))
+        return {head.rpartition(" ")[2] if " --" in head else head for head in heads}
+
+
+_KINDS: Final[Mapping[str, _Kind]] = {
+    "recording": _Kind(
+        "a recording",
+        ("live --replay {}", "compensate {}", "convert {} -o NEW.csv"),
+        ("solve {}", "fleet compensate {}", "loads check --replay {}"),
+    ),
+    "run": _Kind(
+        "a run folder",
+        ("solve {}", "report {}", "live --calibration {}"),
+        (
+            *("replay {}", "bundle {}", "push {}", "diff {}", "export calibration {}", "live --replay {}"),
+            *("calibrate --resume {}", "calibrate --from {}", "solve --test {}", "report --parent {}"),
+            *("push --restore {}", "loads solve {}", "history {}", "history --index {}"),
+            *("fleet index {}", "fleet solve {}"),
+        ),
+    ),
+    "runs": _Kind(
+        "a folder of runs",
+        ("history {}", "fleet solve {}"),
+        ("calibrate --runs {}", "fleet index {}", "history --index {}"),
+    ),
+    "folder": _Kind("a folder without a run", ("calibrate --runs {}", "history"), ("fleet index {}", "history {}")),
+    "calibration": _Kind(
+        "a calibration",
+        ("live --calibration {}", "report {}", "push {}"),
+        ("diff {}", "export calibration {}", "calibrate --from {}", "report --parent {}"),
+    ),
+    "dataset": _Kind("a dataset", ("solve {}", "report {}"), ("solve --test {}",)),
+    "plan": _Kind("a plan", ("calibrate --plan {}", "export plan {} --format urscript")),
+    "config": _Kind("a configuration", ("doctor --config {}", "calibrate --config {}")),
+    "cells": _Kind("a list of cells", ("fleet add {}",)),
+    "transcript": _Kind("a transcript", ("transcript play {}",), ("bundle RUN --transcript {}",)),
+    "bundle": _Kind("a bundle", ("replay {}", "solve {}")),
+    "push": _Kind("a receipt of `ftdrive push`", ("push --restore {}",)),
+    "table": _Kind(
+        "a table or bag of another program",
+        ("solve {}", "compensate {} --calibration PATH", "live --replay {} --calibration PATH"),
+        ("report {}", "solve --wrench {}", "solve --orientation-file {}", "solve --test {}", "fleet compensate {}"),
+    ),
+}
+_TABLES = {".csv", ".tsv", ".txt", ".dat", ".parquet", ".db3", ".bag", ".mcap", ".log"}
+_FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
+# A table of a TOML file that describes a cell.
+_CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
+_START = 4096
+_OUTPUTS = {"-o", "--output", "--png", "--html"}
+
+
+def kind_of(path: Path) -> str | None:
+    """Return the kind of a file or folder, by its first bytes and its ending; None for one that no command takes."""
+    from ftdrive.recording.files import is_bag, is_recording
+
+    with suppress(OSError):
+        if is_bag(path):
+            return "table"
+        if path.is_dir():
+            return "run" if _is_run(path) else "runs" if next(_runs_in(path), None) else "folder"
+        if not path.is_file():
+            return None
+        with open_file(path) as file:
+            start = file.read(_START)
+        if (found := _FORMAT.search(start[:300])) is not None and (name := found[1].decode()) in _KINDS:
+            return name
+        if path.suffix == ".toml":
+            return "config" if _CELL.search(start) else None
+        if path.suffix == ".zip":
+            return "bundle"
+        if path.suffix == ".mcap" and is_recording(path):
+            return "recording"
+        return "table" if path.suffix in _TABLES else None
+    return None
+
+
+def _is_run(path: Path) -> bool:
+    return (path / "run.json").is_file()
+
+
+def _runs_in(folder: Path) -> Iterator[Path]:
+    """Yield the runs in a folder, the newest first."""
+    yield from (path for path in sorted(folder.iterdir(), reverse=True) if _is_run(path))
+
+
+def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:
+    """Return what takes the first file of a line that is of another kind than its place; empty if there is none.
+
+    Where the error is `about` something, only a file that it names counts.
+    """
+    for number, place, name, command in _named(group, arguments):
+        path, kind = Path(name), kind_of(Path(name))
+        if kind is None or place in _OUTPUTS or not name.isprintable() or (about and name not in about):
+            continue
+        if kind == "run" and path.is_file():
+            path = path.parent
+        elif place in _KINDS[kind].places or (place == "--calibration" and kind == "run"):
+            continue
+        options = {name for one in command.params for name in one.opts} & _KINDS[kind].places
+        own = [f"{place} {option} {{}}" for option in sorted(options) if not place.startswith("-")]
+        lines = [
+            f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *_KINDS[kind].lines])
+        ]
+        # another place takes it, or the same place another path
+        better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
+        if better is not None:
+            given = arguments[number].removesuffix(name) + str(better)
+            lines = [shlex.join(["ftdrive", *arguments[:number], given, *arguments[number + 1 :]])]
+        which = place if place.startswith("-") else f"`ftdrive {place}`"
+        what = "a file of a run folder" if kind == "run" and path != Path(name) else _KINDS[kind].words
+        return "\n".join([f"{name} is {what}, which {which} does not take. Type", *lines])
+    return ""
+
+
+def _named(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
+    """Yield number, place, name and command of each argument that is a file, or that its command does not have."""
+    command: click.Command = group
+    words, option = list[str](), ""
+    for number, argument in enumerate(arguments):
+        options = {name: one for one in command.params if isinstance(one, click.Option) for name in one.opts}
+        if option:
+            if isinstance(options[option].type, click.Path):
+                yield number, option, argument, command
+            option = ""
+        elif argument.startswith("-"):
+            name, _, value = argument.partition("=")
+            known = options.get(name)
+            if known is not None and value and isinstance(known.type, click.Path):
+                yield number, name, value, command
+            elif known is not None and not value and not known.is_flag:
+                option = name
+        elif isinstance(command, click.Group) and (sub := command.get_command(click.Context(command), argument)):
+            command = sub
+            words.append(argument)
+        else:
+            types = [one.type for one in command.params if isinstance(one, click.Argument)]
+            # the runs of `diff` may also be named by their tool
+            if not types or command.name == "diff" or any(isinstance(one, click.Path) for one in types):
+                yield number, " ".join(words), argument, command
+
+
+def existing(group: click.Group, arguments: Sequence[str]) -> str:
+    """Return a path like the one that does not exist, or where to find one, as a sentence."""
+    for _, place, name, _ in _named(group, arguments):
+        path = Path(name)
+        if place in _OUTPUTS or path.exists():
+            continue
+        with suppress(OSError):
+            if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1):
+                return _question([str(path.with_name(found[0]))])
+        return " `ftdrive history` lists your runs."
+    return ""
+
+
+def close_command(name: str) -> str:
+    """Return a question that names the command most like a mistyped one; empty if there is none."""
+    return _question(get_close_matches(name, [*COMMANDS, "help"], 1))
+
+
+def _question(names: Iterable[str]) -> str:
+    quoted = [f"'{name}'" for name in names]
+    return f" Did you mean {' or '.join(quoted)}?" if quoted else ""
+
+
+def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
+    """Return all that a line lacks, where `click` names the first, and the line with it."""
+    context = error.ctx
+    if context is None or context.info_name not in arguments:
+        return error.format_message()
+    command, typed = context.command, list(arguments[arguments.index(context.info_name) + 1 :])
+    given, _, _ = command.make_parser(context).parse_args(list(typed))
+    # what is not given is no text, of whatever kind in which version of `click`
+    absent = [
+        one for one in command.params if one.required and not isinstance(given.get(one.name or ""), str | tuple | list)
+    ]
+    names = " and ".join(f"{one.param_type_name} {one.get_error_hint(context)}" for one in absent)
+    options = {name: one for one in command.params for name in one.opts}
+    if "--simulate" in options and not {"--simulate", "--calibration", "--tool", "--sensor"} & set(typed):
+        absent += [options[name] for name in ("--calibration", "--sensor") if name in options][:1]
+    words = " ".join(_blank(one, context) for one in absent)
+    return f"Missing {names}. Type\n{' '.join([context.command_path, shlex.join(typed)]).rstrip()} {words}"
+
+
+def _blank(parameter: click.Parameter, context: click.Context) -> str:
+    value = parameter.make_metavar(context)
+    return f"{max(parameter.opts, key=len)} {value}" if isinstance(parameter, click.Option) else value
