@@ -19,6 +19,7 @@ from urllib.parse import parse_qsl, quote, unquote, urlsplit
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import BadUrl
+from ftdrivers.installation import install_command
 from ftdrivers.interfaces import Fact, ForceTorqueSensor, RobotArm
 from ftdrivers.streaming.sensor import StreamingSensor
 
@@ -251,7 +252,7 @@ def _load(entry: EntryPoint) -> Any:
     except Exception as exc:  # a module of another package may raise anything
         missing = (isinstance(exc, ImportError) and exc.name) or ""
         if missing in _EXTRAS:
-            fix = f"pip install 'ftdrive[{_EXTRAS[missing]}]'"
+            fix = f"install it with `{install_command(_EXTRAS[missing])}`"
         elif missing in sys.stdlib_module_names:
             fix = "use Linux, because this system lacks that module"
         else:

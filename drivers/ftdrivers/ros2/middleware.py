@@ -14,13 +14,9 @@ from typing import Any, Final, NamedTuple
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, NoRos2, ProtocolError
+from ftdrivers.installation import install_command
 from ftdrivers.interfaces import Diagnosis
 
-WAYS: Final = (
-    "source a ROS 2 (`source /opt/ros/jazzy/setup.bash`, ftdrive in a venv with --system-site-packages and its "
-    "Python), or install the extra on Linux x86-64: pip install 'ftdrive[ros2]'"
-)
-"""Both ways to rclpy."""
 # Variables that name the user's profiles of Fast DDS; it also reads DEFAULT_FASTDDS_PROFILES.xml where it starts.
 _PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"}
 
@@ -32,7 +28,10 @@ def ros2_module(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition(".")[0]
-        raise NoRos2(f"Python cannot import {package} ({error}): {WAYS}") from error
+        raise NoRos2(
+            f"Python cannot import {package} ({error}): source a ROS 2 (`source /opt/ros/jazzy/setup.bash`, ftdrive in "
+            f"a venv with --system-site-packages and its Python), or on Linux x86-64 `{install_command('ros2')}`"
+        ) from error
 
 
 def _stay_on_loopback() -> None:

@@ -196,11 +196,10 @@ def require_extra(extra: str, what: str, *modules: str) -> None:
     from importlib.util import find_spec
 
     from ftdrive.errors import ConfigError
+    from ftdrivers.installation import missing_extra
 
     if missing := [name for name in modules if find_spec(name) is None]:
-        raise ConfigError(
-            f"{what} needs {missing[0]}: install ftdrive[{extra}], in a clone with `uv sync --all-extras`"
-        )
+        raise ConfigError(missing_extra(what, missing[0], extra))
 
 
 @dataclass(frozen=True, slots=True)

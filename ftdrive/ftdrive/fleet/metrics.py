@@ -9,13 +9,14 @@ from ftdrive.fleet.serve import FleetReading
 from ftdrive.fleet.state import CellState
 from ftdrive.http_gate import Gate, hidden_host
 from ftdrive.terminal.text import visible
+from ftdrivers.installation import missing_extra
 
 try:
     from prometheus_client import CollectorRegistry, start_http_server
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
     from prometheus_client.registry import Collector
 except ImportError:
-    raise ConfigError("metrics need prometheus-client: pip install 'ftdrive[fleet]'") from None
+    raise ConfigError(missing_extra("`fleet serve`", "prometheus-client", "fleet")) from None
 
 
 def _seconds(time: datetime | None) -> float | None:

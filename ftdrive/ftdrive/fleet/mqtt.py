@@ -14,12 +14,13 @@ from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.serve import FleetReading
 from ftdrive.http_gate import with_port
+from ftdrivers.installation import missing_extra
 
 try:
     from paho.mqtt.client import Client
     from paho.mqtt.enums import CallbackAPIVersion
 except ImportError:
-    raise ConfigError("messages need paho-mqtt: pip install 'ftdrive[fleet]'") from None
+    raise ConfigError(missing_extra("--mqtt", "paho-mqtt", "fleet")) from None
 
 SCHEMA_VERSION: Final = 1
 # Longest time between two attempts to connect; the first is after 1 s.

@@ -28,7 +28,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     ConfigError
         The extra `fleet` is not installed.
     """
-    environment = templates("ftdrive.fleet", "the page of a fleet", "pip install 'ftdrive[fleet]', or --json")
+    environment = templates("ftdrive.fleet", "the page of a fleet", "fleet", "--json")
     from markupsafe import Markup
 
     environment.filters["with_code"] = with_code

@@ -15,6 +15,7 @@ from ftcalib.errors import FtdriveError
 from ftdrive import __version__
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import StreamBroken, Unreachable
+from ftdrivers.installation import missing_extra
 
 # For a scheduler to answer, and for its first worker.
 CONNECT_S: Final = 10.0
@@ -31,8 +32,6 @@ _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
 # A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user.
 _LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
-_NO_ENGINE: Final = "the workers need {}: pip install 'ftdrive[fleet]'"
-
 _DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"
 
 # Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms.
@@ -99,7 +98,7 @@ def local_workers(count: int | None = None) -> Iterator[Workers]:
     try:
         from joblib.externals.loky import cpu_count, get_reusable_executor
     except ModuleNotFoundError as error:
-        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+        raise ConfigError(missing_extra("`fleet`", error.name or "", "fleet")) from None
     count = count or cpu_count()
     executor = partial(  # gives a working one also after a worker was killed
         get_reusable_executor,
@@ -142,7 +141,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
         import distributed
         from dask import config
     except ModuleNotFoundError as error:
-        raise ConfigError(_NO_ENGINE.format(error.name)) from None
+        raise ConfigError(missing_extra("`fleet`", error.name or "", "fleet")) from None
     for name in _LOGS:
         # A lost cluster is one sentence, not several tracebacks.
         logging.getLogger(name).setLevel(logging.CRITICAL)

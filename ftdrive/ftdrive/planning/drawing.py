@@ -16,6 +16,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.geometry.scene import Plane, Scene
 from ftdrive.planning.plan import JOINTS, Plan
+from ftdrivers.installation import missing_extra
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
@@ -55,7 +56,7 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     try:
         from matplotlib.figure import Figure
     except ImportError:
-        raise ConfigError("a picture needs matplotlib: install ftdrive with its extra viz, `ftdrive[viz]`") from None
+        raise ConfigError(missing_extra("a picture", "matplotlib", "viz")) from None
     arm, scene = certifier.arm, certifier.scene
     shown = plan.steps if plan.sweep is None else plan.steps[::_OF_SWEEP]
     poses = arm.frames([step.q_rad for step in shown])

@@ -26,6 +26,7 @@ from ftdrive.recording.recording import (
     Rows,
     measured,
 )
+from ftdrivers.installation import missing_extra
 
 _MAGIC: Final = b"\x89MCAP0\r\n"
 
@@ -106,7 +107,7 @@ def format_of(path: Path) -> Format:
     try:
         import_module(_FORMATS[ending].package)
     except ImportError:
-        raise ConfigError(f"{ending} needs {_FORMATS[ending].package}: pip install 'ftdrive[record]'") from None
+        raise ConfigError(missing_extra(ending, _FORMATS[ending].package, "record")) from None
     return _FORMATS[ending]
 
 

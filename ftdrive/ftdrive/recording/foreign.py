@@ -17,6 +17,7 @@ from ftdrive.recording.files import is_bag, is_recording
 from ftdrive.runs.source import SolveOptions
 from ftdrive.tables.table import Table
 from ftdrivers.errors import ProtocolError
+from ftdrivers.installation import missing_extra
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.arm import SCHEME, pose_reader_of
 from ftdrivers.ros2.poses import UNIT_TOLERANCE, Joints, PoseReader, Poses
@@ -91,7 +92,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
-        raise ConfigError(f"{path.name} needs rosbags: pip install 'ftdrive[ros2]'") from None
+        raise ConfigError(missing_extra(path.name, "rosbags", "ros2")) from None
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")

@@ -16,6 +16,7 @@ from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.report.document import label_of, shown_poses
 from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS
+from ftdrivers.installation import missing_extra
 from ftdrivers.sweep import WRISTS, Sweep
 
 Facts = Mapping[str, Any]
@@ -75,7 +76,7 @@ def draw(name: str, facts: Facts) -> str:
         import matplotlib as mpl
         from matplotlib.figure import Figure
     except ImportError:
-        raise ConfigError("figures need matplotlib: pip install 'ftdrive[report]'") from None
+        raise ConfigError(missing_extra("a figure", "matplotlib", "report")) from None
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):

@@ -10,6 +10,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.document import Section, Table, capital
 from ftdrive.report.figures import draw
 from ftdrive.report.sections import sections_of
+from ftdrivers.installation import missing_extra
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -63,7 +64,7 @@ def _escaped(text: str) -> str:
 
 def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
     """Write the page. Raises `ConfigError` without the extra `report`."""
-    environment = templates("ftdrive.report", "a report in HTML", "pip install 'ftdrive[report]', or --format md")
+    environment = templates("ftdrive.report", "a report in HTML", "report", "--format md")
     from markupsafe import Markup
 
     environment.filters["sentence"] = lambda text: with_code(capital(text))
@@ -72,18 +73,18 @@ def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
     return template.render(facts=facts, sections=sections, drawn=drawn, version=__version__)
 
 
-def templates(package: str, what: str, fix: str) -> "Environment":
+def templates(package: str, what: str, extra: str, instead: str) -> "Environment":
     """Return the templates of a package, which escape every value.
 
     Raises
     ------
     ConfigError
-        jinja2 is not installed: `what` needs it, and `fix` says what to do.
+        jinja2 is not installed: `what` needs it, `extra` has it, and the option `instead` does without it.
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
     except ImportError:
-        raise ConfigError(f"{what} needs jinja2: {fix}") from None
+        raise ConfigError(f"{missing_extra(what, 'jinja2', extra)}, or give {instead}") from None
     return Environment(
         loader=PackageLoader(package),
         autoescape=True,

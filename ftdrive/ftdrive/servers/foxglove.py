@@ -37,12 +37,13 @@ from ftdrive.live.samples import (
 )
 from ftdrive.live.stream import ProcessedStream
 from ftdrive.servers.parameters import checked_value
+from ftdrivers.installation import missing_extra
 from ftdrivers.interfaces import Array
 
 try:
     import foxglove as sdk
 except ImportError:
-    raise ConfigError("a server needs foxglove-sdk: install ftdrive with its extra stream, `ftdrive[stream]`") from None
+    raise ConfigError(missing_extra("a server", "foxglove-sdk", "stream")) from None
 
 from foxglove import Channel, Context, MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
 from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel

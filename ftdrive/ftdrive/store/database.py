@@ -42,6 +42,7 @@ from ftdrive.store.records import (
     StoredWeighings,
     user_folder,
 )
+from ftdrivers.installation import missing_extra
 
 # Version of the index, kept in the database.
 SCHEMA: Final = 4
@@ -141,7 +142,7 @@ class Database:
             raise ConfigError("[store] url is no address of a database: give one such as sqlite:////PATH") from error
         except ImportError as error:
             raise ConfigError(
-                f"[store] url = {self.name!r} needs the package {error.name or 'psycopg'}: pip install 'ftdrive[fleet]'"
+                missing_extra(f"[store] url = {self.name!r}", error.name or "psycopg", "fleet")
             ) from error
 
     @property

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.http_gate import Address, Gate, hidden_host, is_loopback, with_port
+from ftdrivers.installation import missing_extra
 
 if TYPE_CHECKING:
     from viser import GuiEvent, ViserServer
@@ -91,7 +92,7 @@ def serve(title: str, address: Address | None = None) -> Iterator[Page]:
     try:
         from viser import ViserServer
     except ImportError:
-        raise ConfigError("a view needs viser: install ftdrive with its extra viz, `ftdrive[viz]`") from None
+        raise ConfigError(missing_extra("a view", "viser", "viz")) from None
     behind, token = hidden_host(), secrets.token_urlsafe(12)
     # It prints a banner; our stdout is data.
     with redirect_stdout(StringIO()):

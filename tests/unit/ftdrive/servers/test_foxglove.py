@@ -344,5 +344,5 @@ def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> N
 def test_without_the_extra_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "foxglove", None)
     monkeypatch.delitem(sys.modules, FoxgloveServer.__module__)
-    with pytest.raises(ConfigError, match="a server needs foxglove-sdk: install ftdrive with its extra stream"):
+    with pytest.raises(ConfigError, match="a server needs foxglove-sdk, of the extra stream"):
         importlib.import_module(FoxgloveServer.__module__)
