@@ -60,18 +60,15 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] == "help":
-            if not args[1:]:
-                click.echo(ctx.get_help())
-                ctx.exit()
-            return self.resolve_command(ctx, [*args[1:], "--help"])
-        if args[0] not in COMMANDS and not args[0].startswith("-") and not ctx.resilient_parsing:
+        if args[0] not in {*COMMANDS, "help"} and not args[0].startswith("-") and not ctx.resilient_parsing:
             from ftdrive.mistakes import close_command
 
             ctx.fail(f"No such command '{args[0]}'.{close_command(args[0])}")
         return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name == "help":
+            return _help
         if cmd_name not in COMMANDS:
             return None
         # Imported only when the command is called: help is fast.
@@ -82,6 +79,13 @@ class _LazyGroup(click.Group):
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl(list(COMMANDS.items()))
+
+
+@click.command("help")
+@click.argument("words", metavar="[COMMAND]...", nargs=-1)
+def _help(words: tuple[str, ...]) -> None:
+    """Print the help of a command."""
+    cli.main([*words, "--help"], prog_name="ftdrive", standalone_mode=False)
 
 
 @click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
