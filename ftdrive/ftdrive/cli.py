@@ -60,7 +60,8 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if args[0] not in {*COMMANDS, "help"} and not args[0].startswith("-") and not ctx.resilient_parsing:
+        is_option = args[0].startswith("-")
+        if not is_option and not ctx.resilient_parsing and self.get_command(ctx, args[0]) is None:
             from ftdrive.mistakes import close_command
 
             ctx.fail(f"No such command '{args[0]}'.{close_command(args[0])}")

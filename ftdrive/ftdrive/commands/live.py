@@ -30,13 +30,14 @@ from ftdrive.commands.common import (
     view_options,
     write_json,
 )
-from ftdrive.commands.live_source import check_view, open_source
+from ftdrive.commands.live_source import check_view, open_raw, open_source
 from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Axes, Paired, StreamInfo, Tracking, WrenchFrame
+from ftdrive.live.samples import Axes, Paired, Sink, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import RECOVER_S, CompensatedStream
 from ftdrive.recording import Recorder, RecordingReader, read_recording
 from ftdrive.recording.foreign import tables_of
+from ftdrive.recording.raw_table import RawTable
 from ftdrive.recording.recording import with_calibration
 from ftdrive.recording.table_pair import TablePair
 from ftdrive.runs.run import Run
@@ -60,6 +61,11 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 @SOURCE
 @TRACK
 @click.option(
+    "--raw",
+    is_flag=True,
+    help="Show the readings of the sensor alone: no robot and no calibration; t subtracts, r saves a .csv.",
+)
+@click.option(
     "--replay",
     metavar="RUN|RECORDING",
     type=click.Path(exists=True, path_type=Path),
@@ -75,6 +81,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 def live(
     source: Source,
     track: Tracking,
+    raw: bool,
     replay: Path | None,
     speed: float | None,
     axes: Axes,
@@ -89,9 +96,11 @@ def live(
 
     The compensated wrench is the contact wrench: measured minus bias and gravity, along the chosen axes and about the
     chosen point. The arm is only read, never moved. With --json, one object per line. With --simulate, the key f pushes
-    the tool.
+    the tool. With --raw, a sensor needs neither robot nor calibration.
     """
     check_simulate(source.simulate, real={"--replay": replay})
+    if raw:
+        _require_sensor_alone(source, track, replay, axes, about, view)
     if speed is not None and replay is None:
         raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
     if replay is not None and source.tool:
@@ -101,17 +110,21 @@ def live(
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
-        recorder: Callable[[Path], Recorder] | None = None
+        recorder: Callable[[Path], Sink] | None = None
         push: Callable[[], object] | None = None
         if replay is not None:
             stream = replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
             stream.track = track
         else:
-            stream = open_source(source, frame, stack, track)
-            checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+            if raw:
+                stream = open_raw(source, stack)
+                recorder = partial(_raw_table, stream.info)
+            else:
+                stream = open_source(source, frame, stack, track)
+                checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
+                recorder = partial(_recorder, stream.info, stream.cell.to_dict())
             if source.simulate:
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
-            recorder = partial(_recorder, stream.info, stream.cell.to_dict())
         feed = Feed(stream, recorder, push)
         if (page := stack.enter_context(view.page("ftdrive live"))) is not None:
             from ftdrive.view.live_page import LivePage
@@ -179,6 +192,28 @@ def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Re
     return Recorder([path], info, configuration)
 
 
+def _raw_table(info: StreamInfo, path: Path) -> RawTable:
+    return RawTable(path, info)
+
+
+def _require_sensor_alone(
+    source: Source, track: Tracking, replay: Path | None, axes: Axes, about: str, view: ViewOptions
+) -> None:
+    """Raise `ConfigError` for options that need an arm or a calibration."""
+    options = {
+        "--calibration": source.path,
+        "--tool": source.tool,
+        "--robot": source.described.robot,
+        "--replay": replay,
+        "--track": track != "off",
+        "--axes": axes != "sensor",
+        "--about": about != "sensor",
+        "--view": view.wanted,
+    }
+    if given := [option for option, value in options.items() if value]:
+        raise ConfigError(f"{given[0]} does not go with --raw, which shows a sensor alone: leave one of the two out")
+
+
 def _print(feed: Feed, *, once: bool = False, as_json: bool = False) -> None:
     for view in _views(feed, raises=once):
         reading = _reading(view)
@@ -232,7 +267,7 @@ def _views(feed: Feed, checks: Sequence[Check] = (), *, raises: bool = False) ->
 
 def _reading(view: View) -> dict[str, Any]:
     status, calibration, verification = view.status, view.info.calibration, view.info.verification
-    reading = view.reading
+    reading, is_raw = view.reading, view.info.is_raw
     assert reading is not None  # noqa: S101 - a view is shown from the first reading on
 
     def wrench(values: Array) -> dict[str, Any] | None:
@@ -247,17 +282,17 @@ def _reading(view: View) -> dict[str, Any]:
         "axes": reading.frame.axes,
         "about": "sensor origin" if reading.frame.about == "sensor" else reading.frame.about,
         "raw": wrench(reading.raw_in_frame),
-        "compensated": wrench(reading.wrench),
+        "compensated": None if is_raw else wrench(reading.wrench),
         "sigma": wrench(reading.sigma),
         "sigma_at_rest": wrench(reading.rest_sigma),
-        "contact": None if view.silent else reading.in_contact,
+        "contact": None if view.silent or is_raw else reading.in_contact,
         "stale": view.silent or None,
-        "delay_s": {"value": status.delay_s, "sigma": status.delay_sigma_s},
+        "delay_s": None if is_raw else {"value": status.delay_s, "sigma": status.delay_sigma_s},
         "rate_Hz": status.sensor.rate_Hz,
         "lost": status.sensor.lost,
         "calibration": calibration.provenance.get("created_utc"),
-        "calibration_id": calibration.id,
-        "verdict": calibration.verdict,
+        "calibration_id": None if is_raw else calibration.id,
+        "verdict": None if is_raw else calibration.verdict,
         "marks": list(view.info.marks),
         "tracked": None if status.tracked is None else status.tracked.to_dict(),
         "verification": None if verification is None else verification.to_dict(),
@@ -265,7 +300,7 @@ def _reading(view: View) -> dict[str, Any]:
 
 
 def _line(reading: dict[str, Any], frame: WrenchFrame) -> str:
-    contact = reading["compensated"]
+    contact = reading["compensated"] or reading["raw"]
     if contact is None:
         return f"stale: {reading['stale']}"
     force, torque = (

@@ -5,10 +5,12 @@ from contextlib import ExitStack
 from socket import gethostname
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.config import CellConfig
+from ftdrive.cell.config import CellConfig, cell_of
+from ftdrive.cell.emulated import Station
 from ftdrive.commands.common import Source, ViewOptions, store_url
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import SENSOR_FRAME
+from ftdrive.live.raw import RawStream
 from ftdrive.live.samples import Tracking, WrenchFrame
 from ftdrive.live.stream import CompensatedStream
 from ftdrive.runs.source import read_calibration
@@ -46,6 +48,20 @@ def open_source(source: Source, frame: WrenchFrame, stack: ExitStack, track: Tra
     return stream
 
 
+def open_raw(source: Source, stack: ExitStack) -> RawStream:
+    """Open the sensor alone of a real or an emulated cell; `stack` closes it."""
+    cell: CellConfig | Station
+    if source.simulate:
+        cell = Station.of(None, source.described.sensor)
+    else:
+        cell = cell_of(source.described.settings(), devices=False)
+        if not cell.sensor.url:
+            raise ConfigError("no sensor: give --sensor URL, or --simulate; `ftdrive devices --probe PLACE` finds one")
+    stream = stack.enter_context(RawStream(cell))
+    messages.print(f" {stream.info.calibration_state}")
+    return stream
+
+
 def build_stream(
     source: Source,
     cell: CellConfig | None,
@@ -76,7 +92,10 @@ def check_view(view: ViewOptions, *, once: bool, allow_control: bool) -> None:
 
 def no_calibration() -> ConfigError:
     """Return the error of a command that has neither a calibration nor the name of a tool."""
-    return ConfigError("no calibration: give --calibration PATH or --tool NAME, or --simulate")
+    return ConfigError(
+        "no calibration: give --calibration PATH or --tool NAME, or --simulate; `ftdrive history` lists calibrations, "
+        "`ftdrive live --raw` needs none"
+    )
 
 
 def open_log(

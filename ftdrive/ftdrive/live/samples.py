@@ -5,7 +5,7 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal, Protocol
+from typing import ClassVar, Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -269,6 +269,10 @@ class Tracked(Displayed):
         return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
 
 
+NO_ARM: Final = DeviceInfo("", "", "")
+"""The arm of a stream that reads a sensor alone."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StreamInfo(Displayed):
     """What does not change while a stream runs with one calibration; every file and every client gets it."""
@@ -305,6 +309,11 @@ class StreamInfo(Displayed):
     def marks(self) -> tuple[str, ...]:
         """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
         return marks_of(self.calibration, emulated=self.emulated, foreign=self.foreign)
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether these are readings of a sensor alone; `calibration` then has no meaning."""
+        return self.arm is NO_ARM
 
 
 @dataclass(frozen=True, slots=True)

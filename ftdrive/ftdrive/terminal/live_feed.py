@@ -32,6 +32,8 @@ _SEEK_S = 5.0
 _LOWPASS_HZ = 40.0
 # A reader that takes nothing for many seconds misses the oldest ones; a recording never does.
 _MOST_BLOCKS, _MOST_NOTES = 2000, 200
+# Keys that mean nothing for readings of a sensor alone.
+_OF_CALIBRATION = {"x", "a", "1", "2", "3"}
 # Events whose time the plots show; contact has a colour, and a change of frame clears them.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
 _STYLES = {
@@ -119,6 +121,9 @@ class Feed:
 
     def request(self, key: str, text: str = "") -> None:
         """Let the reading thread do what a key stands for; the text is its mark, time or speed."""
+        if self.stream.info.is_raw and key in _OF_CALIBRATION:
+            self.note("raw readings have neither stages nor other axes: start with --calibration for these")
+            return
         self._requests.put((key, text))
 
     def note(self, text: str, style: str = "") -> None:
@@ -169,7 +174,9 @@ class Feed:
             self.note("recording is not available here: use `ftdrive record -o FILE`")
         else:
             utc = datetime.fromtimestamp((self._now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
-            path = Path(f"live-{utc:%Y-%m-%dT%H%M%SZ}.mcap").absolute()
+            # a recording has poses and a calibration, a table of readings has not
+            kind, ending = ("raw", "csv") if self.stream.info.is_raw else ("live", "mcap")
+            path = Path(f"{kind}-{utc:%Y-%m-%dT%H%M%SZ}.{ending}").absolute()
             self._sink, self.recording_since_ns = self._recorder(path), self._now_ns
             self.recorded.append(path)
             self.note(f"recording to {path}")

@@ -41,6 +41,8 @@ _SIGNIFICANT = 4.0
 # Width of the numbers of the table.
 _NUMBERS = 37
 _ARROWS = "→↗↑↖←↙↓↘"
+# Number of the first stage that readings of a sensor alone can have.
+_LOWPASS = 4
 # Width of a half sphere.
 _DISC = 16
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
@@ -79,10 +81,16 @@ def provenance(view: View, width: int) -> Line:
         return line.add("waiting for the first sample").fit(width)
     stages, frame = view.reading.stages, view.reading.frame
     chain = [Part("raw")]
+    is_tared = view.info.is_raw and view.status.tare is not None
+    if is_tared:
+        chain.append(Part("tare"))
     for number, (name, is_on) in enumerate(_stages(stages), 1):
+        if view.info.is_raw and number < _LOWPASS:
+            continue
         text = f"{number} {name}" if is_on else f"{number} {name}(off)"
         chain.append(Part(text, "" if is_on else FAINT, str(number)))
-    right = Line(meaning(stages), STRONG if stages.bias and stages.gravity else WARNING).add(", ")
+    usual = view.info.is_raw or (stages.bias and stages.gravity)
+    right = Line("minus tare" if is_tared else meaning(stages), STRONG if usual else WARNING).add(", ")
     right.add(frame.axes, STRONG, "x").add(" @ ").add(_point(frame), STRONG, "a").add(" ")
     room = width - right.width - 2 - sum(cell_len(part.text) for part in chain)
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
@@ -122,16 +130,21 @@ def _point(frame: WrenchFrame) -> str:
 def state(view: View, width: int) -> Line:
     """Name the calibration, the tare and the drift of the bias."""
     calibration, status = view.info.calibration, view.status
-    line = Line(" cal ")
-    line.add(calibration.id[:6]).add(" ")
-    trusted = calibration.verdict == "good" and not set(view.info.marks) - {EMULATED}
-    line.add(calibration.verdict.upper(), GOOD if trusted else WARNING)
-    line.add(_age(view)).add(", ").add(*_verified(view))
+    if view.info.is_raw:
+        line = Line(" sensor alone: no arm, no calibration", WARNING)
+    else:
+        line = Line(" cal ")
+        line.add(calibration.id[:6]).add(" ")
+        trusted = calibration.verdict == "good" and not set(view.info.marks) - {EMULATED}
+        line.add(calibration.verdict.upper(), GOOD if trusted else WARNING)
+        line.add(_age(view)).add(", ").add(*_verified(view))
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
         line.add(f"  tare {time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
     elif status.tracked is None:
         line.add("  tare ").add("none", FAINT)
+    if view.info.is_raw:
+        return line.fit(width)
     if status.tracked is not None:
         line.add(f"  {status.tracked.in_words()}")
         return line.fit(width)
@@ -303,7 +316,7 @@ def layers(ink: Codes, paper: Codes, in_contact: NDArray[np.bool_]) -> Line:
 
 def _contact(view: View) -> Line:
     reading, status = view.reading, view.status
-    if reading is None or view.silent:
+    if reading is None or view.silent or view.info.is_raw:
         return Line()
     if np.isnan(reading.chi2):
         return Line("noise not known yet", FAINT)
@@ -338,6 +351,8 @@ def line_of_force(reading: ShownWrench | None) -> Line:
 
 def links(view: View, width: int) -> list[Line]:
     """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
+    if view.info.is_raw:
+        return [line.fit(width) for line in (_raw(view), _range(view), _link("sensor", view.status.sensor))]
     dial = _dial(view)
     rows = [_raw(view), _range(view), _link("sensor", view.status.sensor), _link("robot", view.status.arm)]
     if view.replay is None:
@@ -380,7 +395,9 @@ def _range(view: View) -> Line:
         return line
     load = view.reading.raw
     if view.info.sensor.has_arbitrary_zero:
-        load = load - np.concatenate([view.info.calibration.force_bias_N, view.info.calibration.torque_bias_Nm])
+        tare = np.zeros(6) if view.status.tare is None else view.status.tare
+        known = np.concatenate([view.info.calibration.force_bias_N, view.info.calibration.torque_bias_Nm])
+        load = load - (tare if view.info.is_raw else known)
     shares = np.abs(load) / np.array(fact.value)
     worst = int(np.argmax(shares))
     share = float(shares[worst])
@@ -410,7 +427,7 @@ def _checked(check: Check) -> Line:
 def others(view: View, width: int) -> list[Line]:
     """Show the wrench with fewer stages, and in other frames."""
     reading, calibration = view.reading, view.info.calibration
-    if reading is None:
+    if reading is None or view.info.is_raw:
         return []
     raw = reading.raw
     bias = np.r_[calibration.force_bias_N, calibration.torque_bias_Nm]
@@ -442,7 +459,7 @@ def _in_frame(wrench: Array, frame: WrenchFrame, view: View, R_base_flange: Arra
 def sphere(view: View, width: int) -> list[Line]:
     """Draw gravity in flange axes on two half spheres, with the calibrated orientations and the error expected here."""
     reading = view.reading
-    if reading is None:
+    if reading is None or view.info.is_raw:
         return []
     calibration, R = view.info.calibration, reading.R_base_flange
     down = R.T @ _unit(calibration.gravity_force_base_N)
@@ -494,11 +511,10 @@ def _unit(vector: Array) -> Array:
 def identity(view: View, width: int) -> list[Line]:
     """Name the devices with serial numbers, the calibration and the checks shared with `doctor`."""
     info = view.info
-    lines = [
-        Line(" arm       ", FAINT).add(who(info.arm)),
-        Line(" sensor    ", FAINT).add(who(info.sensor)),
-        Line(" cal       ", FAINT).add(info.calibration_name),
-    ]
+    lines = [Line(" sensor    ", FAINT).add(who(info.sensor))]
+    if not info.is_raw:
+        lines.insert(0, Line(" arm       ", FAINT).add(who(info.arm)))
+        lines.append(Line(" cal       ", FAINT).add(info.calibration_name))
     for check in view.checks:
         # stands beside the links
         if check.name == "robot.payload" and check.state == "ok":
@@ -550,6 +566,8 @@ def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
 def keys(view: View, width: int) -> Line:
     """List the keys; a click on one presses it."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
+    if view.info.is_raw:
+        names = ["t tare", "u undo", "4 low-pass", "z freeze", "b mark", "r rec", "p peak", "g span"]
     if view.can_push:
         names.insert(0, "f push")
     if view.replay is not None:

@@ -46,6 +46,7 @@ _HELP = """\
 
  Emulated cell: f push the tool with 8 N for 1 s
  Replay: space pause    ← → seek 5 s    . next samples    + - speed
+ Sensor alone (--raw): t subtracts the present mean; r saves a .csv
 
  Plots: smallest and largest value of each column; dotted lines at 0 and at
         ± 1 sigma of a sample; ━ contact, ◆ mark, tare or change of stages
@@ -70,9 +71,11 @@ def run_live(feed: Feed, checks: Sequence[Check] = ()) -> None:
         The stream had failed when the user quit.
     """
     info = feed.stream.info
-    devices = check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor})
-    dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
-    app = LiveApp(feed, Summary(feed, [devices, *checks], dataset))
+    dataset = None
+    if not info.is_raw:
+        checks = [check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor}), *checks]
+        dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
+    app = LiveApp(feed, Summary(feed, checks, dataset))
     feed.start()
     try:
         app.run_on_terminal()
@@ -212,7 +215,7 @@ def _wide(view: View, width: int, rows: int) -> list[Line]:
     separator = Line("─" * _LEFT, FAINT)
     left = [*live_panels.table(view, _LEFT, with_trace=False), separator, *live_panels.links(view, _LEFT), separator]
     for extra in (live_panels.others(view, _LEFT), live_panels.sphere(view, _LEFT), live_panels.identity(view, _LEFT)):
-        if rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
+        if extra and rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
             left += [*extra, separator]
     left += live_panels.events(view, _LEFT, max(0, rows - len(left)))
     right = _plots(view, width - _LEFT - 1, rows, across=1)
