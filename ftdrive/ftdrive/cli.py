@@ -15,7 +15,7 @@ from typing import Any
 
 import click
 
-from ftcalib.errors import DataError, DeviceError
+from ftcalib.errors import DataError, DeviceError, UsageError
 from ftdrive import __version__
 from ftdrive.errors import SupervisorGone, exit_code
 from ftdrive.terminal.text import COMMANDS, echo, in_one_line
@@ -205,17 +205,20 @@ def _run(arguments: Sequence[str]) -> int:
         if code is None or _closed_terminals:
             raise
         # a file of another kind is the cause of whatever it lacks
-        other = _other_command(arguments) if isinstance(error, DataError | OSError) else ""
+        about = str(error) if isinstance(error, UsageError) else ""
+        other = _other_command(arguments, about) if isinstance(error, DataError | UsageError | OSError) else ""
         _say(f"error: {in_one_line(other or in_a_sentence(error))}")
         return code
 
 
 def _explain(error: click.ClickException, arguments: Sequence[str]) -> None:
     """Print an error of the line itself, and what to type."""
-    from ftdrive.mistakes import existing, missing
+    from ftdrive.mistakes import existing, missing, without_value
 
     if isinstance(error, click.MissingParameter):
         error = click.UsageError(missing(error, arguments), error.ctx)
+    elif isinstance(error, click.BadOptionUsage):
+        error = click.UsageError(without_value(error, cli, arguments), error.ctx)
     elif isinstance(error, click.UsageError):
         if other := _other_command(arguments, error.format_message()):
             _say(f"error: {in_one_line(other)}")

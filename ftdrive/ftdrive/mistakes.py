@@ -14,7 +14,9 @@ from ftcalib.files import open_file
 from ftdrive.terminal.text import COMMANDS
 
 
-class _Kind(NamedTuple):
+class Kind(NamedTuple):
+    """A kind of file, and the commands and options that take it."""
+
     words: str
     lines: tuple[str, ...]
     """What a user wants with such a file, to type."""
@@ -28,13 +30,13 @@ class _Kind(NamedTuple):
         return {head.rpartition(" ")[2] if " --" in head else head for head in heads}
 
 
-_KINDS: Final[Mapping[str, _Kind]] = {
-    "recording": _Kind(
+KINDS: Final[Mapping[str, Kind]] = {
+    "recording": Kind(
         "a recording",
         ("live --replay {}", "compensate {}", "convert {} -o NEW.csv"),
         ("solve {}", "fleet compensate {}", "loads check --replay {}"),
     ),
-    "run": _Kind(
+    "run": Kind(
         "a run folder",
         ("solve {}", "report {}", "live --calibration {}"),
         (
@@ -44,25 +46,25 @@ _KINDS: Final[Mapping[str, _Kind]] = {
             *("fleet index {}", "fleet solve {}"),
         ),
     ),
-    "runs": _Kind(
+    "runs": Kind(
         "a folder of runs",
         ("history {}", "fleet solve {}"),
         ("calibrate --runs {}", "fleet index {}", "history --index {}"),
     ),
-    "folder": _Kind("a folder without a run", ("calibrate --runs {}", "history"), ("fleet index {}", "history {}")),
-    "calibration": _Kind(
+    "folder": Kind("a folder without a run", ("calibrate --runs {}", "history"), ("fleet index {}", "history {}")),
+    "calibration": Kind(
         "a calibration",
         ("live --calibration {}", "report {}", "push {}"),
         ("diff {}", "export calibration {}", "calibrate --from {}", "report --parent {}"),
     ),
-    "dataset": _Kind("a dataset", ("solve {}", "report {}"), ("solve --test {}",)),
-    "plan": _Kind("a plan", ("calibrate --plan {}", "export plan {} --format urscript")),
-    "config": _Kind("a configuration", ("doctor --config {}", "calibrate --config {}")),
-    "cells": _Kind("a list of cells", ("fleet add {}",)),
-    "transcript": _Kind("a transcript", ("transcript play {}",), ("bundle RUN --transcript {}",)),
-    "bundle": _Kind("a bundle", ("replay {}", "solve {}")),
-    "push": _Kind("a receipt of `ftdrive push`", ("push --restore {}",)),
-    "table": _Kind(
+    "dataset": Kind("a dataset", ("solve {}", "report {}"), ("solve --test {}",)),
+    "plan": Kind("a plan", ("calibrate --plan {}", "export plan {} --format urscript")),
+    "config": Kind("a configuration", ("doctor --config {}", "calibrate --config {}")),
+    "cells": Kind("a list of cells", ("fleet add {}",)),
+    "transcript": Kind("a transcript", ("transcript play {}",), ("bundle RUN --transcript {}",)),
+    "bundle": Kind("a bundle", ("replay {}", "solve {}")),
+    "push": Kind("a receipt of `ftdrive push`", ("push --restore {}",)),
+    "table": Kind(
         "a table or bag of another program",
         ("solve {}", "compensate {} --calibration PATH", "live --replay {} --calibration PATH"),
         ("report {}", "solve --wrench {}", "solve --orientation-file {}", "solve --test {}", "fleet compensate {}"),
@@ -73,7 +75,7 @@ _FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
 # A table of a TOML file that describes a cell.
 _CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
 _START = 4096
-_OUTPUTS = {"-o", "--output", "--png", "--html"}
+_ALIKE = 0.75
 
 
 def kind_of(path: Path) -> str | None:
@@ -89,7 +91,7 @@ def kind_of(path: Path) -> str | None:
             return None
         with open_file(path) as file:
             start = file.read(_START)
-        if (found := _FORMAT.search(start[:300])) is not None and (name := found[1].decode()) in _KINDS:
+        if (found := _FORMAT.search(start[:300])) is not None and (name := found[1].decode()) in KINDS:
             return name
         if path.suffix == ".toml":
             return "config" if _CELL.search(start) else None
@@ -117,42 +119,40 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
     """
     for number, place, name, command in _named(group, arguments):
         path, kind = Path(name), kind_of(Path(name))
-        if kind is None or place in _OUTPUTS or not name.isprintable() or (about and name not in about):
+        if kind is None or not name.isprintable() or (about and name not in about):
             continue
         if kind == "run" and path.is_file():
             path = path.parent
-        elif place in _KINDS[kind].places or (place == "--calibration" and kind == "run"):
+        elif place in KINDS[kind].places or (place == "--calibration" and kind == "run"):
             continue
-        options = {name for one in command.params for name in one.opts} & _KINDS[kind].places
+        options = {name for one in command.params for name in one.opts} & KINDS[kind].places
         own = [f"{place} {option} {{}}" for option in sorted(options) if not place.startswith("-")]
-        lines = [
-            f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *_KINDS[kind].lines])
-        ]
+        lines = [f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *KINDS[kind].lines])]
         # another place takes it, or the same place another path
         better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
         if better is not None:
             given = arguments[number].removesuffix(name) + str(better)
             lines = [shlex.join(["ftdrive", *arguments[:number], given, *arguments[number + 1 :]])]
         which = place if place.startswith("-") else f"`ftdrive {place}`"
-        what = "a file of a run folder" if kind == "run" and path != Path(name) else _KINDS[kind].words
+        what = "a file of a run folder" if kind == "run" and path != Path(name) else KINDS[kind].words
         return "\n".join([f"{name} is {what}, which {which} does not take. Type", *lines])
     return ""
 
 
 def _named(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
-    """Yield number, place, name and command of each argument that is a file, or that its command does not have."""
+    """Yield number, place, name and command of each argument that is an existing file, or that no command has."""
     command: click.Command = group
-    words, option = list[str](), ""
+    words, option, number_of_place = list[str](), "", 0
     for number, argument in enumerate(arguments):
         options = {name: one for one in command.params if isinstance(one, click.Option) for name in one.opts}
         if option:
-            if isinstance(options[option].type, click.Path):
+            if _is_read(options[option]):
                 yield number, option, argument, command
             option = ""
         elif argument.startswith("-"):
             name, _, value = argument.partition("=")
             known = options.get(name)
-            if known is not None and value and isinstance(known.type, click.Path):
+            if known is not None and value and _is_read(known):
                 yield number, name, value, command
             elif known is not None and not value and not known.is_flag:
                 option = name
@@ -160,20 +160,25 @@ def _named(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, 
             command = sub
             words.append(argument)
         else:
-            types = [one.type for one in command.params if isinstance(one, click.Argument)]
+            places = [one for one in command.params if isinstance(one, click.Argument)]
             # the runs of `diff` may also be named by their tool
-            if not types or command.name == "diff" or any(isinstance(one, click.Path) for one in types):
+            if not places or command.name == "diff" or _is_read(places[min(number_of_place, len(places) - 1)]):
                 yield number, " ".join(words), argument, command
+            number_of_place += 1
+
+
+def _is_read(parameter: click.Parameter) -> bool:
+    return isinstance(parameter.type, click.Path) and parameter.type.exists
 
 
 def existing(group: click.Group, arguments: Sequence[str]) -> str:
     """Return a path like the one that does not exist, or where to find one, as a sentence."""
-    for _, place, name, _ in _named(group, arguments):
+    for _, _, name, _ in _named(group, arguments):
         path = Path(name)
-        if place in _OUTPUTS or path.exists():
+        if path.exists():
             continue
         with suppress(OSError):
-            if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1):
+            if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1, _ALIKE):
                 return _question([str(path.with_name(found[0]))])
         return " `ftdrive history` lists your runs."
     return ""
@@ -203,9 +208,32 @@ def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
     names = " and ".join(f"{one.param_type_name} {one.get_error_hint(context)}" for one in absent)
     options = {name: one for one in command.params for name in one.opts}
     if "--simulate" in options and not {"--simulate", "--calibration", "--tool", "--sensor"} & set(typed):
-        absent += [options[name] for name in ("--calibration", "--sensor") if name in options][:1]
+        real = [options[name] for name in ("--calibration", "--sensor") if name in options]
+        absent += [one for one in real if one.metavar in {"PATH", "URL"}][:1]
     words = " ".join(_blank(one, context) for one in absent)
     return f"Missing {names}. Type\n{' '.join([context.command_path, shlex.join(typed)]).rstrip()} {words}"
+
+
+def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Sequence[str]) -> str:
+    """Return the line with what may stand behind an option that has no value."""
+    command, words = _command(group, arguments)
+    for one in command.params:
+        if error.option_name in one.opts:
+            line = " ".join(["ftdrive", *words, _blank(one, click.Context(command))])
+            return f"{error.format_message()} Type\n{line}"
+    return error.format_message()
+
+
+def _command(group: click.Group, arguments: Sequence[str]) -> tuple[click.Command, list[str]]:
+    """Return the command of a line, and its words."""
+    command: click.Command = group
+    words = list[str]()
+    for argument in arguments:
+        if not isinstance(command, click.Group) or not (sub := command.get_command(click.Context(command), argument)):
+            break
+        command = sub
+        words.append(argument)
+    return command, words
 
 
 def _blank(parameter: click.Parameter, context: click.Context) -> str:

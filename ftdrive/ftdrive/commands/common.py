@@ -214,6 +214,11 @@ class ViewOptions:
         """Whether there is one: an address implies it."""
         return self.view or self.address is not None
 
+    def require(self) -> None:
+        """Raise `ConfigError` if a page is wanted and a package of it is missing."""
+        if self.wanted:
+            require_extra("viz", "--view", "viser", "segno")
+
     @contextmanager
     def page(self, title: str) -> Iterator["Page | None"]:
         """Serve a page while the block runs, and print its address; None where it is not wanted."""
@@ -225,7 +230,7 @@ class ViewOptions:
         if not self.wanted:
             yield None
             return
-        require_extra("viz", "--view", "viser", "segno")
+        self.require()
         from ftdrive.view.page import announce, serve
 
         with serve(title, address) as page:
