@@ -49,9 +49,13 @@ KINDS: Final[Mapping[str, Kind]] = {
     "runs": Kind(
         "a folder of runs",
         ("history {}", "fleet solve {}"),
-        ("calibrate --runs {}", "fleet index {}", "history --index {}"),
+        ("calibrate --runs {}", "fleet index {}", "history --index {}", "fleet compensate {}"),
     ),
-    "folder": Kind("a folder without a run", ("calibrate --runs {}", "history"), ("fleet index {}", "history {}")),
+    "folder": Kind(
+        "a folder without a run",
+        ("calibrate --runs {}", "history"),
+        ("fleet index {}", "history {}", "fleet compensate {}"),
+    ),
     "calibration": Kind(
         "a calibration",
         ("live --calibration {}", "report {}", "push {}"),
@@ -70,7 +74,8 @@ KINDS: Final[Mapping[str, Kind]] = {
         ("report {}", "solve --wrench {}", "solve --orientation-file {}", "solve --test {}", "fleet compensate {}"),
     ),
 }
-_TABLES = {".csv", ".tsv", ".txt", ".dat", ".parquet", ".db3", ".bag", ".mcap", ".log"}
+_TEXTS, _BINARIES = {".csv", ".tsv", ".txt", ".dat", ".log"}, {".parquet", ".db3", ".bag", ".mcap"}
+_TWO_NUMBERS = re.compile(rb"\d[\s,;]+[-+.]?\d")
 _FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
 # A table of a TOML file that describes a cell.
 _CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
@@ -99,7 +104,8 @@ def kind_of(path: Path) -> str | None:
             return "bundle"
         if path.suffix == ".mcap" and is_recording(path):
             return "recording"
-        return "table" if path.suffix in _TABLES else None
+        is_table = path.suffix in _BINARIES or (path.suffix in _TEXTS and _TWO_NUMBERS.search(start))
+        return "table" if is_table else None
     return None
 
 

@@ -70,12 +70,12 @@ def test_a_repeated_command_continues(run: Callable[..., Ran], tmp_path: Path) -
     [
         (["in/a.csv", "-o", "in"], "would have the path of the recording: choose another folder"),
         (["in", "other/a.csv", "-o", "out"], "have the same name: compensate them into two folders"),
-        (["c.json", "-o", "out"], "has no ending of a recording"),
+        (["c.json", "-o", "out"], "fleet compensate --calibration c.json"),
         (["in", "-o", "c.json"], "'c.json' is a file"),
         (["in"], "Missing option '-o'"),
         (["in", "-o", "out", "--about", "here"], "--about is 'here'"),
         (["in", "-o", "out", "--workers", "2", "--cluster", "dask://host:1"], "exclude one another"),
-        (["in", "-o", "out", "--calibration", "in"], "in/calibration.json: No such file"),
+        (["in", "-o", "out", "--calibration", "in"], "in is a folder without a run, which --calibration does not take"),
     ],
 )
 def test_a_mistake_is_refused_before_any_work(

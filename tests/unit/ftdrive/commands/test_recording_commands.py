@@ -388,7 +388,7 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
     ("options", "words"),
     [
         ([], "RECORDING"),
-        (["--wrench", "c.json"], "--orientation-file and --calibration"),
+        (["--wrench", "c.json"], "c.json is a calibration, which --wrench does not take"),
         (["a.mcap", "--wrench", "c.json"], "RECORDING does not go with --wrench"),
         (["a.mcap", "--delay", "auto"], "describe another program"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
