@@ -48,7 +48,7 @@ NEEDED: Mapping[str, tuple[str, ...]] = {
 """What a command cannot do without; any other must work with --simulate and --json alone."""
 
 FLEET = tuple(name for name in names(cli) if name.startswith("fleet "))
-OFFLINE = ("convert", "compensate", "history", "diff", "export formats", *FLEET)
+OFFLINE = ("completion", "convert", "compensate", "history", "diff", "export formats", *FLEET)
 """They know no cell, or many."""
 
 REHEARSED = ("bundle", "replay", "report", "solve", "export calibration")
@@ -185,6 +185,7 @@ ANSWERED: Mapping[str, tuple[str, str]] = {
     "bundle": ("--simulate -o {n}.zip", "Saved "),
     "calibrate": ("--simulate --minimal --dry-run", "Dry run: nothing has moved."),
     "compensate": ("{csv}", "compensated "),
+    "completion": ("bash", "_ftdrive_completion"),
     "config show": ("--simulate", "[robot]"),
     "convert": ("{csv} {n}.csv", "Saved "),
     "devices": ("--simulate", "/dev/pts/"),

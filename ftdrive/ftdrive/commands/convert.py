@@ -27,7 +27,7 @@ def convert(source: Path | None, target: Path | None, output: Path | None, as_js
     target = target or output or Path()
     format_of(target)
     if not is_recording(source):
-        raise BadRecording("it is not of `ftdrive record`: `ftdrive compensate` reads those of another program", source)
+        raise BadRecording("it is another program's: `ftdrive compensate` reads it", source)
     with working("Converting") as show:
         reader = RecordingReader(source)
         found, failure = converted(reader, target, show)

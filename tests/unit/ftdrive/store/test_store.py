@@ -141,7 +141,7 @@ def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, store_url: st
         ("sqlite+none:////data/store", "no address of a database"),
         ("postgresql+psycopg://lab:secret@host:port/db", "no address of a database"),
         ("mysql://lab:secret@host/db", "begins with mysql: give sqlite"),
-        ("postgresql+psycopg://lab:secret@host/db", "needs the package psycopg"),
+        ("postgresql+psycopg://lab:secret@host/db", "needs psycopg"),
     ],
 )
 def test_an_address_that_cannot_be_used_is_named_without_its_password(
