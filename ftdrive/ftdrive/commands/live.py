@@ -106,6 +106,7 @@ def live(
     if replay is not None and source.tool:
         raise ConfigError("--tool does not go with --replay: leave one of the two out")
     check_view(view, once=once, allow_control=allow_control)
+    view.require()
     frame = read_frame(axes, about)
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream

@@ -83,12 +83,11 @@ def build_stream(
 
 
 def check_view(view: ViewOptions, *, once: bool, allow_control: bool) -> None:
-    """Raise `ConfigError` for options of a page that would be ignored, or without the packages of a page."""
+    """Raise `ConfigError` for options of a page that would be ignored."""
     if once and view.wanted:
         raise ConfigError("--view does not go with --once: leave one of the two out")
     if allow_control and not view.wanted:
         raise ConfigError("--allow-control goes only with --view: add it, or leave --allow-control out")
-    view.require()
 
 
 def no_calibration() -> ConfigError:

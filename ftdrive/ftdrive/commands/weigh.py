@@ -58,6 +58,7 @@ def weigh(
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
     check_view(view, once=once, allow_control=allow_control)
+    view.require()
     with ExitStack() as stack:
         stream = open_source(source, SENSOR_FRAME, stack, "show" if moving else "off")
         recorder = None

@@ -96,7 +96,7 @@ def test_a_force_on_its_line_of_action_has_the_torque(p: list[float], force: lis
 
 def test_a_page_on_this_computer_or_what_to_install() -> None:
     if find_spec("viser") is None:
-        with pytest.raises(ConfigError, match=r"ftdrive\[viz\]"), serve("a plan"):
+        with pytest.raises(ConfigError, match=r"of the extra viz"), serve("a plan"):
             pass
         return
     with serve("a plan") as page:
