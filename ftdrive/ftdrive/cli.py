@@ -213,10 +213,12 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _explain(error: click.ClickException, arguments: Sequence[str]) -> None:
     """Print an error of the line itself, and what to type."""
-    from ftdrive.mistakes import existing, missing, without_value
+    from ftdrive.mistakes import existing, missing, of_subcommand, without_value
 
     if isinstance(error, click.MissingParameter):
         error = click.UsageError(missing(error, arguments), error.ctx)
+    elif isinstance(error, click.NoSuchOption):
+        error = click.UsageError(of_subcommand(error, arguments), error.ctx)
     elif isinstance(error, click.BadOptionUsage):
         error = click.UsageError(without_value(error, cli, arguments), error.ctx)
     elif isinstance(error, click.UsageError):

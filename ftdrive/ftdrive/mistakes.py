@@ -160,7 +160,7 @@ def _named(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, 
             known = options.get(name)
             if known is not None and value and _is_read(known):
                 yield number, name, value, command
-            elif known is not None and not value and not known.is_flag:
+            elif known is not None and not (value or known.is_flag or known.count):
                 option = name
         elif isinstance(command, click.Group) and (sub := command.get_command(click.Context(command), argument)):
             command = sub
@@ -222,24 +222,29 @@ def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
 
 def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Sequence[str]) -> str:
     """Return the line with what may stand behind an option that has no value."""
-    command, words = _command(group, arguments)
+    command: click.Command = group
+    words = ["ftdrive"]
+    for argument in arguments:
+        if isinstance(command, click.Group) and (sub := command.get_command(click.Context(command), argument)):
+            command = sub
+            words.append(argument)
     for one in command.params:
         if error.option_name in one.opts:
-            line = " ".join(["ftdrive", *words, _blank(one, click.Context(command))])
-            return f"{error.format_message()} Type\n{line}"
+            return f"{error.format_message()} Type\n{' '.join([*words, _blank(one, click.Context(command))])}"
     return error.format_message()
 
 
-def _command(group: click.Group, arguments: Sequence[str]) -> tuple[click.Command, list[str]]:
-    """Return the command of a line, and its words."""
-    command: click.Command = group
-    words = list[str]()
-    for argument in arguments:
-        if not isinstance(command, click.Group) or not (sub := command.get_command(click.Context(command), argument)):
-            break
-        command = sub
-        words.append(argument)
-    return command, words
+def of_subcommand(error: click.NoSuchOption, arguments: Sequence[str]) -> str:
+    """Return the line of the command that has an option which stands before it, or without it."""
+    context = error.ctx
+    if context is not None and isinstance(group := context.command, click.Group):
+        names = group.list_commands(context)
+        # to look at all commands takes a second
+        for name in [one for one in names if one in arguments] or (names if context.parent else []):
+            command = group.get_command(context, name)
+            if command is not None and any(error.option_name in one.opts for one in command.params):
+                return f"{error.message} Type\n{context.command_path} {name} {error.option_name}"
+    return error.format_message()
 
 
 def _blank(parameter: click.Parameter, context: click.Context) -> str:

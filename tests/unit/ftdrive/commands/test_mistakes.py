@@ -12,6 +12,7 @@ import click
 import pytest
 
 from ftdrive import cli, mistakes
+from ftdrive.terminal.console import messages
 from tests.unit.ftdrive.recorded import calibration, dataset
 
 # The line, its exit code, and what the answer has to type instead.
@@ -26,6 +27,8 @@ TYPOS = [
     ("live --calib run", 2, "--calibration"),
     ("solve run --outpt x.json", 2, "--output"),
     ("devices --prob can0", 2, "--probe"),
+    ("--simulate live", 2, "ftdrive live --simulate"),
+    ("config --origin", 2, "ftdrive config show --origin"),
     ("fleet statu", 2, "status"),
     ("doctor --sensor can0", 2, "ati-can://can0"),
     ("live --raw --sensor ati-cam://can0", 2, "ati-can://"),
@@ -41,7 +44,7 @@ MISSING = [
     ("live", 2, "--calibration PATH"),
     ("live --raw", 2, "--sensor URL"),
     ("live --replay", 2, "ftdrive live --replay RUN|RECORDING"),
-    ("doctor --robot", 2, "ftdrive doctor --robot HOST"),
+    ("-v doctor --robot", 2, "ftdrive doctor --robot HOST"),
     ("doctor", 2, "--robot"),
     ("weigh", 2, "--calibration PATH"),
     ("stream", 2, "--calibration PATH"),
@@ -71,6 +74,7 @@ MISSING = [
 ]
 KINDS = [
     ("replay rec.csv", 6, "ftdrive live --replay rec.csv"),
+    ("-v -q replay rec.csv", 6, "ftdrive live --replay rec.csv"),
     ("replay calibration.json", 6, "ftdrive live --calibration calibration.json"),
     ("replay runs", 6, "ftdrive replay runs/2"),
     ("replay run/run.json", 6, "ftdrive replay run"),
@@ -166,6 +170,9 @@ def _here(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("XDG_DATA_HOME", "XDG_STATE_HOME", "XDG_CONFIG_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.delenv("UV_RUN_RECURSION_DEPTH", raising=False)
+    # a line with -v or -q changes them
+    monkeypatch.setattr(messages, "quiet", messages.quiet)
+    monkeypatch.setattr(messages, "verbose", messages.verbose)
     monkeypatch.setattr(
         "ftdrive.cell.emulated.Station.__enter__", lambda _: pytest.fail("an emulated cell has started")
     )
