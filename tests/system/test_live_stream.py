@@ -1,6 +1,7 @@
 """The compensated stream of an emulated cell over its real wires: a push, a moving arm, an interruption."""
 
 from dataclasses import replace
+from itertools import islice
 from typing import get_args
 
 import numpy as np
@@ -8,8 +9,9 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.cell.emulated import Station
+from ftdrive.live.raw import RawStream
 from ftdrive.live.samples import Axes, Stages, WrenchFrame
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.live.stream import BlockReader, CompensatedStream
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.live.simulated import calibrated_from
 
@@ -75,3 +77,17 @@ def test_a_push_a_swing_and_an_interruption() -> None:
             read(stream, 0.1)
             kinds = [event.kind for event in stream.take_events()]
             assert kinds.count("stale") == kinds.count("recovered") == 1
+
+
+@pytest.mark.slow
+def test_a_sensor_alone_is_read_again_after_an_interruption() -> None:
+    with Station("serial", OPTIONS) as station, RawStream(station.cell) as stream:
+        before = read(stream, 0.5).mean(axis=0)
+        station.control(do="sensor-faults", stall=True)
+        with pytest.raises(DeviceTimeout):
+            read(stream, 5.0)
+        station.control(do="sensor-faults", stall=False)
+        assert any(block is not None for block in islice(BlockReader(stream), 30))
+        assert read(stream, 0.5).mean(axis=0) == pytest.approx(before, abs=0.05)
+        kinds = [event.kind for event in stream.take_events()]
+        assert kinds.count("stale") == kinds.count("recovered") == 1

@@ -242,7 +242,7 @@ def _component(view: View, i: int, places: int) -> Line:
     if reading is None or view.silent:
         line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT)
         return line.join(_peaks(view, i, places))
-    line.add(f"{reading.wrench[i]:+z8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
+    line.add(_fixed(reading.wrench[i], places, 8), f"bold {CONTACT}" if reading.in_contact else STRONG)
     return line.add(f"{digits(reading.sigma[i], places):>8}", FAINT).join(_peaks(view, i, places))
 
 
@@ -264,7 +264,14 @@ def _peaks(view: View, i: int, places: int) -> Line:
     low, high = view.peaks.low[i], view.peaks.high[i]
     if low > high:
         return Line()
-    return Line(f"{low:+z8.{places - 1}f}{high:+z8.{places - 1}f}", "", "p")
+    return Line(f"{_fixed(low, places - 1, 7):>8}{_fixed(high, places - 1, 7):>8}", "", "p")
+
+
+def _fixed(value: float, places: int, width: int) -> str:
+    """Return a number right in `width` cells; raw readings of some sensors are so large that decimals must go."""
+    while places and len(f"{value:+z.{places}f}") > width:
+        places -= 1
+    return f"{value:+z.{places}f}".rjust(width)
 
 
 def _size(view: View, first: int, places: int) -> Line:

@@ -1,10 +1,12 @@
 """A sensor alone: its readings minus a tare, without a word about an arm or a calibration."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.live.raw import RawStream
 from ftdrive.recording.compensation import compensate_recording
@@ -89,6 +91,18 @@ def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
         assert "raw readings have neither stages nor other axes" in text
         for word in ("GOOD", "cal ", "robot", "payload", "drift", "free ", "CONTACT", "bias", "noise not known"):
             assert word not in text, word
+
+
+def test_a_program_gets_readings_and_no_verdict(
+    sensor: Sensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sensor.push = LOAD
+    monkeypatch.setattr("ftdrive.commands.live.open_raw", lambda _, stack: stack.enter_context(raw(sensor)))
+    assert cli.run(["live", "--raw", "--sensor", "fake://", "--once", "--json"]) == 0
+    reading = json.loads(capsys.readouterr().out)
+    assert reading["raw"]["force_N"] == pytest.approx((sensor.motion.wrench(np.zeros(1))[0] + LOAD)[:3], abs=0.05)
+    for name in ("compensated", "contact", "calibration", "calibration_id", "verdict", "delay_s", "verification"):
+        assert reading[name] is None
 
 
 def test_what_is_saved_is_compensated_beside_a_table_of_poses(sensor: Sensor, tmp_path: Path) -> None:
