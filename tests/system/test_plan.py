@@ -83,7 +83,7 @@ def test_a_plane_with_its_sign_wrong_is_named_at_once() -> None:
 
 
 def test_the_table_fits_into_80_columns() -> None:
-    lines = run(*UR5E).stdout.splitlines()
+    lines = run(*UR5E, "--all").stdout.splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("Poses in degrees"))
     table = lines[start + 1 : lines.index("", start)]
     assert max(map(len, table)) <= 80

@@ -13,7 +13,6 @@ import click
 import numpy as np
 from rich.text import Text
 
-from ftcalib import CalibrationResult
 from ftcalib.known import Setup
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
@@ -46,7 +45,6 @@ from ftdrive.checks.sensor import (
 )
 from ftdrive.commands.common import (
     CELL,
-    FILE,
     JSON,
     MODEL,
     CellOptions,
@@ -57,6 +55,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import NotAccepted
+from ftdrive.runs.source import read_calibration
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.text import echo
@@ -81,7 +80,13 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
 @CELL
 @MODEL
 @simulate()
-@click.option("--calibration", "path", type=FILE, help="Check that this calibration is of these devices.")
+@click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=click.Path(exists=True, path_type=Path),
+    help="Check that this calibration.json or run folder is of these devices.",
+)
 @click.option(
     "--mass-kg", type=Number(0, min_open=True), help="Expected mass of the tool.  [default: [tool] mass_kg, else 1]"
 )
@@ -107,7 +112,7 @@ def doctor(
     sensor and skips the robot. Exit code 7 if a check fails.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot, "--model": model})
-    calibration = None if path is None else CalibrationResult.load(path)
+    calibration = None if path is None else read_calibration(path)
     pushed: dict[str, Any] | None = None
     with ExitStack() as stack:
         station = stack.enter_context(Station.of(None, described.sensor, ["--time-scale", "1"])) if simulate else None

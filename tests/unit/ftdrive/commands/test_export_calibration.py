@@ -53,7 +53,7 @@ def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
     outcome = export("calibration", saved, "--format", "ft-tools")
     assert outcome.exit_code == 0
     assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.0)
-    assert "gravity_in_reference_frame = [0.0, 0.0, -9.80665]" in " ".join(outcome.stderr.split())
+    assert "gravity_in_reference_frame = [0, 0, -9.80665]" in " ".join(outcome.stderr.split())
 
 
 def test_the_mass_of_an_emulated_sensor_is_that_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -205,7 +205,7 @@ def test_at_80_columns_no_word_is_broken_and_none_touches_its_neighbour() -> Non
     assert set(lines[0].split()) <= words
     assert lines[0].endswith(" ● REC 00:12:34 ")
     assert any(
-        line.endswith("▲ CONTACT 123.4 s  χ² 98765 > 40.6, p 1e-6 ") for line in (f"{x.rstrip()} " for x in lines)
+        line.endswith("▲ CONTACT 123.4 s  test 98765, limit 40.6 ") for line in (f"{x.rstrip()} " for x in lines)
     )
 
 
