@@ -7,9 +7,9 @@ wall_mm = [(0, 1, 0, -550)]  # everything stays where y >= -550 mm, in base axes
 
 for poses in (6, 12, 24):
     plan = ftdrive.plan_tour("ur5e", tool_mm, poses, planes_mm=wall_mm, mass_kg=1.5)
-    mass_g = 1e3 * plan.predicted["mass_kg"]
+    error_mN = 1e3 * plan.predicted["force_rms_N"]
     closest_mm = 1e3 * min(step.clearance_m for step in plan.steps)
-    print(f"{poses:2} poses: {plan.motion_time_s:.0f} s, {closest_mm:.0f} mm clear, sigma of mass {mass_g:.1f} g")
+    print(f"{poses:2} poses: {plan.motion_time_s:.0f} s, {closest_mm:.0f} mm clear, force error {error_mN:.0f} mN")
 
 try:
     ftdrive.plan_tour("ur5e", [(0, 900, 120)])
