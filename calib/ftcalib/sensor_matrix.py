@@ -29,7 +29,7 @@ from ftcalib.display import Displayed
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Setup
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEVER_M, Response
+from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEAST_COMMON_GAIN, LEVER_M, Response
 from ftcalib.model import Array, Parameters, read_only, skew
 
 FORMAT = "ftdrive.sensor/1"
@@ -110,6 +110,28 @@ class SensorMatrix(Displayed):
     def sigma(self) -> Array:
         """(6, 6) one standard deviation of the entries of E."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
+
+    def hidden_covariance(self, parameters: Parameters) -> Array:
+        """Covariance (15, 15) of what these errors hide in mounting, weight and centre of mass, before any reading.
+
+        After a calibration `ftcalib.likelihood.response.hidden_covariance` has what it found of them.
+
+        Parameters
+        ----------
+        parameters : Parameters
+            Of the expected tool.
+        """
+        p, C = parameters.p_sensor_com_m, self.covariance[3:, 3:]
+        turn, (_, torque) = _rotation_of(_ENTRIES, p), _gain_at(_ENTRIES, p)
+        (scale,) = _common_gain(p)
+        columns = np.zeros((15, 36))
+        columns[:3] = parameters.R_flange_sensor @ turn.T
+        columns[3:6] = np.outer(parameters.gravity_force_base_N, scale)
+        columns[9:12] = (_vector_of(torque - skew(p) @ skew(turn)) - np.outer(scale, p)).T
+        weight = np.zeros(15)
+        weight[3:6] = parameters.gravity_force_base_N
+        least = max(LEAST_COMMON_GAIN**2 - float(scale @ C @ scale), 0.0)
+        return np.asarray(columns @ C @ columns.T + least * np.outer(weight, weight))
 
     def after(
         self,

@@ -157,35 +157,12 @@ def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigm
     gain_sigma, cross_talk_sigma_m : float
         Standard deviation of the entries of both matrices, from 5 and 6 numbers.
     """
-    # An antisymmetric entry has half the variance of an entry.
-    return _hidden(
-        parameters, _FROM_5 * gain_sigma**2 / 2, _FROM_6 * cross_talk_sigma_m**2 / 2, (COMMON_GAIN * gain_sigma) ** 2
-    )
-
-
-def expected_hidden_covariance(parameters: Parameters, gain_sigma: float, lever_m: float = LEVER_M) -> Array:
-    """Covariance (15, 15) that `hidden_covariance` will have, before any reading.
-
-    Parameters
-    ----------
-    parameters : Parameters
-        As expected.
-    gain_sigma : float
-        Of the gain of one axis, as of the data sheet.
-    lever_m : float
-        Range of torque over range of force.
-    """
-    entry = (CROSS_TALK_SHARE * gain_sigma) ** 2 / 2
-    return _hidden(parameters, entry, entry * lever_m**2, max(LEAST_COMMON_GAIN**2, gain_sigma**2 / 3))
-
-
-def _hidden(parameters: Parameters, rotation: float, shift_m2: float, common_gain: float) -> Array:
-    """Covariance (15, 15) from the variances of a rotation, a shift of the centre of mass, and a common gain."""
     hidden, common = np.zeros((15, 15)), np.zeros(15)
     common[3:6], common[9:12] = parameters.gravity_force_base_N, -parameters.p_sensor_com_m
-    hidden[range(3), range(3)] = rotation
-    hidden[range(9, 12), range(9, 12)] = shift_m2
-    return np.asarray(hidden + common_gain * np.outer(common, common))
+    # An antisymmetric entry has half the variance of an entry.
+    hidden[range(3), range(3)] = _FROM_5 * gain_sigma**2 / 2
+    hidden[range(9, 12), range(9, 12)] = _FROM_6 * cross_talk_sigma_m**2 / 2
+    return np.asarray(hidden + (COMMON_GAIN * gain_sigma) ** 2 * np.outer(common, common))
 
 
 def predicted_covariance(

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.judge.observability import second_minimum
-from ftcalib.likelihood.response import expected_hidden_covariance
 from ftcalib.likelihood.rotation_minima import given_rotation
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+from ftcalib.sensor_matrix import SensorMatrix
 
 # Smaller eigenvalues of the scaled information, as a share of the largest, count as zero.
 OBSERVABLE = 1e-9
@@ -42,14 +42,19 @@ class Guess:
     tilt_alpha_rad: float = 0.0
     tilt_beta_rad: float = 0.0
     g_m_s2: float = STANDARD_GRAVITY_M_S2
-    gain_sigma: float = 0.0
-    """Of the gain of one axis of the sensor. 0: predicted from noise alone, as for a perfect sensor."""
+    sensor: SensorMatrix | None = None
+    """What is known of the sensor's own errors. None: predicted from noise alone, as for a perfect sensor."""
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ValueError(f"{name} is {value}, expected a positive number")
+
+    @property
+    def gain_sigma(self) -> float:
+        """Of the gain of one axis of the sensor; 0 for a perfect one."""
+        return 0.0 if self.sensor is None else float(self.sensor.sigma[0, 0])
 
     @property
     def weight_N(self) -> float:
@@ -128,8 +133,8 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
 
     rows = np.concatenate([np.eye(15), _weight_and_tilt_rows(guess)])
     total = variance(rows)
-    if guess.gain_sigma:
-        hidden = expected_hidden_covariance(guess.parameters, guess.gain_sigma)
+    if guess.sensor is not None:
+        hidden = guess.sensor.hidden_covariance(guess.parameters)
         total = total + np.einsum("ki,ij,kj->k", rows, hidden, rows)
     std, (weight, alpha, beta) = np.sqrt(total[:15]), np.sqrt(total[15:]).tolist()
     everywhere = jacobian(guess.parameters, special(range(1, 25)))

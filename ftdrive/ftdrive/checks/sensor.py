@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib import CalibrationDataset
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.poses.information import Guess, predicted_sigma, special
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks.check import Check, State, who
 from ftdrive.checks.computer import SensorAddress, latency_command
@@ -257,7 +258,9 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
     return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
 
 
-def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: float, gain_sigma: float) -> list[Check]:
+def check_noise(
+    wrench: Array, duration_s: float, average_s: float, mass_kg: float, sensor: SensorMatrix
+) -> list[Check]:
     """Check the noise of a sensor at rest, and predict the accuracy of a calibration from it.
 
     Parameters
@@ -268,24 +271,25 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, mass_kg: flo
         How long each pose is averaged.
     mass_kg : float
         Expected, of all that hangs on the sensor.
-    gain_sigma : float
-        Expected, of the gain of one axis of the sensor.
+    sensor : SensorMatrix
+        What is known of the sensor's own errors.
     """
     level = check_level(wrench)
     if level.state == "failed":
         return [level]
     variance = np.diag(mean_and_covariance(wrench).covariance) * duration_s / average_s
     force_N, torque_Nm = (float(np.sqrt(variance[axes].mean())) for axes in (slice(3), slice(3, 6)))
-    guess = Guess(mass_kg, force_N, torque_Nm, gain_sigma=gain_sigma)
+    guess = Guess(mass_kg, force_N, torque_Nm, sensor=sensor)
     expected = predicted_sigma(special(range(1, 25)), guess)
     com_mm, turn_deg = (
         factor * float(np.max(np.abs(expected.sigma[key])))
         for key, factor in (("p_sensor_com_m", 1e3), ("R_flange_sensor", 180 / np.pi))
     )
     mass_g = 1e3 * float(np.max(expected.sigma["mass_kg"]))
+    off = f"a sensor whose gain is {100 * guess.gain_sigma:.2g} % off"
     accuracy = (
-        f"for {mass_kg:g} kg, 24 poses of {average_s:g} s and a sensor whose gain is {100 * gain_sigma:.2g} % off, one "
-        f"sigma: mass {mass_g:.2g} g, centre of mass {com_mm:.2g} mm, mounting {turn_deg:.2g}°"
+        f"for {mass_kg:g} kg, 24 poses of {average_s:g} s and {off}, "
+        f"one sigma: mass {mass_g:.2g} g, centre of mass {com_mm:.2g} mm, mounting {turn_deg:.2g}°"
     )
     return [level, Check("noise.accuracy", "ok", accuracy)]
 

@@ -13,7 +13,6 @@ import click
 import numpy as np
 from rich.text import Text
 
-from ftcalib.known import Setup
 from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_reached
@@ -55,6 +54,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import NotAccepted
+from ftdrive.planning.planner import declared_sensor
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, messages, working
@@ -235,7 +235,6 @@ def _examine_sensor(
     except DeviceError as error:
         return [*found, blame(name, error)], False
     fact = info.facts.get("range")
-    gain_sigma = Setup(sensor_accuracy_percent=cell.sensor.accuracy_percent).gain_sigma
     limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
         *found,
@@ -243,7 +242,7 @@ def _examine_sensor(
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *check_stream(samples, health, address, _LOOK_S),
-        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, gain_sigma),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, declared_sensor(cell.sensor)),
     ], True
 
 

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib.known import Setup
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
-from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftcalib.sensor_matrix import SensorMatrix
+from ftdrive.cell.config import USUAL_KG, CellConfig, SensorConfig
 from ftdrive.cell.units import side_of
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, HungLoad
@@ -50,20 +51,25 @@ Found = tuple[Sequence[int], Array]
 Attempt = tuple[str, Sequence[str], Found | None]
 
 
+def declared_sensor(sensor: SensorConfig) -> SensorMatrix:
+    """Return the errors of a sensor as its data sheet or its kind has them."""
+    both = None if not (sensor.range_N and sensor.range_Nm) else (sensor.range_N, sensor.range_Nm)
+    return SensorMatrix.declared(Setup(sensor_accuracy_percent=sensor.accuracy_percent, sensor_range=both))
+
+
 def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
     """Return a prior: mass of tool and accuracy of sensor as described, centre of mass at half the tool length.
 
     Noise, and what is not described, as usual.
     """
     length_m = max(part.to_m for part in certifier.arm.tool)
-    mass_kg, accuracy_percent = (None, None) if cell is None else (cell.tool.mass_kg, cell.sensor.accuracy_percent)
     return Guess(
-        mass_kg or USUAL_KG,
+        (cell and cell.tool.mass_kg) or USUAL_KG,
         0.05,
         0.003,
         (0.0, 0.0, length_m / 2),
         tilt_beta_rad=certifier.scene.lean_rad,
-        gain_sigma=Setup(sensor_accuracy_percent=accuracy_percent).gain_sigma,
+        sensor=SensorMatrix.usual() if cell is None else declared_sensor(cell.sensor),
     )
 
 

@@ -164,7 +164,7 @@ class RunningFit:
         """Return the tool as estimated, or a usual one, with the measured noise of the poses."""
         variance = np.mean([np.diag(record.mean.covariance) for record in self._records.values()], axis=0)
         _, alpha, beta = weight_and_tilt(self._down())
-        noise = {
+        noise: dict[str, Any] = {
             "sigma_force_N": float(np.sqrt(variance[:3].mean())),
             "sigma_torque_Nm": float(np.sqrt(variance[3:].mean())),
             "tilt_alpha_rad": alpha,
