@@ -165,7 +165,7 @@ class Session:
     @property
     def least_response(self) -> tuple[float, float]:
         """Variances of gain and cross-talk that a sensor has, whatever a few poses show."""
-        few = FEW_POSES <= self.n < FEW_POSES_FOR_GAIN
+        few = self.n < FEW_POSES_FOR_GAIN
         return (self.gain_sigma**2, (CROSS_TALK_SHARE * self.gain_sigma) ** 2) if few else (0.0, 0.0)
 
     def _groups(self) -> list[range]:

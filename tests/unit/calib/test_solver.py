@@ -637,3 +637,22 @@ def test_a_sensor_with_an_arbitrary_zero_may_have_any_bias() -> None:
         solve(CalibrationDataset.of(R, counts.wrench, meta=facts)),
     ):
         assert known.verdict == "good"
+
+
+def test_five_poses_state_what_errors_of_the_sensor_hide_in_the_mounting() -> None:
+    in_sigmas = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        E = (
+            rng.normal(size=(6, 6))
+            * np.where(np.eye(6) > 0, 0.02, 0.01)
+            * np.outer([1, 1, 1, *[0.05] * 3], [1, 1, 1, *[20] * 3])
+        )
+        R = R24[rng.choice(24, 5, replace=False)]
+        free = predict(replace(TRUTH, force_bias_N=np.zeros(3), torque_bias_Nm=np.zeros(3)), R)
+        wrench = predict(TRUTH, R) + free @ E.T + rng.normal(size=(5, 6)) * SIGMA / 10
+        result = solve(dataset(R, wrench, white(5, SIGMA / 10)))
+        turn_rad = Rotation.from_matrix(result.R_flange_sensor @ TRUTH.R_flange_sensor.T).as_rotvec()
+        in_sigmas += [*(turn_rad / result.sigma["R_flange_sensor"])]
+    assert np.abs(in_sigmas).max() < 5  # 100 and more without what is assumed of a sensor
+    assert np.sqrt(np.mean(np.square(in_sigmas))) > 0.3
