@@ -4,7 +4,8 @@ Colours are of middle brightness, so that a drawing is readable on a white and o
 """
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from html import escape
 from math import atan2, cos, log10, radians, sin
 from pathlib import Path
@@ -53,6 +54,11 @@ class Drawing:
             f'stroke="{colour}" stroke-width="2"/>'
         )
 
+    def titled(self, x: float, y: float, width: float, colour: str, *lines: str) -> None:
+        """Draw a box around centred lines; the first is bold."""
+        self.box(x, y, width, 24 + 18 * (len(lines) - 1) + 12, colour)
+        self.text(x + width / 2, y + 23, *lines, colour=colour, anchor="middle", bold=True)
+
     def dot(self, at: Point, colour: str = GREY, *, filled: bool = True) -> None:
         fill = colour if filled else "none"
         self._shapes.append(
@@ -76,6 +82,13 @@ class Drawing:
             self.arrow(at, tip, colour)
             self.text(tip[0] + 9 * cos(turn), tip[1] - 9 * sin(turn) + 5, name, colour=colour, anchor="middle")
 
+    @contextmanager
+    def turned(self, degrees: float, about: Point) -> Iterator[None]:
+        """Turn what is drawn inside, clockwise."""
+        self._shapes.append(f'<g transform="rotate({degrees:g} {about[0]:g} {about[1]:g})">')
+        yield
+        self._shapes.append("</g>")
+
     def size(self, start: Point, end: Point, colour: str = GREY) -> None:
         """Draw the line of a dimension, level or upright, with a mark at each end."""
         (x, y), (u, v) = start, end
@@ -83,13 +96,18 @@ class Drawing:
         self.path(f"M{x:g},{y:g} L{u:g},{v:g} {ends}", colour, width=1)
 
 
-def _wrist(on: Drawing, x: float, y: float, *, up: bool = False) -> None:
-    """Draw flange, sensor and tool around the axis x; y is the flange face. The tip is 170 px away."""
-    s = -1 if up else 1
+def _mount(on: Drawing, x: float, y: float, s: int = 1) -> None:
+    """Draw flange and sensor around the axis x; y is the flange face, s is -1 upside down."""
     on.path(f"M{x - 26:g},{y - s * 46:g} V{y - s * 12:g} M{x + 26:g},{y - s * 46:g} V{y - s * 12:g}")
     on.box(x - 42, min(y, y - s * 12), 84, 12, round_px=2)
     on.box(x - 34, min(y, y + s * 34), 68, 34, BLUE)
     on.text(x, y + s * 17 + 5, "sensor", colour=BLUE, anchor="middle")
+
+
+def _wrist(on: Drawing, x: float, y: float, *, up: bool = False) -> None:
+    """Draw flange, sensor and tool. The tip is 170 px from the flange face."""
+    s = -1 if up else 1
+    _mount(on, x, y, s)
     on.path(f"M{x - 22:g},{y + s * 34:g} v{s * 76} h15 v{s * 60} h14 v{-s * 60} h15 v{-s * 76}")
 
 
@@ -259,19 +277,15 @@ def data_flow() -> Drawing:
     """Draw how samples become a calibration, and a calibration contact forces."""
     on = Drawing(860, 400, "From the devices to a calibration, and from a calibration to contact forces")
 
-    def box(x: float, y: float, width: float, colour: str, *lines: str) -> None:
-        on.box(x, y, width, 24 + 18 * (len(lines) - 1) + 12, colour)
-        on.text(x + width / 2, y + 23, *lines, colour=colour, anchor="middle", bold=True)
-
     on.text(20, 28, "once: calibrate", colour=BLUE, bold=True)
-    box(20, 50, 130, GREY, "arm", "pose, 500 Hz")
-    box(20, 120, 130, GREY, "sensor", "raw wrench")
-    box(210, 85, 130, BLUE, "calibrate", "24 poses")
-    box(400, 85, 130, BLUE, "run folder", "poses, result")
-    box(400, 12, 130, GREY, "poses.csv", "a file of yours")
-    box(600, 12, 240, BLUE, "report, verify, history, diff", "is it good, does it still hold?")
-    box(600, 85, 240, GREEN, "export", "ROS 2, URDF, URScript, JSON, …")
-    box(600, 158, 240, GREEN, "push", "payload, gravity: to the controller")
+    on.titled(20, 50, 130, GREY, "arm", "pose, 500 Hz")
+    on.titled(20, 120, 130, GREY, "sensor", "raw wrench")
+    on.titled(210, 85, 130, BLUE, "calibrate", "24 poses")
+    on.titled(400, 85, 130, BLUE, "run folder", "poses, result")
+    on.titled(400, 12, 130, GREY, "poses.csv", "a file of yours")
+    on.titled(600, 12, 240, BLUE, "report, verify, history, diff", "is it good, does it still hold?")
+    on.titled(600, 85, 240, GREEN, "export", "ROS 2, URDF, URScript, JSON, …")
+    on.titled(600, 158, 240, GREEN, "push", "payload, gravity: to the controller")
     on.arrow((150, 71), (206, 98))
     on.arrow((150, 141), (206, 114))
     on.arrow((340, 106), (396, 106), BLUE)
@@ -281,9 +295,9 @@ def data_flow() -> Drawing:
     on.arrow((530, 106), (596, 106), BLUE)
     on.arrow((530, 116), (596, 170), BLUE)
     on.text(20, 236, "then: all day", colour=ORANGE, bold=True)
-    box(20, 256, 130, GREY, "arm", "pose, 500 Hz")
-    box(20, 326, 130, GREY, "sensor", "raw wrench")
-    box(
+    on.titled(20, 256, 130, GREY, "arm", "pose, 500 Hz")
+    on.titled(20, 326, 130, GREY, "sensor", "raw wrench")
+    on.titled(
         210,
         282,
         320,
@@ -297,11 +311,187 @@ def data_flow() -> Drawing:
     on.text(455, 208, "calibration", colour=BLUE, anchor="end")
     on.arrow((150, 277), (206, 300))
     on.arrow((150, 347), (206, 324))
-    box(600, 226, 240, ORANGE, "live, weigh, record", "screen, browser, files")
-    box(600, 290, 240, ORANGE, "stream, ros2, serve-load", "Foxglove, topics, UR programs")
-    box(600, 354, 240, ORANGE, "open_stream()")
+    on.titled(600, 226, 240, ORANGE, "live, weigh, record", "screen, browser, files")
+    on.titled(600, 290, 240, ORANGE, "stream, ros2, serve-load", "Foxglove, topics, UR programs")
+    on.titled(600, 354, 240, ORANGE, "open_stream()")
     for y in (247, 311, 372):
         on.arrow((530, 314), (596, y), ORANGE)
+    return on
+
+
+# Known loads
+
+
+def _weight(on: Drawing, x: float, hook: float, kg: int, string: float = 70) -> None:
+    """Draw a weight on a string that hangs from a hook."""
+    top = hook + 5 + string
+    on.dot((x, hook), ORANGE, filled=False)
+    on.line((x, hook + 5), (x, top), colour=ORANGE, width=1.5)
+    on.path(f"M{x - 24:g},{top:g} h48 l6,46 h-60 Z", ORANGE)
+    on.text(x, top + 29, f"{kg} kg", colour=ORANGE, anchor="middle")
+
+
+def load_check() -> Drawing:
+    """Draw the weight that shows the scale of a sensor."""
+    on = Drawing(560, 366, "One weight on a string at the tip")
+    _wrist(on, 230, 60)
+    _weight(on, 230, 235, 1)
+    on.line((140, 60), (180, 60), width=1, dashed=True)
+    on.size((140, 60), (140, 235))
+    on.text(130, 142, "200 mm from", "the flange face", anchor="end")
+    on.line((236, 235), (290, 235), width=1)
+    on.text(298, 240, "--at tip=0,0,200: the hook")
+    on.text(298, 280, "a thin string of 200 to 300 mm")
+    on.text(298, 338, "hangs still")
+    return on
+
+
+def load_string() -> Drawing:
+    """Draw a weight at two points of the tool."""
+    on = Drawing(790, 400, "A weight on a string at a point beside the tool, and at the tip")
+    _wrist(on, 150, 60)
+    on.line((172, 110), (245, 110))
+    _weight(on, 250, 110, 2, 160)
+    on.line((192, 60), (320, 60), width=1, dashed=True)
+    on.size((310, 60), (310, 110))
+    on.text(320, 90, "50 mm")
+    on.size((150, 256), (250, 256))
+    on.line((150, 236), (150, 256), width=1, dashed=True)
+    on.text(203, 250, "100 mm", anchor="middle")
+    with on.turned(35, (560, 235)):
+        _wrist(on, 560, 60)
+    _weight(on, 560, 240, 2)
+    on.line((566, 240), (590, 240), width=1)
+    on.text(598, 236, "the hook stays, the arm", "turns about it")
+    on.text(598, 290, "at least 20 mm between", "string and tool")
+    on.text(150, 386, "1. --at side=100,0,50: 12 tilts", anchor="middle", bold=True)
+    on.text(560, 386, "2. --at tip=0,0,200: 12 tilts", anchor="middle", bold=True)
+    return on
+
+
+def load_bar() -> Drawing:
+    """Draw one bar, gripped at two places."""
+    on = Drawing(760, 270, "One weighed bar, gripped at two places")
+    for x, shift, words in ((190, 0, "1. first grip, 6 poses"), (540, 60, "2. shifted by 60 mm, 6 poses")):
+        _mount(on, x, 50)
+        on.path(f"M{x - 34},84 h68 v44 h-68 Z M{x - 30},128 v50 M{x + 30},128 v50")
+        on.path(f"M{x - 30},150 h9 v26 h-9 M{x + 30},150 h-9 v26 h9")
+        on.box(x - 140 + shift, 152, 280, 22, ORANGE, round_px=2)
+        on.line((x + shift, 146), (x + shift, 180), colour=ORANGE, width=1, dashed=True)
+        on.text(x, 240, words, anchor="middle", bold=True)
+    on.text(54, 196, "bar, 2.000 kg", colour=ORANGE)
+    on.size((540, 192), (600, 192))
+    on.text(608, 197, "60 mm")
+    return on
+
+
+# Connections
+
+
+def connect_robot() -> Drawing:
+    """Draw the computer, the ports of a controller, and what must be set at the pendant."""
+    on = Drawing(860, 390, "Computer, controller, pendant and sensor: what goes through which port")
+    on.box(20, 20, 150, 250, BLUE)
+    on.text(95, 46, "computer", "ftdrive", colour=BLUE, anchor="middle", bold=True)
+    on.box(600, 20, 240, 250)
+    on.text(720, 46, "controller", "--robot 192.168.1.10", anchor="middle", bold=True)
+    rows = (
+        (GREEN, 104, "30004", "RTDE: pose, state, registers"),
+        (GREEN, 146, "30001", "model and kinematics of the arm"),
+        (GREEN, 188, "29999; 80 on PolyScope X", "mode, programs, stop"),
+        (ORANGE, 240, "30001; 30003 with ur-rtde", "a program of ftdrive: moves, payload"),
+    )
+    for colour, y, port, content in rows:
+        on.arrow((170, y), (596, y), colour)
+        on.text(383, y - 8, content, colour=colour, anchor="middle")
+        on.text(612, y + 5, port, colour=colour, bold=True)
+    on.line((720, 270), (720, 310))
+    on.titled(600, 310, 240, GREY, "pendant", "payload, remote control")
+    on.line((95, 270), (95, 310))
+    on.titled(20, 310, 150, GREY, "sensor", "on its own cable")
+    words = "Green needs no control: doctor, live, record, weigh."
+    on.text(385, 328, words, colour=GREEN, anchor="middle")
+    on.text(385, 352, "Orange needs control: calibrate, verify, push.", colour=ORANGE, anchor="middle")
+    return on
+
+
+def ur_program() -> Drawing:
+    """Draw how a program on the controller gets weight and wrench."""
+    on = Drawing(860, 330, "A UR program, registers of its controller, and ftdrive serve-load")
+    on.box(20, 20, 530, 236)
+    on.text(36, 44, "controller", bold=True)
+    on.box(36, 60, 160, 180, GREEN)
+    on.text(52, 84, "your program", "with ftd.script", colour=GREEN, bold=True)
+    on.text(52, 140, "ftd_wrench()", colour=GREEN)
+    on.text(52, 180, "ftd_zero()", "ftd_weigh()", colour=GREEN)
+    on.box(320, 60, 214, 80, BLUE)
+    on.text(
+        427,
+        84,
+        "input registers F …",
+        "wrench, weight, state,",
+        "live counter",
+        colour=BLUE,
+        anchor="middle",
+        bold=True,
+    )
+    on.box(320, 168, 214, 72, ORANGE)
+    request = ("output registers F, F+1", "request: weigh, zero, status")
+    on.text(427, 194, *request, colour=ORANGE, anchor="middle", bold=True)
+    on.arrow((320, 100), (200, 100), BLUE)
+    on.arrow((196, 196), (316, 196), ORANGE)
+    on.box(680, 60, 160, 180, BLUE)
+    on.text(760, 90, "ftdrive serve-load", anchor="middle", colour=BLUE, bold=True)
+    on.text(760, 122, "contact wrench", "of calibration,", "sensor and pose", anchor="middle", colour=BLUE)
+    on.text(760, 206, "never moves the arm", anchor="middle", colour=BLUE)
+    on.arrow((680, 100), (538, 100), BLUE)
+    on.text(609, 90, "125 Hz or more", colour=BLUE, anchor="middle")
+    on.arrow((534, 204), (676, 204), ORANGE)
+    on.titled(680, 268, 160, GREY, "sensor", "raw wrench")
+    on.arrow((760, 268), (760, 243))
+    on.text(36, 288, "F is --first, 24 unless you choose it. If the live counter stands still,")
+    on.text(36, 308, "service, sensor, link or arm are silent: the numbers are old.")
+    return on
+
+
+def ros2_node() -> Drawing:
+    """Draw the node's topics and services, and its frames."""
+    on = Drawing(860, 410, "The node of ftdrive ros2: what it reads, publishes and serves, and its frames")
+    on.titled(20, 40, 180, GREY, "arm", "driver, topic, tf or URDF")
+    on.titled(20, 130, 180, GREY, "sensor", "driver or WrenchStamped")
+    on.titled(270, 85, 170, BLUE, "node /ftdrive", "calibration, tare")
+    on.arrow((200, 67), (266, 98))
+    on.arrow((200, 157), (266, 126))
+    topics = (
+        (ORANGE, 46, "~/wrench, ~/contact", "contact wrench"),
+        (GREY, 84, "~/wrench_raw", "as measured"),
+        (GREEN, 122, "~/status, /diagnostics", "what is wrong, drift"),
+        (BLUE, 160, "/tf, /tf_static", "the frames below"),
+    )
+    for colour, y, name, content in topics:
+        on.arrow((440, 92 + (y - 46) * 0.34), (526, y), colour)
+        on.text(534, y + 5, name, colour=colour, bold=True)
+        on.text(704, y + 5, content, colour=colour)
+    on.arrow((355, 190), (355, 145), GREEN)
+    on.text(355, 208, "services ~/tare, ~/undo_tare; parameters axes, about, tool", colour=GREEN, anchor="middle")
+    on.line((20, 240), (840, 240), width=0.5)
+    for x, frame, colour, words in (
+        (110, "base", GREY, ("the arm's driver", "publishes the arm")),
+        (400, "tool0", GREY, ()),
+        (720, "ft_sensor", BLUE, ("axes as identified",)),
+    ):
+        on.box(x - 90, 275, 180, 36, colour)
+        on.text(x, 298, frame, colour=colour, anchor="middle", bold=True)
+        on.text(x, 332, *words, colour=colour, anchor="middle")
+    on.arrow((200, 293), (306, 293), dashed=True)
+    on.text(253, 283, "/tf", anchor="middle")
+    on.text(253, 266, "publish_base_tf", anchor="middle")
+    on.arrow((490, 293), (626, 293), BLUE)
+    on.text(558, 283, "/tf_static", colour=BLUE, anchor="middle")
+    on.arrow((400, 311), (400, 356), ORANGE)
+    on.text(412, 340, "/tf", colour=ORANGE)
+    on.text(400, 376, "base_at_ft_sensor: frame_id of a wrench", colour=ORANGE, anchor="middle", bold=True)
+    on.text(400, 396, "in base axes about the sensor (--axes base)", colour=ORANGE, anchor="middle")
     return on
 
 
@@ -423,6 +613,12 @@ DRAWINGS: Mapping[str, Callable[[], Drawing]] = MappingProxyType(
         "measure": measure,
         "run-folder": run_folder,
         "data-flow": data_flow,
+        "load-check": load_check,
+        "load-string": load_string,
+        "load-bar": load_bar,
+        "connect-robot": connect_robot,
+        "ur-program": ur_program,
+        "ros2-node": ros2_node,
         "figure-calibration": figure_calibration,
         "figure-motion": figure_motion,
         "figure-planning": figure_planning,

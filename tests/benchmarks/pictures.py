@@ -2,7 +2,9 @@
 
 demo      runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
 live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
+weigh     runs the real app of `ftdrive weigh` with a weight
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
+fleet     photographs the page of `ftdrive fleet status` for four cells, one of which drifts
 tour      stick figures of `ftdrive plan`, and the sweep of `ftdrive demo --sweep`
 drawings  frames, signs, what to measure, files, data flow, and plots of tables of the figures, from `drawings.py`
 
@@ -24,16 +26,22 @@ from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import get_args
 
+import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from ftdrive.checks.check import Check
+from ftdrive.fleet.page import page
+from ftdrive.live.weighing import ScaleState
 from ftdrive.terminal.live_feed import Feed
 from ftdrive.terminal.live_screen import LiveApp
 from ftdrive.terminal.live_view import Summary
+from ftdrive.terminal.weigh_screen import WeighApp
 from tests.benchmarks.common import show
 from tests.benchmarks.drawings import DRAWINGS
-from tests.unit.ftdrive.terminal.fake_stream import FakeStream, Scenario
+from tests.unit.ftdrive.fleet.fleet_records import cell, daily, fleet, observed, result
+from tests.unit.ftdrive.terminal.fake_stream import INFO, FakeStream, Scenario
+from tests.unit.ftdrive.terminal.test_weigh_screen import PART, FakeWeighing
 
 FOLDER = Path(__file__).parents[2] / "docs/pictures"
 COLUMNS, ROWS = 80, 24
@@ -109,6 +117,7 @@ def animated(strip: list[str]) -> str:
 # The states of the live screen
 
 BLOCKS = 1200
+SCALE_ROWS = 12
 CHECKS = (
     Check("calibration.devices", "ok", "verdict good, with these devices"),
     Check("robot.payload", "ok", "robot 1.74 kg; weighed 1.44 kg + 0.30 kg sensor"),
@@ -134,8 +143,24 @@ async def picture(scenario: Scenario) -> str:
         return app.export_screenshot(simplify=True)
 
 
+async def scale() -> str:
+    """Run the scale with a part in the gripper and draw it."""
+    weighing = FakeWeighing(ScaleState(PART, None))
+    weighing.stream.info = INFO
+    app = WeighApp(weighing)
+    async with app.run_test(size=(COLUMNS, SCALE_ROWS)) as pilot:
+        while weighing.shown != weighing.given:
+            await pilot.pause(0.01)
+        app.draw()
+        await pilot.pause()
+        weighing.ends.set()
+        app.reader.join()
+        return app.export_screenshot(title="ftdrive weigh", simplify=True)
+
+
 def with_dots(svg: str) -> str:
     """Replace Braille, which many fonts lack, by one path a line, and the web fonts by those of the reader."""
+    svg = re.sub(r' clip-path="[^"]*"', "", svg)  # it cuts the descenders of the last line
     svg = re.sub(r"@font-face \{.*?\}\s*", "", svg, flags=re.DOTALL)
     svg = svg.replace("Fira Code", "DejaVu Sans Mono, Menlo, Consolas")
     svg = re.sub(r'<text class="([^"]*)" x="([\d.]+)" y="([\d.]+)"[^>]*>([^<]*)</text>', _dots, svg)
@@ -174,32 +199,57 @@ def draw_live() -> None:
         write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
 
 
+def draw_weigh() -> None:
+    write("weigh.svg", with_dots(asyncio.run(scale())))
+
+
 # What commands write into files
 
-REPORT_PX = 900
+REPORT_PX, FLEET_PX = 900, 1120
 
 
 def draw_report() -> None:
-    from PIL import Image
-    from playwright.sync_api import sync_playwright
-
     with TemporaryDirectory() as folder:
         _run(folder, "demo")
         (run,) = Path(folder, "runs").iterdir()
         _run(folder, "report", str(run), "-o", "report.html")
-        with sync_playwright() as driver:
-            browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
-            page = browser.new_page(viewport={"width": REPORT_PX, "height": 1000})
-            page.goto(Path(folder, "report.html").as_uri())
-            second_px = "document.querySelectorAll('section')[1].getBoundingClientRect().top"
-            page.screenshot(
-                path=FOLDER / "report.png",
-                full_page=True,
-                # The head and the estimates.
-                clip={"x": 0, "y": 0, "width": REPORT_PX, "height": page.evaluate(second_px)},
-            )
-            browser.close()
-    Image.open(FOLDER / "report.png").quantize(128).save(FOLDER / "report.png", optimize=True)
+        # The head and the estimates.
+        last = "document.querySelectorAll('section')[1].getBoundingClientRect().top"
+        _photograph(Path(folder, "report.html"), "report", REPORT_PX, last)
+
+
+def draw_fleet() -> None:
+    cells, results, checks = [], [], []
+    drift = np.zeros((60, 6))
+    drift[20:, 0] = np.linspace(0.0, 9.0, 40)
+    for i, name in enumerate(("press-1", "press-2", "press-4", "saw")):
+        cells.append(cell(name))
+        results.append(result(name, 70))
+        checks += daily(results[-1], 60, seed=i, added=drift if name == "press-4" else None)
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "fleet.html")
+        records = cells, results, checks
+        file.write_text(page(fleet(*records), observed(*records), "sqlite:///store.sqlite"), encoding="utf-8")
+        footer = "document.querySelector('footer').getBoundingClientRect().top"
+        _photograph(file, "fleet", FLEET_PX, footer)
+
+
+def _photograph(file: Path, name: str, width_px: int, height: str) -> None:
+    """Draw the upper part of a page; `height` is an expression of its JavaScript."""
+    from PIL import Image
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        tab = browser.new_page(viewport={"width": width_px, "height": 1000})
+        tab.goto(file.as_uri())
+        tab.screenshot(
+            path=FOLDER / f"{name}.png",
+            full_page=True,
+            clip={"x": 0, "y": 0, "width": width_px, "height": tab.evaluate(height)},
+        )
+        browser.close()
+    Image.open(FOLDER / f"{name}.png").quantize(128).save(FOLDER / f"{name}.png", optimize=True)
 
 
 def draw_tour() -> None:
@@ -227,7 +277,9 @@ PICTURES: Mapping[str, Callable[[], None]] = MappingProxyType(
     {
         "demo": draw_demo,
         "live": draw_live,
+        "weigh": draw_weigh,
         "report": draw_report,
+        "fleet": draw_fleet,
         "tour": draw_tour,
         "drawings": draw_drawings,
     }
