@@ -18,14 +18,17 @@ import click
 from ftcalib.errors import DataError, DeviceError, UsageError
 from ftdrive import __version__
 from ftdrive.errors import SupervisorGone, exit_code
-from ftdrive.terminal.text import COMMANDS, echo, in_one_line
+from ftdrive.terminal.text import COMMANDS, GLUE, WholeWords, echo, in_one_line
 
-_EPILOG = """\
+_EPILOG = f"""\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
-5 device fault, 6 file cannot be read or written, 7 check or acceptance failed, 8 recording has gaps,
+5 device fault, 6 file cannot be read or written, 7{GLUE}check or acceptance failed, 8 recording has gaps,
 9 supervisor gone (terminal, reader or input closed; data kept), 130 interrupted (data kept),
 141 the reader of the output has ended."""
 
+
+# Of every command: click takes it from the class.
+click.Context.formatter_class = WholeWords
 
 # As a shell reports a program that SIGPIPE ended.
 _CLOSED_PIPE = 128 + 13

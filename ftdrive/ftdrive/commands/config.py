@@ -9,10 +9,10 @@ from typing import Any
 import click
 
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, check_simulate, simulate, write_json
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import Group, echo
 
 
-@click.group()
+@click.group(cls=Group)
 def config() -> None:
     """Show the configuration. `ftdrive init` writes one; any key may be set by a variable, FTDRIVE_ROBOT_HOST."""
 

@@ -20,13 +20,13 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import Group, echo
 
 if TYPE_CHECKING:
     from ftdrive.planning.plan import Plan
 
 
-@click.group()
+@click.group(cls=Group)
 def export() -> None:
     """Write a plan or a calibration for another program. Files are never overwritten."""
 

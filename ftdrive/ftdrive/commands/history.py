@@ -200,11 +200,13 @@ _OPTIONAL = {"°C", "parent"}
 
 def _row(one: "StoredResult", check: "VerificationRecord | None", now: datetime) -> tuple[str, ...]:
     from ftdrive.store.history import age_days
+    from ftdrive.terminal.text import GLUE
 
     verified = "-"
     if check is not None:
         since = age_days(check.created_utc, now)
-        verified = f"{'passed' if check.passed else 'FAILED'}{'' if since is None else f' {since:.0f} d'}"
+        age = "" if since is None else f" {since:.0f}{GLUE}d"
+        verified = ("passed" if check.passed else "FAILED") + age
         verified += f", {check.change}" if check.change else ""
     return (
         one.id[:6],

@@ -10,7 +10,7 @@ import click
 
 from ftdrive.commands.common import JSON, SOURCE, Number, Source, stop_unless, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.text import echo, visible
+from ftdrive.terminal.text import Group, echo, visible
 
 if TYPE_CHECKING:
     from ftcalib.loads.check import LoadCheck
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 _SHOWS = 0.5
 
 
-@click.group()
+@click.group(cls=Group)
 def loads() -> None:
     """Check a sensor by a known weight, and correct its matrix by several: so that 10 N are 10 N."""
 

@@ -18,7 +18,8 @@ from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import versions
-from ftdrive.terminal.console import answer, messages, working
+from ftdrive.terminal.console import answer, hanging, messages, working
+from ftdrive.terminal.text import Group
 from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
@@ -30,7 +31,7 @@ _PIECE_S = 60.0
 _TAIL_S = 0.3
 
 
-@click.group()
+@click.group(cls=Group)
 def transcript() -> None:
     """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
 
@@ -154,18 +155,18 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
             silent = isinstance(error, ConnectError | DeviceTimeout)
             if silent and loaded.is_broken_off and player.left_s < _TAIL_S:
                 raise BadTranscript(
-                    f"the recording was broken off before there was anything to measure ({error}): record it again"
+                    f"the recording was interrupted before there was anything to measure ({error}): record it again"
                 ) from error
             raise
     recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
     if as_json:
         write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
-        answer.print(f" recorded  {_words(recorded)}")
-        answer.print(f" played    {_words(played)}")
+        answer.print(hanging(" recorded  ", _words(recorded), answer))
+        answer.print(hanging(" played    ", _words(played), answer))
     if duration_s < loaded.header["duration_s"]:
         whole_s = loaded.header["duration_s"]
-        messages.print(f" The recording was broken off: {duration_s:.3g} s of {whole_s:g} s were played.")
+        messages.print(f" The recording was interrupted: {duration_s:.3g} s of {whole_s:g} s were played.")
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
@@ -191,7 +192,7 @@ def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
 
 def _words(seen: dict[str, Any]) -> str:
     if "identity" not in seen:
-        return str(seen.get("error", "broken off"))
+        return str(seen.get("error", "interrupted"))
     force, torque = (
         ", ".join(f"{value:.{digits}f}" for value in seen[key])
         for key, digits in (("mean_force_N", 3), ("mean_torque_Nm", 4))

@@ -10,7 +10,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.text import NARROWEST, as_typed, is_command, visible
+from ftdrive.terminal.text import NARROWEST, as_typed, glued, is_command, unglued, visible
 
 
 class CommandConsole(Console):
@@ -72,15 +72,14 @@ def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
     Print it with `soft_wrap`: a line that is a command stays whole.
     """
     first = Text.assemble(head)
-    text = Text(as_typed(words))
-    width = console.width - first.cell_len
+    words, width = as_typed(words), console.width - first.cell_len
     if console.soft_wrap or width < NARROWEST:
-        return first + text
-    lines = [
-        line for part in text.split() for line in ([part] if is_command(part.plain) else part.wrap(console, width))
-    ]
+        return first + Text(words)
+    parts = Text(glued(words, width)).split()
+    lines = [line for part in parts for line in ([part] if is_command(part.plain) else part.wrap(console, width))]
     for line in lines:
         line.rstrip()
+        line.plain = unglued(line.plain)
     return first + Text("\n" + " " * first.cell_len).join(lines)
 
 

@@ -5,7 +5,7 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import zip_longest
 from textwrap import wrap
 from typing import IO, Final
@@ -86,6 +86,65 @@ def in_one_line(text: str) -> str:
     return first + "".join(("\n" if is_command(line) else "\\n") + line for line in others)
 
 
+GLUE: Final = "\ue000"
+"""A space where no line of help or of a table ends: of private use, so no message has one."""
+# In help, which click would break at a hyphen.
+_HYPHEN: Final = "\ue001"
+# More letters than a sentence has.
+_WHOLE: Final = 1000
+_QUOTED = re.compile(r"`[^`\n]+`")
+
+
+def glued(text: str, width: int | None = None) -> str:
+    """Return text whose commands in backticks are one word each, unless they are wider than a line of `width` columns.
+
+    Fold it, then print it `unglued`.
+
+    Examples
+    --------
+    >>> unglued(glued("type `ftdrive help`"))
+    'type `ftdrive help`'
+    """
+    return _QUOTED.sub(
+        lambda found: found[0].replace(" ", GLUE) if width is None or len(found[0]) <= width else found[0], text
+    )
+
+
+def unglued(text: str) -> str:
+    """Return folded text with the spaces of its commands."""
+    return text.replace(GLUE, " ")
+
+
+class WholeWords(click.HelpFormatter):
+    """Help whose addresses, options and commands in backticks are never broken, so that they can be copied."""
+
+    def write_text(self, text: str) -> None:
+        """Write a paragraph."""
+        super().write_text(self._whole(text))
+
+    def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
+        """Write options or commands, each with its words."""
+        super().write_dl([(term, self._whole(words)) for term, words in rows], col_max, col_spacing)
+
+    def getvalue(self) -> str:
+        """Return the help."""
+        return unglued(super().getvalue()).replace(_HYPHEN, "-")
+
+    @staticmethod
+    def _whole(text: str) -> str:
+        return glued(text).replace("-", _HYPHEN)
+
+
+class Group(click.Group):
+    """A command with commands, whose help has each of their first sentences whole."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands."""
+        named = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, one.get_short_help_str(_WHOLE)) for name, one in named if one is not None])
+
+
 NARROWEST: Final = 20
 """Columns behind a head: with fewer, lines begin at the left."""
 
@@ -93,8 +152,8 @@ NARROWEST: Final = 20
 def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
     """Break lines between words where they are longer than the terminal is wide, but not for a file or pipe.
 
-    Control characters become visible. A word that is longer by itself, such as
-    a path, stays whole. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
+    Control characters become visible. A word that is longer by itself, such as a path, stays whole, and so does a
+    command in backticks. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
     """
     text = visible(as_typed(text))
     try:
@@ -112,7 +171,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
         replace_whitespace=False,
     )
     return "\n".join(
-        line if is_command(line.strip()) else fold.fill(line) + line[len(line.rstrip()) :]
+        line if is_command(line.strip()) else unglued(fold.fill(glued(line))) + line[len(line.rstrip()) :]
         # a prompt ends with a space
         for line in text.split("\n")
     )
@@ -179,4 +238,4 @@ def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[s
 
 
 def _line(row: Sequence[str], widths: Sequence[int]) -> str:
-    return GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip()
+    return unglued(GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip())

@@ -6,9 +6,10 @@ from ftdrive.commands.fleet.cells import add, index, remove
 from ftdrive.commands.fleet.solve import compensate, solve
 from ftdrive.commands.fleet.status import serve, status
 from ftdrive.commands.fleet.verify import verify
+from ftdrive.terminal.text import Group
 
 
-@click.group()
+@click.group(cls=Group)
 def fleet() -> None:
     """Watch many cells: which are due, which sensor drifts, what is wrong in several of them."""
 

@@ -45,7 +45,7 @@ def test_a_long_recording_is_collected_in_pieces() -> None:
     assert _words(seen) == (
         "Mini45, serial FT9: 4 samples, mean (1.750, -3.500, 5.250) N, (0.1750, -0.3500, 0.5250) N·m"
     )
-    assert (_words({"error": "it is gone"}), _words({})) == ("it is gone", "broken off")
+    assert (_words({"error": "it is gone"}), _words({})) == ("it is gone", "interrupted")
 
 
 def test_a_silent_sensor_is_an_error() -> None:
