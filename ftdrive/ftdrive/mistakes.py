@@ -133,6 +133,8 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
             continue
         options = {name for one in command.params for name in one.opts} & KINDS[kind].places
         own = [f"{place} {option} {{}}" for option in sorted(options) if not place.startswith("-")]
+        if " " in place:
+            own += [line for line in (*KINDS[kind].lines, *KINDS[kind].others) if line.split()[0] == place.split()[0]]
         lines = [f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *KINDS[kind].lines])]
         # another place takes it, or the same place another path
         better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
@@ -186,7 +188,8 @@ def existing(group: click.Group, arguments: Sequence[str]) -> str:
         with suppress(OSError):
             if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1, _ALIKE):
                 return _question([str(path.with_name(found[0]))])
-        return " `ftdrive history` lists your runs."
+        # not for a plan, a table or a list of cells
+        return " `ftdrive history` lists your runs." if path.suffix in {"", ".json"} else ""
     return ""
 
 

@@ -19,6 +19,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import ConfigError
+from ftdrive.mistakes import kind_of
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.terminal.console import beside, hanging
 
@@ -52,6 +53,9 @@ def bundle(
     check_simulate(simulate, real={"RUN": run}, emulated={"--sensor": sensor})
     if run is None and not simulate:
         raise ConfigError("no run: give its folder, or --simulate")
+    for file in transcripts:
+        if kind_of(file) != "transcript":
+            raise ConfigError(f"--transcript: {file} is not a file of `ftdrive transcript record`")
     with nullcontext(run) if run is not None else rehearsed_run(sensor) as folder:
         path = output or Path(f"{folder.resolve().name}.zip")
         try:

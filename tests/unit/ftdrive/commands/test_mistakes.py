@@ -96,6 +96,8 @@ KINDS = [
     ("report rec.csv", 6, "ftdrive compensate rec.csv"),
     ("push rec.csv", 6, "ftdrive live --replay rec.csv"),
     ("diff run rec.csv", 6, "ftdrive live --replay rec.csv"),
+    ("bundle run --transcript cell.toml", 2, "ftdrive doctor --config cell.toml"),
+    ("export urscript run", 2, "ftdrive export calibration run"),
     ("bundle rec.csv", 2, "ftdrive convert rec.csv -o NEW.csv"),
     ("plan cell.toml", 2, "ftdrive plan --config cell.toml"),
     ("loads rec.csv", 2, "ftdrive compensate rec.csv"),
