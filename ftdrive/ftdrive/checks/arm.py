@@ -58,14 +58,14 @@ def check_kinematics(info: DeviceInfo) -> Check:
     if info.model not in MODELS:
         return Check(name, "skipped", f"the kinematics of a {info.model} are not known here")
     if own is None:
-        found = f"none reported: plans use those of a nominal {info.model}, with wider margins"
+        found = f"no kinematics reported: plans use those of a nominal {info.model}, with wider margins"
         return Check(name, "warning", found, "enable the primary client interface under Settings, Security, Services")
     q_rad = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, 6))
     real, nominal = frames(own, q_rad), frames(MODELS[info.model], q_rad)
     off_mm = 1e3 * np.linalg.norm(real.flange_m - nominal.flange_m, axis=1).max()
     chord = np.linalg.norm(real.R_base_flange - nominal.R_base_flange, axis=(1, 2)).max() / np.sqrt(8.0)
     off_deg = np.degrees(2 * np.arcsin(chord))
-    found = f"own, up to {off_mm:.1f} mm and {off_deg:.2f}° from a nominal {info.model}"
+    found = f"kinematics reported, up to {off_mm:.1f} mm and {off_deg:.2f}° from a nominal {info.model}"
     return Check(name, "ok", f"{found}; plans use them")
 
 
@@ -109,7 +109,9 @@ def check_program(status: ArmStatus) -> Check:
 
 def check_speed(status: ArmStatus) -> Check:
     """Check that the speed slider lets the arm move in a reasonable time."""
-    found = f"speed slider at {status.speed_slider:.0%}, the controller allows {status.speed_scaling:.0%}"
+    found = (
+        f"speed slider at {100 * status.speed_slider:.0f} %, the controller allows {100 * status.speed_scaling:.0f} %"
+    )
     if status.speed_slider < SLOWEST_SLIDER:
         fix = "raise the speed slider at the pendant, to 100 % if that is safe: ftdrive never moves it"
         return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)

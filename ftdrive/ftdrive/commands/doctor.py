@@ -299,7 +299,7 @@ def _in_brief(checks: list[Check]) -> list[Check]:
     """Return what needs attention, behind the one check that names the subject, with the number of the others."""
     passed = [check for check in checks if check.state == "ok"]
     first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]
-    if first[0].state == "ok" and len(passed) > 1:
-        more = f" ({len(passed) - 1} more check{'s' * (len(passed) > 2)} passed)"
+    if first[0].state == "ok" and len(passed) > 2:
+        more = f" ({len(passed) - 1} more checks passed)"
         first = [replace(first[0], found=first[0].found + more)]
     return first + [check for check in checks if check.state in {"warning", "failed"} and check not in first]

@@ -108,7 +108,7 @@ def arm_checks(status: ArmStatus, tool: ToolConfig = TOOL, sensor_kg: float | No
 def test_a_ready_arm() -> None:
     found = arm_checks(STATUS)
     assert {check.state for check in found.values()} == {"ok"}
-    assert "50%" in found["robot.speed"].found
+    assert "50 %" in found["robot.speed"].found
     payload = found["robot.payload"].found
     assert "1.20 kg" in payload
     assert "(0, 10, 50) mm" in payload
@@ -152,7 +152,7 @@ def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: py
 @pytest.mark.parametrize(
     ("info", "state", "words"),
     [
-        (DeviceInfo("UR5e", "A1", "5.15"), "warning", "none reported: plans use those of a nominal UR5e"),
+        (DeviceInfo("UR5e", "A1", "5.15"), "warning", "no kinematics reported: plans use those of a nominal UR5e"),
         (DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(MODELS["UR5e"].numbers, "device")}), "ok", "0.0 mm"),
         (
             DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(drawn("UR5e").numbers, "device")}),

@@ -135,7 +135,7 @@ def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     lab.arm.set_status(speed_slider=SLOWEST_SLIDER - 0.01)
     assert check_speed(lab.arm.status()).state == "failed"
-    refuse(lab, "slider: speed slider at 4%.*raise the speed slider at the pendant")
+    refuse(lab, "slider: speed slider at 4 %.*raise the speed slider at the pendant")
 
 
 def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
