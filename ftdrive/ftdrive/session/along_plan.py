@@ -15,6 +15,7 @@ import numpy as np
 
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, averaging_time, mean_and_covariance, noise_level
 from ftcalib.model import Array
+from ftcalib.rounding import to_place_of
 from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
@@ -240,7 +241,7 @@ class _AlongPlan:
             return choose_sweep_speed(before, slow=self.options.real and not before.known)
         sampling, sigma = _chosen_sampling(before, todo)
         force_N, torque_Nm = rms_sigma(sigma)
-        noise = f"sigma of {sampling.average_s:g} s averages: {force_N:.2g} N, {torque_Nm:.2g} N·m"
+        noise = f"sigma of {sampling.average_s:g} s averages: {force_N:.2g} N, {to_place_of(torque_Nm, torque_Nm)} N·m"
         cell.note("; ".join(filter(None, (noise, self.task.forecast(plan, before.certifier, sigma)))))
         slow = self._is_slow(before)
         if self.options.fast and slow:
@@ -251,7 +252,7 @@ class _AlongPlan:
         total_s = moves_s(driven, todo, before.approach)
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
-            f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f}°/s: "
+            f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f} °/s: "
             f"about {total_s / 60:.1f} min; {taken} poses taken before"
         )
         return replace(before, plan=driven, config=replace(before.config, sampling=sampling))

@@ -11,6 +11,7 @@ from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.poses.information import predicted_sigma
 from ftcalib.published.methods import SPECIAL
+from ftcalib.rounding import to_place_of
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.checks.check import compare_devices
@@ -146,7 +147,7 @@ class Calibrating:
             f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor whose gain is {100 * guess.gain_sigma:.2g} % off, "
             f"one sigma: mass {1e3 * found.sigma['mass_kg']:.2g} g, "
             f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
-            f"{found.torque_rms_Nm:.2g} N·m"
+            f"{to_place_of(found.torque_rms_Nm, found.torque_rms_Nm)} N·m"
         )
 
 

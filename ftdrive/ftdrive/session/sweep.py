@@ -199,6 +199,6 @@ def choose_sweep_speed(before: Before, *, slow: bool) -> Before:
     total_s = plan.sweep.duration_s + 2 * REST_S + before.approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
     cell.note(
         f"sweep of {plan.sweep.duration_s:.0f} s at {100 * share:.0f} % of the planned speed ({why}), at most "
-        f"{np.degrees(plan.top_speed_rad_s):.0f}°/s: about {total_s:.0f} s of motion"
+        f"{np.degrees(plan.top_speed_rad_s):.0f} °/s: about {total_s:.0f} s of motion"
     )
     return replace(before, plan=plan)

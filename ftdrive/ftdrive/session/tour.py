@@ -274,7 +274,7 @@ class Tour:
         if speed_rad_s is None:
             drives = ", and drives it where --yes may confirm it" if self._trusted and self._options.yes else ""
             return f"Enter plans the approach and shows it{drives}, {joints}, {largest}"
-        return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f}°/s"
+        return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f} °/s"
 
     def _obey_keys(self) -> None:
         """Obey the keys pressed: r refers to the last pose taken, s to the one under way, as on the screen.
@@ -521,7 +521,7 @@ class Tour:
         """Return the question in a hold; `back` is the index of the pose to which the arm can return."""
         kept, ways, later = self._choices(fixed)
         if back is not None:
-            ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f}°/s"
+            ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f} °/s"
         ways["quit"] = later
         choices = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
         return Question(f"{kept} {choices}", tuple(ways))

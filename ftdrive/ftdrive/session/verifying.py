@@ -11,6 +11,7 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array
+from ftcalib.rounding import to_place_of
 from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import BadPlan, PlanRefused
@@ -83,7 +84,7 @@ class Verifying:
     def forecast(self, _plan: Plan, _certifier: Certifier, _sigma: Array, /) -> str:
         """Describe how far poses of an unchanged cell may be from the prediction."""
         error_N, error_Nm = self.calibration.likely_error()
-        return f"error of the calibration: {error_N:.2g} N, {error_Nm:.2g} N·m"
+        return f"error of the calibration: {error_N:.2g} N, {to_place_of(error_Nm, error_Nm)} N·m"
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
         """Find a plan that was driven before: it may have been completed, so that it may run fast."""

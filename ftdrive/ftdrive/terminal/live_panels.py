@@ -329,7 +329,7 @@ def _contact(view: View) -> Line:
         return Line()
     if np.isnan(reading.chi2):
         return Line("noise not known yet", FAINT)
-    chi2 = f"{reading.chi2:.0f}" if reading.chi2 < 1e5 else f"{reading.chi2:.0e}"
+    chi2 = f"{reading.chi2:.0f}" if reading.chi2 < 1e5 else "over 99999"
     test = f"test {chi2}, limit {status.contact_limit:.1f}"
     if reading.in_contact:
         return Line("▲ CONTACT ", f"bold {CONTACT}").add(f"{view.contact_s:.1f} s  ").add(test, FAINT)

@@ -29,7 +29,7 @@ def match(question: Question, typed: str) -> str | None:
         word = typed.lower()
         return next((one for one in (word, _SAME.get(word)) if one in question.answers), None)
     if typed.lower() in {"n", "no"}:
-        raise Declined(f"the answer was no: {question.text}")
+        raise Declined(f"the answer was no, not {question.answers[0]}")
     return None
 
 

@@ -32,6 +32,8 @@ CONTACT_N = 100.0
 _USUAL_TIP_MM = 200.0
 # Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
+# N or N·m.
+_ROUNDING = 1e-9
 # Rows that follow from mass and tilt: printed only with -v.
 _DERIVED = {"gravity_force_base_N"}
 
@@ -173,8 +175,13 @@ def error_in_words(result: CalibrationResult) -> str:
     for words, where in _ELSEWHERE:
         error = result.likely_error(where)
         if error[0] > _WORSE * result.likely_error()[0]:
-            sources.append("{} {:.2g} N, {:.2g} N·m".format(words, *error))
+            sources.append("{} {} N, {} N·m".format(words, *map(_in_brief, error)))
     return f"{likely} rms ({'; '.join([*sources, f'predicted: {predicted}'])})"
+
+
+def _in_brief(value: float) -> str:
+    """Write two digits, without an exponent; a drift of one quantity alone is zero in the other but for rounding."""
+    return "0" if value < _ROUNDING else to_place_of(value, value)
 
 
 def tip_of(result: CalibrationResult) -> Array:
@@ -221,8 +228,8 @@ def drift_in_use(result: CalibrationResult) -> str | None:
         [float(np.linalg.norm(part)) for part in np.split(values, 2)] for values in (offset, growth)
     )
     return (
-        f"at the last pose the bias was {off_N:.2g} N, {off_Nm:.2g} N·m off its mean, which the result has; "
-        f"it moves {grow_N:.2g} N, {grow_Nm:.2g} N·m a minute"
+        f"at the last pose the bias was {_in_brief(off_N)} N, {_in_brief(off_Nm)} N·m off its mean, which the result "
+        f"has; it moves {_in_brief(grow_N)} N, {_in_brief(grow_Nm)} N·m a minute"
     )
 
 

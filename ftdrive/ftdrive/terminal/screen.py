@@ -226,7 +226,7 @@ def _last(view: SessionView) -> list[Text]:
     force_N, torque_Nm = rms_sigma(pose.sigma)
     line = Text(
         f"R{pose.number:02d}: settled {pose.settle_s:.1f} s, {pose.samples} samples, "
-        f"sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
+        f"sigma {force_N:.2g} N {to_place_of(torque_Nm, torque_Nm)} N·m"
     )
     if pose.attempts > 1:
         line.append(f", {pose.attempts} tries")

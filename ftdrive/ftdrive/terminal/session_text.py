@@ -80,6 +80,9 @@ class SessionText:
                 return self._heading("Plan")
             case Checked():
                 return self._heading("Checks")
+            # a run that is continued is opened before its plan is known
+            case RunOpened() if not self._sections:
+                return []
             case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE | State.SWEEP):
                 return self._heading("Motion" if self._sweeps else "Tour")
             case _:
@@ -182,7 +185,7 @@ def _pose_in_words(event: PoseTaken) -> str:
     force_N, torque_Nm = rms_sigma(event.sigma)
     words = (
         f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
-        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {torque_Nm:.2g} N·m"
+        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {to_place_of(torque_Nm, torque_Nm)} N·m"
     )
     if event.attempts > 1:
         words += f", {event.attempts} attempts"
@@ -230,7 +233,10 @@ def proposal_in_lines(push: Push) -> list[str]:
         lines.append(_lean(push))
     if push.contact is not None:
         force_N, torque_Nm = np.linalg.norm(push.contact[:3]), np.linalg.norm(push.contact[3:])
-        lines.append(f"The reading differs from a free tool by {force_N:.1f} N, {torque_Nm:.2f} N·m: drift or contact.")
+        lines.append(
+            f"The reading differs from a free tool by {force_N:.1f} N, {torque_Nm:.2f} N·m. "
+            "A large difference is drift or contact."
+        )
     return lines
 
 

@@ -381,7 +381,7 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
         turn_deg = np.degrees(np.abs(np.subtract(steps[goal].q_rad, steps[start].q_rad)))
         joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))
         assert f"joint{'s' if ',' in joints else ''} {joints}, largest turn {turn_deg.max():.0f}°" in text
-        assert "at 30°/s" in text  # slow, as in any first run
+        assert "at 30 °/s" in text  # slow, as in any first run
     assert "Enter measures" in asked[3]  # pose 2 again, where the arm is
     assert "moves" not in asked[3]
 

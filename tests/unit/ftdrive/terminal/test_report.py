@@ -417,8 +417,8 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
     lines = " ".join(capsys.readouterr().out.split())
     assert "drift: first pose again" in lines
     assert "drift in the fit: 0.500 ± 0.020 N, 0.0500 ± 0.0020 N·m from the first pose to the last" in lines
-    assert "next use: at the last pose the bias was 0.25 N, 0.01 N·m off its mean" in lines
-    assert "it moves 0.5 N, 0.002 N·m a minute. Tare before use." in lines
+    assert "next use: at the last pose the bias was 0.25 N, 0.010 N·m off its mean" in lines
+    assert "it moves 0.50 N, 0.0020 N·m a minute. Tare before use." in lines
     assert drift_in_use(followed()) is None
     assert (poses_in_words(replace(followed(), quality=quality)) or "").startswith("pose 3, 2.3 sigma; each pose")
     assert poses_in_words(followed()) is None

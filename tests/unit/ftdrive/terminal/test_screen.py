@@ -38,6 +38,7 @@ from ftdrive.session.events import (
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.screen import Screen, SessionView, _drift, frame, open_operator
+from ftdrive.terminal.session_text import SessionText
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
 VALUES: dict[str, Any] = {
@@ -240,6 +241,17 @@ def test_numbers_never_touch() -> None:
     precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
     lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
     assert "F bias N        -3.210    7.900 -112.040  ± 0.0000010" in "\n".join(lines)
+
+
+def test_the_tour_of_a_resumed_run_begins_behind_its_checks() -> None:
+    text = SessionText(poses=False)
+    events = (
+        RunOpened(folder="runs/a", resume=RESUME),
+        Checked(name="plan", passed=True, words=""),
+        StateChanged(state=State.APPROACH, words="to pose 7"),
+    )
+    shown = [line.words for event in events for line in text.lines(event)]
+    assert [words for words in shown if words in {"Checks", "Tour"}] == ["Checks", "Tour"]
 
 
 def test_a_resumed_run_counts_the_poses_it_had() -> None:
