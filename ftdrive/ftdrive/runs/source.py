@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from shlex import quote
 from typing import Any, Final
 
 import numpy as np
@@ -254,7 +255,14 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     'good'
     """
     path = Path(path)
-    result = CalibrationResult.load(Run(path).calibration_path if path.is_dir() else path, accept_edited=accept_edited)
+    file = Run(path).calibration_path if path.is_dir() else path
+    if (path / "run.json").is_file() and not file.exists():
+        folder = quote(str(path))
+        raise FileNotFoundError(
+            f"{path} has no calibration, because its run was interrupted or its result rejected. Solve its poses:\n"
+            f"ftdrive solve {folder} --output {folder}/calibration.json"
+        )
+    result = CalibrationResult.load(file, accept_edited=accept_edited)
     if (load := Load.of_header(result.provenance)) is not None:
         raise BadCalibration(f"{path} was made with {load}: use it with `ftdrive loads solve`, not as that of the tool")
     return with_sensor(result)

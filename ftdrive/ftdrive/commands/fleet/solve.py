@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from ftcalib.rounding import counted
 from ftdrive import __version__
 from ftdrive.commands.common import FOLDER, FORCE, FRAME, JSON, STORE, open_store, read_frame, write_json
 from ftdrive.commands.compensate import BIAS, CALIBRATION
@@ -310,7 +311,7 @@ class _Solved:
         """Print the numbers, then one line for each run that changed or failed."""
         now = self.runs - self.solved_before - len(self.failed)
         echo(
-            f"{self.runs} runs with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
+            f"{counted(self.runs, 'run')} with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
             f"{len(self.failed)} failed."
         )
         echo(

@@ -98,6 +98,8 @@ KINDS = [
     ("diff run rec.csv", 6, "ftdrive live --replay rec.csv"),
     ("bundle run --transcript cell.toml", 2, "ftdrive doctor --config cell.toml"),
     ("export urscript run", 2, "ftdrive export calibration run"),
+    ("live --calibration begun --simulate", 6, "ftdrive solve begun --output begun/calibration.json"),
+    ("diff run begun", 6, "ftdrive solve begun --output begun/calibration.json"),
     ("bundle rec.csv", 2, "ftdrive convert rec.csv -o NEW.csv"),
     ("plan cell.toml", 2, "ftdrive plan --config cell.toml"),
     ("loads rec.csv", 2, "ftdrive compensate rec.csv"),
@@ -153,6 +155,8 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
         calibration().save(folder / run / "calibration.json")
     calibration().save(folder / "calibration.json")
     dataset().save(folder / "dataset.json")
+    (folder / "begun").mkdir()
+    (folder / "begun" / "run.json").write_text('{"format": "ftdrive.run/1"}')
     (folder / "empty").mkdir()
     (folder / "rec.csv").write_text("# ftdrive.recording/1: raw\n")
     (folder / "plan.json").write_text('{"format": "ftdrive.plan/2"}')
