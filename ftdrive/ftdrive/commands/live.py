@@ -6,6 +6,7 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -150,7 +151,8 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     if _is_run(path):
         if loaded is None:
-            raise ConfigError("no calibration: give --calibration PATH")
+            own = quote(str(path)) if Run(path).calibration_path.is_file() else "PATH"
+            raise ConfigError(f"no calibration: give --calibration {own}")
         return replay_run(Run(path), loaded, str(calibration), frame=frame, speed=speed)
     if (tables := tables_of(path, SolveOptions())) is not None:
         if loaded is None:

@@ -253,7 +253,7 @@ class _AlongPlan:
         total_s += len(todo) * (sampling.average_s + 0.6)
         cell.note(
             f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f} °/s: "
-            f"about {total_s / 60:.1f} min; {taken} poses taken before"
+            f"about {total_s / 60:.1f} min{f'; {taken} poses taken before' if taken else ''}"
         )
         return replace(before, plan=driven, config=replace(before.config, sampling=sampling))
 

@@ -99,6 +99,7 @@ KINDS = [
     ("bundle run --transcript cell.toml", 2, "ftdrive doctor --config cell.toml"),
     ("export urscript run", 2, "ftdrive export calibration run"),
     ("live --calibration begun --simulate", 6, "ftdrive solve begun --output begun/calibration.json"),
+    ("live --replay run", 2, "give --calibration run"),
     ("diff run begun", 6, "ftdrive solve begun --output begun/calibration.json"),
     ("bundle rec.csv", 2, "ftdrive convert rec.csv -o NEW.csv"),
     ("plan cell.toml", 2, "ftdrive plan --config cell.toml"),
