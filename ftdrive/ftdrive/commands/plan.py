@@ -1,8 +1,10 @@
 """`ftdrive plan`: a tour proven clear, without an arm."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from shlex import quote
 from threading import Event
 from typing import TYPE_CHECKING
 
@@ -185,10 +187,17 @@ def plan(
         messages.print(*saved, sep="\n", end="\n" if saved else "")
     else:
         answer.print(*filter(None, (made.in_words(table=every), made.stop_in_words(cell.robot))), *saved, sep="\n")
-        same = f"{' --simulate' if simulate else ''}{f' --set {sets}' if sets else ''}"
-        messages.print_next(f"ftdrive calibrate{same}   (asks before anything moves)")
+        tour = {"--quick": quick, "--minimal": minimal, f"--set {sets}": sets}
+        messages.print_next(_next_command(tour, output, simulate=simulate))
     if page is not None:
         _show(page, made, certifier)
+
+
+def _next_command(tour: Mapping[str, object], output: Path | None, *, simulate: bool) -> str:
+    """Return the command that drives the plan: from its file, else by the same options."""
+    same = {"--simulate": simulate, **(tour if output is None else {f"--plan {quote(str(output))}": True})}
+    command = " ".join(["ftdrive calibrate", *(option for option, given in same.items() if given)])
+    return f"{command}   (asks before anything moves)"
 
 
 def _show(page: "Page", plan: "Plan", certifier: "Certifier") -> None:

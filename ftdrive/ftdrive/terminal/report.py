@@ -419,7 +419,7 @@ def print_verification(verified: Verified) -> None:
 def verdict_in_words(verified: Verified) -> str:
     """Describe the largest differences, and the limits that decide."""
     limits = verified.limits
-    words = f"largest difference {verified.force_N.max():.3f} N, {verified.torque_Nm.max():.4f} N·m"
+    words = f"largest difference {_in_brief(verified.force_N.max())} N, {_in_brief(verified.torque_Nm.max())} N·m"
     if limits.given:
         given = ((limits.force_N, "N"), (limits.torque_Nm, "N·m"))
         return f"{words}; limit {', '.join(f'{limit:g} {unit}' for limit, unit in given if limit is not None)}"

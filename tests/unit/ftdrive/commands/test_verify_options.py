@@ -73,7 +73,7 @@ def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
         failed(tmp_path, AcceptanceLimits())
     )
     given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))
-    assert verdict_in_words(given) == "largest difference 0.520 N, 0.5196 N·m; limit 1 N, 0.1 N·m"
+    assert verdict_in_words(given) == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
     assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
 
 

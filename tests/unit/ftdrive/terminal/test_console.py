@@ -131,7 +131,7 @@ def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(planner, "plan_for", plan_once)
     shown, quiet = run(*PLAN), run("-q", *PLAN)
     assert "Predicted" in shown.stdout
-    assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate   (asks before anything moves)"]
+    assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate --minimal   (asks before anything moves)"]
     assert "Next" not in shown.stdout
     assert (quiet.exit_code, quiet.stderr, quiet.stdout) == (0, "", shown.stdout)
     assert '"steps"' in run("-q", *PLAN, "--json").stdout

@@ -68,7 +68,7 @@ def test_each_pose_has_what_was_measured_predicted_and_the_difference(printed: A
         "N·m 0.1000 0.2000 0.3000 0.0970 0.2000 0.2960 0.0050 0.0030",
         "R12 N 0.000 0.000 -10.000 0.000 0.000 -9.500 0.500 0.030",
         "N·m 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0030",
-        "PASS largest difference 0.500 N, 0.0050 N·m; chi2 14 for 12 degrees of freedom, p 0.29 "
+        "PASS largest difference 0.50 N, 0.0050 N·m; chi2 14 for 12 degrees of freedom, p 0.29 "
         "(false alarms: 1 in 100, near the poses of the fit)",
         "? R03 was not steady",
         "Saved run/verification.json",
