@@ -1,6 +1,6 @@
 """Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [NAME]...`, all without a name.
 
-demo      runs `ftdrive demo` in tmux at 80x24, copies its screen about once a second, and animates the screens as SVG
+demo      runs `ftdrive demo` in tmux at 80x40, copies its screen about once a second, and animates the screens as SVG
 live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
 weigh     runs the real app of `ftdrive weigh` with a weight
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
@@ -44,7 +44,7 @@ from tests.unit.ftdrive.terminal.fake_stream import INFO, FakeStream, Scenario
 from tests.unit.ftdrive.terminal.test_weigh_screen import PART, FakeWeighing
 
 FOLDER = Path(__file__).parents[2] / "docs/pictures"
-COLUMNS, ROWS = 80, 24
+COLUMNS, ROWS, DEMO_ROWS = 80, 24, 40
 CELL_PX, ROW_PX = 12.2, 24.4
 """Of rich's SVG, whose characters are 20 px high."""
 
@@ -74,7 +74,7 @@ STRIP = """\
 def screens() -> list[str]:
     """Run the demo; return its distinct screens with their colours, the last one when the prompt is back."""
     command = 'echo "$ uv run ftdrive demo"; uv run -q ftdrive demo; printf READY; sleep 60'
-    subprocess.run([*TMUX, "new-session", "-d", "-x", str(COLUMNS), "-y", str(ROWS), command], check=True)
+    subprocess.run([*TMUX, "new-session", "-d", "-x", str(COLUMNS), "-y", str(DEMO_ROWS), command], check=True)
     found: list[str] = []
     try:
         while not (found and "READY" in found[-1]):
@@ -99,10 +99,10 @@ def animated(strip: list[str]) -> str:
     """Draw all screens in one column; the animation shows one at a time. Without animation the last one is shown."""
     console = Console(width=COLUMNS, record=True, file=StringIO(), force_terminal=True)
     for screen in strip:
-        lines = screen.split("\n")[:ROWS]
-        for line in [*lines, *[""] * (ROWS - len(lines))]:
+        lines = screen.split("\n")[:DEMO_ROWS]
+        for line in [*lines, *[""] * (DEMO_ROWS - len(lines))]:
             console.print(Text.from_ansi(line), no_wrap=True, crop=True, soft_wrap=False)
-    screen_px, total_s = ROWS * ROW_PX, SHOWN_S * (len(strip) - 1) + LAST_SHOWN_S
+    screen_px, total_s = DEMO_ROWS * ROW_PX, SHOWN_S * (len(strip) - 1) + LAST_SHOWN_S
     frames = " ".join(
         f"{100 * SHOWN_S * i / total_s:.2f}% {{{{ transform: translateY({-screen_px * i:g}px) }}}}"
         for i in range(len(strip))
