@@ -238,8 +238,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            named = str(error) if str(error).startswith(f"{source}:") else f"{source}: {error}"
-            echo(in_one_line(f"error: {named}"), err=True)
+            echo(in_one_line(f"error: {source}: {error}"), err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
 
