@@ -86,12 +86,13 @@ _ALIKE = 0.75
 def kind_of(path: Path) -> str | None:
     """Return the kind of a file or folder, by its first bytes and its ending; None for one that no command takes."""
     from ftdrive.recording.files import is_bag, is_recording
+    from ftdrive.runs.run import is_run
 
     with suppress(OSError):
         if is_bag(path):
             return "table"
         if path.is_dir():
-            return "run" if _is_run(path) else "runs" if next(_runs_in(path), None) else "folder"
+            return "run" if is_run(path) else "runs" if next(_runs_in(path), None) else "folder"
         if not path.is_file():
             return None
         with open_file(path) as file:
@@ -109,13 +110,11 @@ def kind_of(path: Path) -> str | None:
     return None
 
 
-def _is_run(path: Path) -> bool:
-    return (path / "run.json").is_file()
-
-
 def _runs_in(folder: Path) -> Iterator[Path]:
     """Yield the runs in a folder, the newest first."""
-    yield from (path for path in sorted(folder.iterdir(), reverse=True) if _is_run(path))
+    from ftdrive.runs.run import is_run
+
+    yield from filter(is_run, sorted(folder.iterdir(), reverse=True))
 
 
 def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:

@@ -54,7 +54,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import NotAccepted
-from ftdrive.planning.planner import declared_sensor
+from ftdrive.planning.planner import expected_errors
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, messages, working
@@ -242,7 +242,7 @@ def _examine_sensor(
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *check_stream(samples, health, address, _LOOK_S),
-        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, declared_sensor(cell.sensor)),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, expected_errors(cell.sensor)),
     ], True
 
 

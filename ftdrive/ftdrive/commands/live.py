@@ -120,7 +120,7 @@ def live(
         else:
             if raw:
                 stream = open_raw(source, stack)
-                recorder = partial(_raw_table, stream.info)
+                recorder = partial(RawTable, info=stream.info)
             else:
                 stream = open_source(source, frame, stack, track)
                 checks = [check_weighed_payload(stream.payload_kg, stream.info.calibration, stream.cell.sensor.mass_kg)]
@@ -193,10 +193,6 @@ def _certifier(cell: CellConfig, model: str) -> "Certifier | None":
 
 def _recorder(info: StreamInfo, configuration: dict[str, Any], path: Path) -> Recorder:
     return Recorder([path], info, configuration)
-
-
-def _raw_table(info: StreamInfo, path: Path) -> RawTable:
-    return RawTable(path, info)
 
 
 def _require_sensor_alone(

@@ -34,7 +34,7 @@ from ftdrive.report.report import Format
 from ftdrive.report.report import report as written
 from ftdrive.report.subject import read_subject, trust
 from ftdrive.runs.bundle import unpack
-from ftdrive.runs.run import unused_path
+from ftdrive.runs.run import is_run, unused_path
 from ftdrive.runs.source import SolveOptions
 from ftdrive.tables.table import TableOptions
 from ftdrive.terminal.console import beside, hanging, messages, working
@@ -150,7 +150,7 @@ def _folder_of(source: Path | None) -> Path:
     """Return where a report is kept: in its run, or beside its source."""
     if source is None:
         return Path()
-    return source if (source / "run.json").is_file() else source.parent
+    return source if is_run(source) else source.parent
 
 
 def _typed(context: click.Context) -> tuple[str, ...]:

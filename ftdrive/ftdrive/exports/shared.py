@@ -18,7 +18,7 @@ from ftcalib.model import Array
 from ftdrive.checks.arm import flange_load
 from ftdrive.errors import ConfigError
 from ftdrive.live.samples import sensor_origin_m
-from ftdrive.runs.run import Run
+from ftdrive.runs.run import Run, is_run
 from ftdrive.runs.verification import VerificationRecord
 
 _SPELLED = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
@@ -210,7 +210,7 @@ def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float |
         Read from there.
     """
     folder = path if path.is_dir() else path.resolve().parent
-    if path.is_dir() or (folder.name == calibration.provenance.get("run") and (folder / "run.json").is_file()):
+    if path.is_dir() or (folder.name == calibration.provenance.get("run") and is_run(folder)):
         sensor = Run(folder).header().get("config", {}).get("sensor", {})
         return sensor.get("height_mm"), sensor.get("mass_kg")
     setup: Any = calibration.provenance.get("setup")

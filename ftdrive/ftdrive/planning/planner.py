@@ -51,7 +51,7 @@ Found = tuple[Sequence[int], Array]
 Attempt = tuple[str, Sequence[str], Found | None]
 
 
-def declared_sensor(sensor: SensorConfig) -> SensorMatrix:
+def expected_errors(sensor: SensorConfig) -> SensorMatrix:
     """Return the errors of a sensor as its data sheet or its kind has them."""
     both = None if not (sensor.range_N and sensor.range_Nm) else (sensor.range_N, sensor.range_Nm)
     return SensorMatrix.declared(Setup(sensor_accuracy_percent=sensor.accuracy_percent, sensor_range=both))
@@ -69,7 +69,7 @@ def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
         0.003,
         (0.0, 0.0, length_m / 2),
         tilt_beta_rad=certifier.scene.lean_rad,
-        sensor=SensorMatrix.usual() if cell is None else declared_sensor(cell.sensor),
+        sensor=SensorMatrix.usual() if cell is None else expected_errors(cell.sensor),
     )
 
 

@@ -13,7 +13,7 @@ from ftcalib.files import read_object
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.run import Run, in_motion
+from ftdrive.runs.run import Run, in_motion, is_run
 from ftdrive.runs.source import SolveOptions, read_source, solve_in_motion
 from ftdrive.runs.verification import VerificationRecord, age_of, newest, verification_near
 
@@ -119,7 +119,7 @@ def _is_calibration(source: Path) -> bool:
 
 def _of_result(source: Path, result: CalibrationResult) -> Subject:
     folder = source.absolute().parent
-    if (folder / "run.json").is_file() and not in_motion(folder):
+    if is_run(folder) and not in_motion(folder):
         data = read_source(folder, SolveOptions())
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)

@@ -42,7 +42,7 @@ from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
 from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
-from ftdrive.runs.run import LOCK, Run, versions
+from ftdrive.runs.run import LOCK, Run, is_run, versions
 from ftdrive.runs.sensor_file import sensor_files
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
@@ -242,7 +242,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         `path` exists or cannot be written.
     """
     folder = folder.resolve()
-    if not (folder / "run.json").is_file():
+    if not is_run(folder):
         raise BadDataset(f"{folder} is not a run folder: it has no run.json")
     redaction, left_out = Redaction(), []
     texts = {"environment.json": json.dumps(_environment(folder))}
@@ -325,7 +325,7 @@ def _run_in(folder: Path) -> Path:
     about = read_object(folder / "bundle.json", BadBundle)
     check_format(about, FORMAT, BadBundle)
     run = folder / str(about.get("run"))
-    if run.parent != folder or not (run / "run.json").is_file():
+    if run.parent != folder or not is_run(run):
         raise BadBundle(f"it has no run {about.get('run')!r}: {_COPY_AGAIN}")
     return run
 

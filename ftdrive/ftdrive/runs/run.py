@@ -404,6 +404,11 @@ def _numbered(path: Path) -> Iterator[Path]:
     yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 
 
+def is_run(folder: Path) -> bool:
+    """Whether a folder is that of a run."""
+    return (folder / "run.json").is_file()
+
+
 def unused_path(path: Path) -> Path:
     """Return the first of name, name-2 and so on that does not exist."""
     return next(one for one in _numbered(path) if not one.exists())

@@ -19,7 +19,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.load import Load
 from ftdrive.runs.motion import solve_motion_file
-from ftdrive.runs.run import Run, made_now, versions
+from ftdrive.runs.run import Run, is_run, made_now, versions
 from ftdrive.runs.sensor_file import with_sensor
 from ftdrive.tables.table import Table, TableOptions
 
@@ -256,7 +256,7 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> Calibr
     """
     path = Path(path)
     file = Run(path).calibration_path if path.is_dir() else path
-    if (path / "run.json").is_file() and not file.exists():
+    if is_run(path) and not file.exists():
         folder = quote(str(path))
         raise FileNotFoundError(
             f"{path} has no calibration, because its run was interrupted or its result rejected. Solve its poses:\n"
