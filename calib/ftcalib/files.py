@@ -8,8 +8,9 @@ import json
 import os
 import stat
 from collections.abc import Mapping
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 # What `json` can write: numbers, strings, None, and lists and dicts of them.
 JSON: TypeAlias = Any
@@ -77,7 +78,7 @@ def _refuse_existing(path: Path) -> None:
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
 
 
-def open_file(path: str | Path) -> BinaryIO:
+def open_file(path: str | Path) -> BufferedReader:
     """Open a file for reading; raises `OSError`, also for a pipe or a device, whose reading may never end."""
     path = Path(path)
     mode = path.stat().st_mode

@@ -216,6 +216,8 @@ class Columns:
         share, program, missing, signal = max(near, key=lambda one: one[0])
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
         named = list_names([name for name in self.names if name])
+        if "wrench" in signals and set(missing) == {"tx", "ty", "tz"}:
+            nearest += " A three-axis sensor has no torques and is not supported."
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:

@@ -113,6 +113,8 @@ class Source(Protocol):
     names: Sequence[str]
     units: Sequence[str]
     words: str
+    comments: int
+    """Lines between the rows that `blocks` has left out as comments."""
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
         """Give some columns (n, k) of consecutive rows, and the share of the source before the next ones."""
@@ -121,7 +123,7 @@ class Source(Protocol):
 class Frame:
     """A DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
 
-    words = ""
+    words, comments = "", 0
 
     def __init__(self, frame: Any) -> None:
         self._frame = frame
@@ -295,6 +297,8 @@ class Table:
             )
         if missing := self._count - len(wrench):
             self._guesses.append(f"{missing} of {self._count} rows left out, which lack the wrench or the orientation")
+        if comments := self.source.comments:
+            self._guesses.append(f"{comments} commented lines between the rows left out")
         if sigma and (sigma[0] <= 0).any():
             row = int(np.argmax((sigma[0] <= 0).any(axis=1)))
             raise BadDataset(

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple
+from typing import IO, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,8 @@ from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
 from ftcalib.model import Array
 
-_READ_BYTES, _HEAD_BYTES = 1 << 22, 1 << 16
+# Characters: of a block, of the first part that is looked at, of the longest head, and of the longest line.
+_BLOCK, _FIRST, _HEAD, _LINE = 1 << 22, 1 << 16, 1 << 20, 1 << 18
 _SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _COMMENT = re.compile(r"\s*(#+|%+|//)\s*")
 _NUMBER: Final = {
@@ -29,6 +30,7 @@ _NUMBER: Final = {
 _DECIDE = 30
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?\s*(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")
+_UNIT_LENGTH = 20
 
 
 class TextFormat(NamedTuple):
@@ -52,29 +54,28 @@ class TextTable:
     """A text table on disk; what is not given of how it is written is recognised. Raises `BadDataset` or `OSError`."""
 
     def __init__(self, path: Path, separator: str = "", decimal: str = "") -> None:
-        self.path = path
-        with self._open() as (file, raw):
-            head = file.read(_HEAD_BYTES)
-            more = bool(file.read(1))
-            packed = type(file).__name__ if file is not raw else ""
-        self.format = _format_of(head.decode("utf-8-sig", "replace"), more, separator, decimal)
-        self.names, self.units, self.words = self.format.names, self.format.units, self.format.words
-        if packed:
-            self.words = ", ".join(filter(None, [self.words, "gzip" if packed == "GzipFile" else "UTF-16"]))
+        self.path, self.comments = path, 0
+        with self._open() as (text, raw):
+            self.format = _format_in(text, separator, decimal)
+            encodings = ["gzip"] if text.buffer is not raw else []
+            encodings += ["UTF-16"] if text.encoding == "utf-16" else []
+        self.names, self.units = self.format.names, self.format.units
+        self.words = ", ".join(filter(None, [self.format.words, *encodings]))
 
     @contextmanager
-    def _open(self) -> Iterator[tuple[BinaryIO, BinaryIO]]:
-        """Give the text in UTF-8, and the file as it is on disk."""
+    def _open(self) -> Iterator[tuple[Any, IO[bytes]]]:
+        r"""Give the text, whose lines end with `\n` whatever ends them on disk, and the file on disk.
+
+        A line ends with `\n`, `\r\n` or `\r`; other characters that Unicode calls line breaks belong to a cell.
+        """
         with open_file(self.path) as raw:
-            magic = raw.read(2)
+            packed = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
-            file: Any = raw
-            if magic == b"\x1f\x8b":
-                file = gzip.GzipFile(fileobj=raw)
-            elif magic in (b"\xff\xfe", b"\xfe\xff"):  # Excel calls it Unicode text
-                file = io.BytesIO(raw.read().decode("utf-16", "replace").encode())
+            file = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if packed else raw
             try:
-                yield file, raw
+                is_utf16 = file.peek(2)[:2] in (b"\xff\xfe", b"\xfe\xff")  # Excel calls it Unicode text
+                text = io.TextIOWrapper(file, "utf-16" if is_utf16 else "utf-8-sig", "replace", newline=None)
+                yield text, raw
             except (gzip.BadGzipFile, EOFError, zlib.error) as error:
                 raise BadDataset("the compressed file is damaged or cut: unpack what is left") from error
 
@@ -85,12 +86,16 @@ class TextTable:
         """
         size = self.path.stat().st_size
         with self._open() as (file, raw):
-            line = self.format.first_line
+            line, self.comments = self.format.first_line, 0
             for _ in range(line - 1):
                 file.readline()
-            while text := file.read(_READ_BYTES) + file.readline():
-                yield self._parsed(text, use, line), raw.tell() / size
-                line += text.count(b"\n")
+            while text := file.read(_BLOCK):
+                text += file.readline(_LINE)
+                if len(text) >= _BLOCK + _LINE and not text.endswith("\n"):
+                    cut = line + text.count("\n")
+                    raise BadDataset(f"line {cut} is longer than {_LINE} characters: give one row a sample")
+                yield self._parsed(text.encode(), use, line), raw.tell() / size
+                line += text.count("\n")
 
     def _parsed(self, text: bytes, use: Sequence[int], line: int) -> Array:
         import pyarrow as pa  # .1 s that other commands need not wait
@@ -125,10 +130,12 @@ class TextTable:
     def _slowly_parsed(self, text: bytes, separator: str, use: Sequence[int], first: int) -> Array:
         """Parse what pyarrow refuses, such as a comment or `+1`. Raises `BadDataset` with the line."""
         count, rows = len(self.names), []
-        for line, row in enumerate(
-            csv.reader(text.decode("utf-8", "replace").splitlines(), delimiter=separator), first
-        ):
-            if not any(map(str.strip, row)) or _COMMENT.match(row[0]):
+        for line, one in enumerate(text.decode().split("\n"), first):
+            row = _split(one, separator)
+            if _COMMENT.match(one):
+                self.comments += 1
+                continue
+            if not any(row):
                 continue
             if len(row) == count + 1 and not row[-1].strip():
                 row.pop()
@@ -157,24 +164,42 @@ def seconds_of(dates: NDArray[Any]) -> Array:
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
+def _format_in(text: IO[str], separator: str, decimal: str) -> TextFormat:
+    """Recognise the format of a text from its first lines, of which a long header needs more. Raises `BadDataset`."""
+    head = text.read(_FIRST)
+    while True:
+        more = text.read(len(head))
+        try:
+            return _format_of(head, bool(more), separator, decimal)
+        except _NoNumbers:
+            if not more or len(head) >= _HEAD:
+                raise
+        head += more
+
+
+class _NoNumbers(BadDataset):
+    """The lines so far have no row of numbers."""
+
+
 def _format_of(head: str, more: bool, separator: str, decimal: str) -> TextFormat:
     if "\0" in head:
         raise BadDataset("it is no text table: give a CSV file")
-    lines = head.splitlines()
+    lines = head.split("\n")
     lines = lines[: -1 if more and len(lines) > 1 else None]
     separator, decimal, count, numeric = _decided(lines, separator, decimal)
     if not numeric:
         found = "the file is empty" if not head.strip() else "no row has two numbers or more"
-        raise BadDataset(f"{found}: give a table with one row a sample")
+        raise _NoNumbers(f"{found}: give a table with one row a sample")
     rows = [_split(line, separator) for line in lines]
     first = next(i for i, row in enumerate(rows) if _is_data(lines[i], row, decimal, numeric))
     above = [i for i in range(first) if lines[i].strip()]
+    _require_no_data(lines, above, numeric, separator, decimal)
     # A separator at the end of each line makes one more column.
     ended = all(not row[-1] for row in rows[first:] if len(row) == count)
     # Programs write their settings above the names, one a line.
     header = [(i, cells) for i in above if (cells := _header(lines[i], separator, count, ended))]
     units: Sequence[str] = ()
-    if len(header) > 1 and header[-1][0] == above[-1] and all(_UNIT.fullmatch(cell) for cell in header[-1][1]):
+    if len(header) > 1 and header[-1][0] == above[-1] and all(map(_is_unit, header[-1][1])):
         units = [cell.strip("[]() ") for cell in header.pop()[1]]
     names = header[-1][1] if header else [str(1 + i) for i in range(count)]
     words = [_SEPARATORS[separator]] if separator != "," else []
@@ -208,8 +233,10 @@ def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, s
 def _split(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
-    cells = next(csv.reader([line], delimiter=separator), [])
-    return [cell.strip() for cell in cells]
+    try:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    except csv.Error:  # a cell of more than 131,072 characters
+        return []
 
 
 def _numbers(row: Sequence[str], decimal: str) -> int:
@@ -221,9 +248,26 @@ def _is_data(line: str, row: Sequence[str], decimal: str, numeric: int) -> bool:
     return not _COMMENT.match(line) and _numbers(row, decimal) > max(1, numeric // 4)
 
 
+def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, separator: str, decimal: str) -> None:
+    """Raise `BadDataset` if a line above the first row is a row of numbers that is written in another way."""
+    for i in above:
+        for between, point in ((one, other) for one in _SEPARATORS for other in ".,"):
+            cells = [cell for cell in _split(lines[i], between) if cell]
+            if not _COMMENT.match(lines[i]) and len(cells) == _numbers(cells, point) >= max(2, numeric // 2):
+                ours, theirs = (
+                    f"{_SEPARATORS[a]} and a decimal {'comma' if b == ',' else 'point'}"
+                    for a, b in ((between, point), (separator, decimal))
+                )
+                raise BadDataset(f"line {i + 1} is a row with {ours}, rows below have {theirs}: write all in one way")
+
+
+def _is_unit(cell: str) -> bool:
+    return len(cell) <= _UNIT_LENGTH and _UNIT.fullmatch(cell) is not None
+
+
 def _header(line: str, separator: str, count: int, ended: bool) -> list[str]:
     """Return the names in a line above the numbers; behind `#` or `%`, and perhaps with separators of its own."""
-    line = _COMMENT.sub("", line, count=1)
+    line = line[found.end() :] if (found := _COMMENT.match(line)) else line
     for other in (separator, *_SEPARATORS):
         cells = _split(line, other)
         if len(cells) == count - 1 and count > 2:  # R leaves out the name of the row numbers

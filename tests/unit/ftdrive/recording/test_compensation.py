@@ -166,7 +166,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     lines = (tmp_path / damaged).read_text().splitlines()
     lines[len(lines) * 2 // 3] = "?"
     (tmp_path / damaged).write_text("\n".join(lines))
-    monkeypatch.setattr(text_tables, "_READ_BYTES", 1 << 15)
+    monkeypatch.setattr(text_tables, "_BLOCK", 1 << 15)
     found = TablePair(Table(files[0]), Table(files[1]), calibration(), "c", None)
     assert found.delay_s == pytest.approx(0.012, abs=2e-3)
     numbers, failure = compensate_recording(found, WrenchFrame(), tmp_path / "new.csv")
