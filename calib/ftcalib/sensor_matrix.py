@@ -39,6 +39,9 @@ FLOOR: Final = 0.0025
 # How many of the numbers that a tool shows the usual size of the errors counts as.
 _USUAL_COUNTS = 2.0
 
+# Plausible in a file: errors of the entries and their sigma relative to the ranges, the lever in m, the floor.
+_LARGEST_ERROR, _LARGEST_SIGMA, _LEVERS_M, _LARGEST_FLOOR = 0.5, 0.5, (1e-3, 10.0), 0.5
+
 _ENTRIES = np.eye(36).reshape(36, 6, 6)
 
 Source = Literal["assumed", "data sheet", "loads"]
@@ -189,15 +192,39 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`. Raises `BadCalibration`."""
+        """Build from `to_dict`. Raises `BadCalibration`, also for numbers that no sensor has."""
         check_format(document, FORMAT, BadCalibration)
         names = ("error", "covariance", "source", "lever_m", "floor", "provenance")
         try:
-            return cls(*(document[name] for name in names))
+            for name in ("error", "covariance", "lever_m", "floor"):
+                if any(type(value) not in (int, float) for value in np.array(document[name], object).flat):
+                    raise ValueError(f"{name} has something else than numbers")  # noqa: TRY301, one sentence below
+            if not isinstance(document["provenance"], Mapping):
+                raise TypeError("provenance is no object")  # noqa: TRY301
+            sensor = cls(*(document[name] for name in names))
+            sensor._require_plausible()
         except KeyError as exc:
             raise BadCalibration(f"the sensor's file lacks the field {exc.args[0]}: the file is damaged.") from exc
-        except (TypeError, ValueError) as exc:
+        except (TypeError, ValueError, OverflowError) as exc:
             raise BadCalibration(f"the sensor's file cannot be read ({exc}): the file is damaged.") from exc
+        return sensor
+
+    def _require_plausible(self) -> None:
+        """Raise `ValueError` for errors that no sensor has, and for a covariance that is none."""
+        if not (_LEVERS_M[0] <= self.lever_m <= _LEVERS_M[1] and self.floor <= _LARGEST_FLOOR):
+            raise ValueError(f"lever_m {self.lever_m:g} and floor {self.floor:g} are those of no sensor")
+        relative = ranges(self.lever_m) / ranges(self.lever_m)[:, None]
+        C = self.covariance
+        variance = np.diag(C)
+        least = float(np.linalg.eigvalsh((C + C.T) / 2)[0]) if variance.max() < np.pi**2 * 1e4 else -np.inf
+        if (variance < 0).any() or not np.allclose(C, C.T, rtol=1e-6, atol=1e-12) or least < -1e-9 * variance.max():
+            raise ValueError("the covariance is none: it is not symmetric, or a variance is negative or too large")
+        for name, values, most in (
+            ("error", np.abs(self.error) * relative, _LARGEST_ERROR),
+            ("sigma", self.sigma * relative, _LARGEST_SIGMA),
+        ):
+            if (largest := float(values.max())) > most:
+                raise ValueError(f"a {name} of {100 * largest:.3g} % is that of no sensor")
 
     def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""

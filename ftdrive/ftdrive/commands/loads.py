@@ -189,13 +189,14 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
     from ftdrive.runs.sensor_file import next_sensor_file
 
     read = [_run_of(path) for path in runs]
-    serials = {serial for _, serial, _ in read}
-    if len(serials) > 1:
-        raise ConfigError(f"the runs are of different sensors ({', '.join(map(str, serials))}): give those of one")
+    identity = read[0][1]
+    if other := next((one for _, one, _ in read if one != identity), None):
+        name, ours = next((name, value) for name, value in identity.items() if other[name] != value)
+        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give those of one")
     data = read[0][2]
     of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
     weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
-    prior = _prior(data, next(iter(serials)), [path.name for path in runs])
+    prior = _prior(data, identity, [path.name for path in runs])
     from ftcalib.loads.solve import solve_loads
 
     solution = solve_loads(
@@ -205,7 +206,11 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
         g_m_s2=data.g_m_s2,
         setup=data.setup,
         tool_mass_kg=weighed,
-        provenance={"serial": next(iter(serials)), "created_utc": datetime.now(UTC).isoformat(timespec="seconds")},
+        provenance={
+            "serial": identity["serial"],
+            "sensor": identity,
+            "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        },
     )
     hindering = [one for one in solution.findings if one.severity == "reject"]
     saved = None
@@ -219,26 +224,26 @@ def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: 
     stop_unless(saved is not None, "the runs do not agree on a matrix")
 
 
-def _run_of(path: Path) -> tuple["LoadRun", str | None, Any]:
-    """Read one run with its load, the serial number of its sensor, and what is known of its cell."""
+def _run_of(path: Path) -> tuple["LoadRun", dict[str, Any], Any]:
+    """Read one run with its load, the identity of its sensor, and what is known of its cell."""
     from ftcalib.loads.model import LoadRun
     from ftdrive.runs.load import Load
-    from ftdrive.runs.sensor_file import sensor_serial
+    from ftdrive.runs.sensor_file import sensor_identity
     from ftdrive.runs.source import SolveOptions, read_source
 
     data = read_source(path, SolveOptions())
-    serial = sensor_serial(data.provenance) or sensor_serial(data.dataset.meta)
-    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), serial, data
+    origin = data.provenance if "devices" in data.provenance else data.dataset.meta
+    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), sensor_identity(origin), data
 
 
-def _prior(data: Any, serial: str | None, names: list[str]) -> "SensorMatrix":
+def _prior(data: Any, identity: dict[str, Any], names: list[str]) -> "SensorMatrix":
     """Return what is known of the sensor before these runs: by earlier loads, its data sheet, or as usual."""
     from ftcalib.sensor_matrix import SensorMatrix
-    from ftdrive.runs.sensor_file import sensor_files
+    from ftdrive.runs.sensor_file import difference, sensor_files
 
     for path in reversed(sensor_files()):
         known = SensorMatrix.load(path)
-        if known.provenance.get("serial") == serial and not {*known.provenance.get("runs", ())} & {*names}:
+        if not difference(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:
             echo(f"Begins with {path.name} of {str(known.provenance.get('created_utc'))[:10]}.", err=True)
             return known
     return SensorMatrix.declared(data.setup)
