@@ -435,6 +435,8 @@ CODES: Final[Mapping[str, Code]] = {
     "motion_slow": Code(_NOTE, "the motion does not determine {names}", "turn the three wrist joints together, at "
         "60 °/s or more"),
     # How well the data fit
+    "gain_not_modelled": Code(_LIMIT, "this method does not model the gain of the sensor, which is off by up to "
+        "{gain_percent:.1f}: the residual is {residual_N:.2g}, with the gain {free_N:.2g}", "solve with method ml"),
     "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
         "weight ({error_N:.2g}), more than {limit_percent:g}",
         "check cables, contact and orientations, and take more poses"),
@@ -550,5 +552,9 @@ _EXPLAINS: Final[Sequence[tuple[frozenset[str], frozenset[str]]]] = (
             "sensor_turned", "sensor_changed", "sensors_alternate",
         )),
         _OF_MISTAKES,
+    ),
+    (
+        frozenset(("gain_not_modelled",)),
+        frozenset(("force_error", "torque_error", "noise_exceeded", "residuals_alike")),
     ),
 )  # fmt: skip

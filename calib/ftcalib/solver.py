@@ -7,7 +7,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
-from ftcalib.errors import NotObservable
+from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding, ordered
 from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.described_cell import contradictions
@@ -28,6 +28,8 @@ from ftcalib.sensor_matrix import SensorMatrix
 SIMULATIONS = 400
 # No sensor resolves smaller differences of force.
 UNRESOLVED_N = 1e-12
+# Largest force over the standard error of its mean that a sensor can have.
+_RESOLVED = 3e6
 
 # Published methods that need the direction of gravity, or the weight.
 _NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
@@ -90,6 +92,29 @@ def solve(
     (24, 6)
     """
     known, setup = _choose(dataset, method, drift, known, g_m_s2, setup, as_published=as_published)
+    try:
+        # Numbers that overflow are no result, and end below.
+        with np.errstate(all="ignore"):
+            return _solved(dataset, method, drift, known, g_m_s2, setup, provenance, as_published=as_published)
+    except np.linalg.LinAlgError as error:
+        raise BadDataset(
+            f"the fit is not finite ({error}): check the units of the wrench and of its standard errors, and that each "
+            "row has one orientation and its own reading"
+        ) from error
+
+
+def _solved(
+    dataset: CalibrationDataset,
+    method: Method,
+    drift: Drift,
+    known: Known | None,
+    g_m_s2: float,
+    setup: Setup,
+    provenance: Mapping[str, Any] | None,
+    *,
+    as_published: bool,
+) -> CalibrationResult:
+    """Fit and judge a dataset whose arguments were checked."""
     estimator = None
     if method in PUBLISHED:
         estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup, as_published=as_published)
@@ -163,7 +188,26 @@ def _choose(
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
+    _require_sense(dataset)
     return known, setup
+
+
+def _require_sense(dataset: CalibrationDataset) -> None:
+    """Raise `BadDataset` for torques that are all zero, and for raw counts with standard errors in other units."""
+    force_N = dataset.wrench[:, :3]
+    if not dataset.wrench[:, 3:].any():
+        raise BadDataset(
+            "all torques are zero, as of a three-axis sensor, which shows no centre of mass and is not supported: take "
+            "a six-axis sensor, or give its torques"
+        )
+    if dataset.wrench_cov is None or (dataset.wrench != np.round(dataset.wrench)).any():
+        return
+    sigma_N = float(np.sqrt(np.einsum("nii->ni", dataset.wrench_cov)[:, :3].mean()))
+    if (largest := float(np.abs(force_N).max())) > _RESOLVED * sigma_N:
+        raise BadDataset(
+            f"the wrench looks like raw counts, up to {largest:.3g}, beside standard errors of {sigma_N:.2g}, which no "
+            "sensor resolves: give both in N and N·m, or leave the standard errors out"
+        )
 
 
 def _fit(

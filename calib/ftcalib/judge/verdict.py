@@ -220,14 +220,15 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     # A contradicted mass has it already.
     by_mass = any(one.code == "known_mass" for one in contradicted)
     unit_N = None if by_mass else described_cell.unit_of_force(unconstrained or fit, known, setup, g_m_s2)
+    gain = [] if mistakes or changed else _gain_not_modelled(fit, unconstrained)
 
     findings = [
         *broken,
         *mistakes,
         *changed,
-        *quality.errors,
+        *(replace(one, severity="limit") if gain and one.severity == "reject" else one for one in quality.errors),
         *_weight(fit, weight_N, setup),
-        *_second_solution(fit),
+        *_second_solution(fit, unconstrained),
         *units.implausible(
             parameters,
             _rms(fit.residuals[quality.used, :3]),
@@ -235,7 +236,12 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
             any_bias=setup.sensor_has_arbitrary_zero,
             unit_N=unit_N,
         ),
-        *([] if contradicted or quality.largest_share <= NOISY_SHARE else _misfit_of_known_values(fit, unconstrained)),
+        *gain,
+        *(
+            []
+            if gain or contradicted or quality.largest_share <= NOISY_SHARE
+            else _misfit_of_known_values(fit, unconstrained)
+        ),
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
         *_structure(fit, weight_N, in_motion=not single_poses),
@@ -417,13 +423,32 @@ def _weight(fit: Judged, weight_N: float, setup: Setup) -> list[Finding]:
     return [Finding.of("weight_insignificant", **values)]
 
 
-def _second_solution(fit: Judged) -> list[Finding]:
+def _second_solution(fit: Judged, unconstrained: Judged | None = None) -> list[Finding]:
     if fit.second_basin_chi2 is None:
         return []
-    delta = fit.second_basin_chi2 / max(1.0, fit.chi2 / fit.dof)
+    # What a published method does not model, such as a gain, makes both of its solutions worse.
+    fitted = unconstrained if fit.fit is None and unconstrained is not None else fit
+    delta = fit.second_basin_chi2 / max(1.0, fitted.chi2 / fitted.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
     return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
+
+
+def _gain_not_modelled(fit: Judged, unconstrained: Judged | None) -> list[Finding]:
+    """Name the gain of the sensor if it explains most of the residuals of a method that does not model it."""
+    if fit.fit is not None or unconstrained is None or unconstrained.response is None:
+        return []
+    used = unconstrained.weights > 0.5
+    ours, best = (_rms(one.residuals[used, :3]) for one in (fit, unconstrained))
+    reads = unconstrained.response.wrench(unconstrained.parameters, fit.R_base_flange[used])[:, :3]
+    if best > COLLAPSE * ours or _rms(reads - reads.mean(axis=0)) < ours / 2:
+        return []
+    values = {
+        "gain_percent": 100 * float(np.abs(unconstrained.response.force_gain).max()),
+        "residual_N": ours,
+        "free_N": best,
+    }
+    return [Finding.of("gain_not_modelled", **values)]
 
 
 def _misfit_of_known_values(fit: Judged, unconstrained: Judged | None) -> list[Finding]:

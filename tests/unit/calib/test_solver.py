@@ -249,7 +249,7 @@ def test_a_walk_is_looked_for_where_there_is_nothing_to_see(measured: bool) -> N
     R = Rotation.random(8, rng=3).as_matrix()
     no_lever = replace(TRUTH, p_sensor_com_m=np.zeros(3), torque_bias_Nm=np.zeros(3))
     rng = np.random.default_rng(4)
-    pushed = predict(no_lever, R) + rng.normal(size=(8, 6)) * SIGMA * [1, 1, 1, 0, 0, 0]  # torques are exactly 0
+    pushed = predict(no_lever, R) + rng.normal(size=(8, 6)) * SIGMA * np.repeat([1, 1e-3], 3)  # torques are almost 0
     for truth, wrench in ((TRUTH, predict(TRUTH, R)), (no_lever, pushed)):
         result = solve(dataset(R, wrench, white(8) if measured else None), drift="random-walk")
         error = np.abs(truth.difference(result.parameters))
@@ -656,3 +656,36 @@ def test_five_poses_state_what_errors_of_the_sensor_hide_in_the_mounting() -> No
         in_sigmas += [*(turn_rad / result.sigma["R_flange_sensor"])]
     assert np.abs(in_sigmas).max() < 5  # 100 and more without what is assumed of a sensor
     assert np.sqrt(np.mean(np.square(in_sigmas))) > 0.3
+
+
+@pytest.mark.parametrize("measured", [False, True])
+def test_a_three_axis_sensor_is_named(measured: bool) -> None:
+    R = Rotation.random(12, rng=3).as_matrix()
+    wrench = predict(TRUTH, R)
+    wrench[:, 3:] = 0
+    with pytest.raises(BadDataset, match="three-axis sensor"):
+        solve(dataset(R, wrench, white(12) if measured else None))
+
+
+def test_raw_counts_beside_standard_errors_in_newtons_are_named(recwarn: pytest.WarningsRecorder) -> None:
+    R = Rotation.random(12, rng=3).as_matrix()
+    counts = np.round(predict(TRUTH, R) * 1e6)
+    with pytest.raises(BadDataset, match=r"looks like raw counts, up to .* beside standard errors of"):
+        solve(dataset(R, counts, white(12)))
+    solve(dataset(R, np.round(predict(TRUTH, R) * 1e3), None))  # counts without standard errors are solved
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("method", [one for one in PUBLISHED if one not in (*BASELINES, "carlson-cayley")])
+def test_a_gain_is_named_and_no_second_solution(method: Method) -> None:
+    """Ten sensors whose gains differ by 3 %: their minima lie 180° apart and far from each other."""
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        R = Rotation.random(24, rng=rng).as_matrix()
+        R = SPECIAL_R_flange_base.swapaxes(1, 2) if method in ("srom", "mixed") else R
+        wrench = predict(TRUTH, R)
+        wrench[:, :3] = (wrench[:, :3] - TRUTH.force_bias_N) * rng.normal(1, 0.03, 3) + TRUTH.force_bias_N
+        result = solve(dataset(R, wrench + rng.normal(size=(24, 6)) * SIGMA, white(24)), method)
+        codes = [one.code for one in result.findings]
+        assert "second_solution" not in codes
+        assert result.verdict != "rejected", codes
