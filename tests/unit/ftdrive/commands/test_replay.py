@@ -1,0 +1,27 @@
+"""A replay equals the saved result: to the last digit, or to rounding where another processor computes."""
+
+from dataclasses import replace
+
+import pytest
+
+from ftcalib import CalibrationResult, Finding
+from ftdrive.commands.replay import equality
+from ftdrive.errors import NotAccepted
+from tests.unit.ftdrive.live.simulated import calibrated
+
+
+def moved(result: CalibrationResult, sigmas: float) -> CalibrationResult:
+    """The result with a mass that is off."""
+    weight_N = result.parameters.gravity_force_base_N * (1 + sigmas * result.sigma["mass_kg"] / result.mass_kg)
+    return replace(result, parameters=replace(result.parameters, gravity_force_base_N=weight_N))
+
+
+def test_a_replay_is_equal_to_rounding() -> None:
+    saved = calibrated()
+    assert equality(calibrated(), saved) == "equal to the last digit"
+    assert equality(moved(saved, 1e-8), saved).startswith("equal to rounding, within ")
+    with pytest.raises(NotAccepted, match=r"differs from the saved calibration in .*"):
+        equality(moved(saved, 1e-4), saved)
+    other = replace(moved(saved, 1e-8), findings=(*saved.findings, Finding.of("response_small")))
+    with pytest.raises(NotAccepted, match="differs"):
+        equality(other, saved)
