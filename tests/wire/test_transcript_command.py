@@ -83,7 +83,7 @@ def test_a_recording_that_was_broken_off_is_played_as_far_as_it_goes(
     assert 0.2 < played["duration_s"] < 0.8
     assert played["samples"] > 10
     assert played["mean_force_N"] == pytest.approx(WRENCH[:3], abs=0.02)
-    assert f"broken off: {played['duration_s']:.3g} s of 1 s were played" in outcome.stderr
+    assert f"was interrupted: {played['duration_s']:.3g} s of 1 s were played" in outcome.stderr
 
 
 def test_a_whole_recording_is_not_called_broken_off(recorded: list[str], tmp_path: Path) -> None:

