@@ -182,8 +182,11 @@ class Description:
 
     def judge_rows(self, question: Question) -> None:
         """Raise `ConfigError` unless all rows together can be used; the tool must not end before its sensor."""
-        texts = self.texts.get(question.key, [])
-        self._require_possible(question.key, tuple(self.value(question, text) for text in texts))
+        self._require_possible(question.key, self._rows(question))
+
+    def _rows(self, question: Question) -> tuple[Any, ...]:
+        values = (self.value(question, text) for text in self.texts.get(question.key, []))
+        return tuple(value for value in values if value is not None)
 
     def _require_possible(self, key: str, rows: Sequence[Sequence[float]]) -> None:
         section, name = key.split(".")
@@ -208,8 +211,14 @@ class Description:
         Raises
         ------
         DeviceError or UsageError
-            It does not answer.
+            It does not answer, or there cannot be such an address.
         """
+        try:
+            return self._look(key, text)
+        except (OSError, UnicodeError) as error:
+            raise ConfigError(f"'{text[:60]}' cannot be an address ({error}): correct it") from error
+
+    def _look(self, key: str, text: str) -> str:
         if key == ROBOT:
             # What another arm has reported is not the model of this one.
             given = None if ROBOT in self.reports else self.model
@@ -246,7 +255,7 @@ class Description:
             section, name = question.key.split(".")
             texts = self.texts.get(question.key, [])
             if question.repeats:
-                value: Any = tuple(self.value(question, text) for text in texts)
+                value: Any = self._rows(question)
             else:
                 value = self.value(question, texts[0] if texts else self.usual(question) or "")
             values.setdefault(section, {})[name] = value
