@@ -14,6 +14,7 @@ import socket
 import sys
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from http import HTTPStatus
 from http.client import HTTPException, HTTPMessage, parse_headers
 from io import BytesIO
@@ -26,10 +27,14 @@ from ftdrive.errors import ConfigError
 
 Address = tuple[str, int]
 
-# A request may take so long.
+# Time-out of a request's head, s.
 _HEAD_S: Final = 10.0
-_HEAD_BYTES: Final = 1 << 16
+_HEAD_BYTES: Final = 1 << 14
 _PIECE: Final = 1 << 16
+# Most connections without a head yet. One more closes the oldest, so that idle ones use up no descriptors.
+_WAITING: Final = 500
+# So many refused requests are logged: whoever sends more must not fill the terminal of a session.
+_LOGGED: Final = 5
 
 _HOST: Final = re.compile(r"(\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(:\d{1,5})?", re.ASCII)
 
@@ -53,8 +58,11 @@ def refusal(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Colle
     if not _is_bound(host, bound):
         return f"the server is not {host or 'named in the request'}: use its address"
     origin = headers.get("Origin")
-    if origin is None or origin in (origins or ()) or urlsplit(origin).netloc == host:
+    if origin is None or origin in (origins or ()):
         return ""
+    with suppress(ValueError):  # no address
+        if urlsplit(origin).netloc == host:
+            return ""
     fix = "open the page of this server" if origins is None else f"`ftdrive stream --allow-origin {origin}` serves them"
     return f"pages of {origin} are not served; {fix}"
 
@@ -82,19 +90,40 @@ def hidden_host() -> str:
     return "127." + ".".join(str(random.SystemRandom().randint(1, 254)) for _ in range(3))
 
 
+@dataclass(frozen=True, slots=True)
+class Request:
+    """The head of a permitted request, and what follows it."""
+
+    method: str
+    target: str
+    headers: HTTPMessage
+    head: bytes
+    reader: asyncio.StreamReader
+    writer: asyncio.StreamWriter
+
+    async def answer(
+        self, status: HTTPStatus, body: bytes = b"", content: str = "text/plain; charset=utf-8", *more: str
+    ) -> None:
+        """Send a whole answer; `more` are lines of its head."""
+        head = [f"HTTP/1.1 {status} {status.phrase}", f"Content-Type: {content}", *more]
+        head += [f"Content-Length: {len(body)}", "X-Content-Type-Options: nosniff", "Connection: close"]
+        self.writer.write("\r\n".join([*head, "", ""]).encode() + (b"" if self.method == "HEAD" else body))
+        await self.writer.drain()
+
+    async def refuse(self, status: HTTPStatus, why: str) -> None:
+        """Answer with one sentence."""
+        await self.answer(status, f"{why}\n".encode())
+
+
 class Gate:
-    """Listens for HTTP and WebSocket, and passes the bytes of a permitted request to another server.
+    """Listens for HTTP, refuses foreign requests, and calls `serve` for each of the others in a thread of its own.
 
     Parameters
     ----------
     bound : tuple of str and int
         Host and port; 0 lets the system choose, see `port`.
-    behind : callable
-        Returns the address of the server for an `Origin`; None is that of a program.
     origins : collection of str
         See `refusal`.
-    token : str
-        A browser must have opened `/?token=` with it once, and keeps it as a cookie; empty: none is needed.
 
     Raises
     ------
@@ -102,40 +131,28 @@ class Gate:
         The address cannot be used.
     """
 
-    def __init__(
-        self,
-        bound: Address,
-        behind: Callable[[str | None], Address],
-        *,
-        origins: Collection[str] | None = None,
-        token: str = "",
-    ) -> None:
-        self._host, self._behind, self._origins, self._token = bound[0], behind, origins, token
-        self._clients: dict[str, str] = {}
-        self._loop = asyncio.new_event_loop()
+    def __init__(self, bound: Address, origins: Collection[str] | None = None) -> None:
+        self._host, self._origins = bound[0], origins
+        self._waiting: dict[asyncio.StreamWriter, None] = {}
+        self._refused = 0
+        self.loop = asyncio.new_event_loop()
         try:
-            self._server = self._loop.run_until_complete(
-                asyncio.start_server(self._serve, *bound, limit=_HEAD_BYTES, reuse_address=True)
+            self._server = self.loop.run_until_complete(
+                asyncio.start_server(self._connected, *bound, limit=_HEAD_BYTES, backlog=_WAITING, reuse_address=True)
             )
         except OSError as error:
-            self._loop.close()
+            self.loop.close()
             raise OSError(error.errno, os.strerror(error.errno) if error.errno else str(error)) from None
         self.port: int = self._server.sockets[0].getsockname()[1]
-        self._thread = Thread(target=self._loop.run_forever, name="gate", daemon=True)
+        self._thread = Thread(target=self.loop.run_forever, name="gate", daemon=True)
         self._thread.start()
-
-    def with_clients(self, log: str) -> str:
-        """Return lines of the server's log with the addresses of the clients, for which it sees those of the gate."""
-        for seen, client in list(self._clients.items()):
-            log = log.replace(seen, client)
-        return log
 
     def close(self) -> None:
         """Disconnect all."""
-        asyncio.run_coroutine_threadsafe(self._end(), self._loop).result()
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        asyncio.run_coroutine_threadsafe(self._end(), self.loop).result()
+        self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
-        self._loop.close()
+        self.loop.close()
 
     async def _end(self) -> None:
         self._server.close()
@@ -144,41 +161,72 @@ class Gate:
             task.cancel()
         await asyncio.gather(*others, return_exceptions=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._waiting[writer] = None
+        if len(self._waiting) > _WAITING:
+            oldest = next(iter(self._waiting))
+            del self._waiting[oldest]
+            oldest.transport.abort()
         with suppress(OSError, asyncio.CancelledError):
             try:
                 head, headers = await asyncio.wait_for(_head(reader), _HEAD_S)
-            except (TimeoutError, asyncio.IncompleteReadError, asyncio.LimitOverrunError, HTTPException):
-                await _answer(writer, HTTPStatus.BAD_REQUEST, "this is no HTTP request")
+                method, target, _ = head.partition(b"\r\n")[0].decode("ascii").split(" ")
+            except (TimeoutError, ValueError, EOFError, asyncio.LimitOverrunError, HTTPException):
+                nothing = Request("", "", HTTPMessage(), b"", reader, writer)
+                await nothing.refuse(HTTPStatus.BAD_REQUEST, "this is no HTTP request")
             else:
+                self._waiting.pop(writer, None)
+                request = Request(method, target, headers, head, reader, writer)
                 if why := refusal(headers, self._host, self._origins):
-                    _log.warning("a request was refused: %s", why)
-                    await _answer(writer, HTTPStatus.FORBIDDEN, why)
-                elif self._token and head.split(b" ", 2)[1] == f"/?token={self._token}".encode():
-                    cookie = f"Set-Cookie: {self._cookie}; HttpOnly; SameSite=Strict; Path=/"
-                    await _answer(writer, HTTPStatus.SEE_OTHER, "", "Location: /", cookie)
-                elif self._token and self._cookie not in headers.get("Cookie", "").split("; "):
-                    await _answer(writer, HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
+                    self._refused += 1
+                    if self._refused <= _LOGGED:
+                        last = "; further ones are not logged" if self._refused == _LOGGED else ""
+                        _log.warning("a request was refused: %s%s", why, last)
+                    await request.refuse(HTTPStatus.FORBIDDEN, why)
                 else:
-                    await self._pass_on(reader, writer, head, self._behind(headers.get("Origin")))
+                    await self.serve(request)
+        self._waiting.pop(writer, None)
         writer.close()
 
-    @property
-    def _cookie(self) -> str:
-        # Browsers send the cookies of one port to all ports of a host.
-        return f"ftdrive-{self.port}={self._token}"
+    async def serve(self, request: Request) -> None:
+        """Answer a permitted request; its connection is closed afterwards."""
+        raise NotImplementedError
 
-    async def _pass_on(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, head: bytes, address: Address
+
+class PassingGate(Gate):
+    """Passes the bytes of a permitted request, also of a WebSocket, to another server.
+
+    Parameters
+    ----------
+    bound, origins
+        Those of `Gate`.
+    behind : callable
+        Returns the address of the server for an `Origin`; None is that of a program.
+    """
+
+    def __init__(
+        self, bound: Address, behind: Callable[[str | None], Address], origins: Collection[str] | None = None
     ) -> None:
-        back_reader, back_writer = await asyncio.open_connection(*address)
+        self._behind = behind
+        self._clients: dict[str, str] = {}
+        super().__init__(bound, origins)
+
+    def with_clients(self, log: str) -> str:
+        """Return lines of the server's log with the addresses of the clients, for which it sees those of the gate."""
+        for seen, client in list(self._clients.items()):
+            log = log.replace(seen, client)
+        return log
+
+    async def serve(self, request: Request) -> None:
+        """Copy both directions until one ends."""
+        back_reader, back_writer = await asyncio.open_connection(*self._behind(request.headers.get("Origin")))
         seen = _name(back_writer.get_extra_info("sockname"))
-        self._clients[seen] = _name(writer.get_extra_info("peername"))
+        self._clients[seen] = _name(request.writer.get_extra_info("peername"))
         try:
-            back_writer.write(head)
+            back_writer.write(request.head)
             both = [
-                asyncio.ensure_future(_copy(reader, back_writer)),
-                asyncio.ensure_future(_copy(back_reader, writer)),
+                asyncio.ensure_future(_copy(request.reader, back_writer)),
+                asyncio.ensure_future(_copy(back_reader, request.writer)),
             ]
             try:
                 await asyncio.wait(both, return_when=asyncio.FIRST_COMPLETED)
@@ -204,14 +252,6 @@ async def _head(reader: asyncio.StreamReader) -> tuple[bytes, HTTPMessage]:
         lines = [f"{name}: {value}" for name, value in headers.items()]
         head = request + b"\r\n" + "\r\n".join([*lines, "", ""]).encode("latin-1")
     return head, headers
-
-
-async def _answer(writer: asyncio.StreamWriter, status: HTTPStatus, text: str, *more: str) -> None:
-    body = f"{text}\n".encode()
-    head = [f"HTTP/1.1 {status} {status.phrase}", "Content-Type: text/plain; charset=utf-8", *more]
-    head += [f"Content-Length: {len(body)}", "Connection: close"]
-    writer.write("\r\n".join([*head, "", ""]).encode() + body)
-    await writer.drain()
 
 
 def _name(address: tuple[str, int]) -> str:

@@ -1,10 +1,11 @@
 """`ftdrive calibrate`: a guided calibration."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 from click.core import ParameterSource
@@ -33,11 +34,16 @@ from ftdrive.commands.common import (
 )
 
 if TYPE_CHECKING:
+    from ftcalib import CalibrationResult
     from ftdrive.cell.config import CellConfig
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.load import Load
     from ftdrive.runs.run import Mode, Run
     from ftdrive.runs.source import Outcome
+    from ftdrive.view.page import Page
+
+# Estimates that the page shows at the end.
+_SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 
 
 @click.command()
@@ -137,9 +143,9 @@ def calibrate(
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
     from ftdrive.session.session import calibrate as guide
-    from ftdrive.terminal.console import beside, messages
-    from ftdrive.terminal.report import print_result
+    from ftdrive.terminal.console import beside
     from ftdrive.terminal.screen import open_operator
+    from ftdrive.view.session_page import conclude
 
     _refuse_contradictions(click.get_current_context())
     known_load = None if load is None else Load.of(load, at, gripped=gripped)
@@ -189,17 +195,54 @@ def calibrate(
             on_page(page, operator, options) as (shown, options),
         ):
             outcome = guide(cell, shown, options)
-    if outcome is None:
-        beside(as_json).print("Dry run: nothing has moved.")
-        return
-    index_run(outcome.run.folder, None if simulate else cell)
+        if outcome is None:
+            beside(as_json).print(words := "Dry run: nothing has moved.")
+            if page is not None:
+                conclude(page, words)
+            return
+        index_run(outcome.run.folder, None if simulate else cell)
+        _report(outcome, page, simulate=simulate, as_json=as_json)
+    stop_unless_accepted(outcome.result, to_be_saved=True)
+
+
+def _report(outcome: "Outcome", page: "Page | None", *, simulate: bool, as_json: bool) -> None:
+    """Print the result and what to do next, and show both on the page."""
+    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.report import print_result
+
+    saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
+    commands = _next_commands(outcome.run, is_saved=saved is not None, simulate=simulate)
     if as_json:
         write_json(_as_json(outcome))
     else:
-        saved = None if outcome.result.verdict == "rejected" else outcome.run.calibration_path
         print_result(outcome.result, drift=outcome.drift, records=outcome.run.records(), saved=saved)
-        messages.print_next(*_next_commands(outcome.run, is_saved=saved is not None, simulate=simulate))
-    stop_unless_accepted(outcome.result, to_be_saved=True)
+        messages.print_next(*commands)
+    if page is not None:
+        _conclude(page, outcome.result, commands)
+
+
+def _conclude(page: "Page", result: "CalibrationResult", commands: Sequence[str]) -> None:
+    """Show verdict and estimates of a result."""
+    import numpy as np
+
+    from ftcalib.estimates import FIXED_BELOW, quantities_of, values_of
+    from ftcalib.rounding import to_place_of
+    from ftdrive.terminal.report import error_in_words
+    from ftdrive.view.parts import BAD, GOOD, WARN, number
+    from ftdrive.view.session_page import conclude
+
+    document, figures = result.to_dict(), []
+    for label, factor, unit, key in quantities_of(document):
+        values, sigmas = (factor * values_of(source[key], key) for source in (document, document["sigma"]))
+        sigma = float(sigmas.max())
+        fixed = sigma <= factor * FIXED_BELOW * float(np.sqrt(np.diag(result.covariance).max()))
+        if key in _SHOWN and not fixed:
+            rounded = ", ".join(to_place_of(value, sigma) for value in values)
+            figures.append(number(label, rounded, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)"))
+    words = f"compensation error {error_in_words(result)}"
+    findings = [one.words for one in result.findings if one.severity != "note"]
+    tone = {"good": GOOD, "usable": WARN, "rejected": BAD}[result.verdict]
+    conclude(page, result.verdict.upper(), words, *findings, tone=tone, figures=figures, following=commands)
 
 
 def _put_on(station: "Station", load: "Load | None") -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
 
-from ftdrive.terminal.text import echo
+from ftdrive.terminal.text import echo, in_one_line
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
 if TYPE_CHECKING:
@@ -217,7 +217,7 @@ class ViewOptions:
     def require(self) -> None:
         """Raise `ConfigError` if a page is wanted and a package of it is missing."""
         if self.wanted:
-            require_extra("viz", "--view", "viser", "segno")
+            require_extra("viz", "--view", "uplot", "segno")
 
     @contextmanager
     def page(self, title: str) -> Iterator["Page | None"]:
@@ -231,10 +231,9 @@ class ViewOptions:
             yield None
             return
         self.require()
-        from ftdrive.view.page import announce, serve
+        from ftdrive.view.site import announced, serve
 
-        with serve(title, address) as page:
-            announce(page, address)
+        with serve(title, address) as page, announced(page, address):
             yield page
 
 
@@ -242,14 +241,34 @@ class ViewOptions:
 def on_page(
     page: "Page | None", operator: "Operator", options: "SessionOptions", command: str = "calibrate"
 ) -> Iterator[tuple["Operator", "SessionOptions"]]:
-    """Show a session on a page while the block runs, if there is one; yields the operator and options to use."""
+    """Show a session on a page while the block runs, if there is one; yields the operator and options to use.
+
+    If the block raises, the page shows what the terminal prints about it.
+    """
     if page is None:
         yield operator, options
         return
-    from ftdrive.view.session_page import SessionPage
+    from ftdrive.view.parts import BAD
+    from ftdrive.view.session_page import SessionPage, conclude
 
-    with SessionPage(page, operator, command) as shown:
-        yield shown, replace(options, watch=shown.watch)
+    shown = SessionPage(page, operator, command)
+    try:
+        with shown:
+            yield shown, replace(options, watch=shown.watch)
+    except BaseException as error:
+        head, _, words = _last_line(error).partition(": ")
+        conclude(page, head[:1].upper() + head[1:], words, *shown.kept, tone=BAD)
+        raise
+
+
+def _last_line(error: BaseException) -> str:
+    """Return the line that the terminal prints when an error ends a session."""
+    from ftdrive.cli import in_a_sentence
+    from ftdrive.errors import Declined
+
+    if isinstance(error, Declined):
+        return str(error)
+    return "interrupted" if isinstance(error, KeyboardInterrupt) else f"error: {in_one_line(in_a_sentence(error))}"
 
 
 def view_options(command: F) -> F:

@@ -114,12 +114,18 @@ def init(
             InitPage(page, described, draft, output.name).run()
         cell = described.cell()
         write_new(output, described.file())
+        words, end = ". Measure tool, planes and boxes, then set measured = true in it: nothing moves before.", ""
+        if simulate:
+            words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
+        if page is not None:
+            from ftdrive.view.parts import GOOD, lines
+
+            # at the top, and where Write was pressed
+            written = lines(f"Wrote {output}{words}", f"Next: ftdrive doctor{end}", head="Written", tone=GOOD)
+            page.put({"result": written, "form/words": written, "form/write": None})
     draft.unlink(missing_ok=True)
     if as_json:
         write_json({"schema_version": 1, "file": str(output), **described.found(), "config": cell.to_dict()})
-    words, end = ". Measure tool, planes and boxes, then set measured = true in it: nothing moves before.", ""
-    if simulate:
-        words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
     beside(as_json).print(f"Wrote {output}{words}")
     messages.print_next(f"ftdrive doctor{end}", f"ftdrive plan{end}")
 

@@ -45,6 +45,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import SolveOptions, read_calibration
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.lines import BAD
 from ftdrive.terminal.live_feed import MEAN_S, Feed
 from ftdrive.terminal.live_panels import plain as plain_lines
 from ftdrive.terminal.live_view import Summary, View
@@ -76,7 +77,7 @@ _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
 @FRAME
 @click.option("--once", is_flag=True, help="Print one reading, then end.")
 @click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")
-@click.option("--allow-control", is_flag=True, help="With --view: the page may tare.")
+@click.option("--allow-control", is_flag=True, help="With --view: the page may tare and choose the frame.")
 @view_options
 @JSON
 def live(
@@ -109,6 +110,8 @@ def live(
     check_view(view, once=once, allow_control=allow_control)
     view.require()
     frame = read_frame(axes, about)
+    prints = once or as_json or not sys.stdout.isatty()
+    full_screen = not (prints or plain) and messages.is_terminal and sys.stdin.isatty()
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
@@ -128,17 +131,20 @@ def live(
             if source.simulate:
                 push = partial(stream.station.control, do="push", wrench=_PUSH, seconds=1.0)
         feed = Feed(stream, recorder, push)
-        if (page := stack.enter_context(view.page("ftdrive live"))) is not None:
+        title = "ftdrive live" if replay is None else f"ftdrive live, replay of {replay.name}"
+        if (page := stack.enter_context(view.page(title))) is not None:
             from ftdrive.view.live_page import LivePage
             from ftdrive.view.page import drawing
 
             cell = stream.cell if isinstance(stream, CompensatedStream) else _recorded_cell(replay or Path())
             certifier = None if cell is None else _certifier(cell, stream.info.arm.model)
             shown = LivePage(page, feed, checks, certifier, controls=allow_control)
-            stack.enter_context(drawing(shown.draw))
-        if once or as_json or not sys.stdout.isatty():
+            # the full screen hides what is printed
+            say = partial(feed.note, style=BAD) if full_screen else messages.print
+            stack.enter_context(drawing(page, shown.draw, say))
+        if prints:
             _print(feed, once=once, as_json=as_json)
-        elif plain or not (messages.is_terminal and sys.stdin.isatty()):
+        elif not full_screen:
             _show_table(feed, checks)
         else:
             from ftdrive.terminal.live_screen import run_live

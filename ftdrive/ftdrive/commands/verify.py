@@ -160,10 +160,10 @@ def verify_cell(
         on_page(page, operator, options, task.command) as (shown, options),
     ):
         run = take_poses(task, shown, options)
-    if run is None:
-        raise RuntimeError("a verification is never a dry run")
-    verified = verify_run(run, calibration, path, limits)
-    _report(verified, update, simulated=station is not None, as_json=as_json)
+        if run is None:
+            raise RuntimeError("a verification is never a dry run")
+        verified = verify_run(run, calibration, path, limits)
+    _report(verified, update, page, simulated=station is not None, as_json=as_json)
     index_run(run.folder, cell if station is None else None)
     return verified
 
@@ -197,27 +197,54 @@ def _with_poses(
     return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
 
 
-def _report(verified: "Verified", update: Answer, *, simulated: bool, as_json: bool) -> None:
-    """Print the outcome and what to do next; save the update if it is wanted."""
+def _report(verified: "Verified", update: Answer, page: "Page | None", *, simulated: bool, as_json: bool) -> None:
+    """Print the outcome and what to do next, and show both on the page; save the update if it is wanted."""
     from ftdrive.runs.verification import save_update
     from ftdrive.terminal.console import answer, messages
     from ftdrive.terminal.report import print_verification
 
     if not as_json:
         print_verification(verified)
-    saved = save_update(verified) if _wants_update(verified, update, as_json=as_json) else None
+    if page is not None:
+        _conclude(page, verified)
+    saved = save_update(verified) if _wants_update(verified, update, page, as_json=as_json) else None
+    again = " --simulate" if simulated else ""
+    if saved is not None:
+        following = f"ftdrive live --calibration {quote(str(saved))}{again}"
+    elif verified.passed:
+        following = "ftdrive history   (age and trends of all calibrations)"
+    else:
+        following = f"ftdrive calibrate{again}   (the calibration does not hold any more)"
+    if page is not None:
+        _conclude(page, verified, following)
     if as_json:
         write_json({**verified.to_dict(), "file": str(verified.path), "saved": None if saved is None else str(saved)})
         return
     if saved is not None:
         answer.print(f" Saved {saved}: {_updated(verified)} updated, parent {verified.calibration.id[:6]}")
-    again = " --simulate" if simulated else ""
-    if saved is not None:
-        messages.print_next(f"ftdrive live --calibration {quote(str(saved))}{again}")
-    elif verified.passed:
-        messages.print_next("ftdrive history   (age and trends of all calibrations)")
-    else:
-        messages.print_next(f"ftdrive calibrate{again}   (the calibration does not hold any more)")
+    messages.print_next(following)
+
+
+def _conclude(page: "Page", verified: "Verified", *following: str) -> None:
+    """Show the verdict and the largest differences."""
+    import numpy as np
+
+    from ftcalib.rounding import to_place_of
+    from ftdrive.terminal.report import verdict_in_words
+    from ftdrive.view.parts import BAD, GOOD, number
+    from ftdrive.view.session_page import conclude
+
+    found, figures = verified.verification, []
+    for name, unit, axes in (("force", "N", slice(3)), ("torque", "N·m", slice(3, 6))):
+        sizes = np.linalg.norm(found.residual[:, axes], axis=1)
+        sigma = float(np.linalg.norm(found.predicted_sigma[sizes.argmax(), axes]))
+        value = to_place_of(sizes.max(), sigma)
+        figures.append(
+            number(f"largest difference, {name}", value, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)")
+        )
+    head, tone = ("PASS", GOOD) if verified.passed else ("FAILED", BAD)
+    words = verdict_in_words(verified), "" if found.passed else found.reason
+    conclude(page, head, *words, tone=tone, figures=figures, following=following)
 
 
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
@@ -235,22 +262,28 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
     return station, path
 
 
-def _wants_update(verified: "Verified", update: Answer, *, as_json: bool) -> bool:
+def _wants_update(verified: "Verified", update: Answer, page: "Page | None" = None, *, as_json: bool) -> bool:
     from ftdrive.errors import Declined
     from ftdrive.session.events import Question
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.operators import JsonOperator, PlainOperator
+    from ftdrive.view.session_page import asked
 
     if verified.passed or verified.update is None or update == "no":
         return False
     if update == "yes":
         return True
     operator = JsonOperator() if as_json else PlainOperator(quiet=messages.quiet)
-    text = f"An update of {_updated(verified)} is sufficient. Save it as a new calibration?"
+    question = Question(f"An update of {_updated(verified)} is sufficient. Save it as a new calibration?")
+    if page is not None:
+        page.put({"question": asked(question)})
     try:
-        return operator.ask(Question(text)) == "yes"
+        return operator.ask(question) == "yes"
     except Declined:
         return False
+    finally:
+        if page is not None:
+            page.put({"question": None})
 
 
 def _updated(verified: "Verified") -> str:

@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -78,7 +79,10 @@ def weigh(
             from ftdrive.view.page import drawing
             from ftdrive.view.weigh_page import WeighPage
 
-            stack.enter_context(drawing(WeighPage(page, weighing, controls=allow_control).draw))
+            shown = WeighPage(page, weighing, controls=allow_control)
+            # the full screen hides what is printed, and has a line for notes
+            say = partial(setattr, weighing, "note") if on_screen else messages.print
+            stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:
             from ftdrive.terminal.weigh_screen import run_weigh
 

@@ -7,7 +7,7 @@ from typing import Any, Final
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.fleet.serve import FleetReading
 from ftdrive.fleet.state import CellState
-from ftdrive.http_gate import Gate, hidden_host
+from ftdrive.http_gate import PassingGate, hidden_host
 from ftdrive.terminal.text import visible
 from ftdrivers.installation import missing_extra
 
@@ -112,7 +112,7 @@ class MetricsServer(Collector):
         behind = hidden_host()
         self._server, self._thread = start_http_server(0, behind, registry)
         try:
-            self._gate = Gate((host, port), lambda _: (behind, self._server.server_port))
+            self._gate = PassingGate((host, port), lambda _: (behind, self._server.server_port))
         except OSError as error:
             self._stop()
             raise ConfigError(

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
-from ftdrive.http_gate import Gate, hidden_host
+from ftdrive.http_gate import PassingGate, hidden_host
 from ftdrive.live import ros2
 from ftdrive.live.samples import (
     Block,
@@ -270,7 +270,7 @@ class FoxgloveServer:
             return behind, (self._control if origin is None or allow_control else self._read_only).port
 
         try:
-            self._gate = Gate((host, port), route, origins=(*VIEWERS, *origins))
+            self._gate = PassingGate((host, port), route, origins=(*VIEWERS, *origins))
         except OSError as error:
             self._stop()
             raise ConfigError(

@@ -1,153 +1,119 @@
-"""The server of a command's page, its address, and who looks at it."""
+"""A page of a command: named parts that browsers show, controls that they use, and the loop that draws it."""
 
+import json
 import logging
-import os
-import secrets
-import socket
-import sys
 import threading
-import webbrowser
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, redirect_stdout, suppress
-from io import StringIO
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from math import isfinite
 from time import monotonic
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
-from ftcalib.model import Array
-from ftdrive.errors import ConfigError
-from ftdrive.http_gate import Address, Gate, hidden_host, is_loopback, with_port
-from ftdrivers.installation import missing_extra
-
-if TYPE_CHECKING:
-    from viser import GuiEvent, ViserServer
+from ftdrive.view.parts import Part, button, controls
 
 log = logging.getLogger(__name__)
 
-# Only this computer can open the page.
-LOCAL: Final[Address] = ("127.0.0.1", 8080)
-
-
 # A busy computer, which is late at times, still draws 20 times a second.
 _PERIOD_S: Final = 0.045
+# Drawing that takes longer hangs.
+HUNG_S: Final = 5.0
+_TEXT: Final = 10_000
 
 
 class Page:
-    """A page that browsers show, with a scene of its own and controls beside it.
+    """What all browsers that show the page see, and what they may ask for.
 
     Attributes
     ----------
-    gui, scene
-        Those of viser.
     url : str
         With the token, without which nothing is served.
+    viewers : int
+        Number of browsers that show the page.
     """
 
-    def __init__(self, server: "ViserServer", url: str) -> None:
-        self._server, self.url = server, url
-        self.gui, self.scene = server.gui, server.scene
+    def __init__(self, title: str) -> None:
+        self.url = ""
+        self.viewers = 0
+        self._lock = threading.Lock()
+        # A part with its text and the version of the page that brought it.
+        self._parts: dict[str, tuple[Part | None, str, int]] = {}
+        self._version = 0
+        self._acts: dict[str, Callable[[str, Any], object]] = {}
+        self._drawn_s: float | None = None
+        self.put({"title": {"kind": "title", "text": title}})
 
-    def at_once(self) -> AbstractContextManager[None]:
-        """Let browsers show all changes of a `with` block together."""
-        changes: AbstractContextManager[None] = self._server.atomic()
-        return changes
+    def put(self, parts: Mapping[str, Part | None]) -> None:
+        """Show parts, all together, by their names; None takes one away. What has not changed is not sent again.
 
-    def look(self, at_m: Array, from_m: Array) -> None:
-        """Place the camera of every browser, also of those that open the page later; (3,) each, base axes."""
-        self._server.initial_camera.look_at, self._server.initial_camera.position = at_m, from_m
-        for viewer in self._server.get_clients().values():
-            # A new position takes the point with it.
-            viewer.camera.position, viewer.camera.look_at = from_m, at_m
+        The name before a slash is that of a place in `page.html`, such as `state`, or `scene`.
+        """
+        texts = {name: json.dumps(part, allow_nan=False, separators=(",", ":")) for name, part in parts.items()}
+        with self._lock:
+            for name, text in texts.items():
+                if text != self._parts.get(name, (None, "null", 0))[1]:
+                    self._version += 1
+                    self._parts[name] = parts[name], text, self._version
 
-    @property
-    def viewers(self) -> int:
-        """Number of browsers that show the page."""
-        return len(self._server.get_clients())
+    def on(self, name: str, act: Callable[[str, Any], object]) -> None:
+        """Call `act` when a viewer uses the control of this name that is shown, with viewer and valid value.
+
+        It is called in the thread of the server, so it must not wait; a `ValueError` is shown to the viewer.
+        """
+        self._acts[name] = act
 
     def add_stop(self, stop: Callable[[str], object]) -> None:
-        """Add a Stop button; `stop` is called in another thread, with the name of the viewer who pressed it."""
-        button = self.gui.add_button("Stop", color="red", hint="Stops the arm, as a key in the terminal does.")
+        """Show a Stop button; `stop` is called in another thread, with the name of the viewer who pressed it."""
+        self.put({"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. It is no emergency stop.")})
+        self.on("stop", lambda viewer, _: stop(viewer))
 
-        # Not in the pool of threads, which may be busy.
-        async def pressed(event: "GuiEvent[Any]") -> None:
-            stop(f"viewer {event.client_id}")
+    def act(self, viewer: str, name: object, value: object) -> None:
+        """Use a control for a viewer; raises `ValueError` if it is not shown or the value is not one of its values."""
+        with self._lock:
+            shown = [part["controls"] for part, _, _ in self._parts.values() if part and part["kind"] == "controls"]
+        found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)
+        if found is None or found["name"] not in self._acts:
+            raise ValueError("this page has no such control now")
+        self._acts[found["name"]](viewer, _valid(found, value))
 
-        button.on_click(pressed)
+    def since(self, version: int) -> tuple[int, str]:
+        """Return the present version, and as JSON the parts that are newer than another one; empty if none is."""
+        with self._lock:
+            newer = [f"{json.dumps(name)}:{text}" for name, (_, text, at) in self._parts.items() if at > version]
+            return self._version, f"{{{','.join(newer)}}}" if newer else ""
 
+    def beat(self) -> None:
+        """Say that the page is drawn; from then on it counts as stale whenever it is not drawn again."""
+        self._drawn_s = monotonic()
 
-@contextmanager
-def serve(title: str, address: Address | None = None) -> Iterator[Page]:
-    """Serve a page while the block runs. Needs the extra `viz`.
+    def rest(self) -> None:
+        """Say that the page is drawn only when something happens from now on, as before the first `beat`."""
+        self._drawn_s = None
 
-    Parameters
-    ----------
-    title : str
-    address : tuple of str and int, optional
-        Host and port. Without it only this computer is served: at port 8080, or another one if that is taken.
-
-    Raises
-    ------
-    ConfigError
-        The address cannot be used, or viser is missing.
-    """
-    try:
-        from viser import ViserServer
-    except ImportError:
-        raise ConfigError(missing_extra("a view", "viser", "viz")) from None
-    behind, token = hidden_host(), secrets.token_urlsafe(12)
-    # It prints a banner; our stdout is data.
-    with redirect_stdout(StringIO()):
-        server = ViserServer(host=behind, label=title, verbose=False)
-    try:
-        server.gui.configure_theme(show_logo=False, show_share_button=False)
-        server.gui.main_panel.dock_right()
-        with closing(_gate(address, (behind, server.get_port()), token)) as gate:
-            host = _reached_at((address or LOCAL)[0])
-            yield Page(server, f"http://{with_port(host, gate.port)}/?token={token}")
-    finally:
-        with redirect_stdout(StringIO()):
-            server.stop()
+    @property
+    def stale_s(self) -> float:
+        """Seconds since the page was drawn; 0 of a page that is drawn when something happens."""
+        return 0.0 if self._drawn_s is None else monotonic() - self._drawn_s
 
 
-def _reached_at(host: str) -> str:
-    """Return the address by which others reach a server that listens at `host`: a tablet may not know our name."""
-    if host not in ("0.0.0.0", "::"):
-        return host
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        # Sends nothing: an address for documentation chooses the interface.
-        probe.connect(("192.0.2.1", 9))
-        return str(probe.getsockname()[0])
-    return socket.gethostname()
-
-
-def _gate(address: Address | None, behind: Address, token: str) -> Gate:
-    bound = address or LOCAL
-    try:
-        return Gate(bound, lambda _: behind, token=token)
-    except OSError as error:
-        if address is not None:
-            raise ConfigError(f"--view-address {with_port(*address)} cannot be used: {error.strerror}") from error
-        return Gate((LOCAL[0], 0), lambda _: behind, token=token)
-
-
-def announce(page: Page, address: Address | None = None) -> None:
-    """Print the address of a page, as a QR code too for another device; open it where this computer has a screen."""
-    from ftdrive.terminal.console import messages, print_address
-
-    print_address("The page is shown until this command ends, at ", page.url)
-    if address is not None and not is_loopback(address[0]):
-        import segno
-
-        code = StringIO()
-        segno.make(page.url, error="l").terminal(code, border=1, compact=True)
-        messages.print(code.getvalue(), end="")
-        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
-    elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        webbrowser.open(page.url)
+def _valid(control: Part, value: object) -> object:
+    match control["type"]:
+        case "button" if value is None:
+            return value
+        case "check" if isinstance(value, bool):
+            return value
+        case "select" if isinstance(value, str) and value in control["options"]:
+            return value
+        case "range" if isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value):
+            if 0 <= value <= control["max"]:
+                return float(value)
+        case "text" if isinstance(value, str) and len(value) <= _TEXT and (value.isprintable() or not value):
+            return value
+    raise ValueError(f"{control['label']} cannot have this value")
 
 
 @contextmanager
-def drawing(draw: Callable[[], None]) -> Iterator[None]:
-    """Call `draw` 22 times a second in a thread of its own while the block runs."""
+def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] = log.error) -> Iterator[None]:
+    """Call `draw` 22 times a second in a thread of its own while the block runs; `say` takes what ends it."""
     ended = threading.Event()
 
     def run() -> None:
@@ -157,13 +123,24 @@ def drawing(draw: Callable[[], None]) -> Iterator[None]:
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()
-        except Exception:  # only a picture: the stream goes on
-            log.exception("the page cannot be drawn")
+                page.beat()
+        except Exception as error:  # only a picture: the stream goes on
+            log.debug("the drawing has failed", exc_info=True)
+            say(f"The page is not drawn any more, the command goes on: {error!r}")
+            ended.set()
 
+    def watch() -> None:
+        while not ended.wait(1.0):
+            if page.stale_s > HUNG_S:
+                say(f"The page has not been drawn for {HUNG_S:.0f} s, the command goes on.")
+                return
+
+    page.beat()
     thread = threading.Thread(target=run, name="page", daemon=True)
     thread.start()
+    threading.Thread(target=watch, name="page watch", daemon=True).start()
     try:
         yield
     finally:
         ended.set()
-        thread.join()
+        thread.join(2.0)

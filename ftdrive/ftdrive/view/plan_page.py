@@ -1,150 +1,150 @@
 """The page of a plan: the tour in motion, what it sweeps over, and its largest move."""
 
 import threading
-from collections.abc import Sequence
-from itertools import pairwise
 from time import monotonic
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.motion import tips
+from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
+from ftdrive.view import scene
 from ftdrive.view.page import Page
-from ftdrive.view.scene import GHOST, TOOL, DrawnArm, carried, draw_surroundings, revolved, size_of, turned_up
+from ftdrive.view.parts import Part, button, check, controls, lines, select, slider
 from ftdrivers.ur.kinematics import Array
 
-_FRAME_RAD: Final = np.radians(3)
 _FRAME_S: Final = 0.04
-_TIP: Final = (200, 40, 40)
+_SPEEDS: Final = {f"{speed:g} ×": speed for speed in (0.5, 1, 2, 4, 8)}
+PLAN_LEGEND: Final = (
+    *((scene.ARM, "body", "arm"), (scene.TOOL, "body", "tool"), (scene.PATH, "line", "path of the tool tip")),
+    *((scene.GHOST, "ball", "ball to keep free"), (scene.OBSTACLE, "body", "surroundings")),
+)
+"""What `plan_parts` and an arm are."""
+
+
+class Timeline:
+    """A plan over time at its speeds, after the approach (k + 1, 6) to its first pose if there is one."""
+
+    def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
+        self.plan, way, tour = plan, np.reshape(way_rad, (-1, 6)), [step.q_rad for step in plan.steps]
+        slow, turns_rad = Speeds.first_run(), np.abs(np.diff(way, axis=0)).max(axis=1)
+        # The last leg of the approach has no length: that of a resumed run ends at another pose than the first.
+        approach_s = [*move_duration_s(turns_rad, slow.joint_rad_s, slow.joint_rad_s2), *([0.0] if len(way) else [])]
+        self._nodes_rad = np.array([*way, *tour, tour[0]])
+        self._t_s = np.cumsum([0.0, *approach_s, *(step.duration_s for step in plan.steps)])
+        self.begins_s, self.end_s = self._t_s[len(way) : -1], float(self._t_s[-1])
+        self.q_rad = self.at(np.union1d(self._t_s, np.arange(0, self.end_s, 0.1)))
+
+    def at(self, t_s: ArrayLike) -> Array:
+        """Return joint vectors (..., 6) at times (...)."""
+        return np.stack(
+            [np.interp(np.asarray(t_s, dtype=np.float64), self._t_s, joint) for joint in self._nodes_rad.T], axis=-1
+        )
+
+    def move(self, t_s: float) -> int:
+        """Return the move at a time; -1 in the approach."""
+        return int(np.searchsorted(self.begins_s, t_s, side="right")) - 1
+
+    def slider(self, t_s: float) -> Part:
+        """Return the slider `along` at a time, with pose and seconds in words."""
+        pose = f"pose {self.move(t_s) + 1} of {len(self.begins_s)}, " if self.move(t_s) >= 0 else "approach, "
+        words = f"{'' if self.plan.sweep else pose}{t_s:.0f} of {self.end_s:.0f} s"
+        return slider("along", "Along the plan", round(t_s, 1), round(self.end_s, 1), step=0.1, text=words)
 
 
 class PlanPage:
-    """Fills a page with a plan.
+    """Fills a page with a plan; `certifier` is that of the same arm, tool and scene."""
 
-    Parameters
-    ----------
-    certifier : Certifier
-        For the same arm, tool and scene.
-    way_rad : array, shape (k + 1, 6), optional
-        From the present posture to the first pose; shown before the tour.
-    """
+    def __init__(self, page: Page, plan: Plan, certifier: Certifier) -> None:
+        self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, Timeline(plan)
+        self._volumes = _swept(certifier, self._tour.q_rad)
+        self._lock = threading.Lock()
+        self._chosen: dict[str, Any] = {"along": 0.0, "play": False, "speed": "1 ×", "swept": False}
+        self._drawn: dict[str, Any] = {}
+        page.put(plan_parts(certifier, self._tour))
+        for name in ("previous", "next", "largest", *self._chosen):
+            page.on(name, lambda _, value, name=name: self._choose(name, value))  # type: ignore[misc]
+        self.draw()
 
-    def __init__(self, page: Page, plan: Plan, certifier: Certifier, way_rad: Sequence[Array] | Array = ()) -> None:
-        self._page, self._plan = page, plan
-        self._q, self._move = path(plan, way_rad)
-        self._arm = draw_plan(page, plan, certifier, self._q)
-        gui = page.gui
-        self._words = gui.add_markdown("")
-        self._slider: Any = gui.add_slider("along the tour", min=0, max=len(self._q) - 1, step=1, initial_value=0)
-        self._plays = gui.add_checkbox("play", initial_value=False)
-        self._speed = gui.add_slider("speed", min=0.25, max=8.0, step=0.25, initial_value=1.0)
-        swept = gui.add_checkbox("room that the tool sweeps over", initial_value=False)
-        largest = gui.add_button("largest move")
-        self._slider.on_update(lambda _: self.show())
-        volumes = _swept(page, certifier, self._q[::3])
+    def _choose(self, name: str, value: Any) -> None:
+        with self._lock:
+            begins_s, now_s = self._tour.begins_s, self._chosen["along"]
+            goals_s = {
+                "previous": begins_s[np.searchsorted(begins_s, now_s - _FRAME_S) - 1],
+                "next": begins_s[np.searchsorted(begins_s, now_s + _FRAME_S) % len(begins_s)],
+                "largest": begins_s[np.argmax([step.turn_rad for step in self._plan.steps])],
+            }
+            if name in goals_s:
+                self._chosen |= {"along": float(goals_s[name]), "play": False}
+            else:
+                self._chosen[name] = not self._chosen["play"] if name == "play" else value
 
-        def show_swept(_: object) -> None:
-            for volume in volumes:
-                volume.visible = swept.value
-
-        swept.on_update(show_swept)
-
-        largest.on_click(lambda _: self._go_to(self._largest))
-        self.show()
-
-    @property
-    def _largest(self) -> int:
-        move = int(np.argmax([step.turn_rad for step in self._plan.steps]))
-        return int(np.flatnonzero(self._move == move)[0])
-
-    def _go_to(self, at: int) -> None:
-        self._slider.value = at
-        self.show()
-
-    def show(self) -> None:
-        """Draw the arm where the slider is."""
-        at = int(self._slider.value)
-        with self._page.at_once():
-            self._arm.show(self._q[at])
-            self._words.content = describe(self._plan, int(self._move[at]))
+    def draw(self) -> None:
+        """Show browsers what has changed."""
+        with self._lock:
+            chosen = dict(self._chosen)
+        if chosen == self._drawn:
+            return
+        self._drawn, t_s, swept = chosen, chosen["along"], chosen["swept"]
+        head, *words = describe(self._plan, self._tour.move(t_s))
+        rows = [*PLAN_LEGEND, *([(scene.TOOL, "body", "room that the tool sweeps over")] if swept else [])]
+        shown = controls(
+            button("previous", "Previous pose"),
+            button("play", "Pause" if chosen["play"] else "Play", tone="good"),
+            button("next", "Next pose"),
+            button("largest", "Largest move"),
+            self._tour.slider(t_s),
+            select("speed", "Speed", chosen["speed"], _SPEEDS),
+            check("swept", "Room that the tool sweeps over", value=swept),
+        )
+        parts = {"scene/legend": scene.legend(*rows), "state": lines(*words, head=head), "controls": shown}
+        volumes = self._volumes if swept else dict.fromkeys(self._volumes)
+        self._page.put({**scene.arm_parts(self._arm, self._tour.at(t_s)), **volumes, **parts})
 
     def play(self, ended: threading.Event) -> None:
-        """Move along the tour while `play` is on, until the event."""
-        at, then_s = 0.0, monotonic()
+        """Draw what viewers choose, and the arm in motion along the tour, until the event."""
+        then_s = monotonic()
         while not ended.wait(_FRAME_S):
-            now_s = monotonic()
-            if self._plays.value:
-                speed_rad_s = self._plan.steps[max(0, int(self._move[int(self._slider.value)]))].speed_rad_s
-                at += (now_s - then_s) * self._speed.value * speed_rad_s / _FRAME_RAD
-                if step := int(at):
-                    at -= step
-                    self._go_to((int(self._slider.value) + step) % len(self._q))
-            then_s = now_s
+            passed_s, then_s = monotonic() - then_s, monotonic()
+            with self._lock:
+                if self._chosen["play"]:
+                    passed_s *= _SPEEDS[self._chosen["speed"]]
+                    self._chosen["along"] = (self._chosen["along"] + passed_s) % self._tour.end_s
+            self.draw()
 
 
-def draw_plan(page: Page, plan: Plan, certifier: Certifier, q_rad: Array) -> DrawnArm:
-    """Draw cell, free ball and the path of the tool's tip along joint vectors (n, 6); return the arm, at the first."""
-    arm, size_m = certifier.arm, size_of(certifier)
-    draw_surroundings(page.scene, certifier.scene, size_m)
-    page.scene.add_icosphere(
-        "/ball", plan.ball_m, GHOST, opacity=0.15, position=np.array(plan.ball_centre_m), cast_shadow=False
-    )
+def plan_parts(certifier: Certifier, tour: Timeline) -> dict[str, Part | None]:
+    """Return cell, free ball, the path of the tool's tip, and the camera."""
+    arm, size_m, plan = certifier.arm, scene.size_of(certifier), tour.plan
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
-    tip = tips(arm, q_rad)[:, farthest]
-    segments = np.stack([tip[:-1], tip[1:]], axis=1)
-    page.scene.add_line_segments("/path of the tool tip", segments, _TIP, thickness=0.004)
-    look_at = 0.7 * arm.frames(q_rad[:1]).wrist_m[0]
-    page.look(look_at, look_at + 0.5 * size_m * np.array([1.0, 1.0, 0.6]))
-    drawn = DrawnArm(page.scene, arm)
-    drawn.show(q_rad[0])
-    return drawn
+    look_at = 0.7 * arm.frames(tour.q_rad[:1]).wrist_m[0]
+    return {
+        **scene.surroundings(certifier.scene, size_m),
+        "scene/ball": scene.ball(plan.ball_m, scene.GHOST, alpha=0.15, at=plan.ball_centre_m),
+        "scene/path": scene.path(tips(arm, tour.q_rad)[:, farthest], scene.PATH),
+        "scene/camera": scene.camera(look_at, look_at + 0.6 * size_m * np.array([1.0, 1.0, 0.6])),
+    }
 
 
-def _swept(page: Page, certifier: Certifier, q_rad: Array) -> list[Any]:
-    """Draw the tool at joint vectors (n, 6), invisible at first; one drawing for each of its cylinders."""
-    arm = certifier.arm
-    bodies = arm.bodies(q_rad)
-    drawn = []
-    for i in carried(arm):
-        shape = revolved(bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i])
-        turns, places = turned_up(bodies.axis[:, i]), bodies.centre_m[:, i]
-        drawn.append(
-            page.scene.add_batched_meshes_simple(
-                f"/swept/{arm.names[i]}", *shape, turns, places, batched_colors=TOOL, opacity=0.15, cast_shadow=False
-            )
-        )
-        drawn[-1].visible = False
-    return drawn
+def _swept(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
+    """Return the tool at joint vectors (n, 6), one part for each of its cylinders."""
+    bodies = certifier.arm.bodies(q_rad[:: max(1, len(q_rad) // 250)])
+    copies = np.concatenate([bodies.centre_m, scene.turned_up(bodies.axis)], axis=-1)
+    sizes = zip(bodies.half_length_m, bodies.radius_m, bodies.rounding_m, strict=True)
+    parts = [scene.body(*size, scene.TOOL, alpha=0.15, copies=copies[:, i]) for i, size in enumerate(sizes)]
+    return {f"scene/swept/{i}": parts[i] for i in scene.carried(certifier.arm)}
 
 
-def path(plan: Plan, way_rad: Sequence[Array] | Array = ()) -> tuple[Array, Any]:
-    """Joint vectors (m, 6) along all moves, and the move (m,) that each belongs to.
-
-    The approach is move -1; the closed tour follows.
-    """
-    q = np.array([step.q_rad for step in plan.steps])
-    legs = [(-1, start, end) for start, end in pairwise(way_rad)]
-    legs += [(i, start, end) for i, (start, end) in enumerate(zip(q, np.roll(q, -1, axis=0), strict=True))]
-    parts, moves = [], []
-    for move, start, end in legs:
-        n = max(1, int(np.ceil(np.abs(end - start).max() / _FRAME_RAD)))
-        parts.append(start + np.linspace(0, 1, n, endpoint=False)[:, None] * (end - start))
-        moves += [move] * n
-    return np.concatenate([*parts, q[:1]]), np.array([*moves, len(q) - 1])
-
-
-def describe(plan: Plan, move: int) -> str:
-    """Return a move as text."""
+def describe(plan: Plan, move: int) -> tuple[str, str, str]:
+    """Return a move, its least distance, and the room to keep free, in words."""
     if move < 0:
-        return "From the present posture to the first pose.\n\nIt is confirmed separately."
+        return "From the present posture to the first pose", "This approach is confirmed separately.", ""
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]
     turn_deg, speed_deg_s = np.degrees([step.turn_rad, step.speed_rad_s])
-    what = f"Move **{move + 1} of {len(plan.steps)}**, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}°"
+    what = f"Move {move + 1} of {len(plan.steps)}, R{step.number:02d} to R{following.number:02d}: {turn_deg:.0f}°"
     if plan.sweep is not None:
         what = f"Sweep of {plan.sweep.duration_s:.0f} s"
-    return (
-        f"{what} at {speed_deg_s:.0f}°/s.\n\nNearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}.\n\n"
-        f"{plan.room_in_words()}"
-    )
+    nearest = f"Nearest: {1e3 * step.clearance_m:.0f} mm, {step.limited_by}."
+    return f"{what} at {speed_deg_s:.0f} °/s", nearest, plan.room_in_words()

@@ -1,7 +1,7 @@
-"""The cell in three dimensions: arm, tool and surroundings, and what acts on the tool. Metres, base axes."""
+"""The cell in three dimensions as parts of a page, which `shell/scene.js` draws. Metres, base axes."""
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Collection, Sequence
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,70 +10,103 @@ from scipy.spatial.transform import Rotation
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Plane, Scene
+from ftdrive.view.parts import Part, plain
 from ftdrivers.ur.kinematics import Array
 
-if TYPE_CHECKING:
-    from viser import SceneApi
-
-Colour = tuple[int, int, int]
-ARM: Final[Colour] = (150, 155, 165)
-TOOL: Final[Colour] = (235, 130, 40)
-GHOST: Final[Colour] = (60, 130, 230)
-OBSTACLE: Final[Colour] = (90, 160, 110)
-BAD: Final[Colour] = (215, 40, 40)
-_TORQUE: Final[Colour] = (140, 60, 200)
-# Facets around a body, and over a quarter of its rounding.
-_AROUND, _ARC = 24, 6
+# Names of colours; `shell/page.css` has them for light and dark.
+ARM, TOOL, GHOST, OBSTACLE, BAD = "arm", "tool", "ghost", "obstacle", "bad"
+FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 
 
-class DrawnArm:
-    """An arm with its tool, which `show` moves.
+def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, **more: Any) -> Part:
+    """A cylinder along z with rounded edges; a capsule where its radius is zero, a ball where its length is too.
+
+    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), places and quaternions.
+    """
+    shape = plain([half_length_m, radius_m, rounding_m])
+    return {"kind": "body", "shape": shape, "colour": colour} | {name: plain(value) for name, value in more.items()}
+
+
+def ball(radius_m: float, colour: str, **more: Any) -> Part:
+    """A ball; `more` as for `body`."""
+    return body(0.0, 0.0, radius_m, colour, **more)
+
+
+def box(size_m: ArrayLike, colour: str, **more: Any) -> Part:
+    """A box about its middle; `more` as for `body`."""
+    return {"kind": "box", "size": plain(size_m), "colour": colour} | {name: plain(one) for name, one in more.items()}
+
+
+def path(points_m: Array, colour: str) -> Part:
+    """A line through points (n, 3)."""
+    return {"kind": "path", "points": plain(points_m), "colour": colour}
+
+
+def dots(points_m: ArrayLike, colours: Sequence[str], at: ArrayLike) -> Part:
+    """Round dots at points (n, 3) from `at`, of one size on every screen."""
+    return {"kind": "dots", "points": plain(points_m), "colours": list(colours), "at": plain(at)}
+
+
+def axes(length_m: float, at: ArrayLike = (0, 0, 0), turn: ArrayLike = (1, 0, 0, 0), *, named: bool = False) -> Part:
+    """Axes x, y, z in red, green and blue, with their names."""
+    return {"kind": "axes", "length": length_m, "at": plain(at), "turn": plain(turn), "named": named}
+
+
+def label(text: str, at: ArrayLike) -> Part:
+    """A text at a point (3,), always in front."""
+    return {"kind": "label", "text": text, "at": plain(at)}
+
+
+def camera(at_m: ArrayLike, from_m: ArrayLike) -> Part:
+    """Where browsers look at first, and from where; (3,) each."""
+    return {"kind": "camera", "at": plain(at_m), "from": plain(from_m)}
+
+
+def legend(*rows: tuple[str, str, str]) -> Part:
+    """What things of the scene are: colour, mark (`body`, `ball`, `line` or `arrow`) and words each."""
+    return {"kind": "legend", "rows": [list(row) for row in rows]}
+
+
+def arm_parts(
+    arm: ArmModel,
+    q_rad: ArrayLike | None,
+    name: str = "arm",
+    *,
+    ghost: bool = False,
+    clear: bool = False,
+    bad: Collection[str] = (),
+) -> dict[str, Part | None]:
+    """Return an arm with its tool at joint angles (6,); without them what takes it away.
 
     Parameters
     ----------
-    name : str
-        In the tree of the scene.
     ghost : bool
         Transparent: where the arm will be.
+    clear : bool
+        The tool is transparent, so that a wrench inside it is seen.
+    bad : collection of str
+        Bodies that are drawn red.
     """
-
-    def __init__(self, scene: "SceneApi", arm: ArmModel, name: str = "/arm", *, ghost: bool = False) -> None:
-        self._arm = arm
-        bodies = arm.bodies(np.zeros((1, 6)))
-        beyond = carried(arm)
-        self._colours = [GHOST if ghost else TOOL if i in beyond else ARM for i in range(len(arm.names))]
-        self._meshes = [
-            scene.add_mesh_simple(
-                f"{name}/{i} {body}",
-                *revolved(bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i]),
-                color=self._colours[i],
-                opacity=0.25 if ghost else None,
-                cast_shadow=not ghost,
-            )
-            for i, body in enumerate(arm.names)
-        ]
-
-    def show(self, q_rad: ArrayLike) -> None:
-        """Move to joint angles (6,)."""
-        bodies = self._arm.bodies(np.reshape(np.asarray(q_rad, dtype=np.float64), (1, 6)))
-        for mesh, at_m, wxyz in zip(self._meshes, bodies.centre_m[0], turned_up(bodies.axis[0]), strict=True):
-            mesh.position, mesh.wxyz, mesh.visible = at_m, wxyz, True
-
-    def hide(self) -> None:
-        """Draw nothing until it is shown again."""
-        for mesh in self._meshes:
-            mesh.visible = False
-
-    def reveal(self) -> None:
-        """Draw the tool transparent, so that a wrench inside it is seen."""
-        for mesh, colour in zip(self._meshes, self._colours, strict=True):
-            if colour == TOOL:
-                mesh.opacity = 0.45
-
-    def accuse(self, names: Collection[str]) -> None:
-        """Draw these bodies red, the others as they are."""
-        for mesh, name, colour in zip(self._meshes, self._arm.names, self._colours, strict=True):
-            mesh.color = BAD if name in names else colour
+    names = [f"scene/{name}/{i}" for i in range(len(arm.names))]
+    if q_rad is None:
+        return dict.fromkeys([*names, f"scene/{name}/along"])
+    q = np.reshape(np.asarray(q_rad, dtype=np.float64), (1, 6))
+    bodies, beyond = arm.bodies(q), carried(arm)
+    turns = turned_up(bodies.axis[0])
+    parts: dict[str, Part | None] = {}
+    for i, key in enumerate(names):
+        colour = BAD if arm.names[i] in bad else GHOST if ghost else TOOL if i in beyond else ARM
+        alpha = 0.25 if ghost else 0.45 if clear and i in beyond else 1.0
+        shape = bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i]
+        parts[key] = body(*shape, colour, at=bodies.centre_m[0, i], turn=turns[i], alpha=alpha)
+    if not ghost:
+        # The preset "along the tool" looks from the last body towards the flange.
+        parts[f"scene/{name}/along"] = {
+            "kind": "along",
+            "at": plain(bodies.centre_m[0, -1]),
+            "axis": plain(bodies.axis[0, -1]),
+        }
+    return parts
 
 
 def carried(arm: ArmModel) -> range:
@@ -81,53 +114,38 @@ def carried(arm: ArmModel) -> range:
     return range(arm.names.index("tool 1"), len(arm.names))
 
 
-def draw_surroundings(scene: "SceneApi", surroundings: Scene, size_m: float, bad: Collection[str] = ()) -> None:
-    """Draw base axes, planes as squares of `size_m`, and boxes; those named in `bad`, such as "plane 2", are red."""
-    scene.add_frame("/base", axes_length=0.2, axes_radius=0.004)
-    for i, plane in enumerate(surroundings.planes, start=1):
-        scene.add_box(
-            f"/surroundings/plane {i}",
-            BAD if f"plane {i}" in bad else OBSTACLE,
-            (size_m, size_m, 0.002),
-            opacity=0.3,
-            position=_foot(plane),
-            wxyz=turned_up(np.array(plane.normal)),
-            cast_shadow=False,
-        )
-    for i, box in enumerate(surroundings.boxes, start=1):
-        low, high = np.array(box.low_m), np.array(box.high_m)
-        colour = BAD if f"box {i}" in bad else OBSTACLE
-        # Not transparent: a transparent plane before it would hide it.
-        scene.add_box(f"/surroundings/box {i}", colour, high - low, position=(low + high) / 2)
+def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict[str, Part | None]:
+    """Return base axes, planes as squares of `size_m`, and boxes; those named in `bad`, such as "plane 2", are red."""
+    parts: dict[str, Part | None] = {"scene/base": axes(0.25, named=True)}
+    for i, plane in enumerate(scene.planes, start=1):
+        colour = BAD if f"plane {i}" in bad else OBSTACLE
+        turn = turned_up(np.array(plane.normal))
+        parts[f"scene/plane {i}"] = box((size_m, size_m, 0.002), colour, at=_foot(plane), turn=turn, alpha=0.3)
+    for i, one in enumerate(scene.boxes, start=1):
+        low, high = np.array(one.low_m), np.array(one.high_m)
+        parts[f"scene/box {i}"] = box(high - low, BAD if f"box {i}" in bad else OBSTACLE, at=(low + high) / 2)
+    return parts
 
 
-class DrawnWrench:
-    """Force and torque at a point as arrows, and the line of action of the force."""
+def wrench_parts(
+    p_base_m: Array, wrench_base: Array, m_per_N: float = 0.01, m_per_Nm: float = 0.1
+) -> dict[str, Part | None]:
+    """Return force and torque as arrows, and the line of action of the force.
 
-    def __init__(self, scene: "SceneApi", m_per_N: float = 0.01, m_per_Nm: float = 0.1) -> None:
-        nowhere = np.zeros((1, 2, 3))
-        self._scales = m_per_N, m_per_Nm
-        self._arrows: list[Any] = [
-            scene.add_arrows(f"/wrench/{name}", nowhere, colour, shaft_radius=0.008, head_radius=0.02, head_length=0.04)
-            for name, colour in (("force", BAD), ("torque", _TORQUE))
-        ]
-        self._line: Any = scene.add_line_segments("/wrench/line of action", nowhere, BAD, thickness=0.003)
-        self.hide()
+    The wrench (6,) acts about a point (3,), N and N·m, base axes; a force or a torque of zero is not drawn.
+    """
+    parts: dict[str, Part | None] = dict.fromkeys(NO_WRENCH)
+    for name, vector, m in (("force", wrench_base[:3], m_per_N), ("torque", wrench_base[3:], m_per_Nm)):
+        if vector.any():
+            ends = plain([p_base_m, p_base_m + m * vector])
+            parts[f"scene/{name}"] = {"kind": "arrow", "ends": ends, "colour": name}
+    if wrench_base[:3].any():
+        parts["scene/line of action"] = path(line_of_action(p_base_m, wrench_base)[0], FORCE)
+    return parts
 
-    def show(self, p_base_m: Array, wrench_base: Array) -> None:
-        """Draw a wrench (6,) about a point (3,), N and N·m, base axes; a force or a torque of zero is not drawn."""
-        for arrow, vector, scale in zip(self._arrows, wrench_base.reshape(2, 3), self._scales, strict=True):
-            arrow.visible = bool(vector.any())
-            if arrow.visible:
-                arrow.points = np.array([[p_base_m, p_base_m + scale * vector]])
-        self._line.visible = self._arrows[0].visible
-        if self._line.visible:
-            self._line.points = line_of_action(p_base_m, wrench_base)
 
-    def hide(self) -> None:
-        """Draw nothing until it is shown again."""
-        for drawn in (*self._arrows, self._line):
-            drawn.visible = False
+NO_WRENCH: Final[dict[str, Part | None]] = {"scene/force": None, "scene/torque": None, "scene/line of action": None}
+"""What takes the arrows of a wrench away."""
 
 
 def line_of_action(p_m: Array, wrench: Array, half_m: float = 0.5) -> Array:
@@ -144,24 +162,6 @@ def size_of(certifier: Certifier) -> float:
     """Return twice the reach of an arm, metres: planes are drawn so large."""
     arm = certifier.arm
     return 2 * (arm.ball_m + float(np.linalg.norm(arm.kinematics.links_m[1:3], axis=1).sum()))
-
-
-def revolved(half_length_m: float, radius_m: float, rounding_m: float) -> tuple[Array, Any]:
-    """Vertices (n, 3) and faces (m, 3) of a cylinder along z with rounded edges; a capsule where its radius is zero."""
-    arc = np.linspace(0, np.pi / 2, _ARC + 1) if rounding_m else np.zeros(1)
-    radius = radius_m + rounding_m * np.cos(arc)
-    height = half_length_m + rounding_m * np.sin(arc)
-    radius, height = np.append(radius, 0.0), np.append(height, height[-1])
-    radius, height = np.concatenate([radius[::-1], radius]), np.concatenate([-height[::-1], height])
-    turn = np.linspace(0, 2 * np.pi, _AROUND, endpoint=False)
-    ring = np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    vertices = np.concatenate(
-        [radius[:, None, None] * ring, np.broadcast_to(height[:, None, None], (len(radius), _AROUND, 1))], axis=2
-    )
-    low = np.arange((len(radius) - 1) * _AROUND).reshape(-1, _AROUND)
-    right, up = np.roll(low, -1, axis=1), low + _AROUND
-    faces = np.stack([low, right, up, right, np.roll(up, -1, axis=1), up], axis=2)
-    return vertices.reshape(-1, 3), faces.reshape(-1, 3)
 
 
 def turned_up(axis: Array) -> Array:

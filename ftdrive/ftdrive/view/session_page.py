@@ -1,52 +1,52 @@
-"""The page of a session: arm, plan and poses in the scene; state, question and estimates beside it; Stop."""
+"""The page of a session: state, question, forces and estimates beside the scene; Stop; and at the end the result."""
 
 import logging
 import threading
 import time
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import suppress
-from html import escape
-from typing import Any, Final, Self
+from dataclasses import replace
+from typing import Final, Self
 
 import numpy as np
 
 from ftcalib.model import Array
-from ftcalib.rounding import with_sigma
-from ftdrive.errors import Declined
+from ftdrive.checks.sensor import AXES
+from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.session.events import (
-    Compared,
-    Estimated,
-    Event,
-    GuardTripped,
-    Key,
-    Noted,
-    Operator,
-    Planned,
-    PoseTaken,
-    Question,
-    State,
-)
+from ftdrive.session import events
+from ftdrive.session.events import Event, Key, Operator, Question, State
 from ftdrive.session.guards import Guard, RangeGuard, Seen
 from ftdrive.terminal.screen import ESTIMATES, SessionView, progress_in_words, rounded_estimate, state_lines
 from ftdrive.terminal.session_text import in_words, sigmas_of
-from ftdrive.view.page import Page
-from ftdrive.view.plan_page import describe, draw_plan, path
-from ftdrive.view.scene import BAD, DrawnArm, size_of
+from ftdrive.terminal.text import as_typed
+from ftdrive.view import scene
+from ftdrive.view.page import HUNG_S, Page
+from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, bar, bars, controls, lines, numbers, table
+from ftdrive.view.plan_page import PLAN_LEGEND, Timeline, describe, plan_parts
 
 log = logging.getLogger(__name__)
+
+Parts = dict[str, Part | None]
 
 _FRAME_S: Final = 0.05
 # Guards that have not looked for so long rest.
 _REST_S: Final = 0.5
+# From this share of a limit on, a bar is a warning.
+_NEAR: Final = 0.8
 # Colour of a pose by the largest residual that still has it, in sigmas.
-_COLOURS: Final = ((3.0, (40, 160, 70), "≤ 3"), (5.0, (230, 150, 20), "≤ 5"), (np.inf, BAD, "more"))
-_UNKNOWN: Final = (120, 120, 130)
-_BALL_M: Final = 0.18
+_COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
+_POSES: Final = [
+    (name, "ball", f"pose, {words}") for _, name, words in (*_COLOURS, (0, scene.UNKNOWN, "no residual yet"))
+]
+_SPHERE_M: Final = 0.18
+# By hand there is no arm in the scene.
+_ALONE: Final[Parts] = {"scene/camera": scene.camera([0, 0, 0], [0.5, 0.5, 0.3]), "scene/legend": scene.legend(*_POSES)}
 # In these states the stop is not reached yet.
 _TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
-_ALERT: Final = "color:#e03131"
-_QUESTION: Final = "border-left:4px solid #3c82e6;padding-left:.6em"
+# What is true only while the session runs, and is taken away at its end.
+_LIVE: Final = ("stop", "alert", "question", "question/along", "state/progress", "state/note", "bars", "bars/guards")
+_ENDED: Final[Parts] = {**dict.fromkeys(_LIVE), "state": lines(head="ended")}
 
 
 class Onlooker(Guard):
@@ -54,21 +54,21 @@ class Onlooker(Guard):
 
     def __init__(self) -> None:
         self.seen: Seen | None = None
-        self.fresh_s = self.looked_s = 0.0
-        """When the newest sample was first seen, by `Seen.t_s`; the last look, by the computer's clock."""
+        self.fresh_s = self.age_s = self.looked_s = 0.0
+        """When the newest sample was first seen, by `Seen.t_s`; since when; the last look, by the computer's clock."""
 
     def look(self, seen: Seen) -> None:
         """Keep it."""
         if self.seen is None or seen.sample != self.seen.sample:
             self.fresh_s = seen.t_s
-        self.seen, self.looked_s = seen, time.monotonic()
+        self.seen, self.age_s, self.looked_s = seen, seen.t_s - self.fresh_s, time.monotonic()
 
 
 class SessionPage:
     """An operator that shows the session of another one on a page, where any viewer may stop it.
 
     Questions are answered by the other operator. A thread draws the newest state while the page is open in a browser,
-    so that no browser delays the session.
+    so that no browser delays the session. If that thread fails or hangs, the session goes on and `pressed` reports it.
     """
 
     def __init__(self, page: Page, operator: Operator, command: str) -> None:
@@ -76,28 +76,30 @@ class SessionPage:
         self._lock = threading.Lock()
         self._view = SessionView(command)
         self._question: Question | None = None
-        self._stopped_by = self._note = ""
-        self._downs: dict[int, tuple[Array, float | None]] = {}
-        self._plan: Planned | None = None
+        self._stopped_by = self._note = self._failure = ""
+        self._is_reported = False
+        self._stop = 1  # the last one: a hold has none
+        # Largest residual by stop, in sigmas.
+        self._residuals: dict[int, float | None] = {}
+        self._plan: events.Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
+        self._scene: _Cell | None = None
         self._onlooker = Onlooker()
         self._ended = threading.Event()
         self._drawer = threading.Thread(target=self._run, name="page", daemon=True)
         page.add_stop(self.stop)
-        self._texts = {part: page.gui.add_html("") for part in ("state", "alert", "question")}
-        self._slider: Any = page.gui.add_slider("along the plan", min=0, max=1, step=1, initial_value=0, visible=False)
-        self._texts |= {part: page.gui.add_html("") for part in ("guards", "results", "key")}
-        self._scene: _Cell | None = None
-        self._poses: Any = None
-        page.look(np.zeros(3), np.array([0.4, 0.4, 0.25]))
+        page.on("along", self._look_at)
 
     def __enter__(self) -> Self:
+        self._page.beat()
         self._drawer.start()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._ended.set()
-        self._drawer.join(timeout=2.0)
+        self._drawer.join(timeout=1.0)
+        self._page.rest()
+        self._page.put(_ENDED)
 
     def stop(self, viewer: str) -> None:
         """Stop the session in the name of a viewer, as the key q does; for good, so only the first one counts."""
@@ -113,22 +115,25 @@ class SessionPage:
         with self._lock:
             self._view.update(event, time.monotonic())
             match event:
-                case Planned():
+                case events.Planned():
                     self._plan = event
-                case Noted():
+                case events.Noted():
                     self._note = event.words
-                case PoseTaken():
+                case events.StateChanged(state=State.REPORT):
                     self._note = ""
-                    self._downs[event.stop] = event.gravity_flange, None
-                case Estimated() if self._view.last is not None:
-                    stop = self._view.last.stop
-                    self._downs[stop] = self._downs[stop][0], event.residual_sigma
-                case Compared() if event.stop in self._downs:
-                    self._downs[event.stop] = self._downs[event.stop][0], sigmas_of(event)
+                case events.StateChanged(stop=int(stop)):
+                    self._stop = stop
+                case events.PoseTaken():
+                    self._note, self._residuals[event.stop] = "", None
+                case events.Estimated() if self._view.last is not None:
+                    self._residuals[self._view.last.stop] = event.residual_sigma
+                case events.Compared():
+                    self._residuals[event.stop] = sigmas_of(event)
         self._operator.show(event)
 
     def ask(self, question: Question) -> str:
         """Ask in the terminal; raises `Declined` too if a viewer has stopped the session."""
+        self._report_failure()
         self._require_unstopped()
         self._question, self._view.keys = question, "asking"
         try:
@@ -149,6 +154,7 @@ class SessionPage:
 
     def pressed(self) -> Key | None:
         """Return `Key.STOP` from when a viewer has pressed Stop, else the key of the terminal."""
+        self._report_failure()
         return Key.STOP if self._stopped_by else self._operator.pressed()
 
     @property
@@ -156,174 +162,187 @@ class SessionPage:
         """Who pressed it."""
         return self._stopped_by or self._operator.pressed_by
 
+    @property
+    def kept(self) -> Sequence[str]:
+        """Lines of the last note if there is a run: after an early end, what is kept and how to continue."""
+        return self._note.split("\n") if self._view.folder else ()
+
     def _require_unstopped(self) -> None:
         if self._stopped_by:
             raise Declined(f"stopped by {self._stopped_by}")
+
+    def _report_failure(self) -> None:
+        hung = f"drawing has hung for {HUNG_S:.0f} s" if self._page.stale_s > HUNG_S else ""
+        if (why := self._failure or hung) and not self._is_reported:
+            self._is_reported = True
+            words = f"The page cannot be drawn: {why}. The session goes on. Stop on the page still works."
+            with suppress(SupervisorGone):  # a guard reports it
+                self._operator.show(events.Noted(words=words, warning=True))
+
+    def _look_at(self, _: str, t_s: float) -> None:
+        if self._scene is not None:
+            self._scene.chosen_s = t_s
 
     def _run(self) -> None:
         ended = False
         try:
             while not ended:
                 ended = self._ended.wait(_FRAME_S)
-                if self._page.viewers or (self._scene is None and self._cell is not None):
+                if self._page.viewers or ended:
                     self.draw()
-        # Only a picture: the session goes on.
-        except Exception:
-            log.exception("the page cannot be drawn")
-            with suppress(Exception):
-                self._texts["alert"].content = _paragraph("This page has failed and shows old values.", _ALERT)
+                self._page.beat()
+        except Exception as error:  # only a picture: the session goes on
+            self._failure = repr(error)
+            log.debug("the page cannot be drawn", exc_info=True)
 
     def draw(self) -> None:
         """Show browsers the newest state."""
-        plan, cell, question, seen = self._plan, self._cell, self._question, self._onlooker.seen
-        if plan is not None and cell is not None and self._scene is None:
-            self._scene = _Cell(self._page, plan, cell[0])
-            self._slider.max = len(self._scene.path_rad) - 1
         with self._lock:
-            downs, now = dict(self._downs), self._view.now
-            texts = self._texts_now(question, seen)
-        with self._page.at_once():
-            for part, text in texts.items():
-                if self._texts[part].content != text:
-                    self._texts[part].content = text
-            if self._scene is not None:
-                stop = goes_on_to = None if now is None else now.stop
-                if now is not None and stop is not None and now.state not in _TOWARDS:
-                    goes_on_to = stop + 1
-                if self._slider.visible != (question is not None):
-                    self._slider.value = self._scene.index_of(stop)
-                    self._slider.visible = question is not None
-                self._scene.show(seen, goes_on_to, int(self._slider.value) if question is not None else None)
-            self._draw_downs(downs)
+            view = replace(self._view, taken=dict(self._view.taken), compared=dict(self._view.compared))
+            residuals, note = dict(self._residuals), self._note
+        question, seen, ended = self._question, self._onlooker.seen, self._ended.is_set()
+        if self._scene is None and self._plan is not None and self._cell is not None:
+            self._scene = _Cell(self._plan, self._cell[0])
+            self._page.put(self._scene.fixed)
+        parts = {"question": asked(question), **_state(view, note, self._stopped_by), **_results(view)}
+        if self._scene is not None:
+            parts |= self._scene.parts(view.now, self._stop, seen, question, ended=ended)
+        if seen is not None and self._cell is not None:
+            parts |= self._forces(seen, self._cell[1])
+        downs = [(pose.gravity_flange, residuals.get(stop)) for stop, (pose, _) in view.taken.items()]
+        parts |= _gravity(downs, None if self._scene is None else self._scene.sphere_m)
+        # Drawing that has hung may go on after the end.
+        self._page.put(parts | (_ENDED if self._ended.is_set() else {}))
 
-    def _draw_downs(self, downs: dict[int, tuple[Array, float | None]]) -> None:
-        """Draw the directions of gravity so far on a sphere, above the arm where there is one."""
-        if not downs:
-            return
-        points_m = _BALL_M * np.array([down for down, _ in downs.values()], dtype=np.float32)
-        colours = np.array([_colour(sigmas) for _, sigmas in downs.values()], dtype=np.uint8)
-        if self._poses is None:
-            centre_m, scene = np.zeros(3) if self._scene is None else self._scene.ball_m, self._page.scene
-            scene.add_icosphere("/gravity", _BALL_M, _UNKNOWN, wireframe=True, opacity=0.3, position=centre_m)
-            scene.add_frame("/gravity/flange", axes_length=1.3 * _BALL_M, axes_radius=0.004)
-            scene.add_label("/gravity/name", "gravity in flange axes", position=(0.0, 0.0, 1.5 * _BALL_M))
-            self._poses = scene.add_point_cloud(
-                "/gravity/poses", points_m, colours, point_size=0.03, point_shape="circle", precision="float32"
-            )
-        elif not (np.array_equal(points_m, self._poses.points) and np.array_equal(colours, self._poses.colors)):
-            self._poses.points, self._poses.colors = points_m, colours
-
-    def _texts_now(self, question: Question | None, seen: Seen | None) -> dict[str, str]:
-        view, now_s = self._view, time.monotonic()
-        (state,) = state_lines(view, now_s, 10_000)
-        lines = [f"<b>{escape(state.plain)}</b>", progress_in_words(view, now_s)]
-        texts = {"state": _paragraph("<br>".join(lines)), "alert": self._alert(), "question": ""}
-        if question is not None:
-            place, words = "", f"Waits in the terminal: <b>{escape(question.text)}</b>"
-            if self._scene is not None:
-                move = int(self._scene.moves[int(self._slider.value)])
-                shown = describe(self._scene.plan, move).replace("**", "").split("\n\n")[:2]
-                place = _paragraph("<br>".join(map(escape, shown)))
-            texts["question"] = _paragraph(words, _QUESTION) + place
-        texts["guards"] = "" if seen is None else self._guard_values(seen)
-        texts["results"] = self._results()
-        key = (*_COLOURS, (0.0, _UNKNOWN, "no fit"))
-        dots = " ".join(f'<span style="color:rgb{colour}">●</span> {words}' for _, colour, words in key)
-        texts["key"] = _paragraph(f"Poses, residual in sigmas: {dots}") if self._downs else ""
-        return texts
-
-    def _alert(self) -> str:
-        view, lines = self._view, []
-        is_stopped = view.now is not None and view.now.state in {State.STOP, State.HOLD}
-        if self._stopped_by:
-            lines.append(f"Stop was pressed by {self._stopped_by}.")
-        elif is_stopped and not view.tripped:
-            lines.append(view.now.words if view.now else "")
-        if view.note is not None:
-            lines.append(in_words(view.note))
-        is_red = bool(lines) and (is_stopped or bool(self._stopped_by) or isinstance(view.note, GuardTripped))
-        return "".join(_paragraph(escape(line), _ALERT if is_red else "") for line in lines or [self._note] if line)
-
-    def _guard_values(self, seen: Seen) -> str:
+    def _forces(self, seen: Seen, load: RangeGuard) -> Parts:
+        """Return force and torque beside the limits of their guard, and how fast and how old what the guards see is."""
         if time.monotonic() - self._onlooker.looked_s > _REST_S:
-            return _paragraph("The guards rest: the arm is drawn where they saw it last.")
-        rows = [
-            ["joint speed", f"{np.degrees(np.abs(seen.state.qd_rad_s).max()):.0f} °/s"],
-            ["age of the sample", f"{1e3 * (seen.t_s - self._onlooker.fresh_s):.0f} ms"],
-        ]
-        if self._cell is not None and (load := self._cell[1]).range is not None:
-            share = float((np.abs(seen.wrench - load.zero) / load.range).max())
-            rows.append(["of the sensor's range", f"{100 * share:.0f} %"])
-        return _table(rows)
-
-    def _results(self) -> str:
-        view = self._view
-        if view.compared:
-            table = [["", "N off", "N·m off", "sigmas"]]
-            for one in view.compared.values():
-                force, torque = (
-                    with_sigma(np.linalg.norm(one.residual[part]), float(np.linalg.norm(one.sigma[part])))
-                    for part in (slice(3), slice(3, 6))
-                )
-                table.append([f"R{one.number:02d}", force, torque, f"{sigmas_of(one):.1f}"])
-            return _table(table) + _paragraph(escape(in_words(one).strip()))
-        if (fit := view.estimated) is None:
-            return ""
-        found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
-        rows = [[label, "<br>".join(values), f"± {sigma}"] for label, values, sigma in found if sigma]
-        return _table(rows) + _paragraph(escape(in_words(fit).strip()))
+            rest = "The guards rest: the arm is drawn where they saw it last."
+            return {"bars": lines(rest, tone=QUIET), "bars/guards": None}
+        limits = np.full(6, np.inf) if load.range is None else load.limits.saturation * load.range
+        rows = []
+        for axis, value, limit in zip(AXES, seen.wrench - load.zero, limits, strict=True):
+            digits, unit = (1, "N") if axis.startswith("F") else (2, "N·m")
+            words = f"{value:+.{digits}f} {f'of {limit:.3g} ' if np.isfinite(limit) else ''}{unit}"
+            rows.append(bar(axis, value, limit, words, tone=WARN if abs(value) > _NEAR * limit else ""))
+        head = "Force and torque, since the start" if load.zero.any() else "Force and torque"
+        speed_deg_s, age_ms = np.degrees(np.abs(seen.state.qd_rad_s).max()), 1e3 * self._onlooker.age_s
+        guards = table([("joint speed", f"{speed_deg_s:.0f} °/s"), ("age of the sample", f"{age_ms:.0f} ms")])
+        if load.range is None:  # there is nothing to draw a bar to
+            forces = [(row["label"], row["text"]) for row in rows]
+            return {"bars": table(forces, head=f"{head}; range not known"), "bars/guards": guards}
+        return {"bars": bars(*rows, head=head), "bars/guards": guards}
 
 
 class _Cell:
-    """The arm, its next pose as a ghost, and the plan, in the scene of a page."""
+    """The arm, its next pose as a ghost, and the plan, as parts of a page."""
 
-    def __init__(self, page: Page, planned: Planned, certifier: Certifier) -> None:
-        self.plan = planned.plan
-        self.path_rad, self.moves = path(planned.plan, planned.way_rad)
-        self._arm = draw_plan(page, planned.plan, certifier, self.path_rad)
-        self._ghost = DrawnArm(page.scene, certifier.arm, "/ghost", ghost=True)
-        self._drawn: dict[DrawnArm, Array | None] = {self._arm: self.path_rad[0], self._ghost: None}
-        self._ghost.hide()
-        wrist_m = certifier.arm.frames(self.path_rad[:1]).wrist_m[0]
-        self.ball_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_of(certifier)])
+    def __init__(self, planned: events.Planned, certifier: Certifier) -> None:
+        self._tour, self._arm = Timeline(planned.plan, planned.way_rad), certifier.arm
+        self._asked: Question | None = None
+        self.chosen_s = 0.0
+        """Place of the plan that is shown while a question waits."""
+        wrist_m, size_m = self._arm.frames(self._tour.q_rad[:1]).wrist_m[0], scene.size_of(certifier)
+        self.sphere_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_m])
+        # Arm and sphere are in view.
+        look_at = 0.65 * self.sphere_m
+        camera = scene.camera(look_at, look_at + 0.7 * size_m * np.array([1.0, 1.0, 0.4]))
+        rows = *PLAN_LEGEND, (scene.GHOST, "body", "next pose"), *_POSES
+        self.fixed = plan_parts(certifier, self._tour) | {"scene/camera": camera, "scene/legend": scene.legend(*rows)}
 
-    def index_of(self, stop: int | None) -> int:
-        """Return where the path is at a stop, from 1; at the first where there is none."""
-        return int(np.flatnonzero(self.moves == ((stop or 1) - 1) % len(self.plan.steps))[0])
-
-    def show(self, seen: Seen | None, following: int | None, chosen: int | None) -> None:
-        """Draw the arm where it was seen; as a ghost its goal, the following stop, or a chosen place of the path."""
-        if seen is not None:
-            self._move(self._arm, seen.state.q_rad)
-        self._move(self._ghost, self._goal_rad(seen, following) if chosen is None else self.path_rad[chosen])
-
-    def _goal_rad(self, seen: Seen | None, following: int | None) -> Array | None:
-        if seen is not None and seen.motion.moving:
-            return seen.motion.goal_rad
-        nodes = self.plan.nodes_rad
-        return None if following is None or following > len(nodes) + 1 else nodes[(following - 1) % len(nodes)]
-
-    def _move(self, arm: DrawnArm, q_rad: Array | None) -> None:
-        before = self._drawn[arm]
-        if q_rad is None:
-            if before is not None:
-                arm.hide()
-        elif before is None or not np.allclose(q_rad, before, rtol=0, atol=1e-4):
-            arm.show(q_rad)
-        else:
-            return
-        self._drawn[arm] = q_rad
+    def parts(
+        self, now: events.StateChanged | None, stop: int, seen: Seen | None, question: Question | None, *, ended: bool
+    ) -> Parts:
+        """Return the arm where it was seen, its goal, and while a question waits the slider along the plan."""
+        nodes, goal_rad, along = self._tour.plan.nodes_rad, None, None
+        if question is not None:
+            if question is not self._asked:
+                self.chosen_s = float(self._tour.begins_s[(stop - 1) % len(self._tour.begins_s)])
+            note = ". ".join(describe(self._tour.plan, self._tour.move(self.chosen_s))[:2])
+            goal_rad, along = self._tour.at(self.chosen_s), controls(self._tour.slider(self.chosen_s), note=note)
+        elif seen is not None and seen.motion.moving and not ended:
+            goal_rad = seen.motion.goal_rad
+        elif now is not None and now.stop is not None and not ended:
+            following = now.stop + (now.state not in _TOWARDS)
+            goal_rad = nodes[(following - 1) % len(nodes)] if following <= len(nodes) + 1 else None
+        self._asked = question
+        return {
+            "question/along": along,
+            **scene.arm_parts(self._arm, self._tour.q_rad[0] if seen is None else seen.state.q_rad),
+            **scene.arm_parts(self._arm, goal_rad, "ghost", ghost=True),
+        }
 
 
-def _colour(sigmas: float | None) -> tuple[int, int, int]:
-    return _UNKNOWN if sigmas is None else next((colour for most, colour, _ in _COLOURS if sigmas <= most), BAD)
+def asked(question: Question | None) -> Part | None:
+    """Return what waits in the terminal."""
+    return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 
 
-def _paragraph(html: str, style: str = "") -> str:
-    return f'<p style="margin:.4em .75em;overflow-wrap:anywhere;{style}">{html}</p>'
+def _state(view: SessionView, note: str, stopped_by: str) -> Parts:
+    """Return state, progress and time left, as the terminal says them, the last note, and what has stopped the arm."""
+    now, last, now_s = view.now, view.last, time.monotonic()
+    head, words = state_lines(view, now_s, 10_000)[0].plain, "" if now is None else now.words
+    below = words if head.endswith(words) else ""
+    stopped = now is not None and now.state in {State.STOP, State.HOLD}
+    progress = None if last is None else lines(left := progress_in_words(view, now_s))
+    if last is not None and now is not None and now.stops is not None:
+        progress = bars(bar("", last.stop, last.stops, left, signed=False))
+    alert = None if view.note is None else in_words(view.note)
+    red = isinstance(view.note, events.GuardTripped)
+    if stopped_by:
+        alert, red = f"Stop was pressed by {stopped_by}.", True
+    return {
+        "alert": None if alert is None else lines(alert, tone=BAD if red else WARN),
+        "state": lines(below, head=head.removesuffix(below).strip(), tone=BAD if stopped else ""),
+        "state/progress": progress,
+        "state/note": lines(note, tone=QUIET) if note else None,
+    }
 
 
-def _table(rows: Iterable[Iterable[str]]) -> str:
-    cell = '<td style="padding:0 .75em 0 0;vertical-align:top">'
-    body = "".join(f"<tr>{''.join(f'{cell}{words}</td>' for words in row)}</tr>" for row in rows)
-    return f'<table style="margin:.4em .75em;font-variant-numeric:tabular-nums">{body}</table>'
+def _results(view: SessionView) -> Parts:
+    """Return the running estimates, and in a verification the poses compared."""
+    parts: Parts = {}
+    if (fit := view.estimated) is not None:
+        found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
+        estimates = [(label, f"{', '.join(values)} ± {sigma}") for label, values, sigma in found if sigma]
+        parts["table/estimates"] = table(estimates, ("estimate", "± 1 sigma")) if estimates else None
+        parts["table/words"] = lines(in_words(fit).strip())
+    rows = []
+    for one in view.compared.values():
+        (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (one.residual, one.sigma))
+        sizes = f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}"
+        rows.append((f"R{one.number:02d}", *sizes, f"{sigmas_of(one):.1f}"))
+        parts["table/words"] = lines(in_words(one).strip())
+    return parts | ({"table/compared": table(rows, ("", "N off", "N·m off", "sigmas"))} if rows else {})
+
+
+def _gravity(downs: Sequence[tuple[Array, float | None]], above_m: Array | None) -> Parts:
+    """Return the directions of gravity so far on a sphere, above the arm where there is one."""
+    if not downs:
+        return {}
+    colours = [
+        scene.UNKNOWN if sigmas is None else next((colour for most, colour, _ in _COLOURS if sigmas <= most), BAD)
+        for _, sigmas in downs
+    ]
+    at_m, parts = (np.zeros(3), _ALONE) if above_m is None else (above_m, {})
+    return parts | {
+        "scene/gravity": scene.ball(_SPHERE_M, scene.UNKNOWN, at=at_m, alpha=0.3),
+        "scene/gravity/axes": scene.axes(1.3 * _SPHERE_M, at_m, named=True),
+        "scene/gravity/name": scene.label("gravity in flange axes", at_m + np.array([0, 0, 1.6 * _SPHERE_M])),
+        "scene/gravity/poses": scene.dots(_SPHERE_M * np.array([down for down, _ in downs]), colours, at_m),
+    }
+
+
+def conclude(
+    page: Page, head: str, *words: str, tone: str = "", figures: Sequence[Part] = (), following: Sequence[str] = ()
+) -> None:
+    """Show how a session has ended; `figures` are made by `number`, `following` are the commands of the line Next."""
+    page.put(
+        {
+            "result": lines(head=head, tone=tone),
+            "result/figures": numbers(*figures) if figures else None,
+            "result/words": lines(*map(as_typed, words)),
+            "result/next": lines(*map(as_typed, following), head="Next") if following else None,
+            **dict.fromkeys(("table/estimates", "table/words")),
+        }
+    )

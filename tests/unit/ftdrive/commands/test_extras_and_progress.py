@@ -18,7 +18,7 @@ PLAN = ("plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal")
 @pytest.fixture
 def _without_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
-    extras = {"jinja2", "matplotlib", "viser"}
+    extras = {"jinja2", "matplotlib", "uplot"}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in extras else find(name))
 
 

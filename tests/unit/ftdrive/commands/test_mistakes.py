@@ -188,7 +188,7 @@ def _here(files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def _without_extras(monkeypatch: pytest.MonkeyPatch) -> None:
     find = importlib.util.find_spec
-    extras = {"jinja2", "matplotlib", "viser"}
+    extras = {"jinja2", "matplotlib", "uplot"}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *_: None if name in extras else find(name))
     for name in ("mcap", "rclpy"):
         monkeypatch.setitem(sys.modules, name, None)

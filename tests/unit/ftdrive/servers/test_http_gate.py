@@ -12,7 +12,7 @@ import pytest
 from websockets import InvalidStatus, Origin, Subprotocol
 from websockets.sync.client import connect
 
-from ftdrive.http_gate import Gate, refusal
+from ftdrive.http_gate import PassingGate, refusal
 from ftdrive.servers.foxglove import FoxgloveServer
 from tests.unit.ftdrive.servers.fake_stream import Client, FakeStream
 
@@ -33,13 +33,13 @@ class Echo(BaseHTTPRequestHandler):
         """Log nothing."""
 
 
-@pytest.fixture(params=[""])
-def port(request: pytest.FixtureRequest) -> Iterator[int]:
-    """A web server behind a gate, with a token where the test gives one."""
+@pytest.fixture
+def port() -> Iterator[int]:
+    """A web server behind a gate."""
     server = HTTPServer(("127.0.0.1", 0), Echo)
     thread = Thread(target=server.serve_forever, args=(0.01,))
     thread.start()
-    with closing(Gate(("127.0.0.1", 0), lambda _: ("127.0.0.1", server.server_port), token=request.param)) as gate:
+    with closing(PassingGate(("127.0.0.1", 0), lambda _: ("127.0.0.1", server.server_port))) as gate:
         yield gate.port
     server.shutdown()
     server.server_close()
@@ -66,21 +66,6 @@ def test_foreign_origin_and_host_are_refused_and_programs_are_served(port: int) 
     assert status(port, Origin="null") == 403
     assert status(port, Host=f"evil.example:{port}") == 403
     assert status(port, Host=f"evil.example:{port}", Origin=f"http://evil.example:{port}") == 403
-
-
-@pytest.mark.parametrize("port", ["secret"], indirect=True)
-def test_a_page_with_a_token_is_served_to_who_has_opened_its_address_once(port: int) -> None:
-    for path in ("/page", "/?token=", "/?token=secre", "/page?token=secret"):
-        assert ask(port, path).status == 403
-    assert ask(port, "/?token=secret", Origin=PAGE).status == 403
-    opened = ask(port, "/?token=secret")
-    assert (opened.status, opened.headers["Location"]) == (303, "/")
-    cookie, *rules = opened.headers["Set-Cookie"].split("; ")
-    assert {"HttpOnly", "SameSite=Strict"} <= set(rules)
-    assert str(port) in cookie  # a browser sends it to all ports of the host
-    assert status(port, Cookie=f"other=1; {cookie}") == 200
-    assert status(port, Cookie=f"{cookie}x") == 403
-    assert status(port, Cookie=cookie, Origin=PAGE) == 403
 
 
 def test_a_second_request_on_one_connection_does_not_pass_unchecked(port: int) -> None:

@@ -1,10 +1,12 @@
 """The page of the live wrench and of the scale: what it says of a state, and what a viewer may do."""
 
+import json
 import re
+import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
-from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,16 +19,19 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import FrameTransform, WrenchFrame
 from ftdrive.live.weighing import WORDS, ScaleState
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.planner import certifier_as_described
 from ftdrive.recording import Recorder
 from ftdrive.terminal.live_feed import Feed
-from ftdrive.view.live_page import LivePage, events, head, in_base, is_significant, number, numbers, plot_data
+from ftdrive.view.live_page import LivePage, in_base, is_significant, words
+from ftdrive.view.page import Page, drawing
 from ftdrive.view.scene import turned
-from ftdrive.view.weigh_page import WeighPage, scale
+from ftdrive.view.weigh_page import WeighPage
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.live.simulated import calibrated, dwells, info, paired
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, SIGMA, FakeStream
 from tests.unit.ftdrive.terminal.test_live_summary import Rig, reading_of
-from tests.unit.ftdrive.terminal.test_weigh_screen import NOTHING, PART
+from tests.unit.ftdrive.terminal.test_weigh_screen import NOTHING, PART, FakeWeighing, Scale
 
 PUSHED = np.array([1.0, -2.0, -7.0, 0.1, 0.2, -0.05])
 FRAMES = [
@@ -37,21 +42,50 @@ FRAMES = [
     WrenchFrame("base", "sensor"),
     WrenchFrame("sensor", (0.01, -0.02, 0.3)),
 ]
+CELL = CellConfig(RobotConfig(host="10.0.0.2"), SensorConfig(url="x"), ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),)))
 
 
-def shown_page(feed: Feed, *, viewers: int = 1, controls: bool = False) -> tuple[LivePage, Any]:
-    """A page without a server."""
-    page = MagicMock(viewers=viewers)
-    page.gui.add_html.side_effect = lambda _: MagicMock()
-    page.gui.add_uplot.side_effect = lambda **_: MagicMock()
-    return LivePage(page, feed, controls=controls), page
+def parts_of(page: Page) -> dict[str, Any]:
+    """What a browser shows."""
+    shown: dict[str, Any] = json.loads(page.since(0)[1])
+    return {name: part for name, part in shown.items() if part is not None}
 
 
-def buttons(page: Any) -> dict[str, Any]:
-    """The functions behind the buttons of a page that was filled with mocks, by name."""
-    names = [call.args[0] for call in page.gui.add_button.call_args_list]
-    presses = [call.args[0] for call in page.gui.add_button.return_value.on_click.call_args_list]
-    return dict(zip(names, presses, strict=True))
+class Shown:
+    """A page of a stream that runs block by block; without a server."""
+
+    def __init__(self, stream: Any, *, certifier: Certifier | None = None, controls: bool = False) -> None:
+        self.stream, self.page, self.feed = stream, Page("ftdrive live"), Feed(stream)
+        self.page.viewers = 1
+        self.live = LivePage(self.page, self.feed, [], certifier, controls=controls)
+
+    def run(self, blocks: int = 1) -> dict[str, Any]:
+        """Read, draw until the plots are drawn too, and return the parts."""
+        for _ in range(blocks):
+            self.feed.step()
+        for _ in range(5):
+            self.live.draw()
+        return parts_of(self.page)
+
+    def act(self, name: str, value: object = None) -> None:
+        self.page.act("viewer 2", name, value)
+        self.feed.step()
+
+
+def numbers_of(parts: dict[str, Any]) -> tuple[dict[str, str], ...]:
+    """State, force and torque."""
+    return tuple(parts["numbers"]["rows"])
+
+
+def names_of(parts: dict[str, Any]) -> list[str]:
+    return [one["name"] for part in parts.values() if part["kind"] == "controls" for one in part["controls"]]
+
+
+def control(parts: dict[str, Any], name: str) -> dict[str, Any]:
+    found: dict[str, Any] = next(
+        one for part in parts.values() if part["kind"] == "controls" for one in part["controls"] if one["name"] == name
+    )
+    return found
 
 
 @pytest.mark.parametrize("frame", FRAMES, ids=lambda frame: frame.id)
@@ -76,113 +110,252 @@ def test_the_flange_is_turned_as_the_arm_says() -> None:
     np.testing.assert_allclose(np.transpose(rotated), R_BASE_FLANGE, atol=1e-12)
 
 
-def test_numbers_end_where_their_sigmas_do() -> None:
+def test_less_than_four_sigmas_has_no_arrow() -> None:
     reading = reading_of(Rig(FakeStream("contact")).run(3))
-    sigma = np.array([2.1, 2.1, 2.1, 0.03, 0.03, 0.03])
-    rest = np.array([0.05, 0.04, 0.03, 0.002, 0.002, 0.001])
-    wrench = np.array([0.0, 98.04, 0.0, 0.0, 0.0, 1.234])
-    reading = replace(reading, wrench=wrench, sigma=sigma, rest_sigma=rest)
-    assert number(reading, 0) == ("98.0 ± 2.1 N", "sigma 0.050 N at rest")
-    assert number(reading, 3) == ("1.234 ± 0.030 N·m", "sigma 0.0020 N·m at rest")
-    unknown = replace(reading, sigma=np.full(6, np.nan))
-    assert number(unknown, 0) == ("98.04 N", "the noise is not known yet")
-    assert [is_significant(one, 0) for one in (reading, unknown, replace(reading, wrench=wrench / 100))] == [1, 0, 0]
+    reading = replace(reading, wrench=np.array([0.0, 8.1, 0.0, 0.0, 0.0, 0.13]), sigma=np.repeat([2.0, 0.03], 3))
+    assert [is_significant(reading, first) for first in (0, 3)] == [True, True]
+    weaker = replace(reading, wrench=np.array([0.0, 7.9, 0.0, 0.0, 0.0, 0.11]))
+    assert [is_significant(weaker, first) for first in (0, 3)] == [False, False]
+    assert not is_significant(replace(reading, sigma=np.full(6, np.nan)), 0)  # the noise is not known yet
 
 
-def test_contact_marks_the_plots_and_the_numbers() -> None:
-    rig = Rig(FakeStream("contact", block_s=0.05))
-    view = rig.run(240)
-    columns = view.columns(200)
-    t_s, low, high, above, below, contact, edge = plot_data(columns, 2, 10.0, float(SIGMA[2]))
-    assert (t_s[-1], len(t_s)) == (0.0, 200)
-    assert (np.diff(t_s) > 0).all()
-    known = np.isfinite(low)
-    assert (low[known] <= high[known]).all()
-    np.testing.assert_array_equal(above, -below)
-    np.testing.assert_allclose(above, SIGMA[2])
-    np.testing.assert_array_equal(contact > edge, columns.in_contact)
-    begins_s = t_s[np.flatnonzero(contact > edge)[-1]] - t_s[np.flatnonzero(np.diff(contact > edge))[-1]]
-    assert begins_s == pytest.approx(view.contact_s, abs=0.1)
-    assert re.search(r"contact, 0\.\d s", numbers(view))
-    assert "free" in numbers(Rig(FakeStream()).run(3))
-    assert not plot_data(columns, 2, 10.0, np.nan)[3].any()
+def test_a_push_has_size_sigma_direction_and_arrows() -> None:
+    shown = Shown(FakeStream("contact", block_s=0.05))
+    parts = shown.run(240)
+    state, force, torque = numbers_of(parts)
+    view = shown.live._summary.view()
+    reading = reading_of(view)
+    assert float(force["value"]) == pytest.approx(np.linalg.norm(reading.wrench[:3]), abs=0.02)
+    assert (force["unit"], force["size"], force["note"]) == ("N", "huge", "towards -z of base axes")
+    assert force["sigma"] == f"± {reading.size(0)[1]:.2f} (1 sigma)"  # two digits
+    assert force["label"] == "Force on the tool, contact wrench"
+    assert float(torque["value"]) == pytest.approx(np.linalg.norm(reading.wrench[3:]), abs=0.002)
+    assert (torque["unit"], torque["label"]) == ("N·m", "Torque about the tcp origin")
+    assert state["value"] == f"contact, {view.contact_s:.1f} s"
+    assert state["note"].startswith("line of force ")
+    assert state["tone"] == "warn"
+    start, end = np.array(parts["scene/force"]["ends"])
+    np.testing.assert_allclose(end - start, 0.01 * reading.wrench[:3], rtol=1e-3, atol=1e-4)
+    assert {"scene/torque", "scene/line of action", "scene/flange"} <= parts.keys()
 
 
-def test_no_old_number_of_a_silent_device() -> None:
-    rig = Rig(FakeStream(silent_after=3))
-    assert " ± " in numbers(rig.run(3))
-    view = rig.run(1)
-    assert "no sample for 0.31 s" in head(view)
-    assert not re.search(r"\d+\.\d+ (±|N)", numbers(view))
+def test_numbers_end_where_their_sigmas_do() -> None:
+    view = Rig(FakeStream("contact")).run(3)
+    wrench, sigma = np.array([0.0, 98.04, 0.0, 0.0, 0.0, 1.234]), np.repeat([2.1, 0.03], 3)
+    parts = words(view, replace(reading_of(view), wrench=wrench, sigma=sigma))
+    _, force, torque = numbers_of(cast("Any", parts))
+    assert (force["value"], force["sigma"], force["note"]) == ("98.0", "± 2.1 (1 sigma)", "towards +y of base axes")
+    assert (torque["value"], torque["sigma"]) == ("1.234", "± 0.030 (1 sigma)")
+    assert torque["note"] == "turns about +z of base axes"
+
+
+def test_a_free_tool_has_no_direction_and_no_arrow() -> None:
+    parts = Shown(FakeStream()).run(20)
+    state, force, torque = numbers_of(parts)
+    assert (state["value"], state["tone"]) == ("free", "good")
+    assert force["note"] == torque["note"] == state["note"] == "\u00a0"
+    assert not {"scene/force", "scene/torque", "scene/line of action"} & parts.keys()
+
+
+def test_before_the_noise_is_known_a_tool_is_not_called_free() -> None:
+    class Fresh(FakeStream):
+        def read(self) -> Any:
+            block = super().read()
+            return replace(block, chi2=np.full(len(block), np.nan))
+
+        def sigma_of_mean(self, *_: object, **__: object) -> Any:
+            return np.full(6, np.nan)
+
+    parts = Shown(Fresh()).run(3)
+    state, force, _ = numbers_of(parts)
+    assert (state["value"], state["tone"]) == ("noise not known yet", "quiet")
+    assert (force["sigma"], force["note"]) == ("", "\u00a0")
+    assert "nan" not in json.dumps(parts).lower()
+
+
+def test_contact_is_marked_in_the_plots() -> None:
+    shown = Shown(FakeStream("contact", block_s=0.05))
+    plots = shown.run(240)["plots"]
+    assert [plot["unit"] for plot in plots["plots"]] == ["N"] * 3 + ["N·m"] * 3
+    assert re.fullmatch(r"Fz -4\.\d\d", plots["plots"][2]["label"])
+    assert [plot["sigma"] for plot in plots["plots"]] == pytest.approx(SIGMA)
+    assert plots["full"] == {"N": 10.0, "N·m": 0.5}  # the push of 8 N at 5.5 s is in the last 10 s
+    for plot in plots["plots"]:
+        known = [(low, high) for low, high in zip(plot["low"], plot["high"], strict=True) if low is not None]
+        assert known
+        assert all(-plots["full"][plot["unit"]] <= low <= high <= plots["full"][plot["unit"]] for low, high in known)
+    contact = plots["contact"]
+    assert contact[-1] == 1
+    lasts_s = contact[::-1].index(0) * plots["step_s"]
+    assert lasts_s == pytest.approx(shown.live._summary.view().contact_s, abs=0.1)
+    assert len(contact) * plots["step_s"] == pytest.approx(plots["span_s"])
+
+
+def test_no_old_value_of_a_silent_device() -> None:
+    certifier = certifier_as_described(CELL, "ur5e")
+    stream = FakeStream("contact", silent_after=240, block_s=0.05)
+    shown = Shown(stream, certifier=certifier)
+    before = shown.run(240)
+    assert "alert" not in before
+    assert {"plots", "scene/force", "scene/flange", "scene/arm/0", "scene/arm/along"} <= before.keys()
+    parts = shown.run()
+    assert parts["alert"]["lines"] == ["ATI Mini45: no sample for 0.31 s"]
+    assert parts["alert"]["tone"] == "bad"
+    assert [row["value"] for row in numbers_of(parts)] == ["--"] * 3
+    assert not any(row["sigma"] for row in numbers_of(parts))
+    left = [name for name in parts if name.startswith("scene/") and name not in _still(certifier)]
+    assert left == []
+    assert "plots" not in parts
+    stream.wake()
+    assert shown.run(3).keys() == before.keys()
+
+
+def _still(certifier: Certifier) -> set[str]:
+    """What a page shows of a scene before the first sample."""
+    return {name for name in parts_of(Shown(FakeStream(), certifier=certifier).page) if name.startswith("scene/")}
 
 
 def test_what_the_numbers_are_is_in_words() -> None:
-    rig = Rig(FakeStream())
-    assert "contact wrench, base axes, about the tcp origin. Stages: raw, bias, gravity, low-pass" in head(rig.run(3))
-    rig.stream.stages = replace(rig.stream.stages, gravity=False)
-    assert "weight included" in head(rig.run(30))
-    assert "waiting" in head(Rig(FakeStream()).run(0))
+    shown = Shown(FakeStream())
+    assert shown.run(0)["table/what"]["lines"] == ["waiting for samples"]
+    parts = shown.run(3)
+    assert parts["table"]["lines"] == ["UR5e · ATI Mini45 · gripper_a"]
+    assert parts["table/what"]["lines"][0] == "contact wrench, base axes, about the tcp origin; stages: " + (
+        "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
+    )
+    shown.stream.stages = replace(shown.stream.stages, gravity=False)
+    parts = shown.run(30)
+    assert "weight included" in parts["table/what"]["lines"][0]
+    assert numbers_of(parts)[1]["label"] == "Force on the tool, weight included"
 
 
-def test_events_are_listed_newest_first_and_cannot_write_the_page() -> None:
-    rig = Rig(FakeStream(block_s=0.05))
-    rig.run(123)
-    rig.feed.note("<script>alert(1)</script>")
-    shown = events(rig.run(1))
-    places = [shown.index(text) for text in ("&lt;script&gt;", "contact 8.0 N", "peg in")]
+def test_the_legend_names_each_colour_of_the_scene() -> None:
+    parts = Shown(FakeStream("contact", block_s=0.05), certifier=certifier_as_described(CELL, "ur5e")).run(240)
+    named = {colour for colour, *_ in parts["scene/legend"]["rows"]}
+    drawn = {part["colour"] for name, part in parts.items() if name.startswith("scene/") and "colour" in part}
+    assert drawn <= named
+    assert {"force", "torque", "arm", "tool", "x", "y", "z"} <= named
+    assert parts["scene/base"]["named"]
+    assert any(part.get("alpha", 1) < 1 for part in parts.values() if part.get("colour") == "tool")
+
+
+def test_an_arm_at_rest_is_not_sent_again() -> None:
+    class Trembling(FakeStream):
+        def read(self) -> Any:
+            block = super().read()
+            return replace(block, q_rad=block.q_rad + 5e-5 * (-1) ** self.blocks)
+
+    shown = Shown(Trembling(), certifier=certifier_as_described(CELL, "ur5e"))
+    shown.run(3)
+    version = shown.page.since(0)[0]
+    shown.run(1)
+    newer = json.loads(shown.page.since(version)[1])
+    assert newer
+    assert not any(name.startswith("scene/arm") for name in newer)
+
+
+def test_events_are_listed_newest_first() -> None:
+    shown = Shown(FakeStream(block_s=0.05))
+    assert "events" not in shown.run(3)
+    shown.run(123)
+    shown.feed.note("<script>alert(1)</script>")
+    lines = "\n".join(shown.run()["events"]["lines"])
+    places = [lines.index(text) for text in ("<script>", "contact 8.0 N", "peg in")]
     assert places == sorted(places)
-    assert "<script>" not in shown
+    assert re.search(r"\d\d:\d\d:\d\d contact 8\.0 N", lines)
 
 
-def test_without_a_viewer_nothing_is_drawn_and_nothing_piles_up() -> None:
-    feed = Feed(FakeStream())
-    shown, page = shown_page(feed, viewers=0)
-    for _ in range(5):
-        feed.step()
-        shown.draw()
-    assert not feed._news[0].blocks
-    page.at_once.assert_not_called()
-    page.viewers = 1
-    shown.draw()
-    assert "contact wrench" in shown._head.content
-    assert np.isfinite(shown._plots[2].data[1]).any()
+def test_without_a_viewer_nothing_is_shown_and_nothing_piles_up() -> None:
+    shown = Shown(FakeStream())
+    shown.page.viewers = 0
+    assert "numbers" not in shown.run(5)
+    assert not shown.feed._news[0].blocks
+    shown.page.viewers = 1
+    shown.live.draw()
+    assert {"numbers", "plots"} <= parts_of(shown.page).keys()
 
 
-def test_a_viewer_may_tare_only_if_that_is_allowed() -> None:
-    stream = FakeStream()
-    feed = Feed(stream)
-    _, page = shown_page(feed)
-    assert not buttons(page)
-    _, page = shown_page(feed, controls=True)
-    for press in buttons(page).values():
-        press(None)
-    feed.step()
-    assert stream.called == ["tare", "tare-undone"]
+def test_viewers_tare_and_choose_the_frame_only_if_that_is_allowed() -> None:
+    shown = Shown(FakeStream())
+    assert names_of(shown.run(3)) == ["span"]
+    for name in ("tare", "undo", "axes", "seek"):
+        with pytest.raises(ValueError, match="no such control"):
+            shown.act(name)
+    shown = Shown(FakeStream(), controls=True)
+    assert names_of(shown.run(3)) == ["tare", "undo", "span", "axes", "about"]
+    for name in ("tare", "undo"):
+        shown.act(name)
+    assert shown.stream.called == ["tare", "tare-undone"]
+    shown.act("axes", "flange")
+    shown.act("about", "sensor")
+    assert shown.stream.frame == WrenchFrame("flange", "sensor")
+    parts = shown.run(3)
+    assert "flange axes, about the sensor origin" in parts["table/what"]["lines"][0]
+    assert (control(parts, "axes")["value"], control(parts, "about")["value"]) == ("flange", "sensor")
+    assert "terminal" in parts["controls/frame"]["note"]
+    with pytest.raises(ValueError, match="cannot have this value"):
+        shown.act("axes", "world")
+
+
+def test_a_frame_that_is_not_configured_is_explained() -> None:
+    rows = paired(dwells(1, 3000, seed=1))
+    replay = ReplayedStream(info(calibrated(), height=False), rows, clock=cast("Any", FakeClock()))
+    shown = Shown(replay, controls=True)
+    shown.run()
+    with pytest.raises(ValueError, match=r"set \[sensor\] height_mm"):
+        shown.act("about", "flange")
+    assert replay.frame == WrenchFrame()
+
+
+def test_the_span_of_the_plots_is_chosen() -> None:
+    shown = Shown(FakeStream(block_s=0.05))
+    assert shown.run(60)["plots"]["span_s"] == pytest.approx(10, rel=0.01)
+    shown.act("span", "2 s")
+    parts = shown.run()
+    assert parts["plots"]["span_s"] == pytest.approx(2, rel=0.01)
+    assert control(parts, "span")["value"] == "2 s"
 
 
 def test_a_viewer_of_a_replay_pauses_and_goes_elsewhere() -> None:
     rows = paired(dwells(1, 3000, seed=1))
-    replay = ReplayedStream(info(calibrated()), rows, clock=cast("Any", FakeClock()))
-    feed = Feed(replay)
-    shown, page = shown_page(feed)
-    feed.step()
-    shown.draw()
-    buttons(page)["Pause"](None)
-    moved = MagicMock()
-    moved.target.value = 2.0
-    shown._go_to(moved)
-    feed.request("speed", "4")
-    feed.step()
-    shown.draw()
+    replay = ReplayedStream(info(calibrated()), rows, clock=cast("Any", FakeClock()), speed=3.0)
+    shown = Shown(replay)
+    parts = shown.run()
+    assert (control(parts, "play")["label"], control(parts, "speed")["value"]) == ("Pause", "3")
+    shown.act("play")
+    shown.act("seek", 2)
+    shown.act("speed", "4")
     assert replay.is_paused
     assert replay.at_s == pytest.approx(2.0, abs=0.02)
     assert replay.speed == 4.0
-    assert page.gui.add_button.return_value.label == "Play"
-    moved.client = None  # the page itself has moved the slider
-    moved.target.value = 0.5
-    shown._go_to(moved)
-    feed.step()
-    assert replay.at_s > 1.9
+    parts = shown.run(0)
+    assert (control(parts, "play")["label"], control(parts, "speed")["value"]) == ("Play", "4")
+    assert control(parts, "seek")["value"] == pytest.approx(replay.at_s, abs=0.1)
+    assert control(parts, "seek")["text"] == f"{replay.at_s:.1f} of 3.0 s"
+    shown.act("play")
+    assert not replay.is_paused
+    replay.seek(replay.duration_s)
+    replay.step()
+    assert control(shown.run(0), "play")["label"] == "Play"
+    shown.act("play")
+    assert replay.at_s == pytest.approx(0.0, abs=0.02)
+    with pytest.raises(ValueError, match="cannot have this value"):
+        shown.act("seek", 3.5)
+    assert {"axes", "about"} <= {*names_of(parts)}
+    assert "tare" not in names_of(parts)
+
+
+def test_a_failed_drawing_is_said_once_and_ends_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown, said = Shown(FakeStream()), list[str]()
+    shown.feed.step()
+    monkeypatch.setattr(shown.live._summary, "view", lambda: 1 / 0)
+    with drawing(shown.page, shown.live.draw, said.append):
+        while not said:
+            time.sleep(0.001)
+        shown.feed.step()
+    (words,) = said
+    assert words == "The page is not drawn any more, the command goes on: ZeroDivisionError('division by zero')"
+    assert "\n" not in words
 
 
 def test_options_that_would_be_ignored_are_refused() -> None:
@@ -193,33 +366,78 @@ def test_options_that_would_be_ignored_are_refused() -> None:
     check_view(ViewOptions(True, None), once=False, allow_control=True)
 
 
-def test_the_scale_shows_a_mass_or_why_there_is_none() -> None:
-    shown = scale(ScaleState(PART, None, 3), "zero: the empty gripper was tared")
-    for words in ("0.8123 ± 0.0012 kg", "3 parts", "smallest mass 4.8 g", "zero: the empty"):
-        assert words in shown
-    assert "nothing: " in scale(ScaleState(NOTHING, None))
-    for shown_state in (ScaleState(PART, "contact"), ScaleState(None, "moving")):
-        shown = scale(shown_state)
-        assert "- - -" in shown
-        assert "kg" not in shown
-        assert WORDS[cast("Any", shown_state.refusal)] in shown
-    assert "0.8123 ± 0.0012 kg" in scale(ScaleState(PART, "count"))
+def weighed(
+    shown: ScaleState, *, zeroed_s: float = np.inf, moving: bool = False, controls: bool = False, note: str = ""
+) -> tuple[dict[str, Any], Page, FakeWeighing]:
+    """The parts of the page of a scale, the page, and the scale."""
+    weighing = FakeWeighing(shown, moving=moving)
+    weighing.shown, weighing.note, weighing.part_kg = shown, note, None if shown.count is None else 0.27
+    weighing.stream = cast("Any", SimpleNamespace(info=INFO, reference=lambda: (None, zeroed_s)))
+    page = Page("ftdrive weigh")
+    page.viewers = 1
+    WeighPage(page, weighing, controls=controls).draw()
+    return parts_of(page), page, weighing
+
+
+def test_the_scale_shows_a_mass_with_unit_and_sigma() -> None:
+    parts, *_ = weighed(ScaleState(PART, None, 3), zeroed_s=180, note="zero: the empty gripper was tared")
+    mass, count = parts["numbers"]["rows"]
+    assert (mass["value"], mass["unit"], mass["sigma"], mass["size"]) == ("0.8123", "kg", "± 0.0012 kg", "huge")
+    assert mass["note"] == "sigma 1.2 g, smallest mass 4.8 g"
+    assert count["value"] == "3"
+    assert parts["table/line"]["lines"][0].startswith("3 parts, 0.8123 ± 0.0012 kg at (")
+    assert parts["table/zero"]["lines"] == ["zeroed 3 min ago", "zero: the empty gripper was tared"]
+    assert "alert" not in parts
+    (mass,) = weighed(ScaleState(replace(NOTHING, mass_kg=-1e-4), None))[0]["numbers"]["rows"]
+    assert mass["value"] == "0.00"
+
+
+@pytest.mark.parametrize("shown", [ScaleState(PART, "contact"), ScaleState(None, "moving")], ids=str)
+def test_what_is_not_weighed_has_no_number_but_a_reason(shown: ScaleState) -> None:
+    parts, *_ = weighed(shown)
+    (mass,) = parts["numbers"]["rows"]
+    assert (mass["value"], mass["unit"], mass["sigma"]) == ("- - -", "", "")
+    assert WORDS[cast("Any", shown.refusal)] in parts["table/line"]["lines"][0]
+    assert parts["table/line"]["tone"] == "warn"
+
+
+def test_what_cannot_be_counted_has_a_mass() -> None:
+    parts, *_ = weighed(ScaleState(PART, "count"))
+    assert parts["numbers"]["rows"][0]["value"] == "0.8123"
+    assert parts["table/line"]["lines"] == [f"not weighed: {WORDS['count']}"]
+
+
+def test_a_silent_device_is_red_and_has_no_mass() -> None:
+    parts, *_ = weighed(ScaleState(None, None, stale="the sensor sent nothing for 0.3 s"))
+    assert parts["alert"]["lines"] == ["stale: the sensor sent nothing for 0.3 s"]
+    assert parts["numbers"]["rows"][0]["value"] == "- - -"
+    assert "table/line" not in parts
+
+
+@pytest.mark.parametrize("least_kg", [0.099, 0.101])
+@pytest.mark.parametrize("moving", [False, True])
+def test_page_and_terminal_ask_for_a_zero_at_the_same_moment(least_kg: float, moving: bool) -> None:
+    shown = ScaleState(replace(NOTHING, least_kg=least_kg), None)
+    asks = "press z" in Scale(FakeWeighing(shown, moving=moving)).sigma
+    for zeroed_s, asked in ((780.0, "zeroed 13 min ago: zero again"), (np.inf, "not zeroed: zero the empty gripper")):
+        parts, *_ = weighed(shown, zeroed_s=zeroed_s, moving=moving)
+        assert (parts["table/zero"]["lines"] == [asked]) == asks
+        assert parts["table/zero"]["tone"] == ("warn" if asks else "")
 
 
 def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
-    for controls, moving in ((False, False), (True, True), (True, False)):
-        page, weighing = MagicMock(viewers=0), MagicMock(moving=moving)
-        WeighPage(page, weighing, controls=controls).draw()
-        for press in buttons(page).values():
-            press(None)
-        assert weighing.request_zero.called == (controls and not moving)
+    for controls, moving in ((False, False), (True, True)):
+        _, page, weighing = weighed(ScaleState(PART, None), controls=controls, moving=moving)
+        with pytest.raises(ValueError, match="no such control"):
+            page.act("viewer 2", "zero", None)
+        assert not weighing._zero_requested
+    _, page, weighing = weighed(ScaleState(PART, None), controls=True)
+    page.act("viewer 2", "zero", None)
+    assert weighing._zero_requested
 
 
 def test_a_recording_brings_its_arm_and_tool(tmp_path: Path) -> None:
-    cell = CellConfig(
-        RobotConfig(host="10.0.0.2"), SensorConfig(url="x"), ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),))
-    )
-    recorder = Recorder([path := tmp_path / "peg.mcap"], INFO, cell.to_dict())
+    recorder = Recorder([path := tmp_path / "peg.mcap"], INFO, CELL.to_dict())
     recorder.write(FakeStream().read())
     recorder.close()
     found = _recorded_cell(path)

@@ -1,8 +1,9 @@
-"""The scene of a plan: where it puts things. What a browser draws is looked at by eye."""
+"""The page of a plan: the plan over time, and what viewers choose. What a browser draws is looked at by eye."""
 
-import urllib.error
-import urllib.request
-from importlib.util import find_spec
+import json
+import threading
+import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,16 +11,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
-from ftdrive.view.page import serve
-from ftdrive.view.plan_page import describe, path
-from ftdrive.view.scene import line_of_action, revolved, turned_up
+from ftdrive.view.page import Page
+from ftdrive.view.plan_page import PlanPage, Timeline, describe
+from ftdrive.view.scene import arm_parts, line_of_action, turned_up
 
 
 @pytest.fixture(scope="module")
@@ -33,44 +33,156 @@ def plan(certifier: Certifier) -> Plan:
     return plan_tour(certifier, poses=6, speeds=Speeds(), guess=guess_of(certifier))
 
 
-def test_the_slider_goes_through_every_pose_and_back(plan: Plan) -> None:
-    q, move = path(plan)
-    assert len(q) == len(move)
-    poses = np.array([step.q_rad for step in plan.steps])
-    starts = np.flatnonzero(np.diff(move, prepend=-1))
-    np.testing.assert_allclose(q[starts], poses)
-    np.testing.assert_allclose(q[-1], poses[0])
-    assert np.abs(np.diff(q, axis=0)).max() <= np.radians(3) + 1e-9
-    assert [describe(plan, int(i)).split("**")[1] for i in (0, len(poses) - 1)] == ["1 of 6", "6 of 6"]
+@pytest.fixture
+def page() -> Page:
+    return Page("test")
 
 
-def test_the_slider_begins_where_the_arm_stands(plan: Plan) -> None:
-    first = np.array(plan.steps[0].q_rad)
-    way = first + np.radians([[-20.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 10, 0, 0], [0.0] * 6])
-    q, move = path(plan, way)
-    alone, _ = path(plan)
-    np.testing.assert_allclose(q[0], way[0])
-    np.testing.assert_allclose(q[move >= 0], alone)
-    assert np.abs(np.diff(q, axis=0)).max() <= np.radians(3) + 1e-9
-    assert "From the present posture" in describe(plan, int(move[0]))
+@pytest.fixture
+def shown(page: Page, plan: Plan, certifier: Certifier) -> PlanPage:
+    return PlanPage(page, plan, certifier)
 
 
-@given(st.floats(0, 1), st.floats(0, 0.5), st.floats(0, 0.2))
-def test_bodies_have_their_size_and_are_closed(half_length: float, radius: float, rounding: float) -> None:
-    vertices, faces = revolved(half_length, radius, rounding)
-    assert abs(vertices[:, 2]).max() == pytest.approx(half_length + rounding)
-    assert np.hypot(*vertices[:, :2].T).max() == pytest.approx(radius + rounding)
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    directed = {tuple(edge) for edge in edges.tolist()}
-    rim = [edge for edge in directed if edge[::-1] not in directed]
-    assert np.allclose(vertices[list({i for edge in rim for i in edge})][:, :2], 0)  # only where the caps meet the axis
+def parts_of(shown: PlanPage) -> dict[str, Any]:
+    """Return the parts that browsers show."""
+    shown.draw()
+    parts = json.loads(shown._page.since(0)[1])
+    return {name: part for name, part in parts.items() if part is not None}
 
 
-def test_faces_look_outward() -> None:
-    vertices, faces = revolved(0.3, 0.1, 0.05)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a)
-    assert np.all((normal * (a + b + c)).sum(axis=1) >= -1e-12)
+def control(shown: PlanPage, name: str) -> dict[str, Any]:
+    (found,) = [one for one in parts_of(shown)["controls"]["controls"] if one["name"] == name]
+    return dict(found)
+
+
+def arm_is_at(shown: PlanPage, q_rad: Any) -> bool:
+    parts = parts_of(shown)
+    wanted = arm_parts(shown._arm, q_rad)
+    return all(np.allclose(parts[name]["at"], part["at"], atol=1e-3) for name, part in wanted.items() if part)
+
+
+def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> None:
+    tour = Timeline(plan)
+    np.testing.assert_allclose(tour.at(tour.begins_s), plan.nodes_rad)
+    np.testing.assert_allclose(tour.at([0.0, tour.end_s]), plan.nodes_rad[[0, 0]])
+    assert tour.end_s == pytest.approx(plan.motion_time_s)
+    middle_s = tour.begins_s[2] + plan.steps[2].duration_s / 2
+    np.testing.assert_allclose(tour.at(middle_s), plan.nodes_rad[2:4].mean(axis=0))
+    assert [tour.move(float(t_s)) for t_s in tour.begins_s] == list(range(6))
+    assert [describe(plan, move)[0].split(",")[0] for move in (0, 5)] == ["Move 1 of 6", "Move 6 of 6"]
+    # The path of the tool is drawn through each pose, in pieces of some degrees.
+    assert all(np.abs(tour.q_rad - q).max(axis=1).min() < 1e-9 for q in plan.nodes_rad)
+    assert np.abs(np.diff(tour.q_rad, axis=0)).max() < np.radians(7)
+
+
+def test_the_tour_begins_where_the_arm_stands(plan: Plan) -> None:
+    way = plan.nodes_rad[0] + np.radians([[-20.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 10, 0, 0], [0.0] * 6])
+    tour, alone = Timeline(plan, way), Timeline(plan)
+    approach_s = tour.begins_s[0]
+    np.testing.assert_allclose(tour.at(0.0), way[0])
+    assert approach_s > 1
+    assert tour.end_s == pytest.approx(approach_s + alone.end_s)
+    np.testing.assert_allclose(tour.at(approach_s + 3.0), alone.at(3.0))
+    assert (tour.move(approach_s - 0.1), tour.move(approach_s)) == (-1, 0)
+    assert "From the present posture" in describe(plan, tour.move(0.0))[0]
+
+
+def test_the_approach_of_a_resumed_run_ends_at_its_own_pose(plan: Plan) -> None:
+    way = np.array([plan.nodes_rad[2] + 0.2, plan.nodes_rad[2]])
+    tour = Timeline(plan, way)
+    np.testing.assert_allclose(tour.at(tour.begins_s[0] - 1e-9), plan.nodes_rad[2], atol=1e-6)
+    np.testing.assert_allclose(tour.at(tour.begins_s[0]), plan.nodes_rad[0])
+
+
+@pytest.mark.parametrize(
+    ("approach", "t_s", "words"),
+    [(False, 0.0, "pose 1 of 6, 0 of "), (False, 1e9, "pose 6 of 6, "), (True, 0.0, "approach, 0 of ")],
+)
+def test_the_slider_says_pose_and_seconds(plan: Plan, approach: bool, t_s: float, words: str) -> None:
+    tour = Timeline(plan, [plan.nodes_rad[0] + 0.1, plan.nodes_rad[0]] if approach else ())
+    slider = tour.slider(min(t_s, tour.end_s))
+    assert slider["text"].startswith(words)
+    assert slider["text"].endswith(f" of {tour.end_s:.0f} s")
+    assert slider["max"] == round(tour.end_s, 1)
+
+
+def test_the_page_shows_cell_plan_and_controls(shown: PlanPage, plan: Plan) -> None:
+    parts = parts_of(shown)
+    assert {"scene/plane 1", "scene/plane 2", "scene/box 1", "scene/ball", "scene/path", "scene/camera"} <= set(parts)
+    named = {colour for colour, _, _ in parts["scene/legend"]["rows"]}
+    assert {part["colour"] for name, part in parts.items() if name.startswith("scene/") and "colour" in part} == named
+    assert (parts["state"]["head"], *parts["state"]["lines"]) == describe(plan, 0)
+    assert arm_is_at(shown, plan.nodes_rad[0])
+
+
+def test_viewers_step_from_pose_to_pose(shown: PlanPage, page: Page, plan: Plan) -> None:
+    for name, at in (("next", 1), ("next", 2), ("previous", 1), ("previous", 0), ("previous", 5), ("next", 0)):
+        page.act("viewer 0", name, None)
+        assert arm_is_at(shown, plan.nodes_rad[at]), (name, at)
+        assert control(shown, "along")["text"].startswith(f"pose {at + 1} of 6, ")
+    page.act("viewer 0", "largest", None)
+    largest = int(np.argmax([step.turn_rad for step in plan.steps]))
+    assert arm_is_at(shown, plan.nodes_rad[largest])
+    assert parts_of(shown)["state"]["head"] == describe(plan, largest)[0]
+
+
+def test_the_slider_moves_the_arm(shown: PlanPage, page: Page, plan: Plan) -> None:
+    tour = Timeline(plan)
+    page.act("viewer 0", "along", 4.0)
+    assert arm_is_at(shown, tour.at(4.0))
+    assert (control(shown, "along")["value"], control(shown, "along")["text"].split(", ")[1]) == (
+        4.0,
+        f"4 of {tour.end_s:.0f} s",
+    )
+    with pytest.raises(ValueError, match="cannot have this value"):
+        page.act("viewer 0", "along", tour.end_s + 1)
+
+
+def test_one_button_plays_and_pauses_and_a_step_pauses(shown: PlanPage, page: Page) -> None:
+    page.act("viewer 0", "speed", "8 ×")
+    assert control(shown, "play")["label"] == "Play"
+    page.act("viewer 0", "play", None)
+    assert control(shown, "play")["label"] == "Pause"
+    ended = threading.Event()
+    thread = threading.Thread(target=shown.play, args=(ended,))
+    thread.start()
+    time.sleep(0.5)
+    page.act("viewer 0", "play", None)
+    moved_s = shown._chosen["along"]
+    time.sleep(0.2)
+    ended.set()
+    thread.join()
+    assert 1.0 < moved_s < 12.0
+    assert shown._chosen["along"] == moved_s
+    page.act("viewer 0", "play", None)
+    page.act("viewer 0", "next", None)
+    assert control(shown, "play")["label"] == "Play"
+
+
+def test_playing_goes_round(shown: PlanPage, page: Page, plan: Plan) -> None:
+    page.act("viewer 0", "along", round(plan.motion_time_s - 0.05, 1))
+    page.act("viewer 0", "play", None)
+    ended = threading.Event()
+    threading.Timer(0.3, ended.set).start()
+    shown.play(ended)
+    assert 0 < shown._chosen["along"] < 2
+
+
+def test_the_room_that_the_tool_sweeps_over(shown: PlanPage, page: Page) -> None:
+    assert not [name for name in parts_of(shown) if name.startswith("scene/swept")]
+    page.act("viewer 0", "swept", True)
+    parts = parts_of(shown)
+    swept = [part for name, part in parts.items() if name.startswith("scene/swept")]
+    assert len(swept) == 1
+    assert swept[0]["alpha"] < 1
+    copies = np.array(swept[0]["copies"])
+    assert copies.shape[1] == 7
+    assert len(copies) > 50
+    np.testing.assert_allclose(np.linalg.norm(copies[:, 3:], axis=1), 1, atol=1e-3)
+    assert np.ptp(copies[:, :3], axis=0).max() > 0.1
+    assert [words for _, _, words in parts["scene/legend"]["rows"]][-1] == "room that the tool sweeps over"
+    page.act("viewer 0", "swept", False)
+    assert not [name for name in parts_of(shown) if name.startswith("scene/swept")]
 
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: float(np.linalg.norm(v)) > 1e-3))
@@ -92,25 +204,3 @@ def test_a_force_on_its_line_of_action_has_the_torque(p: list[float], force: lis
     ((start, end),) = line_of_action(at, np.concatenate([F, torque]))
     for point in (start, end):
         np.testing.assert_allclose(np.cross(point - at, F), torque, atol=1e-9)
-
-
-def test_a_page_on_this_computer_or_what_to_install() -> None:
-    if find_spec("viser") is None:
-        with pytest.raises(ConfigError, match=r"of the extra viz"), serve("a plan"):
-            pass
-        return
-    with serve("a plan") as page:
-        assert page.url.startswith("http://127.0.0.1:")
-        bare = page.url.partition("?")[0]
-        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
-        for url, headers in (
-            (bare, {}),
-            (f"{bare}?token=guessed", {}),
-            (page.url, {"Origin": "https://evil.example"}),
-            (page.url, {"Host": "evil.example"}),
-        ):
-            with pytest.raises(urllib.error.HTTPError, match="403"):
-                opener.open(urllib.request.Request(url, headers=headers), timeout=10)
-        for url in (page.url, bare):  # the token is needed once
-            with opener.open(url, timeout=10) as answer:
-                assert b"<html" in answer.read()

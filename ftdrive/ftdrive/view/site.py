@@ -1,0 +1,305 @@
+"""The HTTP side of a page: its address, who may open it, its files, its stream of parts, requests of its controls."""
+
+import asyncio
+import hmac
+import json
+import logging
+import os
+import re
+import secrets
+import socket
+import sys
+import webbrowser
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from html import escape
+from http import HTTPStatus
+from importlib.util import find_spec
+from io import StringIO
+from pathlib import Path
+from tempfile import mkdtemp
+from time import monotonic
+from typing import Final
+
+from ftdrive.errors import ConfigError
+from ftdrive.http_gate import Address, Gate, Request, is_loopback, with_port
+from ftdrive.view.page import Page
+from ftdrivers.installation import missing_extra
+
+# Only this computer can open the page.
+_LOCAL: Final[Address] = ("127.0.0.1", 8080)
+# A busy computer, which is late at times, still sends 20 times a second.
+_PERIOD_S: Final = 0.045
+# A browser takes a page for stale when it has received nothing for some of these.
+_BEAT_S: Final = 1.0
+# A viewer whose buffer is not empty receives nothing more; after this time it is disconnected.
+_SUSPENDED_S: Final = 30.0
+_VIEWERS: Final = 300
+# Of a request: largest body and time-out.
+_BODY_BYTES: Final = 1 << 15
+_BODY_S: Final = 5.0
+# Nothing from elsewhere, no inline script, no other page around this one. uPlot sets styles of elements.
+_POLICY: Final = "; ".join(
+    (
+        "Content-Security-Policy: default-src 'none'",
+        "script-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "connect-src 'self'",
+        "img-src data:",
+        "base-uri 'none'",
+        "form-action 'none'",
+        "frame-ancestors 'none'",
+    )
+)
+_SAFE: Final = (
+    _POLICY,
+    "Referrer-Policy: no-referrer",
+    "Cache-Control: no-store",
+    "Cross-Origin-Resource-Policy: same-origin",
+)
+_TYPES: Final = {".html": "text/html", ".css": "text/css", ".js": "text/javascript"}
+_OPENED: Final = b'<!doctype html><meta http-equiv="refresh" content="0;url=/"><title>ftdrive</title>'
+
+_log = logging.getLogger(__name__)
+
+
+class Site(Gate):
+    """Serves a page to browsers that have opened its address with the token once, and keep it as a cookie.
+
+    Parameters
+    ----------
+    page : Page
+    bound : tuple of str and int
+        Host and port; 0 lets the system choose, see `port`.
+
+    Raises
+    ------
+    ConfigError
+        The extra `viz` is not installed.
+    OSError
+        The address cannot be used.
+    """
+
+    def __init__(self, page: Page, bound: Address) -> None:
+        _files()  # raises before the port is taken
+        self.token = secrets.token_urlsafe(18)
+        self._page = page
+        self._viewers: dict[asyncio.StreamWriter, list[float]] = {}
+        self._opened = 0
+        super().__init__(bound)
+        asyncio.run_coroutine_threadsafe(self._send_all(), self.loop)
+
+    async def serve(self, request: Request) -> None:
+        """Answer a request of the page's own origin."""
+        path, _, query = request.target.partition("?")
+        if path == "/" and request.method == "GET" and query.startswith("token="):
+            await self._open(request, query.removeprefix("token="))
+            return
+        number = self._viewer_of(request.headers.get("Cookie", ""))
+        if number is None:
+            await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
+        elif request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
+            await request.refuse(HTTPStatus.FORBIDDEN, "pages of others are not served")
+        elif request.method == "POST" and path == "/do":
+            await self._act(request, f"viewer {number}")
+        elif request.method != "GET":
+            await request.refuse(HTTPStatus.METHOD_NOT_ALLOWED, "this address is only read")
+        elif path == "/parts":
+            await self._follow(request, number)
+        elif (file := _files().get(path)) is not None:
+            content = f"{_TYPES[file.suffix]}; charset=utf-8"
+            await request.answer(HTTPStatus.OK, file.read_bytes(), content, *_SAFE)
+        else:
+            await request.refuse(HTTPStatus.NOT_FOUND, "there is no such page")
+
+    def end(self) -> None:
+        """Send browsers the last state, and that the program has ended; they keep it."""
+        with suppress(TimeoutError):
+            asyncio.run_coroutine_threadsafe(self._end_viewers(), self.loop).result(1.0)
+
+    async def _open(self, request: Request, token: str) -> None:
+        if not hmac.compare_digest(token.encode(), self.token.encode()):
+            await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
+            return
+        number = self._viewer_of(request.headers.get("Cookie", ""))
+        if number is None:
+            number, self._opened = self._opened, self._opened + 1
+        # Browsers send the cookies of one port to all ports of a host. The page opens itself: after a redirect from
+        # another page, such as the file of `announce`, they would keep a strict cookie back.
+        cookie = f"Set-Cookie: ftdrive-{self.port}={self.token}.{number}; HttpOnly; SameSite=Strict; Path=/"
+        await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
+
+    def _viewer_of(self, cookies: str) -> int | None:
+        """Return the number of the viewer that has a cookie of this page."""
+        for cookie in cookies.split("; "):
+            name, _, value = cookie.partition("=")
+            token, _, number = value.rpartition(".")
+            if name == f"ftdrive-{self.port}" and hmac.compare_digest(token.encode(), self.token.encode()):
+                return int(number) if number.isascii() and number.isdecimal() and int(number) < self._opened else None
+        return None
+
+    async def _act(self, request: Request, viewer: str) -> None:
+        """Pass a request of a control on to the page; a foreign page cannot send this type without asking first."""
+        headers = request.headers
+        length = headers.get("Content-Length", "")
+        if headers.get("Origin") is None or headers.get("Content-Type") != "application/json":
+            await request.refuse(HTTPStatus.FORBIDDEN, "controls are used from the page itself")
+        elif not re.fullmatch("[0-9]{1,6}", length) or int(length) > _BODY_BYTES or headers.get("Transfer-Encoding"):
+            await request.refuse(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"{_BODY_BYTES} bytes at most")
+        else:
+            with suppress(TimeoutError, asyncio.IncompleteReadError):
+                body = await asyncio.wait_for(request.reader.readexactly(int(length)), _BODY_S)
+                try:
+                    asked = json.loads(body)
+                    self._page.act(viewer, asked["name"], asked["value"])
+                except (ValueError, TypeError, KeyError, RecursionError) as error:
+                    why = str(error) if type(error) is ValueError else "a request is an object with a name and a value"
+                    await request.refuse(HTTPStatus.BAD_REQUEST, why[:300])
+                except Exception:
+                    _log.exception("a control of the page has failed")
+                    await request.refuse(HTTPStatus.INTERNAL_SERVER_ERROR, "this control has failed: see the terminal")
+                else:
+                    await request.answer(HTTPStatus.NO_CONTENT)
+
+    async def _follow(self, request: Request, number: int) -> None:
+        """Send parts as server-sent events until the browser disconnects; bytes that it sends are dropped."""
+        if len(self._viewers) >= _VIEWERS:
+            await request.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{_VIEWERS} viewers at most")
+            return
+        head = ["HTTP/1.1 200 OK", "Content-Type: text/event-stream", *_SAFE, "Connection: close"]
+        hello = f"retry: 500\n\ndata: {json.dumps({'viewer': {'kind': 'viewer', 'number': number}})}\n\n"
+        request.writer.write("\r\n".join([*head, "", hello]).encode())
+        self._viewers[request.writer] = [0, monotonic()]
+        self._page.viewers = len(self._viewers)
+        try:
+            while await request.reader.read(1024):
+                await asyncio.sleep(_PERIOD_S)
+        finally:
+            self._viewers.pop(request.writer, None)
+            self._page.viewers = len(self._viewers)
+
+    async def _send_all(self) -> None:
+        """Send each viewer what has changed for it; one that does not read receives the newest state later."""
+        beat_s = 0.0
+        while True:
+            await asyncio.sleep(_PERIOD_S)
+            now_s = monotonic()
+            beats = now_s - beat_s > _BEAT_S
+            if beats:
+                beat_s = now_s
+            self._send(now_s, beats=beats)
+
+    def _send(self, now_s: float, *, beats: bool) -> None:
+        made: dict[float, tuple[int, bytes]] = {}
+        for writer, seen in list(self._viewers.items()):
+            if writer.transport.get_write_buffer_size():
+                if now_s - seen[1] > _SUSPENDED_S:
+                    writer.transport.abort()
+                continue
+            seen[1] = now_s
+            if seen[0] not in made:
+                version, parts = self._page.since(int(seen[0]))
+                made[seen[0]] = version, f"data: {parts}\n\n".encode() if parts else b""
+            seen[0], data = made[seen[0]]
+            if beats:
+                data += f"event: beat\ndata: {json.dumps(round(self._page.stale_s, 1))}\n\n".encode()
+            if data and not writer.is_closing():
+                writer.write(data)
+
+    async def _end_viewers(self) -> None:
+        self._send(monotonic(), beats=False)
+        for writer in self._viewers:
+            if not writer.transport.get_write_buffer_size():
+                writer.write(b"event: end\ndata: 0\n\n")
+        while any(writer.transport.get_write_buffer_size() for writer in self._viewers):
+            await asyncio.sleep(0.01)
+
+
+@contextmanager
+def serve(title: str, address: Address | None = None) -> Iterator[Page]:
+    """Serve a page while the block runs. Needs the extra `viz`.
+
+    Parameters
+    ----------
+    title : str
+    address : tuple of str and int, optional
+        Host and port. Without it only this computer is served: at port 8080, or another one if that is taken.
+
+    Raises
+    ------
+    ConfigError
+        The address cannot be used, or the extra is missing.
+    """
+    page = Page(title)
+    try:
+        site = Site(page, address or _LOCAL)
+    except OSError as error:
+        if address is not None:
+            raise ConfigError(f"--view-address {with_port(*address)} cannot be used: {error.strerror}") from error
+        site = Site(page, (_LOCAL[0], 0))
+    page.url = f"http://{with_port(_reached_at((address or _LOCAL)[0]), site.port)}/?token={site.token}"
+    try:
+        yield page
+    finally:
+        site.end()
+        site.close()
+
+
+def _reached_at(host: str) -> str:
+    """Return the address by which others reach a server that listens at `host`: a tablet may not know our name."""
+    if host not in ("0.0.0.0", "::"):
+        return host
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
+        # Sends nothing: an address for documentation chooses the interface.
+        probe.connect(("192.0.2.1", 9))
+        return str(probe.getsockname()[0])
+    return socket.gethostname()
+
+
+@contextmanager
+def announced(page: Page, address: Address | None = None) -> Iterator[None]:
+    """Print the address of a page, as a QR code too for another device; open it where this computer has a screen."""
+    from ftdrive.terminal.console import messages, print_address
+
+    print_address("The page is shown until this command ends, at ", page.url)
+    if address is not None and not is_loopback(address[0]):
+        import segno
+
+        code = StringIO()
+        segno.make(page.url, error="l").terminal(code, border=1, compact=True)
+        messages.print(code.getvalue(), end="")
+        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
+    elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        with _only_ours(page.url) as file:
+            webbrowser.open(file.as_uri())
+            yield
+        return
+    yield
+
+
+@contextmanager
+def _only_ours(url: str) -> Iterator[Path]:
+    """Yield a file that redirects to an address: as an argument of the browser, `ps` would show it to every user."""
+    folder = Path(mkdtemp(prefix="ftdrive-"))  # only its owner may enter it
+    file = folder / "page.html"
+    try:
+        file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(url)}">')
+        yield file
+    finally:
+        file.unlink(missing_ok=True)
+        with suppress(OSError):
+            folder.rmdir()
+
+
+@cache
+def _files() -> dict[str, Path]:
+    """Return the files of a page by their address: our shell, and uPlot from its package, which is not imported."""
+    shell = Path(__file__).parent / "shell"
+    files: dict[str, Path] = {f"/{file.name}": file for file in shell.iterdir() if file.suffix in _TYPES}
+    files["/"] = files.pop("/page.html")
+    package = find_spec("uplot")
+    if package is None or package.origin is None:
+        raise ConfigError(missing_extra("a view", "uplot", "viz"))
+    plots = Path(package.origin).parent / "static"
+    return files | {f"/{name}": plots / name for name in ("uPlot.iife.js", "uPlot.min.css")}

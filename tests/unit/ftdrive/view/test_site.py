@@ -1,0 +1,243 @@
+"""A page over HTTP: who is served, what a viewer receives, and what it may ask for."""
+
+import json
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from http.client import HTTPConnection, HTTPResponse
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+
+from ftdrive.view.page import Page, drawing
+from ftdrive.view.parts import button, check, controls, lines, select, slider, text_field
+from ftdrive.view.site import announced, serve
+
+pytest.importorskip("uplot", reason="the extra viz is not installed")
+JSON = "application/json"
+
+
+class Viewer:
+    """A browser that has opened a page."""
+
+    def __init__(self, page: Page) -> None:
+        self.port = urlsplit(page.url).port
+        self.origin = f"http://127.0.0.1:{self.port}"
+        self.cookie = ""
+        opened = self.ask("GET", f"/?{urlsplit(page.url).query}")
+        self.cookie = opened.headers["Set-Cookie"].split(";")[0]
+
+    def ask(self, method: str, target: str, body: str = "", **headers: str) -> HTTPResponse:
+        with closing(HTTPConnection("127.0.0.1", self.port, timeout=30)) as connection:
+            connection.request(method, target, body, {"Cookie": self.cookie} | headers)
+            answer = connection.getresponse()
+            answer.body = answer.read()  # type: ignore[attr-defined]
+        return answer
+
+    def do(self, name: object, value: object = None, **headers: str) -> int:
+        given = {"Origin": self.origin, "Content-Type": JSON} | headers
+        return self.ask("POST", "/do", json.dumps({"name": name, "value": value}), **given).status
+
+    def follow(self) -> Iterator[tuple[str, dict[str, object]]]:
+        """Yield events of the page with their data."""
+        raw = socket.create_connection(("127.0.0.1", self.port), timeout=30)
+        raw.sendall(f"GET /parts HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\nCookie: {self.cookie}\r\n\r\n".encode())
+        with closing(raw), raw.makefile("r", encoding="utf-8") as received:
+            event = "message"
+            for line in received:
+                if line.startswith("event: "):
+                    event = line[7:-1]
+                elif line.startswith("data: "):
+                    yield event, json.loads(line[6:])
+                    event = "message"
+
+
+@pytest.fixture
+def page() -> Iterator[Page]:
+    with serve("a <b>page</b>") as page:
+        yield page
+
+
+def wait_for(event: threading.Event) -> None:
+    event.wait()
+
+
+def until(condition: Callable[[], object]) -> None:
+    deadline_s = time.monotonic() + 30
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+def test_a_page_is_served_to_who_has_opened_its_address(page: Page) -> None:
+    viewer = Viewer(page)
+    shell = viewer.ask("GET", "/")
+    assert (shell.status, b"<title>" in shell.body) == (200, True)  # type: ignore[attr-defined]
+    assert "default-src 'none'" in shell.headers["Content-Security-Policy"]
+    for name in ("page.js", "page.css", "scene.js", "uPlot.iife.js", "uPlot.min.css"):
+        assert viewer.ask("GET", f"/{name}").status == 200
+    for target in ("/page.html", "/../page.py", "/site.py", "/%2e%2e/page.py", "//etc/passwd"):
+        assert viewer.ask("GET", target).status == 404
+
+
+def test_without_the_token_nothing_is_served(page: Page) -> None:
+    viewer = Viewer(page)
+    cookie, viewer.cookie = viewer.cookie, ""
+    token = urlsplit(page.url).query
+    for target in ("/", "/parts", "/page.js", "/?token=", f"/?{token[:-1]}", f"/x?{token}", "/?token=%C3"):
+        assert viewer.ask("GET", target).status == 403
+    assert viewer.do("stop") == 403
+    name, _, value = cookie.partition("=")
+    for wrong in (f"{value}1", f"{value}0x", value[1:], "", ".0"):
+        viewer.cookie = f"{name}={wrong}"
+        assert viewer.ask("GET", "/").status == 403
+    for wrong in (f"ftdrive-1={value}", value):
+        viewer.cookie = wrong
+        assert viewer.ask("GET", "/").status == 403
+    viewer.cookie = f"other=1; {cookie}"
+    assert viewer.ask("GET", "/").status == 200
+
+
+def test_parts_arrive_once_and_the_newest_counts(page: Page) -> None:
+    page.put({"state": lines("one"), "alert": lines("gone")})
+    events = Viewer(page).follow()
+    seen: dict[str, object] = {}
+    while not {"viewer", "title", "state"} <= seen.keys():
+        seen |= next(events)[1]
+    assert seen["title"] == {"kind": "title", "text": "a <b>page</b>"}
+    page.put({"state": lines("one"), "alert": None})
+    assert next(event for event in events if event[0] == "message")[1] == {"alert": None}
+    until(lambda: page.viewers == 1)
+    events.close()  # type: ignore[attr-defined]
+    until(lambda: page.viewers == 0)
+
+
+def test_the_last_state_arrives_before_the_end() -> None:
+    with serve("a page") as page:
+        events = Viewer(page).follow()
+        assert next(events)[1] == {"viewer": {"kind": "viewer", "number": 0}}
+        page.put({"result": lines("GOOD")})
+    received = list(events)
+    assert any("result" in data for _, data in received[:-1] if isinstance(data, dict))
+    assert received[-1][0] == "end"
+
+
+def test_stop_is_called_in_the_name_of_the_viewer_whatever_the_drawing_does(page: Page) -> None:
+    stopped: list[str] = []
+    page.add_stop(stopped.append)
+    viewers = [Viewer(page), Viewer(page)]
+    hangs = threading.Event()
+    with drawing(page, lambda: wait_for(hangs)):
+        assert viewers[1].do("stop") == 204
+        hangs.set()
+    assert stopped == ["viewer 1"]
+
+
+def taken_by(taken: list[tuple[str, object]], name: str, _: str, value: object) -> None:
+    taken.append((name, value))
+
+
+def test_controls_take_only_their_own_values(page: Page) -> None:
+    taken: list[tuple[str, object]] = []
+    page.put(
+        {
+            "controls": controls(
+                button("go", "Go"),
+                button("off", "Off", disabled=True),
+                select("axes", "Axes", "base", ["base", "tcp"]),
+                slider("at", "seconds", 0, 12),
+                check("swept", "swept", value=False),
+            ),
+            "form/a": controls(text_field("name", "Name", "")),
+        }
+    )
+    for name in ("go", "off", "axes", "at", "swept", "name", "hidden"):
+        page.on(name, partial(taken_by, taken, name))
+    viewer = Viewer(page)
+    right: list[tuple[str, object]] = [("go", None), ("axes", "tcp"), ("at", 12), ("swept", True), ("name", "<script>")]
+    for name, value in right:
+        assert viewer.do(name, value) == 204
+    wrong: list[tuple[object, object]] = [
+        ("go", 1), ("off", None), ("hidden", None), ("axes", "world"), ("axes", ["tcp"]), ("at", 1e9), ("at", -1),
+        ("at", True), ("at", "3"), ("swept", 1), ("name", "x" * 10_001), ("name", "a\nb"), ("name", {"a": 1}),
+        (["go"], None), (None, None),
+    ]  # fmt: skip
+    for wrong_name, value in wrong:
+        assert viewer.do(wrong_name, value) == 400
+    for body in ("", "[]", "nothing", "{}", '{"name":"at","value":NaN}', '{"name":"at","value":Infinity}', "[" * 9999):
+        headers = {"Origin": viewer.origin, "Content-Type": JSON}
+        assert viewer.ask("POST", "/do", body, **headers).status == 400
+    assert taken == right
+
+
+def test_controls_are_used_from_the_page_itself(page: Page) -> None:
+    page.add_stop(lambda _: pytest.fail("a foreign page has stopped the arm"))
+    viewer = Viewer(page)
+    for headers in (
+        {"Origin": "https://evil.example"},
+        {"Origin": "null"},
+        {"Origin": f"http://127.0.0.1:{viewer.port}0"},
+        {"Origin": "http://["},
+        {"Sec-Fetch-Site": "same-site"},
+        {"Host": "evil.example"},
+        {"Content-Type": "text/plain"},
+        {"Content-Type": "application/x-www-form-urlencoded"},
+    ):
+        assert viewer.do("stop", **headers) == 403
+    assert viewer.ask("POST", "/do", "{}", **{"Content-Type": JSON}).status == 403  # a program, without an origin
+    for method in ("GET", "PUT", "DELETE", "OPTIONS"):
+        assert viewer.ask(method, "/do", Origin=viewer.origin).status in (404, 405)
+    long = {"Origin": viewer.origin, "Content-Type": JSON, "Content-Length": "45000000"}
+    assert viewer.ask("POST", "/do", "{}", **long).status == 413
+
+
+def test_a_value_that_a_handler_rejects_is_explained(page: Page) -> None:
+    def reject(_: str, value: object) -> None:
+        raise ValueError(f"{value} is no name")
+
+    page.put({"controls": controls(text_field("name", "Name", ""))})
+    page.on("name", reject)
+    viewer = Viewer(page)
+    headers = {"Origin": viewer.origin, "Content-Type": JSON}
+    answer = viewer.ask("POST", "/do", json.dumps({"name": "name", "value": "x"}), **headers)
+    assert (answer.status, answer.body) == (400, b"x is no name\n")  # type: ignore[attr-defined]
+
+
+def test_idle_connections_keep_nobody_out(page: Page) -> None:
+    stopped: list[str] = []
+    page.add_stop(stopped.append)
+    viewer = Viewer(page)
+    idle = [socket.create_connection(("127.0.0.1", viewer.port)) for _ in range(150)]
+    assert viewer.do("stop") == 204
+    assert stopped == ["viewer 0"]
+    for one in idle:
+        one.close()
+
+
+def test_a_page_that_is_not_drawn_any_more_is_stale(page: Page) -> None:
+    assert page.stale_s == 0
+    page.beat()
+    time.sleep(0.01)
+    assert 0 < page.stale_s < 30
+    beat = next(data for event, data in Viewer(page).follow() if event == "beat")
+    assert isinstance(beat, float | int)
+
+
+def test_the_browser_is_given_a_file_that_only_its_owner_can_read(
+    page: Page, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setenv("DISPLAY", ":0")
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    with announced(page):
+        (address,) = opened
+        file = Path(urlsplit(address).path)
+        assert "token" not in address
+        assert page.url in file.read_text()
+        assert file.parent.stat().st_mode & 0o077 == 0
+    assert not file.exists()
+    assert page.url in "".join(capsys.readouterr().err.split())
