@@ -13,8 +13,9 @@ HOST, SENSOR = "127.99.99.9", "ati-serial:///dev/no-such-port"
 
 
 def field(page: "Page", label: str, which: int = 1) -> "Locator":
-    """The input behind a label; labels of viser do not name theirs."""
-    return page.locator(f"xpath=(//*[normalize-space(text())='{label}'])[{which}]/following::input[1]")
+    """The input behind a label; its words below belong to the label too."""
+    named = page.locator("label").filter(has=page.locator("span").get_by_text(label, exact=True))
+    return named.locator("input, select").nth(which - 1)
 
 
 def enter(page: "Page", label: str, text: str, which: int = 1) -> None:
@@ -22,8 +23,7 @@ def enter(page: "Page", label: str, text: str, which: int = 1) -> None:
 
 
 def choose(page: "Page", label: str, choice: str) -> None:
-    field(page, label).click()
-    page.get_by_role("option", name=choice, exact=True).click()
+    field(page, label).select_option(choice)
 
 
 def test_a_cell_is_described(ftdrive: CommandLine, open_page: "Callable[..., Page]") -> None:
