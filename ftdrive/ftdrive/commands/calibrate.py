@@ -145,7 +145,6 @@ def calibrate(
     from ftdrive.session.session import calibrate as guide
     from ftdrive.terminal.console import beside
     from ftdrive.terminal.screen import open_operator
-    from ftdrive.view.session_page import conclude
 
     _refuse_contradictions(click.get_current_context())
     known_load = None if load is None else Load.of(load, at, gripped=gripped)
@@ -198,6 +197,8 @@ def calibrate(
         if outcome is None:
             beside(as_json).print(words := "Dry run: nothing has moved.")
             if page is not None:
+                from ftdrive.view.session_page import conclude
+
                 conclude(page, words)
             return
         index_run(outcome.run.folder, None if simulate else cell)

@@ -85,7 +85,8 @@ class Site(Gate):
         _files()  # raises before the port is taken
         self.token = secrets.token_urlsafe(18)
         self._page = page
-        self._viewers: dict[asyncio.StreamWriter, list[float]] = {}
+        # The version of the page that each viewer has, and when it last had taken all that was sent.
+        self._viewers: dict[asyncio.StreamWriter, tuple[int, float]] = {}
         self._opened = 0
         super().__init__(bound)
         asyncio.run_coroutine_threadsafe(self._send_all(), self.loop)
@@ -126,7 +127,7 @@ class Site(Gate):
         if number is None:
             number, self._opened = self._opened, self._opened + 1
         # Browsers send the cookies of one port to all ports of a host. The page opens itself: after a redirect from
-        # another page, such as the file of `announce`, they would keep a strict cookie back.
+        # another page, such as the file of `announced`, they would keep a strict cookie back.
         cookie = f"Set-Cookie: ftdrive-{self.port}={self.token}.{number}; HttpOnly; SameSite=Strict; Path=/"
         await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
 
@@ -170,7 +171,7 @@ class Site(Gate):
         head = ["HTTP/1.1 200 OK", "Content-Type: text/event-stream", *_SAFE, "Connection: close"]
         hello = f"retry: 500\n\ndata: {json.dumps({'viewer': {'kind': 'viewer', 'number': number}})}\n\n"
         request.writer.write("\r\n".join([*head, "", hello]).encode())
-        self._viewers[request.writer] = [0, monotonic()]
+        self._viewers[request.writer] = 0, monotonic()
         self._page.viewers = len(self._viewers)
         try:
             while await request.reader.read(1024):
@@ -191,17 +192,17 @@ class Site(Gate):
             self._send(now_s, beats=beats)
 
     def _send(self, now_s: float, *, beats: bool) -> None:
-        made: dict[float, tuple[int, bytes]] = {}
-        for writer, seen in list(self._viewers.items()):
+        made: dict[int, tuple[int, bytes]] = {}
+        for writer, (had, taken_s) in list(self._viewers.items()):
             if writer.transport.get_write_buffer_size():
-                if now_s - seen[1] > _SUSPENDED_S:
+                if now_s - taken_s > _SUSPENDED_S:
                     writer.transport.abort()
                 continue
-            seen[1] = now_s
-            if seen[0] not in made:
-                version, parts = self._page.since(int(seen[0]))
-                made[seen[0]] = version, f"data: {parts}\n\n".encode() if parts else b""
-            seen[0], data = made[seen[0]]
+            if had not in made:
+                version, parts = self._page.since(had)
+                made[had] = version, f"data: {parts}\n\n".encode() if parts else b""
+            version, data = made[had]
+            self._viewers[writer] = version, now_s
             if beats:
                 data += f"event: beat\ndata: {json.dumps(round(self._page.stale_s, 1))}\n\n".encode()
             if data and not writer.is_closing():

@@ -63,7 +63,8 @@ const fields = {
     const button = made("button", control.tone, control.label);
     button.type = "button";
     if (control.key) button.append(made("kbd", "", `key ${control.key}`));
-    button.onclick = () => ask(control.name, null);
+    // Stop is sent when a finger touches it; a click without one comes from the keyboard.
+    button.onclick = event => { if (control.name !== "stop" || !event.detail) ask(control.name, null); };
     return [button, button, () => null];
   },
   text: control => field(control, "input", "text", input => input.value),
@@ -99,7 +100,6 @@ function controls(box, part) {
     const [element, input, value] = known.get(control.name);
     if (box.row.children[part.controls.indexOf(control)] !== element) box.row.insertBefore(element, box.row.children[part.controls.indexOf(control)] ?? null);
     input.disabled = Boolean(control.disabled);
-    element.hidden = Boolean(control.hidden);
     if (control.type === "button") {
       if (input.firstChild.textContent !== control.label) input.firstChild.textContent = control.label;
       continue;
