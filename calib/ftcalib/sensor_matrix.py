@@ -196,11 +196,7 @@ class SensorMatrix(Displayed):
         check_format(document, FORMAT, BadCalibration)
         names = ("error", "covariance", "source", "lever_m", "floor", "provenance")
         try:
-            for name in ("error", "covariance", "lever_m", "floor"):
-                if any(type(value) not in (int, float) for value in np.array(document[name], object).flat):
-                    raise ValueError(f"{name} has something else than numbers")  # noqa: TRY301, one sentence below
-            if not isinstance(document["provenance"], Mapping):
-                raise TypeError("provenance is no object")  # noqa: TRY301
+            _require_types(document)
             sensor = cls(*(document[name] for name in names))
             sensor._require_plausible()
         except KeyError as exc:
@@ -237,6 +233,15 @@ class SensorMatrix(Displayed):
             return cls.from_dict(read_object(path, BadCalibration))
         except BadCalibration as exc:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
+
+
+def _require_types(document: Mapping[str, Any]) -> None:
+    """Raise `TypeError` for values that JSON or numpy would take for numbers, such as strings and booleans."""
+    for name in ("error", "covariance", "lever_m", "floor"):
+        if any(type(value) not in (int, float) for value in np.array(document[name], object).flat):
+            raise TypeError(f"{name} has something else than numbers")
+    if not isinstance(document["provenance"], Mapping):
+        raise TypeError("provenance is no object")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,7 @@
 """Solve a dataset for a calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -35,6 +36,20 @@ _RESOLVED = 3e6
 _NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
 
 
+@contextmanager
+def _finite() -> Iterator[None]:
+    """Ignore numbers that overflow; raise `BadDataset` for a fit that comes to no end by them."""
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except np.linalg.LinAlgError as error:
+        raise BadDataset(
+            f"the fit is not finite ({error}): check the units of the wrench and of its standard errors, and that each "
+            "row has one orientation and its own reading"
+        ) from error
+
+
+@_finite()
 def solve(
     dataset: CalibrationDataset,
     method: Method = "ml",
@@ -92,29 +107,6 @@ def solve(
     (24, 6)
     """
     known, setup = _choose(dataset, method, drift, known, g_m_s2, setup, as_published=as_published)
-    try:
-        # Numbers that overflow are no result, and end below.
-        with np.errstate(all="ignore"):
-            return _solved(dataset, method, drift, known, g_m_s2, setup, provenance, as_published=as_published)
-    except np.linalg.LinAlgError as error:
-        raise BadDataset(
-            f"the fit is not finite ({error}): check the units of the wrench and of its standard errors, and that each "
-            "row has one orientation and its own reading"
-        ) from error
-
-
-def _solved(
-    dataset: CalibrationDataset,
-    method: Method,
-    drift: Drift,
-    known: Known | None,
-    g_m_s2: float,
-    setup: Setup,
-    provenance: Mapping[str, Any] | None,
-    *,
-    as_published: bool,
-) -> CalibrationResult:
-    """Fit and judge a dataset whose arguments were checked."""
     estimator = None
     if method in PUBLISHED:
         estimator = estimator_of(method, dataset.R_base_flange, known, g_m_s2, setup, as_published=as_published)
@@ -194,7 +186,6 @@ def _choose(
 
 def _require_sense(dataset: CalibrationDataset) -> None:
     """Raise `BadDataset` for torques that are all zero, and for raw counts with standard errors in other units."""
-    force_N = dataset.wrench[:, :3]
     if not dataset.wrench[:, 3:].any():
         raise BadDataset(
             "all torques are zero, as of a three-axis sensor, which shows no centre of mass and is not supported: take "
@@ -203,7 +194,7 @@ def _require_sense(dataset: CalibrationDataset) -> None:
     if dataset.wrench_cov is None or (dataset.wrench != np.round(dataset.wrench)).any():
         return
     sigma_N = float(np.sqrt(np.einsum("nii->ni", dataset.wrench_cov)[:, :3].mean()))
-    if (largest := float(np.abs(force_N).max())) > _RESOLVED * sigma_N:
+    if (largest := float(np.abs(dataset.wrench[:, :3]).max())) > _RESOLVED * sigma_N:
         raise BadDataset(
             f"the wrench looks like raw counts, up to {largest:.3g}, beside standard errors of {sigma_N:.2g}, which no "
             "sensor resolves: give both in N and N·m, or leave the standard errors out"
