@@ -33,7 +33,7 @@ _HEAD_BYTES: Final = 1 << 14
 _PIECE: Final = 1 << 16
 # Most connections without a head yet. One more closes the oldest, so that idle ones use up no descriptors.
 _WAITING: Final = 500
-# So many refused requests are logged: whoever sends more must not fill the terminal of a session.
+# Number of refused requests that are logged. Further ones must not fill the terminal of a session.
 _LOGGED: Final = 5
 
 _HOST: Final = re.compile(r"(\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(:\d{1,5})?", re.ASCII)

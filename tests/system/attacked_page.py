@@ -14,7 +14,7 @@ from typing import Any
 
 from tests.system.command_line import wait_until
 
-SECRET = "name-that-nobody-reads"
+SECRET = "name-behind-the-token"
 # Every kind of control, and a scene that changes faster than a viewer that sleeps can take.
 PAGE = f"""
 import sys, time

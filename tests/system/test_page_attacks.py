@@ -275,7 +275,7 @@ def test_viewers_that_sleep_are_disconnected(attacked: Attacked) -> None:
 
 
 # Run by another user: tries the page, and all files about the process, and prints what it gets.
-NOBODY = """
+OTHER_USER = """
 import glob, socket, sys
 pid, host, port = sys.argv[1:]
 for more in ("", "Upgrade: websocket\\r\\nConnection: Upgrade\\r\\n", f"Origin: http://{host}\\r\\n"):
@@ -308,7 +308,7 @@ def test_another_user_of_the_computer_reads_nothing(ftdrive: CommandLine, monkey
     assert page.listens_at() == [("tcp", page.port)]
     if os.getuid() == 0 and Path("/usr/bin/python3").exists():
         child = subprocess.run(
-            ["/usr/bin/python3", "-c", NOBODY, str(page.process.pid), page.host, page.port],
+            ["/usr/bin/python3", "-c", OTHER_USER, str(page.process.pid), page.host, page.port],
             user=65534, group=65534, extra_groups=[], capture_output=True, text=True, cwd="/", env={}, check=True,
         )  # fmt: skip
         assert child.stdout.count("HTTP/1.1 403") == 15
