@@ -9,9 +9,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset, NotObservable
-from ftcalib.model import Array
+from ftcalib.model import Array, nearest_rotation
 from ftcalib.published import carlson
-from ftcalib.published.carlson import ForceFit, cayley, eigen, iterative, nullspace, polynomial, relaxation
+from ftcalib.published.carlson import (
+    ForceFit,
+    cayley,
+    eigen,
+    iterative,
+    kron_identity,
+    nullspace,
+    polynomial,
+    relaxation,
+)
 
 Method = Callable[[Array, Array, Array, bool], ForceFit]
 
@@ -265,6 +274,26 @@ def test_algorithm_1_reaches_the_truth_with_few_poses_from_its_own_start() -> No
             truth.force_bias_N,
             1e-9,
         )
+
+
+def test_appendix_b_from_the_identity_needs_the_negation() -> None:
+    """Erratum of appendix B: from R = I, 60 random gravity vectors are all found only with the negation."""
+    rng = np.random.default_rng(11)
+    reached = {True: 0, False: 0}
+    for _ in range(60):
+        truth, R = random_truth(rng), random_poses(rng, 60)
+        force_N = truth.force_N(R)
+        D, F = R.swapaxes(1, 2).reshape(-1, 3), kron_identity(force_N)
+        F_of_D, D_of_F = (np.linalg.lstsq(*pair)[0] for pair in ((F, D), (D, F)))
+        for negates in reached:
+            r = np.eye(3).ravel()
+            for _ in range(30):
+                X = (F_of_D @ (D_of_F @ r)).reshape(3, 3).T
+                X = nearest_rotation(-X if negates and np.linalg.det(X) < 0 else X)
+                r = X.T.ravel()
+            reached[negates] += apart_deg(X, truth.R_flange_sensor) < 0.01
+    assert reached[True] == 60
+    assert 10 < reached[False] < 40  # 39 % of 1000 with 100 poses
 
 
 # --- the polynomial problem ---
