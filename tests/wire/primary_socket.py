@@ -1,4 +1,4 @@
-"""A client of port 30001 in plain bytes."""
+"""A client of port 30001 or 30002 in plain bytes."""
 
 import contextlib
 import socket
@@ -15,8 +15,8 @@ Message = dict[str, Any]
 class PrimarySocket:
     """Reads packages, writes programs."""
 
-    def __init__(self, host: str) -> None:
-        self._socket = socket.create_connection((host, 30001), LIMIT_S)
+    def __init__(self, host: str, port: int = 30001) -> None:
+        self._socket = socket.create_connection((host, port), LIMIT_S)
         self._rest = b""
         self.received: list[Message] = []
         """Every package so far, decoded."""

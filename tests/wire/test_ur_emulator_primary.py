@@ -75,17 +75,27 @@ def ask_api(station: StationProcess, method: str, path: str, body: object = None
         connection.close()
 
 
-def test_a_connection_begins_with_version_and_complete_state_and_streams_ten_a_second(station: StationProcess) -> None:
-    with PrimarySocket(station.host) as client:
+@pytest.mark.parametrize("port", [30001, 30002])
+def test_a_connection_begins_with_a_greeting_and_streams_ten_a_second(station: StationProcess, port: int) -> None:
+    with PrimarySocket(station.host, port) as client:
         client.wait_for(lambda m: m["type"] == "state" and m["mode"]["timestamp"] > first_us(client) + 900_000)
-        assert client.received[0]["type"] == "version"
-        assert set(client.received[1]) >= {"mode", "joints", "cartesian", "kinematics", "configuration"}
-        steps = [message["mode"]["timestamp"] for message in client.received[2:] if message["type"] == "state"]
+        assert [message["type"] for message in client.received[:4]] == ["version", "unexplained", "tolerances", "state"]
+        assert set(client.received[3]) >= {"mode", "joints", "cartesian", "kinematics", "configuration"}
+        steps = [message["mode"]["timestamp"] for message in client.received[4:] if message["type"] == "state"]
         assert {b - a for a, b in itertools.pairwise(steps)} == {100_000}
 
 
 def first_us(client: PrimarySocket) -> int:
-    return int(client.received[1]["mode"]["timestamp"])
+    return int(client.received[3]["mode"]["timestamp"])
+
+
+def test_port_30002_runs_programs_and_reports_nothing_of_them(station: StationProcess) -> None:
+    with PrimarySocket(station.host, 30002) as client:
+        client.send('def quiet():\n  textmsg("hello")\n  sync()\nend\n')
+        station.wait_for_event("stopped quiet")
+        client.next("state")
+        client.next("state")
+        assert {message["type"] for message in client.received[3:]} == {"state"}
 
 
 def test_a_program_from_port_30001_runs_and_is_heard_by_every_client(station: StationProcess) -> None:

@@ -99,7 +99,7 @@ class Client(ABC):
 
 
 class ScriptClient(Client):
-    """Ports 30002 and 30003: receives programs, sends nothing."""
+    """Port 30003: receives programs, sends nothing."""
 
     kind = "script"
 
@@ -127,21 +127,22 @@ class PrimaryClient(Client):
         """Entries of the event log that were sent, or are older than this connection."""
 
     def greeting(self) -> bytes:
-        """Return the version and a complete state."""
-        return primary.version_message(self.robot) + primary.state_package(self.robot, complete=True)
+        """Return version, tolerances and a complete state."""
+        return primary.greeting(self.robot)
 
     def on_bytes(self, buffer: bytearray) -> None:
         """Start every complete program."""
+        by = f"{self.kind} port"
         for upload in take_uploads(buffer):
             command = primary.COMMANDS.get(upload.text.strip())
             if not self._can_write:
-                self.robot.note("primary port", f"program {upload.name}", accepted=False, why="read-only connection")
-                self.send(primary.read_only_error(self.robot))
+                self.robot.note(by, f"program {upload.name}", accepted=False, why="read-only connection")
+                self._report(primary.read_only_error(self.robot))
             elif command is not None:
-                self.robot.note("primary port", upload.text.strip())
+                self.robot.note(by, upload.text.strip())
                 command(self.robot)
             else:
-                start_upload(self.robot, upload, by="primary port")
+                start_upload(self.robot, upload, by=by)
 
     def on_cycle(self) -> None:
         """Send what has happened, and the state when it is due."""
@@ -150,10 +151,22 @@ class PrimaryClient(Client):
             self.close()
             return
         news, self._seen = self.robot.events[self._seen :], len(self.robot.events)
-        if messages := b"".join(map(primary.messages_of, news)):
-            self.send(messages)
+        self._report(b"".join(map(primary.messages_of, news)))
         if self.robot.cycle % self._every == 0 and not self.lagging:
             self.send(primary.state_package(self.robot))
+
+    def _report(self, messages: bytes) -> None:
+        if messages:
+            self.send(messages)
+
+
+class SecondaryClient(PrimaryClient):
+    """Port 30002: as port 30001, but without messages behind the greeting."""
+
+    kind = "secondary"
+
+    def _report(self, messages: bytes) -> None:
+        """Send nothing."""
 
 
 class DashboardClient(Client):

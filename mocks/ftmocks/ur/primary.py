@@ -1,19 +1,25 @@
-"""Wire format of the primary interface (port 30001): what the controller sends. No sockets.
+"""Wire format of the primary and the secondary interface (ports 30001, 30002): what the controller sends. No sockets.
 
 Every package starts with its size (int32, this field included) and its type (uint8): 16 is a robot state, a sequence
 of sub-packages with a size (uint32) and a type (uint8) each; 20 is a message with a timestamp (uint64), a source (int8)
-and a type (uint8). All numbers are big-endian. A client skips types that it does not know.
+and a type (uint8). All numbers are big-endian. A client skips types that it does not know. The secondary interface
+has states and the greeting, but no messages of programs.
 
 Source: Universal Robots, "Remote Control via TCP/IP" (client interfaces) and the parsers of its client library
 (BSD, fields and types only); recorded streams of URSim in the tests of that library and in the README of robotlab
 (Pharmaceutical Bioinformatics, Uppsala): timestamps, sources, wording, which sub-packages come once. A maintainer of
 the client library on local control (issue 459 of the ROS driver): connections end when the pendant is switched to
 local control; one opened in local control can only read, also later; a program sent there is answered by the error
-C210 and not executed. Commands that are no programs: the client library's primary client.
+C210 and not executed. Commands that are no programs: the client library's primary client. The packages of the greeting
+behind the version: logs of port 30002 in the README of Shawn-Armstrong/URSim_Demo (5.13), and in published clients of
+a UR5 with 3.10 and of an e-Series arm with 5.12.
 
 Chosen here, where the sources are silent:
 
-* Timestamps are microseconds of the controller's clock; version and compile errors have none (all bits set).
+* Timestamps are microseconds of the controller's clock; the greeting and compile errors have none (all bits set).
+* No source explains message 12, the second of a greeting. It has the numbers of the logs of 5.12 and 5.13. The log of
+  3.10 has 510 and 259 in place of the two zeros.
+* The tolerances, package 24, follow in every version. Only the log of 3.10 is long enough to show them.
 * Kinematics and configuration come in the first state of a connection only, the parts that are not modelled in each.
 * C210 has argument 0, level warning and no text, and goes to the client that sent the program.
 * A run-time error is the message of an exception with line, column and text, then ``PROGRAM_XXX_STOPPED``. It has the
@@ -36,11 +42,11 @@ from ftmocks.ur.robot import Robot
 STATES_HZ = 10
 BUILD_DATE = "24-03-2022, 12:00:00"
 
-ROBOT_STATE, ROBOT_MESSAGE = 16, 20
+ROBOT_STATE, ROBOT_MESSAGE, TOLERANCES = 16, 20, 24
 MODE_DATA, JOINT_DATA, CARTESIAN_INFO, KINEMATICS_INFO, CONFIGURATION_DATA = 0, 1, 4, 5, 6
 NOT_MODELLED = {2: 32, 3: 70, 7: 56, 8: 4, 9: 48, 10: 38, 11: 21, 12: 3}
 """Other parts of a state, all zeros here: type and size of their content."""
-TEXT, VERSION, SAFETY_MODE, ERROR_CODE, KEY, RUNTIME_EXCEPTION = 0, 3, 5, 6, 7, 10
+TEXT, VERSION, SAFETY_MODE, ERROR_CODE, KEY, RUNTIME_EXCEPTION, UNEXPLAINED = 0, 3, 5, 6, 7, 10, 12
 FROM_CONTROLLER, FROM_PROGRAM = -2, -3
 NO_TIMESTAMP = 2**64 - 1
 READ_ONLY_CODE = 210
@@ -52,6 +58,9 @@ SUB_TYPES = {False: 2, True: 3}
 JOINT_ACCELERATION_RAD_S2 = 40.0
 DEFAULTS = (1.0471975511965976, 1.3962634015954636, 0.25, 1.2, 0.25)
 """Joint speed and acceleration, tool speed and acceleration, radius of a joint: rad and m."""
+
+COMPLIANCE = (0.15, 25.0, 0.0, 3.0, *[0.2] * 6, *[0.052359878] * 6, 0.0, 0.0, 0.0, 0.01745329, 0.001, 0.01)
+"""What package 24 of the log of 3.10 contains."""
 
 _MESSAGE = struct.Struct(">iBQbB")
 _EMERGENCY_BIT, _PROTECTIVE_BIT = 0x80, 0x04
@@ -69,6 +78,13 @@ COMMANDS: dict[str, Callable[[Robot], object]] = {
 def message(kind: int, payload: bytes, timestamp: int, source: int = FROM_CONTROLLER) -> bytes:
     """Frame one message."""
     return _MESSAGE.pack(_MESSAGE.size + len(payload), ROBOT_MESSAGE, timestamp, source, kind) + payload
+
+
+def greeting(robot: Robot) -> bytes:
+    """Return what a client receives first: version, message 12, tolerances, and a complete state."""
+    second = message(UNEXPLAINED, struct.pack(">iiB", 0, 0, 1), NO_TIMESTAMP)
+    tolerances = struct.pack(">iB", 5 + 8 * len(COMPLIANCE), TOLERANCES) + _doubles(COMPLIANCE)
+    return version_message(robot) + second + tolerances + state_package(robot, complete=True)
 
 
 def version_message(robot: Robot) -> bytes:

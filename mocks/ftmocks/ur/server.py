@@ -10,11 +10,11 @@ from collections.abc import Callable
 
 from ftmocks.clock import time_out_s
 from ftmocks.ur import api
-from ftmocks.ur.clients import ApiClient, Client, DashboardClient, PrimaryClient, ScriptClient
+from ftmocks.ur.clients import ApiClient, Client, DashboardClient, PrimaryClient, ScriptClient, SecondaryClient
 from ftmocks.ur.robot import Robot
 from ftmocks.ur.rtde_client import RtdeClient, RtdeLink
 
-PORTS = {30001: "primary", 30002: "script", 30003: "script", 30004: "rtde"}
+PORTS = {30001: "primary", 30002: "secondary", 30003: "script", 30004: "rtde"}
 DASHBOARD_PORT = 29999
 """Only before PolyScope X."""
 API_PORT = 30080
@@ -26,7 +26,8 @@ After 2.5 s without a sample ur_rtde reconnects, stops the running program and u
 """
 
 Select = selectors.BaseSelector
-CLIENTS: dict[str, type[Client]] = {c.kind: c for c in (ScriptClient, PrimaryClient, DashboardClient, ApiClient)}
+_KINDS: tuple[type[Client], ...] = (PrimaryClient, SecondaryClient, ScriptClient, DashboardClient, ApiClient)
+CLIENTS = {c.kind: c for c in _KINDS}
 """Those without RTDE."""
 
 

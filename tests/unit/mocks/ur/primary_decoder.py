@@ -39,6 +39,8 @@ def decoded(package: bytes) -> dict[str, Any]:
     assert size == len(package)
     if kind == 16:
         return {"type": "state"} | _state(reader)
+    if kind == 24:
+        return {"type": "tolerances", "values": reader.take("22d")}
     assert kind == 20
     timestamp, source, message = reader.take("QbB")
     fields = _MESSAGES[message](reader)
@@ -51,6 +53,10 @@ def _version(reader: Reader) -> dict[str, Any]:
     return {"type": "version", "project": project, "version": reader.take("BBi"), "build": reader.take("i")} | {
         "date": reader.text()
     }
+
+
+def _unexplained(reader: Reader) -> dict[str, Any]:
+    return {"type": "unexplained", "values": reader.take("iiB")}
 
 
 def _key(reader: Reader) -> dict[str, Any]:
@@ -79,6 +85,7 @@ _MESSAGES = {
     6: _error,
     7: _key,
     10: _exception,
+    12: _unexplained,
 }
 
 

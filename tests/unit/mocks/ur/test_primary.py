@@ -66,6 +66,18 @@ def test_the_version_comes_first() -> None:
     }
 
 
+def test_a_greeting_has_packages_that_are_neither_state_nor_documented() -> None:
+    """Message 12 as recorded from 5.12 and 5.13, the tolerances as from a UR5 with 3.10."""
+    robot = new_robot()
+    version = primary.version_message(robot)
+    head = "00000018 14 ffffffffffffffff fe 0c 00000000 00000000 01" + "000000b5 18 3fc3333333333333 4039000000000000"
+    assert primary.greeting(robot).startswith(version + bytes.fromhex(head))
+    found, rest = packages(primary.greeting(robot))
+    assert rest == b""
+    assert [decoded(package)["type"] for package in found] == ["version", "unexplained", "tolerances", "state"]
+    assert "kinematics" in decoded(found[-1])
+
+
 def test_the_state_of_a_nominal_arm() -> None:
     """Sizes, modes and kinematics as in a recorded state of a UR5e in URSim 5.8 (client library's parser test)."""
     robot = new_robot()
