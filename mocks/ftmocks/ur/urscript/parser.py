@@ -177,8 +177,6 @@ class _Parser:
             yield "URScript: the program has lines of comment"
         if len(name) > LONGEST_NAME:
             yield f"URScript: the name {name} has more than {LONGEST_NAME} characters"
-        if underscored := sorted({used for used in (*self._known, name) if used.startswith("_")}):
-            yield f"URScript: the name {underscored[0]} begins with an underscore"
 
     def _function(self, names: _Names | None = None) -> Function:
         outer, self._names = self._names, names or _Names()
@@ -265,7 +263,7 @@ class _Parser:
     def _assignment_or_call(self, place: Place) -> Statement:
         scope = self._accept("local", "global") or ""
         if scope == "global" and self._names.blocks:
-            raise syntax_error(self._text, place, "'global' inside an if or while: declare the variable before it")
+            self._doubt(place, "'global' inside an if or while")
         used, free = len(self._used), len(self._names.free)
         left = self._expression()
         if not self._accept("="):
@@ -304,7 +302,7 @@ class _Parser:
         left = self._expression(level + 1)
         while operator := self._accept(*operators):
             if operators in _ARITHMETIC and self._is("-", "+"):
-                self._fail(f"a number or a bracket expected behind {operator!r}")
+                self._doubt(self._next.place, f"a sign behind {operator!r}")
             left = Operation(operator, (left, self._expression(level + 1)))
             if operators is _COMPARISONS and self._is(*_COMPARISONS):
                 self._fail("one comparison expected")
@@ -338,6 +336,8 @@ class _Parser:
             return Literal(self._take().text)
         if self._next.kind == "number":
             digits = self._take().text
+            if not set(digits).isdisjoint("eE"):
+                self._doubt(place, f"{digits} has an exponent")
             return Literal(int(digits) if digits.isdigit() else float(digits))
         name = self._name()
         if self._is("("):

@@ -15,8 +15,8 @@ Chosen here, where the manual is silent:
 * A critical section changes nothing, because a thread is never interrupted before it waits. It does not hold others
   while it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
-* A condition must be True or False. A variable keeps its type and a list its length, and so does what a function
-  returns: see docs/reference/urscript-constructs.md for the reports.
+* A condition must be True or False. A variable keeps its type, of which all numbers have one, and a list its length.
+  What a function returns keeps its type: see docs/reference/urscript-constructs.md for the reports.
 * A thread that computes for ever in one cycle is a run-time error. The manual lets it go on in the next cycle, and
   warns of a lost connection to the controller.
 """
@@ -44,6 +44,7 @@ from ftmocks.ur.urscript.syntax import (
     While,
 )
 from ftmocks.ur.urscript.threads import Halt, Leave, Run, Scope, Thread
+from ftmocks.ur.urscript.types import same_type
 from ftmocks.ur.urscript.values import Pose, Value, combined, element, negative, number, single, text_of, truth
 
 STATEMENTS_PER_CYCLE = 2000
@@ -133,7 +134,8 @@ class Program(ControllerProgram):
                 raise ScriptError(f"{leave.word} outside of a loop") from None
             if not scope.function.is_thread:
                 before = self._returned.setdefault(id(scope.function), leave.value)
-                _keep_type(f"the value of {scope.function.name}", before, leave.value)
+                if type(before) is not type(leave.value):
+                    raise _changed(f"the value of {scope.function.name}", before, leave.value) from None
             return leave.value
 
     def _block(self, scope: Scope, statements: Block) -> Run:
@@ -206,7 +208,8 @@ class Program(ControllerProgram):
         )
         variables = self._globals if is_global else scope.variables
         before = variables.get(name, value)
-        _keep_type(f"the variable {name}", before, value)
+        if not same_type(type(before).__name__, type(value).__name__):
+            raise _changed(f"the variable {name}", before, value)
         if isinstance(before, list) and len(before) != len(value):
             raise ScriptError(f"Resizing of 'List' is not supported: {name} has {len(before)} elements")
         variables[name] = type(value)(value) if isinstance(value, list) else value
@@ -307,7 +310,6 @@ class Program(ControllerProgram):
         return (yield from result) if isgenerator(result) else result
 
 
-def _keep_type(what: str, before: Value, now: Value) -> None:
-    if type(before) is not type(now):
-        one, other = ("nothing" if value is None else type(value).__name__ for value in (before, now))
-        raise ScriptError(f"Type error: {what} changes from {one} to {other}")
+def _changed(what: str, before: Value, now: Value) -> ScriptError:
+    one, other = ("nothing" if value is None else type(value).__name__ for value in (before, now))
+    return ScriptError(f"Type error: {what} changes from {one} to {other}")

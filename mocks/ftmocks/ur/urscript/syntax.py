@@ -153,7 +153,7 @@ class Token(NamedTuple):
 
 
 _TOKEN = re.compile(
-    r'(?P<blank>[ \t\r]+|#[^\n]*|\$[ \t]*\d+[ \t]*"[^"\n]*")|(?P<newline>\n)'
+    r'(?P<blank>[ \t\r]+|#[^\n]*|\$[ \t]*\d+(?:[ \t]*"[^"\n]*")+)|(?P<newline>\n)'
     r"|(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)"
     r'|"(?P<text>[^"\n]*)"|(?P<pose>p\[)|(?P<name>[A-Za-z_]\w*)|(?P<sign>==|!=|<=|>=|[-+*/%<>=()\[\],:^.{}])',
     re.ASCII,
@@ -173,8 +173,8 @@ def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
 def tokens_of(text: str) -> Iterator[Token]:
     """Yield the words of a program, without blanks, comments and program labels, and ``end`` behind the last.
 
-    A program label is ``$ 2 "text"``: the node of the pendant's program to which the next lines belong. A line
-    break inside brackets, or behind an operator, is a blank.
+    A program label is ``$ 2 "text" "noBreak"``: the node of the pendant's program to which the next lines belong, and
+    in some versions where a step ends. A line break inside brackets, or behind an operator, is a blank.
 
     Raises
     ------
@@ -194,8 +194,6 @@ def tokens_of(text: str) -> Iterator[Token]:
             line, line_start = line + 1, at
         if kind == "sign" and word in "^.{}":
             raise NotEmulated(place, repr(word))
-        if kind == "number" and not set(word).isdisjoint("eE"):
-            raise syntax_error(text, place, f"{word} has an exponent, which not every controller reads")
         if kind == "blank" or (kind == "newline" and (depth or goes_on)):
             continue
         yield Token(kind, word, place)

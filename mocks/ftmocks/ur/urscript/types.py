@@ -45,6 +45,11 @@ def check_types(main: Function) -> None:
         _check(function, shared, program, is_main=function is main)
 
 
+def same_type(one: str, other: str) -> bool:
+    """Whether a variable may have values of both types, by their names in Python; integers and floats are numbers."""
+    return one == other or {one, other} == {"int", "float"}
+
+
 def _functions(function: Function) -> Iterator[Function]:
     yield function
     for inner in function.functions.values():
@@ -55,7 +60,7 @@ def _check(function: Function, shared: Types, program: set[str], *, is_main: boo
     local: Types = {}
     for place, scope, name, kind in _assignments(function):
         types = shared if is_main or scope == "global" or (not scope and name in program) else local
-        if kind and types.setdefault(name, kind) != kind:
+        if kind and not same_type(types.setdefault(name, kind), kind):
             raise _error(place, f"the variable {name} changes its type from {types[name]} to {kind}", name)
     returned: set[str] = set()
     for statement in _statements(function.body):
