@@ -47,7 +47,7 @@ class Operator:
             "dashboard-stop": lambda _: {"reply": dashboard.answer(robot, "stop", by="another dashboard client")},
             "crash-script": lambda _: {"accepted": robot.crash("requested")},
             "foreign-program": self._foreign_program,
-            "close-popup": lambda _: self._pendant("close popup"),
+            "close-popup": self._close_popup,
             "hand-move": self._hand_move,
             "hand-guide": self._hand_guide,
             "pendant-program": self._pendant_program,
@@ -89,6 +89,10 @@ class Operator:
     def _pendant(self, command: str) -> dict[str, Any]:
         reply = dashboard.answer(self._robot, command, by="operator")
         return {"accepted": self._robot.events[-1].accepted, "reply": reply}
+
+    def _close_popup(self, request: Request) -> dict[str, Any]:
+        self._robot.popup_answer = request.get("value")
+        return self._pendant("close popup")
 
     def _slider(self, request: Request) -> None:
         self._robot.arm.speed_fraction = _fraction(request)

@@ -7,7 +7,7 @@ keeps the cell's time, and so does the controller's clock when the arm's own sen
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import PurePosixPath
 from typing import Any
 
@@ -112,6 +112,26 @@ class RobotSettings:
     time_scale: float = 1.0
 
 
+@dataclass
+class Signals:
+    """Digital and analog signals, and the boolean registers that programs write.
+
+    Parameters
+    ----------
+    inputs, outputs
+        Bits as in RTDE: eight standard signals, eight configurable ones, two of the tool.
+    analog_outputs
+        Levels, 0 to 1.
+    registers
+        Bits of the boolean output registers.
+    """
+
+    inputs: int = 0
+    outputs: int = 0
+    analog_outputs: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    registers: int = 0
+
+
 class Robot:
     """State of the controller and the arm, advanced by `tick`.
 
@@ -122,6 +142,11 @@ class Robot:
     arm
         None makes one that stands where the world has it.
     """
+
+    popup: str | None = None
+    """Text of the popup that a program shows, until the operator closes it."""
+    popup_answer: bool | float | str | None = None
+    """What the operator entered in the last popup."""
 
     def __init__(self, world: World, settings: RobotSettings, arm: Arm | None = None) -> None:
         self.world = world
@@ -155,6 +180,7 @@ class Robot:
         self.inputs: dict[str, Value] = {}
         self.output_ints = [0] * 48
         self.output_doubles = [0.0] * 48
+        self.signals = Signals()
         self.events: list[Event] = []
         """The event log, newest last: commands accepted and refused, program, safety, start and end of motion."""
         self.hand: Iterator[None] | None = None
@@ -162,8 +188,6 @@ class Robot:
         self._remote_control = True
         self._reduced = False
         self._program: ControllerProgram | None = None
-        self.popup: str | None = None
-        """Text of the popup that a program shows, until the operator closes it."""
         self.wrist_sensor: Callable[[int], Array] | None = None
         """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
         self._physical_s = self._stopped_at_s = self._watchdog_age_s = 0.0

@@ -53,8 +53,8 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "target_TCP_pose": ("VECTOR6D", lambda r: r.tcp_pose("target")),
     "target_TCP_speed": ("VECTOR6D", lambda r: r.tcp_speed("target")),
     "tcp_force_scalar": ("DOUBLE", lambda r: float(np.linalg.norm(r.tcp_wrench()[:3]))),
-    "actual_digital_input_bits": ("UINT64", _fixed(0)),
-    "actual_digital_output_bits": ("UINT64", _fixed(0)),
+    "actual_digital_input_bits": ("UINT64", lambda r: r.signals.inputs),
+    "actual_digital_output_bits": ("UINT64", lambda r: r.signals.outputs),
     "joint_temperatures": ("VECTOR6D", _fixed((28.0, 29.0, 29.5, 31.0, 32.0, 33.0))),
     "actual_execution_time": ("DOUBLE", _fixed(0.0)),
     "robot_mode": ("INT32", lambda r: int(r.robot_mode)),
@@ -72,8 +72,8 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "runtime_state": ("UINT32", lambda r: int(r.runtime)),
     "standard_analog_input0": ("DOUBLE", _fixed(0.0)),
     "standard_analog_input1": ("DOUBLE", _fixed(0.0)),
-    "standard_analog_output0": ("DOUBLE", _fixed(0.0)),
-    "standard_analog_output1": ("DOUBLE", _fixed(0.0)),
+    "standard_analog_output0": ("DOUBLE", lambda r: r.signals.analog_outputs[0]),
+    "standard_analog_output1": ("DOUBLE", lambda r: r.signals.analog_outputs[1]),
     "robot_status_bits": ("UINT32", _status_bits),
     "safety_status_bits": ("UINT32", lambda r: SAFETY_BITS[r.safety_mode]),
     "ft_raw_wrench": ("VECTOR6D", lambda r: r.raw_wrench()),
@@ -82,8 +82,8 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "payload_inertia": ("VECTOR6D", lambda r: r.payload_inertia),
     "tcp_offset": ("VECTOR6D", lambda r: r.tcp_offset),
     "target_gravity": ("VECTOR3D", lambda r: r.target_gravity_m_s2),
-    "output_bit_registers0_to_31": ("UINT32", _fixed(0)),
-    "output_bit_registers32_to_63": ("UINT32", _fixed(0)),
+    "output_bit_registers0_to_31": ("UINT32", lambda r: r.signals.registers & 0xFFFFFFFF),
+    "output_bit_registers32_to_63": ("UINT32", lambda r: r.signals.registers >> 32 & 0xFFFFFFFF),
 }
 """Output name -> RTDE type and reader."""
 

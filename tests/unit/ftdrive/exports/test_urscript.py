@@ -17,8 +17,8 @@ from ftdrive.errors import ConfigError, PlanRefused, exit_code
 from ftdrive.exports import urscript
 from ftdrive.planning.plan import Plan
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.urscript.library import norm
 from ftmocks.ur.urscript.program import Program
+from ftmocks.ur.urscript.urmath import norm
 
 
 class Pendant:

@@ -1,0 +1,818 @@
+"""Programs as PolyScope saves them: 27 texts of our own with its constructs, nine of each generation.
+
+The constructs and their sources: docs/reference/urscript-constructs.md.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from ftmocks.disturbances import Push
+from ftmocks.kinematics import MODELS, Vector6, forward, pose_of, vector6
+from ftmocks.ur.dashboard import answer
+from ftmocks.ur.modes import Runtime
+from ftmocks.ur.robot import Robot
+from ftmocks.ur.variables import OUTPUTS
+from tests.unit.mocks.ur.urscript_robot import HOME, end_of, logged, new_robot, results, run, start
+
+POLYSCOPE = {"3": (3, 15, 0), "5": (5, 15, 0), "10": (10, 11, 0)}
+
+
+def java(value: float) -> str:
+    """A number as PolyScope writes it."""
+    if value and not 1e-3 <= abs(value) < 1e7:
+        mantissa, exponent = f"{value:.15e}".split("e")
+        return f"{float(mantissa)}E{int(exponent)}"
+    return repr(float(value))
+
+
+def pose(q: Sequence[float]) -> str:
+    """The pose of the flange at joint angles, without the zero in front of the point."""
+    values = pose_of(forward(MODELS["UR5e"], q))
+    return "p[" + ", ".join(f"{value:.12f}".replace("0.", ".", 1) for value in values) + "]"
+
+
+def at(*turned: float) -> Vector6:
+    """Joint angles off the start, rad."""
+    return vector6([q + turn for q, turn in zip(HOME, (*turned, *[0.0] * 6), strict=False)])
+
+
+def waypoint(name: str, q: Sequence[float]) -> str:
+    joints = ", ".join(map(java, q))
+    return f"global {name}_p={pose(q)}\n  global {name}_q=[{joints}]"
+
+
+NEAR = vector6([math.pi / 4 + 0.1, *HOME[1:5], 9.03e-5 + HOME[5]])
+FAR = at(0.2, 0.1)
+LOW = at(0.1, 0.05)
+NEAR_, FAR_, LOW_ = waypoint("Waypoint_1", NEAR), waypoint("Waypoint_2", FAR), waypoint("Waypoint_3", LOW)
+MOVEJ = "movej(get_inverse_kin({0}_p, qnear={0}_q), a=1.3962634015954636, v=1.0471975511965976)".format
+
+DOMAINS = """set_standard_analog_input_domain(0, 1)
+  set_standard_analog_input_domain(1, 1)
+  set_tool_analog_input_domain(0, 1)
+  set_tool_analog_input_domain(1, 1)
+  set_analog_outputdomain(0, 0)
+  set_analog_outputdomain(1, 0)
+  set_input_actions_to_default()"""
+TOOL = """set_tool_communication(False, 115200, 0, 1, 1.5, 3.5)
+  set_tool_output_mode(0)
+  set_tool_digital_output_mode(0, 1)
+  set_tool_digital_output_mode(1, 1)
+  set_tool_voltage(0)"""
+COUNTER = """step_count_4c0f_11 = {zero}
+  thread Step_Counter_Thread_7d1e_22():
+    while (True):
+      step_count_4c0f_11 = step_count_4c0f_11 + {one}
+      sync()
+    end
+  end
+  run Step_Counter_Thread_7d1e_22()""".format
+PREAMBLE = {
+    "3": f"""{DOMAINS}
+  set_tool_voltage(0)
+  set_tcp(p[0.0,0.0,0.0,0.0,0.0,0.0])
+  set_payload(0.0)
+  set_gravity([9.82, 1.803904735144051E-15, 6.013015783813504E-16])
+  set_safety_mode_transition_hardness(1)
+  {COUNTER(zero=0, one=1)}""",
+    "5": f"""global _hidden_verificationVariable=0
+  set_gravity([0.0, 0.0, 9.82])
+  set_tcp(p[0.0,0.0,0.0,0.0,0.0,0.0])
+  set_target_payload(0.000000, [0.000000, 0.000000, 0.000000], [0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+  {TOOL}
+  set_safety_mode_transition_hardness(1)
+  {DOMAINS}
+  {COUNTER(zero="0.0", one="1.0")}""",
+    "10": f"""global _hidden_verificationVariable = 0
+  set_gravity([0.0, 0.0, 9.82])
+  set_tcp(p[0.0,0.0,0.0,0.0,0.0,0.0], "Tool_flange")
+  set_target_payload(0.5, [0.0, 0.0, 5.0E-2], [9.03E-5, 9.03E-5, 9.03E-5, 0.0, 0.0, 0.0])
+  {TOOL}
+  {DOMAINS}""",
+}
+TOWARDS = """def calculate_point_to_move_towards(feature, direction, position_distance):
+    local posDir=[direction[0], direction[1], direction[2]]
+    if (norm(posDir) < 1e-6):
+      return get_target_waypoint()
+    end
+    local unit=normalize(posDir)
+    local step=p[unit[0] * position_distance, unit[1] * position_distance, unit[2] * position_distance, 0, 0, 0]
+    local wanted=pose_sub(pose_trans(feature, step), feature)
+    return pose_add(get_target_tcp_pose(), wanted)
+  end"""
+TIMER = """global timer_1=0
+  timer_1_is_counting = False
+  thread Timer_Thread_1():
+    while (True):
+      if (timer_1_is_counting):
+        timer_1 = timer_1 + get_steptime()
+      end
+      sync()
+    end
+  end
+  run Timer_Thread_1()"""
+
+
+def pallet(first: Sequence[float], across: Sequence[float]) -> str:
+    return f"""cnt_1_x = cnt_1 % 2
+      cnt_1_y = floor(cnt_1 / 2)
+      pose_1 = interpolate_pose(interpolate_pose({pose(first)}, {pose(across)}, cnt_1_x/1), {pose(LOW)}, cnt_1_y/1)
+      if (cnt_1 >= 3):
+        cnt_1 = 0
+      else:
+        cnt_1 = cnt_1 + 1
+      end"""
+
+
+def contact(robot: Robot) -> None:
+    """Something opposes the tool, which moves down."""
+    robot.world.touch("push", Push(np.array([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])))
+
+
+def answered(value: object) -> Callable[[Robot], None]:
+    """The operator enters a value in each popup."""
+
+    def enter(robot: Robot) -> None:
+        robot.popup_answer = value  # type: ignore[assignment]
+        answer(robot, "close popup")
+
+    return enter
+
+
+def input_on(place: int) -> Callable[[Robot], None]:
+    def set_it(robot: Robot) -> None:
+        robot.signals.inputs |= 1 << place
+
+    return set_it
+
+
+class Saved(NamedTuple):
+    """A program, what the operator does 0.6 s after its start, and what becomes of it."""
+
+    name: str
+    generation: str
+    body: str
+    says: list[str]
+    """Messages in the log of the pendant."""
+    seconds: float = 1.5
+    ends: bool = True
+    """Else it plays on."""
+    meanwhile: Callable[[Robot], object] = lambda _: None
+    stands: Vector6 | None = None
+    """Where the arm is in the end."""
+    shows: Callable[[Robot], object] = lambda _: True
+
+
+PROGRAMS = [
+    Saved(
+        "waypoints on a wall",
+        "3",
+        f"""{NEAR_}
+  {FAR_}
+  $ 1 "Robot Program"
+  $ 2 "MoveJ"
+  $ 3 "Waypoint_1"
+  {MOVEJ("Waypoint_1")}
+  $ 4 "MoveL"
+  $ 5 "Waypoint_2"
+  movel(Waypoint_2_p, a=1.2, v=0.25)
+  textmsg(step_count_4c0f_11 > 100)""",
+        ["True"],
+        seconds=3.5,
+        stands=FAR,
+        shows=lambda r: r.target_gravity_m_s2 == (9.82, 1.803904735144051e-15, 6.013015783813504e-16),
+    ),
+    Saved(
+        "installation node with lines of comment",
+        "3",
+        """# begin: URCap Installation Node
+  #   Source: Sensor_Node, 1.0.3, Example
+  #   Type: Sensor
+  ###########################################
+  # Talks to nothing
+  ###########################################
+
+  def relative(P_from, P_to, Pi):
+    # only this line, and
+    # this one
+    return pose_trans(P_to, pose_trans(pose_inv(P_from), Pi))
+  end
+
+  def difference(list1, list2):
+    global node_list=list1
+    i=0
+    while i<length(list1):
+      node_list[i]=list1[i] - list2[i]
+      i=i+1
+    end
+    return node_list
+  end
+  if (not get_standard_digital_in(0) == False):
+   popup("Not connected", "Sensor", error=True)
+  # in front of else
+  elif (norm(difference([3,4], [0,0])) == 5):
+    # nothing is done here
+  else:
+    # nor here
+  end
+  # end: URCap Installation Node
+  $ 1 "Robot Program"
+  $ 2 "'a comment of the tree'"
+  # 'a comment of the tree'
+  textmsg(relative(p[0,0,0,0,0,0], p[0,0,.5,0,0,0], p[0,0,.25,0,0,0])[2])
+  textmsg(node_list)
+  $ 3 "Halt"
+  halt""",
+        ["0.75", "[3, 4]"],
+    ),
+    Saved(
+        "output, and wait for an input",
+        "3",
+        """while (True):
+    $ 1 "Robot Program"
+    $ 2 "Set DO[0]=On"
+    set_standard_digital_out(0, True)
+    $ 3 "Wait DI[2]=HI"
+    while (get_standard_digital_in(2) == False):
+      sync()
+    end
+    $ 4 "Set DO[0]=Off"
+    set_standard_digital_out(0, False)
+    set_configurable_digital_out(7, True)
+    $ 5 "Wait: 0.01"
+    sleep(0.01)
+    halt
+  end""",
+        [],
+        meanwhile=input_on(2),
+        shows=lambda r: OUTPUTS["actual_digital_output_bits"][1](r) == 1 << 15,
+    ),
+    Saved(
+        "thread that assigns global variables in blocks",
+        "3",
+        """global chosen=0
+  global speed=0
+  global speed_low=0.5
+  thread Thread_1():
+    while (True):
+      $ 5 "Thread_1"
+      if (chosen == 0):
+        global speed=speed_low
+      else:
+        if (chosen == 1):
+          global speed=1.0
+        end
+      end
+      sync()
+    end
+  end
+  threadId_Thread_1 = run Thread_1()
+  sleep(0.1)
+  textmsg(speed)
+  global chosen=1
+  sleep(0.1)
+  kill threadId_Thread_1
+  textmsg(speed)""",
+        ["0.5", "1.0"],
+    ),
+    Saved(
+        "loop, choice and a popup that waits",
+        "3",
+        """$ 1 "Robot Program"
+  $ 2 "Loop 3 times"
+  Loop_1 = 0
+  while (Loop_1 < 3):
+    $ 3 "If Loop_1 = 1"
+    if (Loop_1 == 1):
+      # the second round
+      $ 4 "Popup"
+      popup("the second round", title="Message", warning=True, error=False, blocking=True)
+    # between
+    elif (Loop_1 == 2):
+      $ 5 "ElseIf"
+      textmsg("third")
+    else:
+      # first
+      $ 6 "Else"
+    end
+    Loop_1 = Loop_1 + 1
+  end
+  textmsg(Loop_1)""",
+        ["third", "3"],
+        meanwhile=answered(None),
+    ),
+    Saved(
+        "pallet of a pattern",
+        "3",
+        f"""global cnt_1=0
+  global count=0
+  while (True):
+      $ 1 "Robot Program"
+      $ 2 "Pallet"
+      {pallet(NEAR, HOME)}
+      $ 3 "Approach_1" "noBreak"
+      movel(pose_trans(pose_1, pose_trans(pose_inv({pose(NEAR)}),{pose(at(0.11))})), a=2.5, v=0.25)
+      $ 4 "PatternPoint_1" "noBreak"
+      movel(pose_1, a=2.5, v=0.25)
+      global count=count+1
+      if (cnt_1 == 0):
+        $ 5 "AfterEnd" "noBreak"
+        textmsg(count)
+        halt
+      end
+  end""",
+        ["4"],
+        seconds=9.0,
+        stands=LOW,
+    ),
+    Saved(
+        "timer that is set back",
+        "3",
+        f"""{TIMER}
+  $ 1 "Robot Program"
+  $ 2 "timer_1: Start"
+  timer_1_is_counting = True
+  sleep(0.4)
+  $ 3 "timer_1: Stop"
+  timer_1_is_counting = False
+  global CycleTime=timer_1
+  $ 4 "timer_1: Reset"
+  timer_1 = 0
+  textmsg(norm(CycleTime - 0.4) < 0.02)
+  textmsg(timer_1)""",
+        ["True", "0"],
+    ),
+    Saved(
+        "variable that the operator enters",
+        "3",
+        """global var_1=1
+  $ 2 "var_1:=operator"
+  global var_1=request_integer_from_primary_client("How many rows?")
+  global var_1=var_1+1
+  textmsg(var_1)""",
+        ["8"],
+        meanwhile=answered(7),
+    ),
+    Saved(
+        "gripper at the tool flange",
+        "3",
+        """global measure_width=0
+  global lost_grip=False
+  global zsysm=0.7415
+  global zsysz=0.06935
+  thread lost_grip_thread():
+    while True:
+      set_tool_voltage(24)
+      if True ==get_digital_in(8):
+        lost_grip=True
+      end
+      sync()
+    end
+  end
+  run lost_grip_thread()
+  def RG(width, force=40, payload=0.0):
+    set_tool_digital_out(0, True)
+    zscale = (get_analog_in(2)-0.026)/2.9760034
+    zangle = zscale*1.57079633+-0.08726646
+    global measure_width = (floor((5.0+110*sin(zangle))*10))/10-9.2
+    zload=payload+zsysm
+    set_payload(zload,[0, 0,(zsysz*zsysm)/zload])
+    return measure_width < width
+  end
+  set_tcp(p[0,0,0.18659,0,-0,-3.14159])
+  $ 2 "RG(100)"
+  textmsg(RG(100, 40, payload=0.25))
+  while (not lost_grip):
+    sync()
+  end
+  textmsg(lost_grip)""",
+        ["True", "True"],
+        meanwhile=input_on(16),
+        shows=lambda r: (r.payload_kg, r.signals.outputs, r.tcp_offset[2]) == (0.9915, 1 << 16, 0.18659),
+    ),
+    Saved(
+        "two waypoints for ever",
+        "5",
+        f"""{NEAR_}
+  {FAR_}
+  global rounds=0
+  while (True):
+    $ 2 "Robot Program"
+    $ 3 "MoveJ"
+    $ 4 "Waypoint_1" "breakAfter"
+    {MOVEJ("Waypoint_1")}
+    $ 6 "Waypoint_2" "breakAfter"
+    {MOVEJ("Waypoint_2")}
+    $ 7 "rounds≔rounds+1" "breakAfter"
+    global rounds=rounds+1
+    if (rounds == 2):
+      $ 8 "Script: textmsg"
+      textmsg("two rounds")
+    end
+  end""",
+        ["two rounds"],
+        seconds=2.5,
+        ends=False,
+    ),
+    Saved(
+        "move down until contact",
+        "5",
+        f"""{TOWARDS}
+  global move_thread_flag_3=0
+  thread move_thread_3():
+    enter_critical
+    move_thread_flag_3 = 1
+    local towardsPos=calculate_point_to_move_towards(p[0.0,0.0,0.0,0.0,0.0,0.0], [0.0,0.0,-1.0], 1000.0)
+    movel(towardsPos, a=1.2, v=0.02)
+    move_thread_flag_3 = 2
+    exit_critical
+  end
+  move_thread_flag_3 = 0
+  move_thread_han_3 = run move_thread_3()
+  global start_z=get_actual_tcp_pose()[2]
+  while (True):
+    local targetTcpDirection=get_target_tcp_speed()
+    local stepsToRetract=tool_contact(direction=targetTcpDirection)
+    if (stepsToRetract > 0):
+      kill move_thread_han_3
+      stopl(3.0)
+      local backTrackMovement=get_actual_joint_positions_history(stepsToRetract)
+      local contactPose=get_forward_kin(backTrackMovement)
+      local posDir=[targetTcpDirection[0],targetTcpDirection[1],targetTcpDirection[2]]
+      local retractTo=contactPose
+      if (norm(posDir) > 1e-6):
+        local unit=normalize(posDir)
+        retractTo = pose_sub(contactPose, p[unit[0] * 0.0, unit[1] * 0.0, unit[2] * 0.0, 0, 0, 0])
+      end
+      movel(retractTo, a=3.0, v=0.1)
+      break
+    end
+    sync()
+  end
+  global moved=start_z-get_actual_tcp_pose()[2]
+  textmsg(moved > 0.005)
+  textmsg(moved < 0.03)""",
+        ["True", "True"],
+        meanwhile=contact,
+    ),
+    Saved(
+        "force mode",
+        "5",
+        f"""{NEAR_}
+  $ 2 "Force"
+  zero_ftsensor()
+  force_mode_set_damping(0.005)
+  force_mode_set_gain_scaling(1.0)
+  force_mode(tool_pose(), [0, 0, 1, 0, 0, 0], [0.0, 0.0, -2.0, 0.0, 0.0, 0.0], 2, [0.1, 0.1, 0.15, 0.3, 0.3, 0.3])
+  $ 3 "MoveL"
+  $ 4 "Waypoint_1"
+  movel(Waypoint_1_p, a=1.2, v=0.25)
+  $ 5 "Wait: 0.1"
+  sleep(0.1)
+  end_force_mode()
+  stopl(5.0)
+  textmsg(force() < 1.0)""",
+        ["True"],
+        seconds=2.0,
+        stands=NEAR,
+    ),
+    Saved(
+        "signals of Modbus",
+        "5",
+        """modbus_add_signal("192.168.1.3", 255, 1, 0, "MODBUS_1", False)
+  modbus_set_signal_update_frequency("MODBUS_1", 10)
+  modbus_add_signal("192.168.1.3", 255, 1, 1, "MODBUS_2", False)
+  modbus_set_signal_update_frequency("MODBUS_2", 10)
+  modbus_set_runstate_dependent_choice("MODBUS_2",0)
+  set_standard_digital_input_action(0, "default")
+  set_runstate_standard_digital_output_to_value(1, 2)
+  $ 2 "Set MODBUS_2=On"
+  modbus_set_output_signal("MODBUS_2", True, False)
+  set_tool_digital_out(1, True)
+  textmsg(get_tool_digital_out(1))""",
+        ["True"],
+        shows=lambda r: r.signals.outputs == 1 << 17,
+    ),
+    Saved(
+        "subprogram with assignments",
+        "5",
+        """global N_Parts=0
+  def PUT_PART():
+    $ 28 "PUT_PART" "noBreak"
+    $ 29 "N_Parts≔N_Parts+1" "noBreak"
+    global N_Parts=N_Parts+1
+    if (N_Parts == 2):
+      $ 30 "Palé: ¿fin?" "noBreak"
+      global finished=True
+    end
+  end
+  global finished=False
+  while (finished == False):
+    $ 3 "Call PUT_PART"
+    PUT_PART()
+  end
+  textmsg("parts: ", N_Parts)""",
+        ["parts: 2"],
+    ),
+    Saved(
+        "choice that is checked continuously",
+        "5",
+        """global ready=True
+  global thread_flag_4=0
+  while (True):
+    $ 4 "If ready"
+    global thread_flag_4=0
+    thread Thread_if_4():
+      $ 5 "Wait: 100.0"
+      sleep(100.0)
+      global thread_flag_4=1
+      while (True):
+        sync()
+      end
+      return False
+    end
+    if (ready):
+      global thread_handler_4=run Thread_if_4()
+      while (thread_flag_4 == 0):
+        if not(get_configurable_digital_in(1) == False):
+          kill thread_handler_4
+          global thread_flag_4=2
+        end
+        sync()
+      end
+      kill thread_handler_4
+    end
+    textmsg(thread_flag_4)
+    break
+  end""",
+        ["2"],
+        meanwhile=input_on(9),
+    ),
+    Saved(
+        "tool and payload",
+        "5",
+        """$ 2 "Set"
+  set_tcp(p[-0.018457705833652818,-0.06671608895162245,0.19891377627880122,0.0,0.0,0.0])
+  set_target_payload(1.500000, [-0.003000, -0.016000, 0.015000], [0.003026, 0.003026, 0.003026, 0.0, 0.0, 0.0])
+  set_payload_mass(1.25)
+  set_payload_cog([0.0, 0.0, 9.03E-5])
+  global offset=get_tcp_offset()
+  textmsg(offset[2])
+  textmsg(point_dist(get_actual_tcp_pose(), get_target_tcp_pose()) < 1E-3)""",
+        ["0.19891377627880122", "True"],
+        shows=lambda r: (r.payload_kg, r.payload_cog_m) == (1.25, (0.0, 0.0, 9.03e-5)),
+    ),
+    Saved(
+        "popups, and halt inside a folder",
+        "5",
+        """$ 2 "Folder"
+  $ 3 "Popup"
+  popup("Not activated.", "Sensor", False, True, True)
+  textmsg("closed")
+  if (True):
+    $ 4 "Halt"
+    halt
+  end
+  textmsg("never")""",
+        ["closed"],
+        meanwhile=lambda r: answer(r, "close popup"),
+    ),
+    Saved(
+        "waypoints in a plane",
+        "5",
+        f"""global Plane_1=p[0.0,0.0,0.0,5.470302593228572E-14,0.0,-3.5212753610990396E-14]
+  {NEAR_}
+  {LOW_}
+  $ 2 "MoveJ"
+  movej(pose_trans(Plane_1, Waypoint_1_p), a=1.3962634015954636, v=1.0471975511965976)
+  $ 3 "MoveP"
+  movep(pose_trans(Plane_1, Waypoint_3_p), a=1.2, v=0.25, r=0.025)
+  $ 4 "CircleMove"
+  movec(Waypoint_1_p, Waypoint_3_p, a=1.2, v=0.25, r=0.025, mode=0)
+  $ 5 "MoveL"
+  movel(Waypoint_1_q, a=1.2, v=0.25, t=1.0)
+  textmsg(norm(get_actual_joint_positions()[0] - Waypoint_1_q[0]) < 1e-3)""",
+        ["True"],
+        seconds=5.0,
+        stands=NEAR,
+    ),
+    Saved(
+        "move of PolyScope X",
+        "10",
+        f"""{FAR_}
+  # Move
+  $ 3 "Move" "breakAfter"
+  {MOVEJ("Waypoint_2")}
+  textmsg(is_steady())""",
+        ["False"],
+        seconds=2.5,
+        stands=FAR,
+        shows=lambda r: r.payload_inertia == (9.03e-5, 9.03e-5, 9.03e-5, 0.0, 0.0, 0.0),
+    ),
+    Saved(
+        "watch of a contribution",
+        "10",
+        """eject_error_flag = 0
+  thread watch_a084():
+    set_tool_digital_out(0,False)
+    sleep(0.2)
+    set_standard_digital_out(7,True)
+    eject_error_flag = 1
+    return False
+  end
+  ma = run watch_a084()
+  while (get_standard_digital_in(2) == False):
+    if (eject_error_flag == 1):
+      kill ma
+      popup("Check the switch.",title="Not ejected.",error=True,blocking=True)
+      break
+    end
+    sync()
+  end
+  kill ma
+  textmsg(eject_error_flag)""",
+        ["1"],
+        meanwhile=lambda r: answer(r, "close popup"),
+        shows=lambda r: r.signals.outputs == 1 << 7,
+    ),
+    Saved(
+        "loop with a condition",
+        "10",
+        """global i_var_1 = 0
+  while (i_var_1 < 2 and not get_standard_digital_in(0)):
+    global i_var_1 = i_var_1 + 0.5
+    sync()
+  end
+  textmsg(i_var_1)""",
+        ["2.0"],
+    ),
+    Saved(
+        "values that the operator enters",
+        "10",
+        """global mass_1 = request_float_from_primary_client("Mass of the part?")
+  global wanted = mass_1 * 2
+  textmsg(wanted)
+  set_payload(mass_1, [0.0, 0.0, 0.1])""",
+        ["3.0"],
+        meanwhile=answered(1.5),
+        shows=lambda r: r.payload_kg == 1.5,
+    ),
+    Saved(
+        "registers",
+        "10",
+        """write_output_boolean_register(0, True)
+  write_output_boolean_register(33, True)
+  write_output_integer_register(24, 7)
+  write_output_float_register(24, 9.03E-5)
+  textmsg(read_output_boolean_register(33) == True  and  read_output_integer_register(24) == 7)""",
+        ["True"],
+        shows=lambda r: (
+            [OUTPUTS[f"output_bit_registers{bits}"][1](r) for bits in ("0_to_31", "32_to_63")] == [1, 2]
+            and r.output_doubles[24] == 9.03e-5
+        ),
+    ),
+    Saved(
+        "pallet in a function",
+        "10",
+        f"""global cnt_1 = 0
+  def palletizing():
+      {pallet(NEAR, HOME)}
+      movel(pose_1, a=2.5, v=0.25)
+      return cnt_1
+  end
+  textmsg(palletizing())
+  textmsg(palletizing())""",
+        ["1", "2"],
+        seconds=4.0,
+        stands=HOME,
+    ),
+    Saved(
+        "analog output by a choice",
+        "10",
+        """global level = 2
+  if (level == 1):
+    set_standard_analog_out(0, 0.25)
+  elif (level == 2):
+    # half of the range
+    set_standard_analog_out(0, 0.5)
+  else:
+    # nothing
+  end
+  textmsg(get_standard_analog_in(1))
+  textmsg(get_standard_analog_out(0))""",
+        ["0.0", "0.5"],
+        shows=lambda r: OUTPUTS["standard_analog_output0"][1](r) == 0.5,
+    ),
+    Saved(
+        "signals of the box",
+        "10",
+        """set_configurable_digital_out(0, True)
+  while (get_configurable_digital_in(3) == False):
+    sync()
+  end
+  set_configurable_digital_out(0, get_standard_digital_out(0))
+  set_digital_out(1, True)
+  textmsg(get_configurable_digital_out(0))""",
+        ["False"],
+        meanwhile=input_on(11),
+        shows=lambda r: r.signals.outputs == 1 << 1,
+    ),
+    Saved(
+        "timer and steps beside a move",
+        "10",
+        f"""{TIMER}
+  {COUNTER(zero="0.0", one="1.0")}
+  {NEAR_}
+  timer_1_is_counting = True
+  {MOVEJ("Waypoint_1")}
+  timer_1_is_counting = False
+  textmsg(timer_1 > 0.3)
+  textmsg(step_count_4c0f_11 > 100)
+  timer_1 = 0
+  textmsg(timer_1)""",
+        ["True", "True", "0"],
+        seconds=2.0,
+        stands=NEAR,
+    ),
+]
+
+
+@pytest.mark.parametrize("saved", PROGRAMS, ids=lambda saved: f"{saved.generation}: {saved.name}")
+def test_what_polyscope_saves_runs_to_its_end(saved: Saved) -> None:
+    text = f"def saved():\n  {PREAMBLE[saved.generation]}\n  {saved.body}\nend\n"
+    robot = start(text, new_robot(POLYSCOPE[saved.generation]))
+    run(robot, 0.6)
+    saved.meanwhile(robot)
+    run(robot, saved.seconds)
+    assert logged(robot) == saved.says
+    if saved.ends:
+        assert end_of(robot).why == "ended"
+    assert (robot.runtime == Runtime.PLAYING) is not saved.ends
+    if saved.stands is not None:
+        assert robot.arm.q == pytest.approx(saved.stands, abs=1e-6)
+    assert saved.shows(robot)
+
+
+def test_each_generation_has_nine_programs() -> None:
+    assert [sum(saved.generation == one for saved in PROGRAMS) for one in POLYSCOPE] == [9, 9, 9]
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("floor(r2d(d2r(1.5)) + 0.1)", "1"),
+        ("pow(2, 3) + atan2(0, 1) + ceil(0.5)", "9.0"),
+        ("normalize([3, 4])", "[0.6, 0.8]"),
+        ("pose_trans(p[1, 0, 0, 0, 0, d2r(90)], p[1, 0, 0, 0, 0, 0])[1]", "1.0"),
+        ("pose_add(p[0, 0, 1, 0, 0, 0], pose_inv(p[0, 0, 2, 0, 0, 0]))[2]", "-1.0"),
+        ("norm(pose_sub(get_forward_kin(), get_actual_tcp_pose())) < 1E-9", "True"),
+        ("floor(100 * norm(pose_add(p[1, 0, 0, 1, 0, 0], pose_sub(p[0, 2, 0, 0, 0, 1], p[1, 0, 0, 1, 0, 0]))))", "223"),
+        ("point_dist(p[0, 0, 0, 0, 0, 0], interpolate_pose(p[0, 0, 0, 0, 0, 0], p[3, 4, 0, 0, 0, 1], 0.5))", "2.5"),
+        ("norm(get_inverse_kin(get_forward_kin())[3] - d2r(-50)) < 1E-6", "True"),
+        ("floor(10.1 * norm(pose_sub(get_forward_kin(tcp=p[0, 0, 0.5, 0, 0, 0]), get_forward_kin())))", "5"),
+        ("get_tcp_force()[0] * 0", "0.0"),
+        ("get_target_tcp_speed()", str([0.0] * 6)),
+        ("get_actual_tcp_speed()", str([0.0] * 6)),
+        ("get_configurable_digital_in(0) or get_tool_digital_in(1) or get_digital_out(9)", "False"),
+    ],
+)
+def test_functions_of_poses_numbers_and_signals(expression: str, value: str) -> None:
+    assert results(expression) == [value]
+
+
+@pytest.mark.parametrize(
+    ("body", "why"),
+    [
+        ("  set_tool_voltage()", "set_tool_voltage: missing a required argument: 'voltage'"),
+        ("  set_standard_digital_out(8, True)", "the number of a digital signal must be a whole number from 0 to 7"),
+        ("  set_standard_digital_out(0, 1)", "must be True or False, not 1"),
+        ("  movel(p[9, 0, 0, 0, 0, 0], a=9, v=2)", "leaves the workspace"),
+        ("  x = get_inverse_kin(p[9, 0, 0, 0, 0, 0])", "get_inverse_kin: x: no solution for the pose"),
+        ("  x = pose_inv([0, 0, 0, 0, 0, 0])", "pose_inv: p_from must be a pose, not [0, 0, 0, 0, 0, 0]"),
+        ("  x = normalize([0, 0])", "normalize: [0, 0] has no direction"),
+    ],
+)
+def test_wrong_arguments_end_the_program(body: str, why: str) -> None:
+    robot = start(f"def f():\n{body}\nend\n")
+    run(robot, 3.0)
+    assert any(why in event.why for event in robot.events)
+    assert robot.runtime != Runtime.PLAYING
+
+
+def test_a_question_that_the_operator_cancels_ends_the_program() -> None:
+    robot = start('def f():\n  x = request_boolean_from_primary_client("Go on?")\n  textmsg(x)\nend\n')
+    assert robot.popup == "Go on?"
+    answer(robot, "close popup")
+    run(robot, 0.1)
+    assert (end_of(robot).why, logged(robot)) == ("ended", [])
+
+
+@pytest.mark.parametrize("function", ["set_tool_output_mode(0)", "tool_contact()"])
+def test_a_cb3_controller_lacks_functions_of_the_e_series(function: str) -> None:
+    robot = new_robot(POLYSCOPE["3"])
+    with pytest.raises(AssertionError, match="does not exist"):
+        start(f"def f():\n  {function}\nend\n", robot)
