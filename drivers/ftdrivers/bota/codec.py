@@ -23,6 +23,7 @@ OVERRANGE, INVALID, RAW = 2, 4, 8
 
 BAUDS = (9600, 57_600, 115_200, 230_400, 460_800)
 """In the order of their codes 0 to 4."""
+DEFAULT_BAUD = 230_400
 
 ENTER_SETUP, ENTER_RUN, ASK_SERIAL = b"C", b"R", b"p?"
 

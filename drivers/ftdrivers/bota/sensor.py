@@ -24,12 +24,12 @@ from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
 from ftdrivers.wires.framing import describe_status
-from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.serial_port import SerialPort, other_baud
 
 log = logging.getLogger(__name__)
 
 # The rates of the maker's examples, and the default of its ROS 2 driver.
-_USUAL_BAUDS = (460_800, 230_400)
+_USUAL_BAUDS = (460_800, codec.DEFAULT_BAUD)
 # The median of their spacing is the sample period.
 _FIRST_FRAMES = 8
 # The longest wait for a sensor that boots.
@@ -139,7 +139,7 @@ class BotaSensor(StreamingSensor):
     def _find(self) -> list[codec.Frame]:
         """Open the port at the baud rate of the sensor, configure it if requested, and return its first frames."""
         # The boot text is not waited for, because a sensor that runs already sends none.
-        found: list[str] = []
+        found, has_noise = list[str](), False
         for baud, port in tuple(self._ports):
             self._port, self._text, self._frames = port, b"", codec.deframer()
             self._ports.sort(key=lambda one: one[0] != baud)  # a driver that reconnects tries the last one first
@@ -152,11 +152,12 @@ class BotaSensor(StreamingSensor):
                 return self._first_frames()
             except DeviceTimeout as exc:
                 found.append(f"{exc.found} at {baud} baud")
+                has_noise = has_noise or self._frames.has_noise
                 port.close()
-        raise ConnectError(
-            f"{self.name}: {', '.join(found)}",
-            "check supply and wiring; add baud=… to its address, or sinc=512 for a sensor in set-up or text mode",
-        )
+        fix = other_baud(codec.DEFAULT_BAUD) if has_noise else "check supply and wiring"
+        if self._sinc is None:
+            fix += "; add sinc=512 to its address if it is in set-up or text mode"
+        raise ConnectError(f"{self.name}: {', '.join(found)}", fix)
 
     def _configure(self, baud: int, sinc: int) -> None:
         # Only what the address requests is changed; an unusual mode needs ?sinc=512 once.
@@ -173,14 +174,17 @@ class BotaSensor(StreamingSensor):
             begin = len(self._text)
             self._port.write(command)
             for _ in self._clock.looks(_REPLY_S):
-                self._text += self._port.read_all(1)
+                data = self._port.read_all(1)
+                self._text += data
+                self._frames.feed(data)
                 if codec.success(command) in self._text[begin:]:
                     return
         raise DeviceTimeout(f"'{command.decode()}' was not confirmed within {attempts} times {_REPLY_S:g} s")
 
     def _first_frames(self) -> list[codec.Frame]:
         frames: list[codec.Frame] = []
-        begin = len(self._text)
+        begin, begin_s = len(self._text), self._clock.now_s()
+        self._frames = codec.deframer()
         for _ in self._clock.looks(_BOOT_S):
             data = self._port.read_all(1)
             self._text += data
@@ -189,7 +193,7 @@ class BotaSensor(StreamingSensor):
                 return frames
             if not frames and len(self._text) - begin > _NOISE_BYTES:
                 break
-        raise DeviceTimeout(f"{len(frames)} intact frames within {_BOOT_S:g} s, {_FIRST_FRAMES} are needed")
+        raise DeviceTimeout(f"{self._frames.arrived} within {self._clock.now_s() - begin_s:.1f} s")
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
         """Unwrap the sensor's clock; return (time in µs, sequence number)."""

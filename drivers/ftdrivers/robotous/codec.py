@@ -28,6 +28,8 @@ AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
 """Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
 
+DEFAULT_BAUD = 115_200
+
 FASTEST_Hz = {57_600: 200, 115_200: 333, 230_400: 500, 460_800: 500, 921_600: 1000}
 """The highest output rate at each baud rate of a UART."""
 

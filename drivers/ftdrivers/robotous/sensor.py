@@ -19,7 +19,7 @@ from ftdrivers.registry import Options
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
-from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.serial_port import SerialPort, other_baud
 
 _REPLY_S = 0.15
 _ATTEMPTS = 3
@@ -158,7 +158,7 @@ class RobotousSerial(RobotousSensor):
         self,
         port: str,
         *,
-        baud: int = 115_200,
+        baud: int = codec.DEFAULT_BAUD,
         rate_Hz: int | None = None,
         counts_per_unit: tuple[int, int] | None = None,
         sign: int = 1,
@@ -166,6 +166,7 @@ class RobotousSerial(RobotousSensor):
     ) -> None:
         if baud not in codec.FASTEST_Hz:
             raise ValueError(f"baud is {baud}; choose one of {', '.join(map(str, codec.FASTEST_Hz))}")
+        self._baud = baud
         super().__init__(
             f"Robotous sensor on {port}",
             codec.FASTEST_Hz[baud],
@@ -181,7 +182,7 @@ class RobotousSerial(RobotousSensor):
         """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
         return cls(
             address,
-            baud=options.integer("baud", 115_200, 57_600, 921_600),
+            baud=options.integer("baud", codec.DEFAULT_BAUD, 57_600, 921_600),
             rate_Hz=options.integer("rate", 0, 0, 1000) or None,
             counts_per_unit=options.counts(),
             sign=sign,
@@ -197,6 +198,15 @@ class RobotousSerial(RobotousSensor):
 
     def _send(self, field: bytes) -> None:
         self._port.write(codec.encode_frame(field))
+
+    def _ask(self, command: Command, *parameters: int) -> bytes:
+        try:
+            return super()._ask(command, *parameters)
+        except DeviceTimeout as exc:
+            if not self._frames.has_noise:
+                raise
+            found = f"{exc.found}: {self._frames.arrived} at {self._baud} baud"
+            raise DeviceTimeout(found, other_baud(codec.DEFAULT_BAUD)) from exc
 
     def _receive(self) -> list[Field]:
         frames = self._frames.feed(self._port.read_all(codec.FRAME_SIZE))

@@ -84,6 +84,18 @@ class Deframer:
         del buffer[:at]
         return frames
 
+    @property
+    def arrived(self) -> str:
+        """What has arrived so far, in words."""
+        if self.number:
+            return f"{self.number - self.damaged} frames arrive"
+        return f"bytes arrive, but no frames of {self._size} bytes" if self.has_noise else "no bytes arrive"
+
+    @property
+    def has_noise(self) -> bool:
+        """Whether bytes have arrived, but no frame, as with another baud rate or another device."""
+        return not self.number and bool(self._skipped or self._buffer)
+
     def _next_number(self) -> int:
         if self._skipped and self.number:
             missing = max(1, round(self._skipped / self._size))

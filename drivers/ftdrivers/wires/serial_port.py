@@ -101,6 +101,14 @@ def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> Co
     return ConnectError(f"{owner}: {found}", fix)
 
 
+def other_baud(default: int) -> str:
+    """Return the fix for bytes without frames; `default` is the baud rate of a new sensor."""
+    return (
+        f"set baud=… in its address to the baud rate of the sensor ({default} by default), and check that no other "
+        "device is on this port"
+    )
+
+
 class SerialPort:
     """The serial port of one device.
 

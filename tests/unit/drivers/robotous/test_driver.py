@@ -191,5 +191,13 @@ def test_noise_is_no_sensor(table: Table) -> None:
     mute = [(sent, b"") for sent, _ in turns]
     noise = Stream.of(b"\xaa" * 40, 0.005)
     wire = table.serial([*[mute[0], (mute[1][0], noise)] * 3, mute[0]], noise)
-    with wire, pytest.raises(ConnectError, match="check supply, wiring"):
+    found = r"to MODEL .*: bytes arrive, but no frames of 19 bytes at 921600 baud; set baud=… .* \(115200 by default"
+    with wire, pytest.raises(ConnectError, match=found):
+        uart(wire).open()
+
+
+def test_silence_names_the_wiring(table: Table) -> None:
+    mute = [(sent, b"") for sent, _ in on_uart({MODEL: b""}, Stream.of(b""))[:2]]
+    wire = table.serial([*mute * 3, mute[0]])
+    with wire, pytest.raises(ConnectError, match=r"0\.15 s; check supply, wiring"):
         uart(wire).open()

@@ -45,6 +45,21 @@ def test_a_false_header_costs_no_frame() -> None:
     assert frames.feed(inside[3:] + inside + inside) == [(1, inside), (2, inside)]
 
 
+@pytest.mark.parametrize(
+    ("data", "arrived", "has_noise"),
+    [
+        (b"", "no bytes arrive", False),
+        (b"A", "bytes arrive, but no frames of 6 bytes", True),
+        (b"?" * 30, "bytes arrive, but no frames of 6 bytes", True),
+        (b"?" + frame(b"abc") + b"?" * 6 + frame(b"abc"), "2 frames arrive", False),
+    ],
+)
+def test_what_has_arrived_is_described(data: bytes, arrived: str, has_noise: bool) -> None:
+    frames = deframer()
+    frames.feed(data)
+    assert (frames.arrived, frames.has_noise) == (arrived, has_noise)
+
+
 def test_a_header_of_one_byte_may_stand_before_that_of_a_frame() -> None:
     frames, good = Deframer(b"A", 4, lambda frame: sum(frame[1:3]) & 0xFF == frame[3]), b"A\x01\x02\x03"
     assert frames.feed(b"A" + good + b"AA" + good) == [(1, good), (3, good)]
