@@ -43,6 +43,7 @@ _COUNTS_PER_N_NM = {
     "RFT76-HA01": (50, 2000),
     "RFT80-6A01": (50, 1000),
     "RFT80-6A02": (50, 1000),
+    "RFT82-HA02": (50, 1000),
 }
 _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 

@@ -54,6 +54,7 @@ def test_overload_bits(overload: int, axes: list[str]) -> None:
         ("RFT76-HA01", 2000),
         ("RFT80-6A01", 1000),
         ("RFT80-6A02", 1000),
+        ("RFT82-HA02", 1000),
         ("RFT40-SA01-D", 2000),
     ],
 )
