@@ -90,6 +90,7 @@ MODELS = {
         Model("RFT64-6A01", torque_divisor=1000.0),
         Model("RFT80-6A01", torque_divisor=1000.0),
         Model("RFT80-6A02", torque_divisor=1000.0),
+        Model("RFT82-HA02", torque_divisor=1000.0),
     )
 }
 """By the name that the sensor reports."""

@@ -78,6 +78,7 @@ def test_documented_sample(sensor: RobotousSensor[bytes]) -> None:
         ("RFT64-6A01", 1000),
         ("RFT80-6A01", 1000),
         ("RFT80-6A02", 1000),
+        ("RFT82-HA02", 1000),
     ],
 )
 def test_every_model_reports_its_name_and_has_its_divisors(
