@@ -145,6 +145,8 @@ class NetFtBox(Device[bytes]):
         Scale and identity.
     product
         Name the box gives itself.
+    firmware
+        Version of its firmware.
     tool_transform
         (6,) displacements dx dy dz and rotations rx ry rz, in these units; zeros for none.
     distance_unit, angle_unit
@@ -170,6 +172,7 @@ class NetFtBox(Device[bytes]):
     http_port: int = 0
     calibration: Calibration = Calibration()
     product: str = "Net F/T"
+    firmware: str = "2.2.59"
     tool_transform: Sequence[float] = (0.0, 0.0, 132.71, 0.0, 0.0, 0.0)
     distance_unit: int = 3
     angle_unit: int = 1
@@ -365,6 +368,7 @@ class NetFtBox(Device[bytes]):
             "comrdtrate": self.rate_hz,
             "comrdtbsiz": self.buffer_size,
             "setrate": INTERNAL_HZ,
+            "mfgdigver": self.firmware,
             "prodname": self.product,
         }
 

@@ -77,6 +77,7 @@ def test_page_of_a_real_box(box: NetFtBox) -> None:
         "cfgmr": "330;330;990;30;30;30",
         "setcfgsel": "0",
         "setbias": "745;17;447;184;-596;-253",
+        "mfgdigver": "2.2.59",
     }
     box.calibration = Calibration(rating=(330.0, 330.0, 990.0, 30.0, 30.0, 30.0))
     assert real.items() <= page(box, "/netftapi2.xml").items()
