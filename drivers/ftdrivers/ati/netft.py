@@ -264,7 +264,10 @@ class NetFtSensor(StreamingSensor):
             units = f"{text_in(page, 'scfgtdu')}, {text_in(page, 'scfgtau')}"
             facts["tool_transformation"] = Fact(f"{text_in(page, 'cfgtfx')} ({units})", "device")
         return DeviceInfo(
-            model=model, serial=text_in(page, "cfgcalsn") or NOT_REPORTED, firmware=NOT_REPORTED, facts=facts
+            model=model,
+            serial=text_in(page, "cfgcalsn") or NOT_REPORTED,
+            firmware=text_in(page, "mfgdigver") or NOT_REPORTED,
+            facts=facts,
         )
 
     def _read_block(self) -> FtSamples:
@@ -367,7 +370,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _read_page(self, path: str) -> bytes:
-        """Read what pynetft does not: serial number of the calibration in use, rate, range, tool transformation."""
+        """Read what pynetft does not, such as firmware, rate and range."""
         try:
             page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
             with self._clock.away(), closing(page) as connection:

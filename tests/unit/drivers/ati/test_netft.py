@@ -271,6 +271,12 @@ def test_rate_range_and_bias_are_the_devices() -> None:
         assert math.isnan(sensor.health().nominal_rate_Hz)
 
 
+@pytest.mark.parametrize(("element", "firmware"), [(b"<mfgdigver>2.2.59</mfgdigver>", "2.2.59"), (b"", "not reported")])
+def test_firmware_is_read_where_the_page_has_it(element: bytes, firmware: str) -> None:
+    with Box(page=PAGE.replace(b"</netft>", element + b"</netft>")) as box, box.sensor() as sensor:
+        assert sensor.identify().firmware == firmware
+
+
 def test_tool_transformation_of_the_box_is_undone() -> None:
     """The torque about the origin of the transducer is the one sent plus d × F: 0.13271 m × (1.5, -2.25, 10) N."""
     with Box(RECORD, page=PAGE.replace(b"</netft>", FRAME + b"</netft>")) as box, box.sensor() as sensor:
