@@ -43,6 +43,7 @@ _EXAMPLES = (
     "ati-can://can0?bitrate=250000&base=0x20",
     "ati-can:///dev/ttyACM0?interface=slcan",
     "ati-serial:///dev/serial/by-id/NAME?calibration=1",
+    "robotiq-ft300://192.168.1.10:63351",
 )
 
 
@@ -193,7 +194,8 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}': {fix}")
     begins = (f"{parts.scheme}://", "ros2:/")  # a topic is a path, without a host
     if not parts.address.strip("/") or parts.fragment or not url.lower().startswith(begins):
-        raise BadUrl(f"{url}: names no device; write it like {', '.join(_EXAMPLES)}")
+        examples = [example for example in _EXAMPLES if example.startswith(f"{parts.scheme}:")] or _EXAMPLES
+        raise BadUrl(f"{url}: names no device; write it like {', '.join(examples)}")
     driver = _load(entry)
     if not hasattr(driver, "from_url"):
         raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver; reinstall {_package(entry)}")

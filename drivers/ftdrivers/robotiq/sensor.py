@@ -13,6 +13,7 @@ Checked on hardware: no. Verified against: tests/unit/drivers/robotiq and the em
 """
 
 import socket
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -133,6 +134,20 @@ class RobotiqUrcap(StreamingSensor):
         )
 
 
+def _host_and_port(address: str) -> tuple[str, int | None]:
+    """Split the address of a controller; raises `ValueError` with what to write."""
+    try:
+        parts = urlsplit(f"//{address}")
+        if parts.hostname and parts.netloc == address:
+            return parts.hostname, parts.port
+    except ValueError:
+        pass
+    raise ValueError(
+        f"'{address}' is not a host with a port: write robotiq-ft300://HOST:{PORT} for the controller, or "
+        "robotiq-ft300:///dev/ttyUSB0 for a serial port"
+    )
+
+
 _BAUD = 19_200
 _REPLY_S = 0.2
 # The silence that proves that a stream has stopped, and the longest wait for it.
@@ -164,10 +179,14 @@ class RobotiqFt300(StreamingSensor):
     def from_url(
         cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL
     ) -> "RobotiqFt300 | RobotiqUrcap":
-        """Build from ``robotiq-ft300:///dev/serial/by-id/…``; from ``robotiq-ft300://HOST?port=…`` a `RobotiqUrcap`."""
-        if not address.startswith("/"):
-            return RobotiqUrcap(address, port=options.integer("port", PORT, 1, 65535), sign=sign, clock=clock)
-        return cls(address, sign=sign, clock=clock)
+        """Build from ``robotiq-ft300:///dev/serial/by-id/…``; from ``robotiq-ft300://HOST:63351`` a `RobotiqUrcap`."""
+        if address.startswith("/"):
+            return cls(address, sign=sign, clock=clock)
+        host, written = _host_and_port(address)
+        port = options.integer("port", PORT if written is None else written, 1, 65535)
+        if written not in {None, port}:
+            raise ValueError(f"it has two ports, {written} and {port}; leave one out")
+        return RobotiqUrcap(host, port=port, sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
         self._port.open()

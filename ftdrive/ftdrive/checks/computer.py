@@ -6,6 +6,7 @@ its facts (/sys, /dev) are parameters. On a computer without them a check is ski
 
 import json
 import os
+import re
 import shutil
 import stat
 import subprocess
@@ -64,8 +65,9 @@ class SensorAddress:
     @property
     def host(self) -> str | None:
         """The host that sends its samples over Ethernet."""
-        of_controller = self.scheme == "robotiq-ft300" and not self.address.startswith("/")
-        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET or of_controller else None
+        if self.scheme == "robotiq-ft300" and not self.address.startswith("/"):
+            return re.sub(r":\d+$", "", self.address).strip("[]")
+        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
 
     @property
     def place(self) -> str | None:

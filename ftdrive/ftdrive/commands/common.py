@@ -143,7 +143,7 @@ def CELL(command: Callable[..., None]) -> Callable[..., None]:
     def with_cell(config: Path | None, robot: str | None, sensor: str | None, **options: Any) -> None:
         command(described=CellOptions(config, robot, sensor), **options)
 
-    sensor_help = "Address, such as ati-can://can0?bitrate=250000 or ati-serial:///dev/ttyUSB0."
+    sensor_help = "Address, such as ati-can://can0?bitrate=250000, bota:///dev/ttyUSB0 or robotiq-ft300://HOST."
     found = click.option("--sensor", metavar="URL", help=sensor_help)(with_cell)
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(found))
 

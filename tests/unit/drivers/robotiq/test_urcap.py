@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftdrivers.clock import Clock
-from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.errors import BadUrl, ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import Fact
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.robotiq.sensor import Readings, RobotiqFt300, RobotiqUrcap
@@ -121,8 +121,41 @@ def test_a_controller_without_the_urcap_is_named(monkeypatch: pytest.MonkeyPatch
         Sensor(FakeClock()).open()
 
 
-def test_an_address_is_a_port_or_a_host() -> None:
-    assert isinstance(sensor_from_url("robotiq-ft300:///dev/ttyUSB0"), RobotiqFt300)
-    sensor = sensor_from_url("robotiq-ft300://10.0.0.2?port=1234&serial=FTS-1")
+@pytest.mark.parametrize(
+    ("address", "host", "port"),
+    [
+        ("10.0.0.2", "10.0.0.2", 63351),
+        ("10.0.0.2:63351", "10.0.0.2", 63351),
+        ("10.0.0.2:1234", "10.0.0.2", 1234),
+        ("ur5e.local:1234?serial=FTS-1", "ur5e.local", 1234),
+        ("10.0.0.2?port=1234", "10.0.0.2", 1234),
+        ("10.0.0.2:1234?port=1234", "10.0.0.2", 1234),
+        ("[fe80::1]:63351", "fe80::1", 63351),
+    ],
+)
+def test_an_address_may_have_the_port_of_the_urcap(address: str, host: str, port: int) -> None:
+    sensor = sensor_from_url(f"robotiq-ft300://{address}")
     assert isinstance(sensor, RobotiqUrcap)
-    assert sensor._address == ("10.0.0.2", 1234)
+    assert sensor._address == (host, port)
+
+
+def test_an_address_with_a_path_is_a_serial_port() -> None:
+    assert isinstance(sensor_from_url("robotiq-ft300:///dev/ttyUSB0"), RobotiqFt300)
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        ("//10.0.0.2:port", r"'10.0.0.2:port' is not a host with a port: write robotiq-ft300://HOST:63351 "),
+        ("//10.0.0.2:63351:1", "write robotiq-ft300://HOST:63351 "),
+        ("//10.0.0.2:99999", "write robotiq-ft300://HOST:63351 "),
+        ("//dev/ttyUSB0", "robotiq-ft300:///dev/ttyUSB0 for a serial port"),
+        ("//:63351", "write robotiq-ft300://HOST:63351 "),
+        ("//10.0.0.2:0", "allowed are 1 to 65535"),
+        ("//10.0.0.2:63351?port=1234", "two ports, 63351 and 1234; leave one out"),
+        ("10.0.0.2:63351", r"names no device; write it like robotiq-ft300://192\.168\.1\.10:63351$"),
+    ],
+)
+def test_a_mistyped_address_is_answered_with_what_to_write(address: str, message: str) -> None:
+    with pytest.raises(BadUrl, match=message):
+        sensor_from_url(f"robotiq-ft300:{address}")

@@ -203,6 +203,7 @@ def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: py
         ("ur-ft://10.0.0.1?counts_per_N=1&counts_per_Nm=1", None, None),
         ("ati-netft://192.168.1.1", None, None),
         ("robotiq-ft300://192.168.1.10", None, None),
+        ("robotiq-ft300://192.168.1.10:63351", None, None),
         ("robotiq-ft300:///dev/ttyUSB0", "/dev/ttyUSB0", None),
         ("ati-can://PCAN_USBBUS1?interface=pcan", None, None),
         ("bota://COM3", "COM3", None),
@@ -213,7 +214,7 @@ def test_what_an_address_says(url: str, port: str | None, interface: str | None)
     address = SensorAddress.of(url)
     assert address.serial_port == (None if port is None else Path(port))
     assert address.can_interface == interface
-    assert (address.host is not None) == (".1" in url or "10.0" in url)
+    assert address.host == next((host for host in ("10.0.0.1", "192.168.1.10", "192.168.1.1") if host in url), None)
 
 
 def test_what_is_no_address_is_a_mistake_of_the_user() -> None:
