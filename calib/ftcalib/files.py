@@ -7,8 +7,9 @@ import hashlib
 import json
 import os
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from io import BufferedReader
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -16,6 +17,8 @@ from typing import Any, Final, TypeAlias
 JSON: TypeAlias = Any
 # Largest text that is read whole: 200,000 poses with their covariances.
 MOST_BYTES: Final = 200_000_000
+# Longest line of a file that is read by lines: a calibration is a thousandth of it.
+_LONGEST_LINE: Final = 16_000_000
 
 
 def write_new(path: str | Path, content: str | bytes) -> None:
@@ -95,6 +98,28 @@ def read_file(path: str | Path) -> bytes:
                 f"{path} has {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f} MB: check that it is the file"
             )
         return file.read(MOST_BYTES)
+
+
+def read_lines(file: BufferedReader, error: type[Exception], first: int = 1) -> Iterator[bytes]:
+    """Yield the lines of the rest of a file, with their ends; raise `error`, one sentence, for a line above 16 MB.
+
+    Parameters
+    ----------
+    file : BufferedReader
+    error : type
+    first : int
+        Number of the first line, for the error.
+    """
+    # An iteration over the file would read a line of any length, and hide the place in the file.
+    for number in count(first):
+        line = file.readline(_LONGEST_LINE)
+        if len(line) == _LONGEST_LINE:
+            raise error(
+                f"line {number} is longer than {_LONGEST_LINE / 1e6:.0f} MB: the file is damaged or of another kind"
+            )
+        if not line:
+            return
+        yield line
 
 
 def parsed_json(text: str | bytes) -> JSON:

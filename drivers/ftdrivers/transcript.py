@@ -40,6 +40,8 @@ from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
+# More than a serial port buffers, in hexadecimal.
+_LONGEST_LINE: Final = 16_000_000
 INTERRUPTED: Final = "interrupted"
 """The error of a recording that the user has interrupted."""
 # A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once.
@@ -181,9 +183,10 @@ class Transcript:
         end: Mapping[str, Any] = {}
         number = 0
         try:
-            with path.open(encoding="utf-8") as file:
-                for number, text in enumerate(file, start=1):
-                    line = json.loads(text)
+            with path.open("rb") as file:
+                while text := file.readline(_LONGEST_LINE):
+                    number += 1
+                    line = _parsed(text)
                     if number == 1:
                         header = _checked_header(path, line)
                     elif "dir" in line:
@@ -208,6 +211,12 @@ class Transcript:
         parts = split_url(str(self.header["url"]))
         options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
         return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
+
+
+def _parsed(line: bytes) -> Any:
+    if len(line) == _LONGEST_LINE:
+        raise ValueError(f"it is longer than {_LONGEST_LINE / 1e6:.0f} MB")
+    return json.loads(line)
 
 
 def _checked_header(path: Path, line: Any) -> Mapping[str, Any]:

@@ -108,8 +108,8 @@ class FileOf:
     def __init__(self, data: bytes) -> None:
         self._data = data
 
-    def open(self, encoding: str) -> io.TextIOWrapper:
-        return io.TextIOWrapper(io.BytesIO(self._data), encoding)
+    def open(self, _: str) -> io.BytesIO:
+        return io.BytesIO(self._data)
 
 
 def address(data: bytes) -> None:

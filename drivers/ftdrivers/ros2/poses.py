@@ -13,6 +13,8 @@ from ftdrivers.errors import BadUrl, ProtocolError
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.middleware import is_finite, stamp_ns
 
+# Bytes of a URDF; its meshes are files of their own.
+_LARGEST: Final = 16_000_000
 _MOVES: Final = ("revolute", "continuous", "prismatic")
 
 
@@ -43,7 +45,8 @@ class Chain:
 
     def __init__(self, path: Path, base: str, flange: str) -> None:
         try:
-            root = ET.fromstring(path.read_text(encoding="utf-8"))  # of the user's own disk
+            with path.open("rb") as file:
+                root = ET.fromstring(file.read(_LARGEST).decode())  # of the user's own disk
         except (OSError, UnicodeDecodeError, ET.ParseError) as error:
             raise BadUrl(f"{path} is not a URDF ({error}): give the file with xacro evaluated") from error
         joints = {}

@@ -20,13 +20,13 @@ import io
 import json
 import zlib
 from collections.abc import Collection, Generator, Iterator, Sequence
+from io import BufferedReader
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import IO
 
 import numpy as np
 
-from ftcalib.files import open_file, parsed_json
+from ftcalib.files import MOST_BYTES, open_file, parsed_json, read_lines
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
@@ -97,7 +97,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
     """Read a recording in pieces; return why it ends early. Raises `BadRecording` or `OSError`."""
     size = path.stat().st_size
     with open_file(path) as file:
-        if not file.readline().startswith(f"# {FORMAT.partition('/')[0]}/".encode()):
+        if not file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode()):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
         file.seek(0)
         parts = _checked(file)
@@ -140,20 +140,19 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
         return "" if ended else "the last line is not '# end'"
 
 
-def _checked(file: IO[bytes]) -> Iterator[list[str]]:
+def _checked(file: BufferedReader) -> Iterator[list[str]]:
     """Give the lines of each checksum that fits them, and the end."""
-    crc, waiting = 0, list[str]()
-    number = 0
-    # an iteration would hide the place in the file
-    while line := file.readline():
-        number += 1
+    crc, waiting, begin = 0, list[str](), 0
+    for number, line in enumerate(read_lines(file, BadRecording), 1):
+        if file.tell() - begin > MOST_BYTES:
+            raise BadRecording(f"no checksum follows line {number - len(waiting)}: the file is damaged")
         if not line.endswith(b"\n"):
             break
         if line.startswith(_CRC.encode()):
             if line != _crc_line(crc):
                 raise BadRecording(f"line {number} is not the checksum of the lines before it: the file is damaged")
             yield waiting
-            waiting = []
+            waiting, begin = [], file.tell()
         else:
             waiting.append(line.decode(errors="replace"))
         crc = zlib.crc32(line, crc)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset, UsageError
+from ftcalib.files import open_file
 from ftdrive.errors import ConfigError
 from ftdrive.recording.files import is_bag, is_recording
 from ftdrive.runs.source import SolveOptions
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
 
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+_BAG: Final = b"#ROSBAG V2.0\n"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
 # Times in ns, and numbers.
 _Column = tuple[NDArray[np.int64], Array]
@@ -93,6 +95,10 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise ConfigError(missing_extra(path.name, "rosbags", "ros2")) from None
+    if path.suffix == ".bag":
+        with open_file(path) as file:
+            if file.read(len(_BAG)) != _BAG:  # rosbags would read up to the first end of a line
+                raise BadDataset(f"{path.name}: the first bytes are not those of a bag of ROS 1: record it again")
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")

@@ -21,7 +21,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ftcalib.files import open_file, parsed_json
+from ftcalib.files import MOST_BYTES, open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
@@ -74,7 +74,6 @@ _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
-_LARGEST: Final = 1 << 32
 LEVEL: Final = -5
 """Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 _NONE: Final = np.zeros(0, np.int64)
@@ -371,8 +370,8 @@ def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
     crc = zlib.crc32(_MAGIC)
     while len(start := file.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", start)
-        if length > _LARGEST:
-            raise ValueError(f"a record of {length} bytes")
+        if not opcode or length > MOST_BYTES:
+            raise ValueError(f"a record of the kind {opcode} and {length} bytes")
         data = file.read(length)
         if len(data) < length:
             return

@@ -25,7 +25,7 @@ from typing import IO, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib.files import open_file, parsed_json
+from ftcalib.files import MOST_BYTES, open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
@@ -263,9 +263,10 @@ def _read_record(file: IO[bytes]) -> dict[str, Any] | None:
     if len(start) < 12:
         return None
     length, crc = struct.unpack_from("<II", start, 4)
-    text = file.read(length)
-    if start[:4] == _RECORD and len(text) < length:
+    is_record = start[:4] == _RECORD and length <= MOST_BYTES
+    text = file.read(length) if is_record else b""
+    if is_record and len(text) < length:
         return None
-    if start[:4] != _RECORD or zlib.crc32(text) != crc:
+    if not is_record or zlib.crc32(text) != crc:
         raise BadRecording("a record differs from its checksum: the file is damaged")
     return dict(parsed_json(text))

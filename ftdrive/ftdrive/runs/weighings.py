@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from ftcalib.errors import BadDataset
-from ftcalib.files import JSON, check_format, open_file
+from ftcalib.files import JSON, check_format, open_file, read_lines
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -100,13 +100,14 @@ class WeighingsFile:
 
         with open_file(self.path) as file:
             file.seek(self.size)
-            *lines, _ = file.read().split(b"\n")
-        for line in lines:
-            if (found := read_line(line.decode(errors="replace"))) is None:
-                raise BadDataset(f"line {self._lines + 1} of the weighings is damaged: take the file from a copy")
-            self._take(found)
-            self._lines += 1
-            self.size += len(line) + 1
+            for line in read_lines(file, BadDataset, self._lines + 1):
+                if not line.endswith(b"\n"):
+                    break
+                if (found := read_line(line.decode(errors="replace"))) is None:
+                    raise BadDataset(f"line {self._lines + 1} of the weighings is damaged: take the file from a copy")
+                self._take(found)
+                self._lines += 1
+                self.size += len(line)
         if not self._lines:
             raise BadDataset("the file has no weighings: delete it")
 

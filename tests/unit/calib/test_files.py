@@ -29,6 +29,17 @@ def test_a_file_above_the_limit_is_not_read(tmp_path: Path, monkeypatch: pytest.
         read_file(path)
 
 
+def test_a_line_without_an_end_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "_LONGEST_LINE", 8)
+    path = tmp_path / "a.csv"
+    path.write_bytes(b"one\n123456\nthree" + bytes(100))
+    with files.open_file(path) as file:
+        lines = files.read_lines(file, BadDataset, 10)
+        assert [next(lines), file.tell(), next(lines)] == [b"one\n", 4, b"123456\n"]
+        with pytest.raises(BadDataset, match=r"^line 12 is longer than .* damaged"):
+            next(lines)
+
+
 @pytest.mark.parametrize("depth", [*range(200, 1200, 40), 50_000])
 def test_nested_brackets_are_no_defect(depth: int) -> None:
     """At a depth that can be parsed, the checksum may still be too deep."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from ftdrivers import transcript
 from ftdrivers.errors import BadTranscript
 from ftdrivers.transcript import Transcript, Writer
 from tests.fake_clock import FakeClock
@@ -123,6 +124,14 @@ def test_what_is_no_transcript_is_refused(tmp_path: Path, text: str, says: str) 
     (tmp_path / "bad.jsonl").write_text(text)
     with pytest.raises(BadTranscript, match=says):
         Transcript.load(tmp_path / "bad.jsonl")
+
+
+def test_a_line_without_an_end_is_refused_before_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "a.jsonl"
+    path.write_bytes(OPENED.encode() + bytes(1000))
+    monkeypatch.setattr(transcript, "_LONGEST_LINE", 500)
+    with pytest.raises(BadTranscript, match=rf"^{path}, line 3: .* \(it is longer than 0 MB\); record it again"):
+        Transcript.load(path)
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from ftdrive.checks.sensor import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
+from ftdrivers.ros2 import poses
 from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
 from ftdrivers.ros2.middleware import Received
 from ftdrivers.ros2.poses import Chain, Joints, Poses, Transforms
@@ -49,6 +50,12 @@ def test_a_chain_agrees_with_kinematics_written_apart(urdf: Path) -> None:
     expected_R, expected_p = flange(q)
     assert np.allclose(R, expected_R, atol=1e-12)
     assert np.allclose(p, expected_p, atol=1e-12)
+
+
+def test_a_urdf_is_not_read_without_end(urdf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(poses, "_LARGEST", 100)
+    with pytest.raises(BadUrl, match=r"is not a URDF .*: give the file with xacro evaluated"):
+        Chain(urdf, "", "flange")
 
 
 def test_other_joints_on_the_topic_are_left_out(urdf: Path) -> None:

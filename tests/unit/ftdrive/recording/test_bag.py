@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from ftcalib.errors import FtdriveError
+from ftcalib.errors import BadDataset, FtdriveError
 from ftdrive.recording.files import is_bag
 from ftdrive.recording.foreign import read_bag
 from ftdrive.recording.in_motion import solve_recording
@@ -279,6 +279,12 @@ def test_a_bag_that_cannot_be_used_is_one_sentence(
         read_bag(path, wrench_topic, pose_topic)
     assert re.search(words, str(error.value))
     assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_no_bag_of_ros_1_is_not_read_to_the_end_of_its_line(tmp_path: Path) -> None:
+    (tmp_path / "a.bag").write_bytes(bytes(1000))
+    with pytest.raises(BadDataset, match=r"^a\.bag: the first bytes are not those of a bag of ROS 1"):
+        read_bag(tmp_path / "a.bag", None, None)
 
 
 def test_a_recording_of_ours_is_no_bag(tmp_path: Path) -> None:

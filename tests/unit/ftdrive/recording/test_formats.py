@@ -19,9 +19,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
+from ftcalib import files
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
-from ftdrive.recording import Recorder, Recording, read_recording, write_recording
+from ftdrive.recording import Recorder, Recording, csv_file, read_recording, write_recording
 from tests.unit.ftdrive.recorded import BASE_TCP, CONFIGURATION, UTC_OFFSET_NS, block, info
 
 ENDINGS = (".mcap", ".csv", ".parquet")
@@ -308,6 +309,44 @@ def test_each_block_of_a_csv_file_has_its_checksum(small: Sequence[Path], tmp_pa
     changed[ends[2] - 1] = changed[ends[2] - 1].replace("0.", "1.", 1)
     path.write_text("".join(changed), encoding="utf-8")
     with pytest.raises(BadRecording, match=f"line {ends[2] + 1} is not the checksum"):
+        read_recording(path)
+
+
+def test_a_csv_line_without_an_end_is_refused(
+    small: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content, path = small[ENDINGS.index(".csv")].read_bytes(), tmp_path / "a.csv"
+    path.write_bytes(content + bytes(300_000))
+    monkeypatch.setattr(files, "_LONGEST_LINE", 200_000)
+    number = content.count(b"\n") + 1
+    with pytest.raises(BadRecording, match=f"line {number} is longer than .*: the file is damaged"):
+        read_recording(path)
+
+
+def test_csv_lines_without_a_checksum_are_not_collected_without_end(
+    small: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.csv"
+    path.write_bytes(small[ENDINGS.index(".csv")].read_bytes().partition(b"# crc32 ")[0] + b"1,2\n" * 100_000)
+    monkeypatch.setattr(csv_file, "MOST_BYTES", 200_000)
+    with pytest.raises(BadRecording, match="no checksum follows line 1: the file is damaged"):
+        read_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("ending", "more"),
+    [
+        (".mcap", bytes(9)),
+        (".mcap", b"\5" + (200_000_001).to_bytes(8, "little")),
+        (".parquet", b"FTDR" + (200_000_001).to_bytes(4, "little") + bytes(4)),
+    ],
+)
+def test_records_that_no_file_of_ours_has_are_refused_before_they_are_read(
+    small: Sequence[Path], tmp_path: Path, ending: str, more: bytes
+) -> None:
+    path, content = tmp_path / f"a{ending}", small[ENDINGS.index(ending)].read_bytes()
+    path.write_bytes(content[: 8 if ending == ".mcap" else 4] + more + bytes(100))
+    with pytest.raises(BadRecording, match="the file is damaged"):
         read_recording(path)
 
 

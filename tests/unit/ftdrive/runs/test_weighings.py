@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from ftcalib import files
 from ftcalib.errors import BadDataset
 from ftdrive.live.weighing import WORDS
 from ftdrive.runs.weighings import FORMAT, REFUSALS, WeighingsFile
@@ -75,6 +76,17 @@ def test_damage_is_refused(tmp_path: Path) -> None:
         file.path.write_text(damaged)
         with pytest.raises(BadDataset, match=words):
             WeighingsFile(file.path).read()
+
+
+def test_a_line_without_an_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = WeighingsFile.of(tmp_path, ORIGIN, DAY)
+    file.append([part(0.1)])
+    file.read()
+    with file.path.open("ab") as end:
+        end.write(bytes(5000))
+    monkeypatch.setattr(files, "_LONGEST_LINE", 4000)
+    with pytest.raises(BadDataset, match="line 3 is longer than"):
+        file.read()
 
 
 def test_a_failed_write_leaves_the_file_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
