@@ -29,6 +29,8 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 }
 COUNTS: Final = ("counts", "count", "cts", "digits")
 _BEHIND = re.compile(r"(?P<name>.+?)(?:\s*[\[(](?P<bracket>[^\])]*)[\])]|_(?P<suffix>[^\W_]+))\s*")
+# A longer name has no unit: the time to look for it grows with the square of the length.
+_LONGEST_NAME = 200
 _SUFFIXES: Final = frozenset(
     {*UNITS["time"], *UNITS["torque"], *COUNTS, "N", "mN", "kgf", "lbf", "mm", "cm", "m", "deg", "rad"}
 )
@@ -349,7 +351,7 @@ def factor(unit: str, kind: str, column: str) -> float | None:
 
 def _keys_of(name: str) -> Iterator[tuple[str, str]]:
     """Give the keys of a name with the unit that each leaves: `fx [N]`, `t_ms`, `x (mm)`."""
-    match = _BEHIND.fullmatch(name)
+    match = _BEHIND.fullmatch(name) if len(name) <= _LONGEST_NAME else None
     if match and match["bracket"] is not None and re.search(r"[^\W\d]|°|^$", match["bracket"]):
         yield normalized(match["name"]), match["bracket"].strip()
         return

@@ -6,7 +6,7 @@ import io
 import re
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple
@@ -103,8 +103,8 @@ class TextTable:
 
         separator = self.format.separator
         if separator == " ":
-            text = re.sub(rb"(?m)^[ \t]+|[ \t\r]+$", b"", text)
             text = re.sub(rb"[ \t]+", b"\t", text)
+            text = re.sub(rb"(?m)^\t|\t$", b"", text)
             separator = "\t"
         names = [str(i) for i in range(len(self.names))]
         wanted = [names[i] for i in use]
@@ -149,9 +149,11 @@ class TextTable:
             return np.nan
         if _NUMBER[self.format.decimal].fullmatch(cell):
             return float(cell.replace(",", "."))
-        if _DATE.fullmatch(cell):
-            date = datetime.fromisoformat(cell.replace(",", "."))
-            return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
+        if match := _DATE.fullmatch(cell):
+            zone = match[3] or ""
+            with suppress(ValueError):  # a 13th month
+                date = datetime.fromisoformat(cell.removesuffix(zone).rstrip().replace(",", ".") + zone)
+                return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
         other = ",."[self.format.decimal == ","]
         point = {",": "comma", ".": "point"}[other]
         why = f"has a decimal {point}, unlike others" if _NUMBER[other].fullmatch(cell) else "is no number"
