@@ -69,6 +69,6 @@ def bundle(
     counted = ", ".join(f"{count} {kind}" for kind, count in bundled.redacted.items()) or "nothing found"
     say.print(hanging(" redacted: ", counted, say))
     if bundled.left_out:
-        words = f"{', '.join(bundled.left_out)} (neither text nor a pose)"
+        words = f"{', '.join(bundled.left_out)} (neither text nor a pose, or above 200 MB)"
         say.print(hanging(" left out: ", words, say))
     say.print(f" Saved {path}")

@@ -38,6 +38,7 @@ from ftcalib.files import (
     read_object,
     write_new,
 )
+from ftcalib.files import MOST_BYTES as _MOST_IN_MEMORY
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
@@ -249,8 +250,9 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     poses: dict[str, bytes] = {}
     for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
-        # A pipe has no end.
-        content = file.read_bytes() if file.is_file() and not file.is_symlink() else None
+        # A pipe has no end, and memory has one.
+        is_readable = file.is_file() and not file.is_symlink() and file.stat().st_size <= _MOST_IN_MEMORY
+        content = read_file(file) if is_readable else None
         if content is not None and file.suffix == ".npz":
             poses[name] = content
         elif content is not None and (text := _text(content)) is not None:
@@ -303,13 +305,13 @@ def unpack(source: Path) -> Iterator[Path]:
 
 
 def _unpack(source: Path, folder: Path) -> Path:
+    if (size := source.stat().st_size) > MOST_BYTES:
+        raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle {MOST_BYTES / 1e9:g} GB at most: check the name")
     try:
         with open_file(source) as file, zipfile.ZipFile(file) as archive:
             members = archive.infolist()
             _require_harmless(members)
             archive.extractall(folder)
-        for poses in folder.rglob("*.npz"):
-            _require_small(poses)
         return _run_in(folder)
     except BadBundle as error:
         raise BadBundle(f"{source}: {error}") from error
@@ -341,17 +343,6 @@ def _require_harmless(members: Sequence[zipfile.ZipInfo]) -> None:
             raise BadBundle(f"the name {member.filename!r} leads out of its folder: do not use this file")
     if len({member.filename for member in members}) < len(members):
         raise BadBundle(f"two files have the same name: {_COPY_AGAIN}")
-
-
-def _require_small(poses: Path) -> None:
-    """Check what the arrays of a pose unpack to. A damaged pose is left to `Run`, which names it."""
-    try:
-        with zipfile.ZipFile(poses) as arrays:
-            size = sum(one.file_size for one in arrays.infolist())
-    except (*ZIP_DAMAGE, OSError):
-        return
-    if size > MOST_BYTES:
-        raise BadBundle(f"{poses.name} unpacks to {size / 1e9:.0f} GB: do not use this file")
 
 
 def _text(content: bytes) -> str | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
+from ftcalib.files import read_file
 from ftcalib.model import Array
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
@@ -161,7 +162,7 @@ def solve_motion_file(
     wrench, poses = means_of(path)
     digest = hashlib.sha256()
     for file in files_of(path):
-        digest.update(file.read_bytes())
+        digest.update(read_file(file))
     source = {"recording": path.name, "recording_sha256": digest.hexdigest()}
     return solve_motion(
         wrench,

@@ -12,7 +12,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, Final
 
-from ftcalib.files import open_file, parsed_json, write_new
+from ftcalib.files import MOST_BYTES, parsed_json, read_file, write_new
 
 # Errors of `zipfile` for a damaged file: RuntimeError for an apparent password or unknown compression. OSError too.
 ZIP_DAMAGE: Final = (
@@ -38,7 +38,9 @@ def read_arrays(path: Path) -> dict[str, Any]:
     """Read a file of arrays; raises one of `DAMAGE`."""
     import numpy as np
 
-    with open_file(path) as content, zipfile.ZipFile(content) as file:
+    with zipfile.ZipFile(io.BytesIO(read_file(path))) as file:
+        if (size := sum(one.file_size for one in file.infolist())) > MOST_BYTES:
+            raise ValueError(f"it unpacks to {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f} MB")
         # `ZipFile.read` reads to the end of each array, where its CRC-32 is checked; `numpy.load` need not.
         return {
             name.removesuffix(".npy"): np.lib.format.read_array(io.BytesIO(file.read(name)), allow_pickle=False)

@@ -267,8 +267,7 @@ class Run(Displayed):
     def _remove_incomplete_event(self) -> None:
         """Remove what a power failure left of the last line, so that the next event begins a new one."""
         if self._events_path.exists():
-            with self._events_path.open("r+b") as file:
-                file.truncate(file.read().rfind(b"\n") + 1)
+            os.truncate(self._events_path, read_file(self._events_path).rfind(b"\n") + 1)
 
     def temperature_C(self) -> float | None:
         """Return the mean temperature of the sensor over the poses; None where it reported none."""

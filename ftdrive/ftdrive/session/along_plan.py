@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, averaging_time, mean_and_covariance, noise_level
+from ftcalib.files import read_file
 from ftcalib.model import Array
 from ftcalib.rounding import to_place_of
 from ftcalib.routine import PoseRecord
@@ -57,10 +58,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
-    return any(
-        wanted.items() <= _read(line).items()
-        for line in path.read_text(encoding="utf-8", errors="replace").splitlines()
-    )
+    return any(wanted.items() <= _read(line).items() for line in read_file(path).decode(errors="replace").splitlines())
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:

@@ -210,12 +210,19 @@ def test_a_hostile_or_damaged_bundle_is_refused(
     assert [file.name for file in tmp_path.iterdir()] == ["a.zip"]
 
 
-def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bundle, "MOST_BYTES", 1_000_000)
-    np.savez_compressed(inner := io.BytesIO(), wrench=np.zeros(200_000))
-    files = {"bundle.json": ABOUT, "r/run.json": "{}", "r/poses/01.npz": inner.getvalue()}
-    with pytest.raises(BadBundle, match="do not use"), unpack(zipped(tmp_path / "a.zip", files)):
+def test_a_file_larger_than_any_bundle_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = zipped(tmp_path / "a.zip", {"bundle.json": ABOUT, "r/run.json": "{}"})
+    monkeypatch.setattr(bundle, "MOST_BYTES", 100)
+    with pytest.raises(BadBundle, match="a bundle 1e-07 GB at most: check the name"), unpack(path):
         pass
+
+
+def test_what_is_too_large_for_memory_is_left_out_and_named(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (run.folder / "notes.txt").write_bytes(b"x" * 300_000)
+    monkeypatch.setattr(bundle, "_MOST_IN_MEMORY", 200_000)
+    assert "notes.txt" in write_bundle(run.folder, tmp_path / "a.zip").left_out
 
 
 def test_shapes_larger_than_memory_are_refused_in_a_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

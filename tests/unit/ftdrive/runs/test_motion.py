@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ftcalib.errors import BadDataset
-from ftdrive.runs import motion
+from ftdrive.runs import motion, numbers
 from ftdrive.runs.motion import MotionRecording, means_of, measured_s
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -56,6 +56,14 @@ def test_no_single_bit_of_its_headers_can_end_in_another_error(tmp_path: Path) -
         path.write_bytes(bytes(damaged))
         with suppress(BadDataset):
             MotionRecording.load(path)
+
+
+def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "motion.npz"
+    recording().save(path)
+    monkeypatch.setattr(numbers, "MOST_BYTES", 10_000)
+    with pytest.raises(BadDataset, match=r"not a recording in motion \(it unpacks to 0 MB, more than"):
+        MotionRecording.load(path)
 
 
 @pytest.mark.parametrize("shape", [(10**13, 6), (10**30, 6), (10**13, 0), (20, 5), (0, 6)])
