@@ -57,6 +57,7 @@ def check(
 
     from ftcalib.after.weighing import drift_since
     from ftcalib.loads.check import check_load
+    from ftdrive.cell.emulated import TOOL_MM
     from ftdrive.live.weighing import Scale
     from ftdrive.runs.load import Load, mass_of
 
@@ -65,8 +66,10 @@ def check(
         stream = _opened(source, replay, stack)
         if zero and replay is None:
             _zero(Scale(stream), stream, wait_s)
-        if source.simulate and load.p_flange_mm is not None:
-            stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=load.p_flange_mm, string_mm=250, swing_deg=0)
+        if source.simulate and replay is None:
+            x, y, z = hook_mm = load.p_flange_mm or (0.0, 0.0, TOOL_MM[1])
+            stream.station.control(do="hang", mass_kg=load.mass_kg, at_mm=hook_mm, string_mm=250, swing_deg=0)
+            echo(f"{load.mass_kg:g} kg hangs on the emulated tool, {x:g}, {y:g}, {z:g} mm from the flange.", err=True)
         measured, reference, tare_age_s = _weighed(stream, load.mass_kg, poses, wait_s, replayed=replay is not None)
     found = check_load(
         stream.info.calibration,
@@ -139,7 +142,9 @@ def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed
                 best = (scale.poses, *stream.reference())
                 if not replayed and weight.poses >= poses:
                     break
-            elif replayed and best is None and stream.reference()[1] > WEIGH_S:
+            elif not replayed:
+                refusal = CannotWeigh("samples")
+            elif best is None and stream.reference()[1] > WEIGH_S:
                 scale.zero()
         except CannotWeigh as error:
             refusal = error

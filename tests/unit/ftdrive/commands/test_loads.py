@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from ftcalib import CalibrationResult, solve
 from ftcalib.loads.model import LoadRun
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
-from ftdrive.commands import live
+from ftdrive.commands import live, live_source
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.live.replay import ReplayedStream
 from ftdrive.live.samples import Paired
@@ -19,7 +20,7 @@ from ftdrive.runs.sensor_file import next_sensor_file, sensor_files
 from ftdrive.runs.source import read_calibration
 from tests.loaded_sensor import PROTOCOLS, LoadedSensor, with_load
 from tests.unit.ftdrive.live.simulated import calibrated, info
-from tests.unit.ftdrive.live.test_weighing import POSE, part, rests
+from tests.unit.ftdrive.live.test_weighing import POSE, part, rests, stream
 
 
 def run(*arguments: str) -> Result:
@@ -119,6 +120,26 @@ def test_a_recording_is_tared_where_the_tool_is_free_before_the_load(
     # 9 % off is hidden by the drift, and only by that.
     assert answer["is_within"] is not bool(free_s)
     assert ("hang the load" in found.stderr) is not bool(free_s)
+
+
+def test_an_emulated_cell_hangs_the_load_itself_also_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    cell, hung = stream(rests((POSE, part(POSE, 1.0)), seconds=2.0)), list[dict[str, object]]()
+    cell.station = SimpleNamespace(control=lambda **request: hung.append(request))  # type: ignore[attr-defined]
+    monkeypatch.setattr(live_source, "open_source", lambda *_: cell)
+    found = run("check", "1.000", "--simulate", "--json")
+    assert found.exception is None, found.output
+    assert [(one["do"], one["mass_kg"], one["at_mm"]) for one in hung] == [("hang", 1.0, (0.0, 0.0, 200.0))]
+
+
+def test_a_load_that_hangs_nowhere_is_named_after_an_unsteady_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = np.zeros(6)
+    touched = [(POSE, sign * part(POSE, 0.2)) for sign in (1, -1)]
+    rows = Paired.concatenate([rests(*touched, seconds=0.1), rests((POSE, nothing), seconds=4.0)])
+    rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
+    monkeypatch.setattr(live_source, "open_source", lambda *_: stream(rows))
+    found = run("check", "1.000", "--tool", "gripper", "--wait", "3")
+    assert isinstance(found.exception, ConfigError)
+    assert "no load of about 1 kg" in str(found.exception)
 
 
 @pytest.mark.parametrize(("mass", "at"), [("two", None), ("-1", None), ("1", "tip"), ("1", "tip=0,0"), ("1±-2", None)])
