@@ -358,7 +358,7 @@ def _drift(view: SessionView) -> Text:
 
 
 def _keys(view: SessionView) -> list[Text]:
-    end = "Ctrl-C ends, poses are kept" if view.folder else "Ctrl-C ends"
+    end = "Ctrl-C ends, poses are kept" if view.resume else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
     # before and after the poses no key is read
@@ -379,10 +379,8 @@ def _keys(view: SessionView) -> list[Text]:
 def _kept(view: SessionView, width: int) -> list[Text]:
     if not view.folder:
         return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
-    return [
-        Text("kept in " + _end_of(view.folder, width - 8)),
-        Text("resume  " + _end_of(as_typed(view.resume), width - 8)),
-    ]
+    resume = as_typed(view.resume) or "starts again: a recording in motion is not continued"
+    return [Text("kept in " + _end_of(view.folder, width - 8)), Text("resume  " + _end_of(resume, width - 8))]
 
 
 def _rule(width: int) -> Text:

@@ -271,6 +271,14 @@ def test_a_long_path_keeps_the_end_that_distinguishes_runs() -> None:
     assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]
 
 
+def test_a_sweep_on_hold_shows_that_it_starts_again_and_promises_no_poses() -> None:
+    on_hold = view(RunOpened(folder="runs/a", resume=""), StateChanged(state=State.HOLD, words="the operator stopped"))
+    *_, keys, kept, resume = drawn(on_hold)
+    assert keys.endswith("Ctrl-C ends")
+    assert kept == "kept in runs/a"
+    assert resume.startswith("resume  starts again")
+
+
 # The terminal.
 
 
