@@ -238,7 +238,10 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            echo(in_one_line(f"error: {source}: {error}"), err=True)
+            # many errors begin with the name of the file
+            why = str(error).removeprefix(f"{source.name}: ")
+            named = "" if why.startswith(str(source)) else f"{source}: "
+            echo(in_one_line(f"error: {named}{why}"), err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
 

@@ -49,3 +49,13 @@ def test_options_that_do_not_go_together_are_refused(
     assert isinstance(error, ConfigError)
     assert words in str(error)
     assert not Path("new.json").exists()
+
+
+def test_each_of_several_sources_that_fail_is_named_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        Path(name).mkdir()
+        Path(name, "poses.csv").write_text("p,q\n1,2\n")
+    Path("empty").mkdir()
+    printed = CliRunner().invoke(cli, ["solve", "a/poses.csv", "b/poses.csv", "empty"]).output
+    assert [printed.count(name) for name in ("error: ", "poses.csv", "a/poses.csv", "empty")] == [3, 2, 1, 1]
