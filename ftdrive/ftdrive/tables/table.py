@@ -12,7 +12,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset
-from ftcalib.data.dataset import MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS, Orientation, rotations_of
+from ftcalib.data.dataset import (
+    LARGEST,
+    MATRIX_COLUMNS,
+    QUATERNION_COLUMNS,
+    VECTOR_COLUMNS,
+    Orientation,
+    rotations_of,
+)
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
 from ftcalib.model import Array
@@ -409,6 +416,10 @@ class Table:
                     row = int(np.argmax(partly))
                     name = self.source.names[one.columns[int(np.argmin(known[row]))]]
                     raise BadDataset(_wrong_row(count + row, f"{name} is missing or no finite number"))
+                if (huge := np.argwhere(known & (np.abs(numbers) > LARGEST))).size:
+                    row, column = huge[0]
+                    name, value = self.source.names[one.columns[column]], numbers[row, column]
+                    raise BadDataset(_wrong_row(count + row, f"{name} is {value:.3g}, more than any device reports"))
                 complete &= known.all(axis=1)
             if time is not None:
                 t_s = values[-1].sum(axis=1)

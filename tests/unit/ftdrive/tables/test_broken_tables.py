@@ -276,6 +276,11 @@ MOTION: dict[str, tuple[dict[str, np.ndarray], str, Callable[[Table], object]]] 
         r"row 8: the time is missing",
         lambda table: list(table.wrenches()),
     ),
+    "a force near the largest number": (
+        recording(fz=np.where(np.arange(600) == 7, -1e308, RECORDING.wrench[:, 2])),
+        r"row 8: fz is -1e\+308, more than any device reports",
+        lambda table: list(table.wrenches()),
+    ),
     "gravity alone": (
         t(RECORDING) | columns("gx gy gz", RECORDING.p_m),
         r"gravity does not show how the arm turns",
