@@ -145,11 +145,11 @@ EVENTS = [
     ),
     Event("power-off", lambda s: s.dashboard("power off"), power_up, DeviceFault, "power the arm on"),
     Event("brakes", on("mode", robot=5), on("mode", robot=7), DeviceFault, r"\(idle\); release its brakes"),
-    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "stopped or paused", hits_opening=False),
+    Event("program-stop", on("dashboard-stop"), nothing, DeviceFault, "or stopped from outside", hits_opening=False),
     Event(
         "program-pause", lambda s: s.dashboard("pause"), nothing, DeviceFault, "stopped or paused", hits_opening=False
     ),
-    Event("crash-script", on("crash-script"), nothing, DeviceFault, "stopped or paused|in line", hits_opening=False),
+    Event("crash-script", on("crash-script"), nothing, DeviceFault, "ended .* by itself|in line", hits_opening=False),
     Event(
         "foreign-program",
         another_takes_over,

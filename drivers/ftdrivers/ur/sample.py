@@ -176,10 +176,13 @@ class Sample:
         """Return why our program on the controller does not move the arm."""
         if self.program_state == PROGRAM_PLAYING:
             return None
-        state = _PROGRAM_STATES.get(self.program_state, "unknown")
+        state = f"(state {self.program_state}, {_PROGRAM_STATES.get(self.program_state, 'unknown')})"
+        if self.program_state <= PROGRAM_STOPPED:
+            return DeviceFault(
+                f"the control program has ended {state}: by itself, or stopped from outside", "read the pendant's log"
+            )
         return DeviceFault(
-            f"the control program was stopped or paused from outside (state {self.program_state}, {state})",
-            "end other programs for this arm",
+            f"the control program was stopped or paused from outside {state}", "end other programs for this arm"
         )
 
     def flange(self, tcp_offset: Sequence[float]) -> Pose:

@@ -340,11 +340,17 @@ class SafetyGuard(Guard):
                 Hazard.SAFETY_MODE,
                 f"the safety mode changed from {self._mode} to {status.safety_mode}: check the pendant",
             )
+        if status.program in ("stopping", "stopped"):
+            raise fault(
+                Hazard.OTHER_CLIENT,
+                f"the control program is {status.program}: it ended by itself, or a second Ctrl-C, the pendant or "
+                "another client stopped it; read the pendant's log, then resume",
+            )
         if status.program != "playing":
             raise fault(
                 Hazard.OTHER_CLIENT,
-                f"the control program is {status.program}: a second Ctrl-C, the pendant or another client ended or "
-                "paused it; leave the arm to this program, then resume",
+                f"the control program is {status.program}: the pendant or another client paused it; leave the arm to "
+                "this program, then resume",
             )
 
 

@@ -145,6 +145,10 @@ class GuardedCell:
         if not isinstance(error, DeviceError):
             return None
         if (trip := self.watcher.tripped(wait_s=0.3)) is not None:
+            reported = error.__cause__
+            if trip.hazard is Hazard.OTHER_CLIENT and isinstance(reported, DeviceFault):
+                # A guard sees only that the program has ended; the arm may know why.
+                return Tripped(trip.hazard, type(reported)(reported.found, reported.fix))
             return trip
         try:
             self.cell.sensor.check()

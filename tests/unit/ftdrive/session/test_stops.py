@@ -556,3 +556,19 @@ def test_the_failure_of_an_arm_that_ends_its_own_program_is_kept_as_the_cause(la
     with pytest.raises(DeviceFault, match="the control program is stopped") as stopped:
         lab.calibrate()
     assert stopped.value.__cause__ is late
+
+
+def test_what_the_arm_reports_of_its_program_is_shown_instead_of_a_guess(lab: Lab) -> None:
+    failed = DeviceFault("the control program failed in line 60: is a joint limit violated?", "read the log")
+
+    def fail_and_end_the_program() -> None:
+        lab.arm.set_status(program="stopped")
+        lab.clock.sleep(0.2)  # the guards look meanwhile, and stop the arm
+        raise DeviceFault("a stop was requested before the arm arrived") from failed
+
+    lab.arm.at_move[4] = fail_and_end_the_program
+    with pytest.raises(DeviceFault, match="line 60"):
+        lab.calibrate()
+    (held,) = [one for one in lab.operator.of(StateChanged) if one.state is State.HOLD]
+    assert "line 60" in held.words
+    assert "client" not in held.words
