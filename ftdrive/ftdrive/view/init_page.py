@@ -6,6 +6,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Thread
 from typing import Any, Final
 
 import numpy as np
@@ -209,14 +210,26 @@ class InitPage:
         """Read robot and sensor, and show what they report here and in the terminal."""
         for field in [one for one in self._fields.values() if one.name in (ROBOT, SENSOR) and one.text]:
             self._page.put({"form/words": lines(f"Reading {field.text} …", tone=ASK)})
-            try:
-                self._found[field.name] = f"✔ {self._described.look(field.name, field.text)}", GOOD
-                field.typed = self._described.texts[field.name][0]
-            except (DeviceError, UsageError) as error:
-                self._found[field.name] = f"✘ {error}", WARN
-                self._described.keep(field.name, field.text)
+            # Ctrl-C does not interrupt the lookup of a name, which may take 10 s, but it interrupts this wait.
+            ended: SimpleQueue[Exception | None] = SimpleQueue()
+            Thread(target=self._look_at, args=(field, ended.put), daemon=True).start()
+            if (error := ended.get()) is not None:
+                raise error
             words = self._found[field.name][0]
             messages.print(hanging(f"  {words[:2]}", words[2:]), soft_wrap=True)
+
+    def _look_at(self, field: _Field, end: Callable[[Exception | None], object]) -> None:
+        """Read one device; then call `end` with an error that no device raises, or with None."""
+        failure = None
+        try:
+            self._found[field.name] = f"✔ {self._described.look(field.name, field.text)}", GOOD
+            field.typed = self._described.texts[field.name][0]
+        except (DeviceError, UsageError) as error:
+            self._found[field.name] = f"✘ {error}", WARN
+            self._described.keep(field.name, field.text)
+        except Exception as error:
+            failure = error
+        end(failure)
 
     def _draw(self, wrong: Collection[_Field]) -> str:
         """Draw the cell, red what is refused or in the way; return what is nearer to the arm than allowed."""

@@ -1,10 +1,11 @@
 """The form of `ftdrive init` without a browser: no answer ends it, rows keep their names, a busy form says so."""
 
 import json
+import signal
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event, Thread, current_thread, main_thread
 from typing import Any
 
 import pytest
@@ -148,6 +149,28 @@ def test_an_address_that_cannot_exist_is_named(form: Form, name: str, monkeypatc
         form.enter(key, name)
     form.enter("look")
     form.wait(lambda: all(form.controls()[key]["words"].startswith("✘") for key in (ROBOT, SENSOR)))
+
+
+def test_ctrl_c_ends_the_form_while_a_device_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page, ended = Page("test"), Event()
+    described = Description(REAL, {key: setting.value for key, setting in settings().items()})
+
+    def look(*_: str) -> str:
+        assert current_thread() is not main_thread()  # where a lookup in C keeps Ctrl-C waiting
+        signal.pthread_kill(main_thread().ident or 0, signal.SIGINT)
+        ended.wait(30)
+        return "found"
+
+    monkeypatch.setattr(described, "look", look)
+    form = InitPage(page, described, tmp_path / "draft", "ftdrive.toml")
+    form._refresh()  # only a control that is shown can be used
+    page.act("viewer 0", ROBOT, "robot-of-another-network")
+    page.act("viewer 0", "look", None)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            form.run()
+    finally:
+        ended.set()
 
 
 def test_a_busy_form_refuses_more(form: Form, monkeypatch: pytest.MonkeyPatch) -> None:
