@@ -58,6 +58,12 @@ def test_whatever_a_closed_terminal_leaves_behind_is_exit_code_9(
     assert capsys.readouterr().err.removeprefix("interrupted\n") == "error: the terminal was closed\n"
 
 
+def test_the_end_of_a_command_collects_no_garbage() -> None:
+    code = "import atexit, gc; atexit.register(lambda: print(gc.get_freeze_count())); import ftdrive.cli as c; c.main()"
+    ended = subprocess.run([sys.executable, "-c", code, "-V"], capture_output=True, text=True, check=True, timeout=60)
+    assert int(ended.stdout.split()[-1]) > 0
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("setsid") is None, reason="setsid of util-linux gives a process its terminal")
 @pytest.mark.parametrize(
