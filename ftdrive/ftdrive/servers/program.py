@@ -148,14 +148,16 @@ class ProgramService:
             self._stream.read()
         self._scale.warm_up()
         watch = threading.Thread(target=self._watch, daemon=True)
-        watch.start()
         try:
+            watch.start()
             # an emulated controller must not wait for a busy computer
             with clock.keeping_up():
                 self._serve()
         finally:
+            # Ctrl-C may come while the thread starts: it must not outlive the cell.
             self._ends.set()
-            watch.join()
+            if watch.ident is not None:
+                watch.join()
             self.stop()
 
     def _serve(self) -> None:
@@ -224,7 +226,8 @@ class ProgramService:
             # All inputs go in one package, so that a program never reads half of an answer.
             self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist(), *tracked])
         except DeviceError as error:
-            self._say(f"{error}. Trying again.")
+            if self._state is not State.STOPPED:
+                self._say(f"{error}. Trying again.")
             self._registers.close()
             self._registers = None
 
