@@ -238,10 +238,9 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            # many errors begin with the name of the file
-            why = str(error).removeprefix(f"{source.name}: ")
-            named = "" if why.startswith(str(source)) else f"{source}: "
-            echo(in_one_line(f"error: {named}{why}"), err=True)
+            # An error of a file names it, without its folder; one of the solution does not.
+            is_named = isinstance(error, DataError) and [one.name for one in sources].count(source.name) == 1
+            echo(in_one_line(f"error: {error}" if is_named else f"error: {source}: {error}"), err=True)
     if first_failure is not None:
         raise SystemExit(exit_code(first_failure))
 
