@@ -3,7 +3,7 @@
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Protocol, get_args
@@ -20,9 +20,11 @@ from ftcalib.data.dataset import (
     Orientation,
     rotations_of,
 )
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, QUIET, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
-from ftcalib.model import Array
+from ftcalib.model import Array, angle_between, nearest_rotation
+from ftcalib.rounding import counted
 from ftdrive.errors import ConfigError
 from ftdrive.tables.columns import COUNTS, UNITS, Columns, Signal, factor
 from ftdrive.tables.text import TextTable, seconds_of
@@ -55,6 +57,10 @@ _STEPS_S: Final = (2e-5, 0.2)
 _RECORDING_ROWS = 200
 # From pose to pose; longer ones are in another unit.
 _POSE_STEPS_S: Final = (0.5, 1e3)
+# Rows at rest in one orientation differ by no more, with encoder noise and rounded angles.
+_AT_REST_RAD: Final = float(np.radians(0.2))
+# Rows at rest become poses if they are at least this share of the table: the others are rows between two poses.
+_MOSTLY: Final = 0.9
 # Nearer to it, any horizontal axis turns a vector upright.
 _UPSIDE_DOWN = 1e-9
 
@@ -281,7 +287,10 @@ class Table:
             yield Rows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-        """Return the rows as poses at rest. Raises `BadDataset`."""
+        """Return the rows as poses at rest: each row is one, or the rows of each dwell in a long table.
+
+        Raises `BadDataset`.
+        """
         if orientation not in get_args(Orientation):
             raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
         if self._found["sigma"] is None and self._columns.begins("sigma"):
@@ -313,7 +322,7 @@ class Table:
             )
         with self._named():
             R, _ = self._flange([pose])
-            return CalibrationDataset(
+            rows = CalibrationDataset(
                 R_base_flange=np.swapaxes(R, 1, 2) if orientation == "R_flange_base" else R,
                 wrench=self._in_flange(wrench, [pose]),
                 wrench_cov=sigma[0][:, :, None] ** 2 * np.eye(6) if sigma else None,
@@ -321,6 +330,26 @@ class Table:
                 t_s=t_s - t_s[0],
                 meta={"source": self.name, "orientation": orientation, **self._form(signals[0].form)},
             )
+        return rows if sigma or len(rows) < _RECORDING_ROWS else self._of_dwells(rows)
+
+    def _of_dwells(self, rows: CalibrationDataset) -> CalibrationDataset:
+        """Return one pose per dwell; the rows themselves if they are not mostly dwells."""
+        dwells = _dwells(rows.R_base_flange, rows.wrench)
+        n_samples = np.array([len(range(*one.indices(len(rows)))) for one in dwells], np.int64)
+        if n_samples.sum() < _MOSTLY * len(rows):
+            return rows
+        self._guesses.append(f"{n_samples.sum():,} rows at rest are {counted(len(dwells), 'pose')}")
+        if between := len(rows) - n_samples.sum():
+            self._guesses.append(f"{counted(between, 'row')} between them left out")
+        means = [mean_and_covariance(rows.wrench[one]) for one in dwells]
+        return replace(
+            rows,
+            R_base_flange=nearest_rotation(np.array([rows.R_base_flange[one].mean(axis=0) for one in dwells])),
+            wrench=np.array([one.mean for one in means]),
+            wrench_cov=np.array([one.covariance for one in means]),
+            n_samples=n_samples,
+            t_s=np.array([rows.t_s[one].mean() for one in dwells]),
+        )
 
     def _form(self, form: str) -> dict[str, JSON]:
         """Return what the orientations were read from, which limits what a mistake in them can be."""
@@ -481,6 +510,49 @@ class Table:
             R = rotations_of(_COLUMNS[form], numbers)
         R = R @ self.options.R_flange_tcp.T
         return R, None if p is None else p - R @ self.options.p_flange_tcp_m
+
+
+def _dwells(R: Array, wrench: Array) -> list[slice]:
+    """Return the rows of each dwell: 20 or more in one orientation (n, 3, 3), without a step of the wrench (n, 6)."""
+    dwells: list[slice] = []
+    first = 0
+    for end in (*(np.flatnonzero(angle_between(R[1:], R[:-1]) > _AT_REST_RAD) + 1), len(R)):
+        while end - first >= LEAST_SAMPLES:
+            ahead = LEAST_SAMPLES
+            while not (moved := angle_between(R[first : first + ahead], R[first]) > _AT_REST_RAD).any():
+                if first + ahead >= end:
+                    break
+                ahead *= 2
+            last = min(end, first + (int(np.argmax(moved)) if moved.any() else ahead))
+            if last - first >= LEAST_SAMPLES:
+                dwells += _without_steps(wrench, first, last)
+            first = last
+        first = end
+    return dwells
+
+
+def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
+    """Split the rows of a dwell at steps of the wrench (n, 6), such as a tare; each part has 20 rows or more."""
+    parts, waiting = list[slice](), [(first, last)]
+    while waiting:
+        first, last = waiting.pop()
+        step = None if last - first < 2 * LEAST_SAMPLES else _step(wrench[first:last])
+        if step is None:
+            parts.append(slice(first, last))
+        else:
+            waiting += [(first + step, last), (first, first + step)]
+    return parts
+
+
+def _step(wrench: Array) -> int | None:
+    """Return the row (n, 6) from which on the mean differs most, None if it is within the noise."""
+    n = len(wrench)
+    before = np.arange(LEAST_SAMPLES, n - LEAST_SAMPLES + 1)
+    path = np.cumsum(wrench - wrench.mean(axis=0), axis=0)[before - 1] / np.maximum(wrench.std(axis=0), 1e-300)
+    step = int(before[np.argmax(np.abs(path).max(axis=1) / np.sqrt(before * (n - before)))])
+    parts = [mean_and_covariance(part) for part in (wrench[:step], wrench[step:])]
+    sigma = np.sqrt(np.diag(parts[0].covariance + parts[1].covariance))
+    return step if (np.abs(parts[0].mean - parts[1].mean) > QUIET * sigma).any() else None
 
 
 def _wrong_row(row: int, words: str) -> str:

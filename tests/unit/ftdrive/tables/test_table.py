@@ -1,5 +1,6 @@
 """Which numbers a table means: orientations, times, units, frames, and what the numbers themselves show."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -188,3 +189,75 @@ def test_rows_that_follow_quickly_or_two_streams_are_in_motion() -> None:
 def test_a_signal_in_counts_is_said() -> None:
     names = {f"{name} [counts]": values for name, values in wrench(POSES).items()}
     assert Table(names | quaternion(POSES)).words == "wrench in counts"
+
+
+def dwells(*counts: int, steps: Sequence[float] = (), turned_deg: float = 0.02) -> tuple[Any, Any]:
+    """Return a table of dwells with these numbers of rows, in orientations 90° apart or more, and the orientations."""
+    rng, poses = np.random.default_rng(4), Rotation.create_group("O")[: len(counts)]
+    pose = np.repeat(np.arange(len(counts)), counts)
+    jitter = Rotation.from_rotvec(np.radians(turned_deg) * rng.uniform(-1, 1, (len(pose), 3)))
+    level = pose[:, None] + rng.normal(0, 0.01, (len(pose), 6))
+    for row in steps:
+        level[int(row) :] += 0.5
+    return columns(MATRIX, (poses[pose] * jitter).as_matrix().reshape(-1, 9)) | columns(
+        "fx fy fz tx ty tz", level
+    ), poses
+
+
+def test_successive_rows_at_rest_in_one_orientation_are_one_pose() -> None:
+    counts = (20, 60, 45, 75, 40)
+    rows, poses = dwells(*counts)
+    table = Table(rows | {"t_s": np.arange(240.0)})
+    data = table.dataset()
+    assert data.n_samples.tolist() == list(counts)
+    np.testing.assert_allclose(data.R_base_flange, poses.as_matrix(), atol=2e-4)
+    np.testing.assert_allclose(data.wrench, np.arange(5)[:, None] * np.ones(6), atol=0.01)
+    assert data.wrench_cov is not None
+    sigma = np.sqrt(np.einsum("nii->ni", data.wrench_cov))
+    np.testing.assert_allclose(sigma.mean(axis=1), 0.01 / np.sqrt(counts), rtol=0.5)
+    np.testing.assert_allclose(data.t_s[:2], [9.5, 49.5])
+    assert table.words == "240 rows at rest are 5 poses"
+
+
+def test_correlated_samples_of_a_dwell_count_less() -> None:
+    rows, _ = dwells(200, 200)
+    slow = np.convolve(np.random.default_rng(1).normal(size=409), np.ones(10) / np.sqrt(10), "valid")
+    cov = Table(rows | {"fx": 0.01 * slow, "fy": rows["fy"]}).dataset().wrench_cov
+    assert cov is not None
+    assert cov[:, 0, 0].mean() > 3 * cov[:, 1, 1].mean()
+
+
+def test_a_step_of_the_wrench_begins_another_pose() -> None:
+    rows, _ = dwells(100, 100, steps=[130])
+    data = Table(rows).dataset()
+    assert data.n_samples.tolist() == [100, 30, 70]
+    np.testing.assert_allclose(data.wrench[:, 0], [0, 1, 1.5], atol=0.02)
+
+
+def test_rows_between_two_poses_are_left_out() -> None:
+    rows, _ = dwells(100, 5, 100)
+    table = Table(rows)
+    assert table.dataset().n_samples.tolist() == [100, 100]
+    assert table.words == "200 rows at rest are 2 poses; 5 rows between them left out"
+
+
+@pytest.mark.parametrize("turned_deg", [0.02, 30.0], ids=["short", "different orientations"])
+def test_ordinary_tables_have_one_row_per_pose(turned_deg: float) -> None:
+    rows, _ = dwells(*((190,) if turned_deg < 1 else (300,)), turned_deg=turned_deg)
+    data = Table(rows).dataset()
+    assert len(data) == len(rows["fx"])
+    assert data.wrench_cov is None
+    assert not data.n_samples.any()
+
+
+def test_rows_with_standard_errors_are_poses() -> None:
+    rows, _ = dwells(100, 100)
+    sigma = columns("sigma_fx sigma_fy sigma_fz sigma_tx sigma_ty sigma_tz", np.full((200, 6), 0.01))
+    assert len(Table(rows | sigma).dataset()) == 200
+
+
+def test_a_slow_turn_is_no_single_pose() -> None:
+    turned = Rotation.from_rotvec(np.linspace(0, np.radians(6), 600)[:, None] * [0, 0, 1])
+    rows, _ = dwells(600)
+    data = Table(rows | columns(MATRIX, turned.as_matrix().reshape(-1, 9))).dataset()
+    assert 25 <= len(data) <= 35
