@@ -22,6 +22,7 @@ from ftcalib.model import UP_IN_BASE
 from ftcalib.poses.selection import EVERY_SET
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
+from ftcalib.rounding import counted
 from ftcalib.routine import PoseRecord, drift_check
 from ftdrive.commands.common import (
     BAG_TOPICS,
@@ -315,7 +316,7 @@ def _save(result: CalibrationResult, output: Path | None, force: bool, as_json: 
 def _solve_poses(data: RecordedData, options: SolveOptions) -> CalibrationResult:
     chosen: Any = options.method
     how: dict[str, Any] = {"drift": options.drift, "as_published": options.as_published, **data.circumstances}
-    with working("Solving"):
+    with working(f"Solving {counted(len(data.dataset), 'pose')}"):
         try:
             return solve_dataset(data.dataset, chosen, **how, provenance=data.provenance)
         except ValueError as error:

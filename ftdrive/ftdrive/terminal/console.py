@@ -3,7 +3,8 @@
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from threading import Timer
+from typing import Any, Final
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -11,6 +12,9 @@ from rich.style import Style
 from rich.text import Text
 
 from ftdrive.terminal.text import NARROWEST, as_typed, glued, is_command, unglued, visible
+
+# A command that takes longer says at what it works, also in a pipe.
+_PATIENCE_S: Final = 2.0
 
 
 class CommandConsole(Console):
@@ -85,8 +89,20 @@ def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
 
 @contextmanager
 def working(words: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal that a command works, and at what; a pipe gets nothing. Yields a function for other words."""
-    if not messages.is_terminal or messages.quiet:
+    """Show on a terminal that a command works, and at what; a pipe gets one line after 2 s.
+
+    Yields a function for other words.
+    """
+    if not messages.is_terminal:
+        line = Timer(_PATIENCE_S, messages.print, [f" {words} …"])
+        line.daemon = True
+        line.start()
+        try:
+            yield lambda _: None
+        finally:
+            line.cancel()
+        return
+    if messages.quiet:
         yield lambda _: None
         return
     with messages.status(f"{words} …") as status:

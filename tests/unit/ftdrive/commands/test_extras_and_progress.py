@@ -1,7 +1,7 @@
 """Extras are missed before any work, and no command is silent for long on a terminal."""
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,17 +58,32 @@ def test_a_terminal_sees_at_what_a_command_works(monkeypatch: pytest.MonkeyPatch
     assert seen == ["Recording …", "3.0 s, 1500 samples, gaps: 0 …"]
 
 
-def test_a_pipe_gets_nothing_of_it(capsys: pytest.CaptureFixture[str]) -> None:
+class _Timer:
+    """Runs out when the command works."""
+
+    def __init__(self, interval_s: float, function: Callable[[str], None], words: Sequence[str]) -> None:
+        self.start = lambda: function(f"{words[0]} after {interval_s:g} s")
+        self.cancel = lambda: None
+
+
+@pytest.mark.parametrize(("quiet", "words"), [(False, " Recording … after 2 s\n"), (True, "")])
+def test_a_pipe_gets_one_line_of_a_command_that_takes_long(
+    quiet: bool, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     with working("Recording") as show:
         show("3.0 s")
     assert capsys.readouterr() == ("", "")
+    monkeypatch.setattr("ftdrive.terminal.console.Timer", _Timer)
+    monkeypatch.setattr(messages, "quiet", quiet)
+    with working("Recording"):
+        assert capsys.readouterr().err == words
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (PLAN, "Planning …"),
-        (("solve", "poses.csv"), "Solving …"),
+        (("solve", "poses.csv"), "Solving 8 poses …"),
     ],
 )
 def test_commands_that_take_long_say_at_what_they_work(
