@@ -184,8 +184,12 @@ def _across(direction: Array) -> Array:
 
 # One sigma of the entries of the gain of mounted sensors, measured against other sensors: 2 to 5 % at most.
 USUAL_GAIN: Final = 0.02
+# Share of that variance that is common to all axes: 1.4 % in all of them, and 1.4 % in each.
+COMMON_SHARE: Final = 0.5
 # Cross-talk over gain, as sigmas of their entries.
 CROSS_TALK_SHARE: Final = 0.5
+# One sigma, an axis, of the orientation of an arm that computes with its own factory kinematics.
+USUAL_ORIENTATION_DEG: Final = 0.06
 # Range of torque over range of force, of a sensor without data sheet.
 RANGE_LEVER_M: Final = 0.05
 
@@ -225,6 +229,9 @@ class Setup:
     """Of the readings under load, 95 % of them, from the data sheet or a check; otherwise 4 is assumed."""
     sensor_range: Sequence[float] | None = None
     """(2,) of a force, N, and of a torque, N·m."""
+    orientation_accuracy_deg: float | None = None
+    """Of the arm, one standard deviation of an axis; otherwise 0.06 is assumed, as for an arm with its own factory
+    kinematics. 0 declares an exact arm with rigid mounts."""
     sensor_has_arbitrary_zero: bool = False
     """Whether the sensor may read anything without load, so that its bias shows no mistake."""
 
@@ -255,6 +262,12 @@ class Setup:
     def gain_sigma(self) -> float:
         """One standard deviation of the entries of the sensor's gain, before a session shows it."""
         return USUAL_GAIN if self.sensor_accuracy_percent is None else self.sensor_accuracy_percent / 196
+
+    @property
+    def orientation_rad(self) -> float:
+        """One standard deviation of the arm's orientation, an axis."""
+        declared = self.orientation_accuracy_deg
+        return float(np.deg2rad(USUAL_ORIENTATION_DEG if declared is None else declared))
 
     @property
     def up(self) -> Array:

@@ -21,14 +21,10 @@ from ftcalib.files import JSON, check_format, is_changed, read_object, write_obj
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
 from ftcalib.likelihood.response import (
-    COMMON_GAIN,
-    LEAST_COMMON_GAIN,
     LEVER_M,
     SIZE,
     SQUARES,
-    USUAL,
     Response,
-    hidden_covariance,
     joint_covariance,
     predicted_covariance,
 )
@@ -141,7 +137,7 @@ class CalibrationResult(Displayed):
     >>> import ftdrive
     >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"))
     >>> f"{result.mass_kg:.4f} kg, sigma {result.sigma['mass_kg']:.4f} kg, {result.verdict}"
-    '1.2350 kg, sigma 0.0025 kg, good'
+    '1.2350 kg, sigma 0.0182 kg, good'
     """
 
     parameters: Parameters
@@ -180,6 +176,8 @@ class CalibrationResult(Displayed):
     """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
     """Standard deviation of the entries of the gain, if one was found."""
+    hidden_covariance: Array = field(default_factory=lambda: np.zeros((15, 15)))
+    """(15, 15) of the estimates, from errors of arm and mounts that the poses do not show."""
     cable_shift: Array | None = None
     """(15,) by which a cable that acts as a spring may have moved the estimates, in the coordinates of `covariance`;
     None: the readings show none."""
@@ -207,7 +205,7 @@ class CalibrationResult(Displayed):
             raise ValueError(f"R_flange_sensor must be a rotation matrix, not {self.R_flange_sensor.tolist()}")
         _require_known_words(self)
         n = len(self.residuals)
-        for name, shape in (("covariance", (15, 15)), ("residuals", (n, 6))):
+        for name, shape in (("covariance", (15, 15)), ("hidden_covariance", (15, 15)), ("residuals", (n, 6))):
             value = read_only(getattr(self, name))
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
@@ -341,33 +339,31 @@ class CalibrationResult(Displayed):
     def tool_covariance(self) -> Array:
         """(15, 15) of mounting, weight and centre of mass of the tool itself, in the coordinates of `covariance`.
 
-        It includes what the gain and cross-talk that were found, and a cable, can hide in them. `covariance` does not,
-        because compensation needs only the sum.
+        It includes what errors of arm, mounts and sensor, and a cable, can hide in them. `covariance` does not, because
+        compensation needs only the sum.
         """
-        hidden = np.zeros((15, 15))
-        if self.response is not None:
-            hidden += hidden_covariance(self.parameters, self.gain_sigma, self.response.cross_talk_sigma_m)
+        hidden = self.contact.hidden_covariance + self.hidden_covariance
+        lag, weight = self.components.get("hysteresis", 0.0), self.gravity_force_base_N
+        hidden[3:6, 3:6] += lag**2 * np.outer(weight, weight)
         if self.cable_shift is not None:
             hidden += np.outer(self.cable_shift, self.cable_shift)
-        # A value that was given exactly hides nothing.
-        known = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)) < 1e-12
-        hidden[known], hidden[:, known] = 0.0, 0.0
-        return np.asarray(self.covariance + hidden)
+        # Nothing hides in a value that was given exactly, such as the mass: the covariance has none along it.
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        scale[scale < 1e-12] = 1.0
+        value, vector = np.linalg.eigh(self.covariance / np.outer(scale, scale))
+        free = vector[:, value > 1e-13]
+        project = scale[:, None] * (free @ free.T) / scale
+        project[np.diag(self.covariance) < 1e-24] = 0.0
+        return np.asarray(self.covariance + project @ hidden @ project.T)
 
     @property
     def sigma(self) -> Mapping[str, Array | float]:
         """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
 
-        They are those of `tool_covariance`. Weight, mass and the gravity force along the weight have at least 0.2 %,
-        unless they were known.
+        They are those of `tool_covariance`.
         """
         std = np.sqrt(np.maximum(np.diag(self.tool_covariance), 0.0))
-        cov = self.covariance[3:6, 3:6]
-        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, cov)
-        if weight > 1e-9 * self.weight_N:  # not exactly known
-            weight = float(np.hypot(weight, self.scale_sigma * self.weight_N))
-            hidden = self.scale_sigma**2 - (COMMON_GAIN * self.gain_sigma) ** 2  # beyond `tool_covariance`
-            std[3:6] = np.sqrt(std[3:6] ** 2 + hidden * self.gravity_force_base_N**2)
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.tool_covariance[3:6, 3:6])
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],
@@ -383,9 +379,8 @@ class CalibrationResult(Displayed):
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the gain common to all axes, which no orientation shows."""
-        lag = self.components.get("hysteresis", 0.0)
-        return max(LEAST_COMMON_GAIN, float(np.hypot(COMMON_GAIN * self.gain_sigma, lag)))
+        """Standard deviation of the scale of the sensor, at the tool, which no orientation shows."""
+        return float(np.hypot(self.contact.scale_sigma, self.components.get("hysteresis", 0.0)))
 
     def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
         """Subtract weight and bias to give the contact wrench.
@@ -441,7 +436,8 @@ class CalibrationResult(Displayed):
         shown = max(self.dof, 0) / (6 * n) / 2 * n * SQUARES * (self.weight_N / error) ** 2
         covariance = np.zeros((15 + SIZE, 15 + SIZE))
         covariance[:15, :15] = self.covariance
-        covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (USUAL**-2.0 + shown)
+        usual = (self.sensor or SensorMatrix.usual()).shown_variance(self.p_sensor_com_m)
+        covariance[range(15, 15 + SIZE), range(15, 15 + SIZE)] = 1 / (1 / np.maximum(usual, 1e-12) + shown)
         return Response(np.zeros(SIZE), covariance)
 
     def contact_sigma(self, wrench: ArrayLike, R_base_flange: Rotations) -> Array:
@@ -647,6 +643,7 @@ class CalibrationResult(Displayed):
             "g_m_s2": self.g_m_s2,
             "parameter_names": list(PARAMETER_NAMES),
             "covariance": self.covariance.tolist(),
+            "hidden_covariance": self.hidden_covariance.tolist(),
             "residuals": self.residuals.tolist(),
             "provenance": dict(self.provenance),
             **({} if self.motion is None else self.motion.to_dict()),
@@ -668,12 +665,13 @@ class CalibrationResult(Displayed):
         """
         check_format(document, FORMAT, BadCalibration)
         try:
-            apart = {"parameters", "cable_shift", "sensor", "weighed_kg", "motion"}
+            apart = {"parameters", "hidden_covariance", "cable_shift", "sensor", "weighed_kg", "motion"}
             plain = [field.name for field in fields(cls) if field.name not in apart]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
                 **{name: document[name] for name in plain},
                 # Files of version 0.1.0 and earlier have none of these.
+                hidden_covariance=document.get("hidden_covariance", np.zeros((15, 15))),
                 cable_shift=document.get("cable_shift"),
                 sensor=document.get("sensor"),
                 weighed_kg=document.get("weighed_kg"),

@@ -28,8 +28,19 @@ from scipy.linalg import block_diag
 from ftcalib.display import Displayed
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
-from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Setup
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN, LEAST_COMMON_GAIN, LEVER_M, Response
+from ftcalib.known import COMMON_SHARE, USUAL_GAIN, Setup
+from ftcalib.likelihood.response import (
+    ENTRIES,
+    LEAST_COMMON_GAIN,
+    LEVER_M,
+    Response,
+    gain_at,
+    own_variances,
+    ranges,
+    rotation_of,
+    shown_by,
+    vector_of,
+)
 from ftcalib.model import Array, Parameters, read_only, skew
 
 FORMAT = "ftdrive.sensor/1"
@@ -42,14 +53,9 @@ _USUAL_COUNTS = 2.0
 # Plausible in a file: errors of the entries and their sigma relative to the ranges, the lever in m, the floor.
 _LARGEST_ERROR, _LARGEST_SIGMA, _LEVERS_M, _LARGEST_FLOOR = 0.5, 0.5, (1e-3, 10.0), 0.5
 
-_ENTRIES = np.eye(36).reshape(36, 6, 6)
+_DIAGONAL = np.arange(0, 36, 7)
 
 Source = Literal["assumed", "data sheet", "loads"]
-
-
-def ranges(lever_m: float) -> Array:
-    """Return the ranges (6,) of the axes relative to that of a force, for a range of torque of `lever_m` times it."""
-    return np.repeat([1.0, lever_m], 3)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,14 +100,15 @@ class SensorMatrix(Displayed):
         Parameters
         ----------
         gain_sigma : float
-            One standard deviation of the entries of the diagonal. The others have half of it, of the ranges.
+            One standard deviation of the entries of the diagonal. Half of that variance is common to all axes, because
+            calibration masses, ageing and temperature act on all of them. The other entries have half of the deviation,
+            relative to the ranges.
         lever_m : float
         source : {"assumed", "data sheet"}
         """
-        F = ranges(lever_m)
-        sigma = gain_sigma * np.where(np.eye(6) > 0, 1.0, CROSS_TALK_SHARE) * F[:, None] / F
-        variance = np.concatenate([np.full(3, np.pi**2), sigma.ravel() ** 2])
-        return cls(np.zeros((6, 6)), np.diag(variance), source, lever_m)
+        covariance = np.diag(np.concatenate([np.full(3, np.pi**2), own_variances(gain_sigma, lever_m)]))
+        covariance[np.ix_(3 + _DIAGONAL, 3 + _DIAGONAL)] += COMMON_SHARE * gain_sigma**2
+        return cls(np.zeros((6, 6)), covariance, source, lever_m)
 
     @classmethod
     def declared(cls, setup: Setup) -> Self:
@@ -114,27 +121,33 @@ class SensorMatrix(Displayed):
         """(6, 6) one standard deviation of the entries of E."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
 
+    @cached_property
+    def common(self) -> Array:
+        """(36, 36) part of the covariance of the entries of E that is common to all axes."""
+        shared = np.zeros((36, 36))
+        shared[np.ix_(_DIAGONAL, _DIAGONAL)] = self.covariance[3 + _DIAGONAL[0], 3 + _DIAGONAL[1]]
+        return shared
+
+    def shown_variance(self, p_sensor_com_m: Array) -> Array:
+        """Return the variance (11,) of the gain and cross-talk that a tool shows, before it is measured.
+
+        Parameters
+        ----------
+        p_sensor_com_m : array, shape (3,)
+            Its centre of mass.
+        """
+        H = shown_by(p_sensor_com_m)
+        return np.asarray(np.einsum("ai,ij,aj->a", H, self.covariance[3:, 3:] - self.common, H))
+
     def hidden_covariance(self, parameters: Parameters) -> Array:
         """Covariance (15, 15) of what these errors hide in mounting, weight and centre of mass, before any reading.
-
-        After a calibration `ftcalib.likelihood.response.hidden_covariance` has what it found of them.
 
         Parameters
         ----------
         parameters : Parameters
             Of the expected tool.
         """
-        p, C = parameters.p_sensor_com_m, self.covariance[3:, 3:]
-        turn, (_, torque) = _rotation_of(_ENTRIES, p), _gain_at(_ENTRIES, p)
-        (scale,) = _common_gain(p)
-        columns = np.zeros((15, 36))
-        columns[:3] = parameters.R_flange_sensor @ turn.T
-        columns[3:6] = np.outer(parameters.gravity_force_base_N, scale)
-        columns[9:12] = (_vector_of(torque - skew(p) @ skew(turn)) - np.outer(scale, p)).T
-        weight = np.zeros(15)
-        weight[3:6] = parameters.gravity_force_base_N
-        least = max(LEAST_COMMON_GAIN**2 - float(scale @ C @ scale), 0.0)
-        return np.asarray(columns @ C @ columns.T + least * np.outer(weight, weight))
+        return _hidden_covariance(parameters, np.zeros(36), self.covariance[3:, 3:])
 
     def after(
         self,
@@ -164,18 +177,20 @@ class SensorMatrix(Displayed):
             return ContactResponse(self, parameters, E, T @ self.covariance @ T.T)
         # A sensor that is declared perfect has nothing to learn.
         if self.source != "loads" and seen is not None and C.any():
-            H, shown, remaining = _shown_by(p), seen.coefficients, seen.covariance[15:, 15:]
+            H, shown, remaining = shown_by(p), seen.coefficients, seen.covariance[15:, 15:]
+            # The tool shows how large the differences between the axes are; two numbers less count, as for Student's
+            # distribution. It shows nothing of the part that is common to them.
+            squares = (shown**2 + np.diag(remaining)) / self.shown_variance(p)
+            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
+            C = size * (C - self.common) + self.common
             if excess is not None:
                 H = np.concatenate([H, _common_gain(p)])
                 shown, remaining = np.append(shown, excess[0]), block_diag(remaining, np.array([[excess[1] ** 2]]))
             prior = H @ C @ H.T
-            # The tool shows the size of all errors too; two numbers less count, as for Student's distribution.
-            squares = (shown**2 + np.diag(remaining)) / np.diag(prior)
-            size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
             gain = C @ H.T @ np.linalg.inv(prior)
-            E, C = (gain @ shown).reshape(6, 6), size * C - gain @ (size * prior - remaining) @ gain.T
+            E, C = (gain @ shown).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
         turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
-        T = np.concatenate([_rotation_of(_ENTRIES, p).T, np.eye(36)])
+        T = np.concatenate([rotation_of(ENTRIES, p).T, np.eye(36)])
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
@@ -261,7 +276,7 @@ class ContactResponse:
         """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
         if not self.error.any():
             return None
-        turn = skew(_rotation_of(self.error, self.parameters.p_sensor_com_m))
+        turn = skew(rotation_of(self.error, self.parameters.p_sensor_com_m))
         return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
@@ -271,10 +286,21 @@ class ContactResponse:
     def error_columns(self, wrench: Array) -> Array:
         """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by what `error_covariance` is of."""
         turns = -np.kron(np.eye(2), skew(np.eye(3)))
-        effects = np.concatenate([turns, _ENTRIES])
+        effects = np.concatenate([turns, ENTRIES])
         if self.decoder is not None:
             effects = self.decoder @ effects
         return np.asarray(np.einsum("aij,...j->...ia", effects, wrench))
+
+    @cached_property
+    def hidden_covariance(self) -> Array:
+        """(15, 15) mean square of what the sensor hides in mounting, weight and centre of mass of the tool itself."""
+        return _hidden_covariance(self.parameters, self.error.ravel(), self.error_covariance[3:, 3:])
+
+    @property
+    def scale_sigma(self) -> float:
+        """Standard deviation of the weight of the tool itself, relative to its reading."""
+        weight = self.parameters.gravity_force_base_N
+        return float(np.sqrt(weight @ self.hidden_covariance[3:6, 3:6] @ weight) / max(weight @ weight, 1e-12))
 
     @cached_property
     def _by_products(self) -> Array:
@@ -316,38 +342,30 @@ class ContactResponse:
             reading += p.weight_N * np.concatenate([seen.force_gain, seen.cross_talk_m])
         force, torque = np.split(reading if self.decoder is None else self.decoder @ reading, 2)
         weight_N = float(np.trace(force)) / 3
-        return weight_N, _vector_of(torque) / (weight_N or 1.0)
+        return weight_N, vector_of(torque) / (weight_N or 1.0)
 
 
-def _gain_at(E: Array, p: Array) -> tuple[Array, Array]:
-    """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
-    P = skew(p)
-    return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
+def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
+    """Mean square (15, 15) of what entries of E, with a mean (36,) and covariance C, hide in the estimates of a tool.
 
-
-def _vector_of(M: Array) -> Array:
-    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3)."""
-    A = (M - np.swapaxes(M, -1, -2)) / 2
-    return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
-
-
-def _rotation_of(E: Array, p: Array) -> Array:
-    """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
-    return _vector_of(_gain_at(E, p)[0])
-
-
-def _shown_by(p: Array) -> Array:
-    """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
-    force, torque = _gain_at(_ENTRIES, p)
-    torque = torque - skew(p) @ skew(_rotation_of(_ENTRIES, p))
-    parts = [
-        np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
-        for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
-    ]
-    return np.concatenate(parts)
+    An antisymmetric gain is a rotation of the mounting, an antisymmetric cross-talk a shift of the centre of mass, and
+    a gain common to all axes a weight, with a centre of mass that is as much nearer. No orientation shows them.
+    """
+    p = parameters.p_sensor_com_m
+    turn, (_, torque) = rotation_of(ENTRIES, p), gain_at(ENTRIES, p)
+    (scale,) = _common_gain(p)
+    columns = np.zeros((15, 36))
+    columns[:3] = parameters.R_flange_sensor @ turn.T
+    columns[3:6] = np.outer(parameters.gravity_force_base_N, scale)
+    columns[9:12] = (vector_of(torque - skew(p) @ skew(turn)) - np.outer(scale, p)).T
+    weight = np.zeros(15)
+    weight[3:6] = parameters.gravity_force_base_N
+    square = C + np.outer(mean, mean)
+    least = max(LEAST_COMMON_GAIN**2 - float(scale @ square @ scale), 0.0)
+    return np.asarray(columns @ square @ columns.T + least * np.outer(weight, weight))
 
 
 def _common_gain(p: Array) -> Array:
     """Return the derivative (1, 36) of the gain common to all axes, of a tool at p, by the entries of E."""
-    force, _ = _gain_at(_ENTRIES, p)
+    force, _ = gain_at(ENTRIES, p)
     return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

@@ -127,6 +127,7 @@ def solve(
     return CalibrationResult(
         parameters=judged.parameters,
         covariance=judged.covariance,
+        hidden_covariance=best.hidden_covariance(setup.orientation_rad),
         residuals=judged.residuals,
         chi2=judged.chi2 if wrench_cov is None else judged.measured_chi2,
         dof=judged.dof,

@@ -143,7 +143,7 @@ def yu_fig4(rng: np.random.Generator) -> Drawing:
     def below(of: Array) -> str:  # the rounding differs between computers
         return "< 1e-12" if of.max() < 1e-12 else f"{of.max():.1e}"
 
-    found_errors = np.array(errors)
+    found_errors: Array = np.array(errors)
     return figure, [
         ("epsilon_2 of R / F_b / F0 / P / T0", "< 1e-12", " / ".join(map(below, found_errors[:, :5].T))),
         ("epsilon_max of force / torque, 200 poses", "< 1e-12", " / ".join(map(below, found_errors[:, 5:].T))),
@@ -355,8 +355,8 @@ def yu_table3(rng: np.random.Generator) -> Drawing:
 
 def cayley_least_squares(f: Array, a: Array) -> Array:
     """Return R_TF^S of one Cayley transform by ordinary least squares (eq. 11), which the paper advises against."""
-    s = np.linalg.lstsq(skew(f + a).reshape(-1, 3), (f - a).ravel())[0]
-    return np.linalg.solve(np.eye(3) + skew(s), np.eye(3) - skew(s)).T
+    s = np.asarray(np.linalg.lstsq(skew(f + a).reshape(-1, 3), (f - a).ravel())[0], dtype=np.float64)
+    return np.asarray(np.linalg.inv(np.eye(3) + skew(s)) @ (np.eye(3) - skew(s))).T
 
 
 def carlson_fig1(rng: np.random.Generator) -> Drawing:
@@ -406,7 +406,7 @@ def pairwise_nullspace(A: Array, f: Array, *, successive: bool) -> Array:
     r = np.linalg.svd((rows[first] - rows[second]).reshape(-1, 9))[2][-1]
     X = r.reshape(3, 3).T
     U, _, Vt = np.linalg.svd(X * np.sign(np.linalg.det(X)))
-    return U @ Vt
+    return np.asarray(U @ Vt)
 
 
 def carlson_pairs(rng: np.random.Generator) -> Drawing:

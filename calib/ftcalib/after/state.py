@@ -210,6 +210,7 @@ def apply_update(
     return CalibrationResult(
         parameters=update.parameters,
         covariance=update.covariance,
+        hidden_covariance=calibration.hidden_covariance,
         residuals=update.residuals,
         chi2=update.chi2,
         dof=update.dof,

@@ -29,13 +29,14 @@ from ftcalib.errors import BadDataset
 from ftcalib.likelihood.response import (
     joint_covariance,
     joint_jacobian,
+    ranges,
     response_columns,
     with_covariance,
 )
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
 from ftcalib.rounding import to_place_of, with_sigma
-from ftcalib.sensor_matrix import ContactResponse, ranges
+from ftcalib.sensor_matrix import ContactResponse
 
 # A part is held so near to the given point, one standard deviation an axis.
 REACH_M = 0.1

@@ -29,12 +29,15 @@ from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
+from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters
 from ftcalib.published.yu import SPECIAL_R_flange_base
 
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
+# Mean square of the cross-validated residuals, in sigma, up to which a few poses are as their covariance predicts.
+_AS_PREDICTED = 4.0
 # If residuals reach half the weight, neither gravity nor centre of mass mean anything.
 SENSELESS_SHARE = 0.5
 # Largest error of a good result whose residuals exceed the measured noise.
@@ -84,6 +87,8 @@ class Quality:
     """(2,) the same, of all poses if many were rejected: what they had may come again."""
     elsewhere: Array
     """(2,) mean square error in any orientation less that in those of the poses."""
+    of_arm: Array
+    """(2,) mean square error that the arm's orientation adds with other base joints."""
     expected_rms: Array
     """(2,) from noise alone, over all orientations."""
     ahead: DriftAhead
@@ -132,9 +137,9 @@ class Quality:
 
     @property
     def workspace_rms(self) -> Array:
-        """(2,) N, N·m: the same in any orientation."""
+        """(2,) N, N·m: the same in any orientation, with any base joints."""
         more = 0.0 if self._is_noise else np.maximum(self.elsewhere, 0.0)
-        return np.asarray(np.sqrt(self.next_use_rms**2 + more))
+        return np.asarray(np.sqrt(self.next_use_rms**2 + more + self.of_arm))
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the statistics that a result keeps as its `quality`."""
@@ -194,7 +199,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     written : str
         As what the orientations were written, as of `faults`.
     """
-    quality = _statistics(fit, t_s)
+    quality = _statistics(fit, t_s, setup)
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
     # Uneven rounding alone also rejects poses.
     accidents = few_rejected(quality.used) or bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
@@ -252,7 +257,8 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     payload = described_cell.payload(setup.payload_kg, weight_N / g_m_s2, setup.sensor_mass_kg, parameters)
     # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
     if not mistakes and quality.largest_share < SENSELESS_SHARE:
-        findings += described_cell.directions(parameters, fit.covariance, setup, written)
+        hidden = hidden_in_any_poses(parameters, setup.orientation_rad)
+        findings += described_cell.directions(parameters, fit.covariance + hidden, setup, written)
         findings += [one for one in payload if one.code == "payload_units" and not broken]
     if verdict_of(findings) != "rejected":  # its contradictions would be consequences
         findings += [one for one in payload if one not in findings]
@@ -264,12 +270,14 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     return replace(quality, findings=tuple(folded(ordered(findings))), cable_shift=None if cable is None else cable[1])
 
 
-def _statistics(fit: Judged, t_s: Array | None) -> Quality:
+def _statistics(fit: Judged, t_s: Array | None, setup: Setup) -> Quality:
     used = fit.weights > 0.5
     weight_N = fit.parameters.weight_N
     residuals = standardize(fit.left_out_residuals, fit.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
-    largest_share, errors, left_out_rms = _errors(fit, used, weight_N)
+    # The others predict one of a few poses badly, as the covariance of the prediction says.
+    few = used.sum() < RECOMMENDED_POSES and np.mean(residual_sigma[used] ** 2) < _AS_PREDICTED
+    largest_share, errors, left_out_rms = _errors(fit, used, weight_N, few=bool(few))
     measured = bool(np.isfinite(fit.measured_chi2))
     return Quality(
         used,
@@ -282,6 +290,7 @@ def _statistics(fit: Judged, t_s: Array | None) -> Quality:
         *left_out_rms,
         np.array(left_out_rms if few_rejected(used) else _left_out_rms(fit, np.ones_like(used))),
         fit.elsewhere.reshape(2, 3).sum(axis=1),
+        error_with_other_joints(fit.parameters, setup.orientation_rad) ** 2,
         np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
         drift_ahead(fit, t_s),
         noise_factor=float(np.sqrt(fit.measured_chi2 / fit.dof)) if measured else None,
@@ -384,10 +393,13 @@ def expected_error(parameters: Parameters, covariance: Array, response: Response
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[float, list[Finding], tuple[float, float]]:
+def _errors(
+    fit: Judged, used: NDArray[np.bool_], weight_N: float, *, few: bool
+) -> tuple[float, list[Finding], tuple[float, float]]:
     """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
 
-    Of residual, cross-validated and expected error the first is named that exceeds the highest limit.
+    Of residual, cross-validated and expected error the first is named that exceeds the highest limit. With a `few`
+    poses the cross-validated error limits the use of a result, and does not reject it.
     """
     lever_m = max(USUAL_LEVER_M, float(np.linalg.norm(fit.parameters.p_sensor_com_m)))
     expected = expected_error(fit.parameters, fit.covariance, fit.response)
@@ -405,7 +417,8 @@ def _errors(fit: Judged, used: NDArray[np.bool_], weight_N: float) -> tuple[floa
         share = error / scale if scale else float("inf")
         largest = max(largest, share)
         if share > USABLE_SHARE:
-            severity: Severity = "reject" if share > REJECTED_SHARE else "limit"
+            rejects = share > REJECTED_SHARE and not (few and source == "cross-validation")
+            severity: Severity = "reject" if rejects else "limit"
             limit_percent = 100 * (REJECTED_SHARE if severity == "reject" else USABLE_SHARE)
             values = {f"error_{unit}": error, "share_percent": 100 * share, "limit_percent": limit_percent}
             code = ("force_error", "torque_error")[k]

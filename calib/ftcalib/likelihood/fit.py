@@ -17,7 +17,7 @@ from ftcalib.likelihood.response import SIZE, Response, sensor_columns
 from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
-from ftcalib.likelihood.structure import structure_columns
+from ftcalib.likelihood.structure import hidden_columns, hidden_in_any_poses, structure_columns
 from ftcalib.likelihood.variance_components import (
     HYSTERESIS,
     POSES_THAT_SHOW_THE_NOISE,
@@ -32,6 +32,10 @@ from ftcalib.likelihood.variance_components import (
 )
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 
+# Difference of two left-out errors that is no accident, as the logarithm of their squares.
+_CLEARLY = 0.05
+# Such squares are rounding of data without noise.
+_EXACT = 1e-18
 # Compensation does not know them.
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
@@ -132,6 +136,23 @@ class Fit:
         problem = self.at.problem
         return everywhere - self.at.squares(problem.J, {kind: problem.effects[kind] for kind in effects})
 
+    def hidden_covariance(self, orientation_rad: float) -> Array:
+        """Return the covariance (15, 15) of the estimates from errors of arm and mounts, which the poses do not show.
+
+        Parameters
+        ----------
+        orientation_rad : float
+            One standard deviation of an axis of the arm's orientation; 0 for an exact arm with rigid mounts.
+        """
+        if self.at is None:
+            Z = self.free
+            return np.asarray(Z @ Z.T @ hidden_in_any_poses(self.parameters, orientation_rad) @ Z @ Z.T)
+        R = self.R_base_flange[self.order]
+        columns = hidden_columns(self.parameters, R, R.mean(axis=0), orientation_rad)
+        moved = self.at.C @ summed_products(self.at.weigh_columns()[0], columns)
+        moved = self.free @ moved[: self.free.shape[1]]
+        return np.asarray(moved @ moved.T)
+
     @property
     def gain_sigma(self) -> float:
         """Standard deviation of the entries of the gain; 0 if none was found."""
@@ -187,10 +208,21 @@ def fit(
     """
     session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2), gain_sigma)
     e, minima, static_chi2 = explain(session)
-    if not minima[0].settled and session.structure():  # which explains wrong data so well that no weight remains
-        session.structured = False
-        e, minima, static_chi2 = explain(session)
-    return _fit_of(session, e, minima, static_chi2)
+    has_structure = any(c in STRUCTURE for c in e.components)
+    # Structure explains wrong data so well that no weight remains.
+    best = _fit_of(session, e, minima, static_chi2) if minima[0].settled or not session.structure() else None
+    if best is not None and not has_structure:
+        return best
+    session.structured = False
+    plain = _fit_of(session, *explain(session))
+    # Compensation knows gain and cross-talk, and no structure, which may have taken their place.
+    return plain if best is None or _left_out_error(plain) < _left_out_error(best) - _CLEARLY else best
+
+
+def _left_out_error(found: Fit) -> float:
+    """Sum the logarithms of the left-out errors of force and torque, mean squares."""
+    square = (found.left_out_residuals[found.weights > 0] ** 2).reshape(-1, 2, 3).mean(axis=(0, 2))
+    return float(np.log(np.maximum(square, _EXACT)).sum())
 
 
 def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:

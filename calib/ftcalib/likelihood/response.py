@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftcalib.files import JSON
-from ftcalib.known import CROSS_TALK_SHARE, RANGE_LEVER_M, USUAL_GAIN
-from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
+from ftcalib.known import COMMON_SHARE, CROSS_TALK_SHARE, RANGE_LEVER_M, USUAL_GAIN
+from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only, skew
 
 # Cross-talk counts relative to a force at this lever.
 LEVER_M = RANGE_LEVER_M
@@ -40,11 +40,7 @@ SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 
 # Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the symmetric
 # part of two entries has half their variance.
-_ENTRIES = np.array([1, 1, 2, 2, 2]) / 5, np.array([1, 1, 1, 2, 2, 2]) / 6
-# By which a variance that five or six numbers determine is too small: that of Student's distribution.
-_FROM_5, _FROM_6 = 5 / 3, 6 / 4
-# Sigma of the mean of three gains over that of one.
-COMMON_GAIN = float(np.sqrt(_FROM_5 / 3))
+_ENTRIES = np.array([1, 1, 2, 2, 2]) / 5
 # Least sigma of the gain common to all axes: no orientation shows it, and no sensor is better.
 LEAST_COMMON_GAIN = 0.002
 
@@ -102,16 +98,7 @@ class Response:
     @property
     def gain_sigma(self) -> float:
         """Standard deviation of the entries of the whole gain, of which the symmetric part without trace shows."""
-        return float(np.sqrt(_ENTRIES[0] @ self._squares[:5]))
-
-    @property
-    def cross_talk_sigma_m(self) -> float:
-        """Standard deviation of the entries of the whole cross-talk, N·m/N."""
-        return LEVER_M * float(np.sqrt(_ENTRIES[1] @ self._squares[5:]))
-
-    @property
-    def _squares(self) -> Array:
-        return np.asarray(self.coefficients**2 + np.diag(self.covariance)[15:])
+        return float(np.sqrt(_ENTRIES @ (self.coefficients**2 + np.diag(self.covariance)[15:])[:5]))
 
     def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
         """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
@@ -144,27 +131,6 @@ def with_covariance(response: Response | None, joint: Array) -> Response | None:
     return None if response is None else Response(response.coefficients, joint)
 
 
-def hidden_covariance(parameters: Parameters, gain_sigma: float, cross_talk_sigma_m: float) -> Array:
-    """Covariance (15, 15) of what gain and cross-talk hide in mounting, weight and centre of mass.
-
-    An antisymmetric gain is a rotation, an antisymmetric cross-talk a shift of the centre of mass, and a gain common to
-    all axes a weight, with a centre of mass that is as much nearer. No orientation reveals them, and the prediction of
-    the wrench does not need them. They are as large as what does show.
-
-    Parameters
-    ----------
-    parameters : Parameters
-    gain_sigma, cross_talk_sigma_m : float
-        Standard deviation of the entries of both matrices, from 5 and 6 numbers.
-    """
-    hidden, common = np.zeros((15, 15)), np.zeros(15)
-    common[3:6], common[9:12] = parameters.gravity_force_base_N, -parameters.p_sensor_com_m
-    # An antisymmetric entry has half the variance of an entry.
-    hidden[range(3), range(3)] = _FROM_5 * gain_sigma**2 / 2
-    hidden[range(9, 12), range(9, 12)] = _FROM_6 * cross_talk_sigma_m**2 / 2
-    return np.asarray(hidden + (COMMON_GAIN * gain_sigma) ** 2 * np.outer(common, common))
-
-
 def predicted_covariance(
     parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array
 ) -> Array:
@@ -179,6 +145,60 @@ def predicted_covariance(
     """
     J = joint_jacobian(parameters, response, R_base_flange)
     return np.asarray(J @ joint_covariance(covariance, response) @ np.swapaxes(J, -1, -2))
+
+
+# The whole matrix of the sensor, of which a tool shows eleven numbers.
+
+ENTRIES = np.eye(36).reshape(36, 6, 6)
+"""Derivative of an error (6, 6) of the matrix by its entries, row by row."""
+
+
+def ranges(lever_m: float) -> Array:
+    """Return the ranges (6,) of the axes relative to that of a force, for a range of torque of `lever_m` times it."""
+    return np.repeat([1.0, lever_m], 3)
+
+
+def own_variances(gain_sigma: float, lever_m: float = LEVER_M) -> Array:
+    """Return the variances (36,) of the entries of a usual sensor's error, without what all axes have in common.
+
+    Parameters
+    ----------
+    gain_sigma : float
+        One standard deviation of the entries of the diagonal, the common part included.
+    lever_m : float
+        Range of torque over range of force.
+    """
+    F = ranges(lever_m)
+    share = np.where(np.eye(6) > 0, np.sqrt(1 - COMMON_SHARE), CROSS_TALK_SHARE)
+    return np.asarray((gain_sigma * share * F[:, None] / F).ravel() ** 2)
+
+
+def gain_at(E: Array, p: Array) -> tuple[Array, Array]:
+    """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
+    P = skew(p)
+    return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
+
+
+def vector_of(M: Array) -> Array:
+    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3)."""
+    A = (M - np.swapaxes(M, -1, -2)) / 2
+    return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
+
+
+def rotation_of(E: Array, p: Array) -> Array:
+    """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
+    return vector_of(gain_at(E, p)[0])
+
+
+def shown_by(p: Array) -> Array:
+    """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
+    force, torque = gain_at(ENTRIES, p)
+    torque = torque - skew(p) @ skew(rotation_of(ENTRIES, p))
+    parts = [
+        np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
+        for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
+    ]
+    return np.concatenate(parts)
 
 
 # How a sensor with hysteresis reads: each axis lags behind by a share of its last swing.

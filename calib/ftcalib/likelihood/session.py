@@ -6,10 +6,10 @@ from typing import Literal
 import numpy as np
 
 from ftcalib.data.dwell_mean import RESOLUTION
-from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN, Constraints
+from ftcalib.known import USUAL_GAIN, Constraints
 from ftcalib.likelihood.descent import Descent, Kept, Minimum, Statistics, coefficients, column_scale, features
+from ftcalib.likelihood.response import GAIN, hysteresis_columns, own_variances, sensor_columns, shown_by
 from ftcalib.likelihood.response import LEVER_M as CROSS_TALK_LEVER_M
-from ftcalib.likelihood.response import hysteresis_columns, sensor_columns
 from ftcalib.likelihood.session_noise import Noise, pose_times
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.structure import structure_columns
@@ -158,15 +158,17 @@ class Session:
         effects = sensor_columns(p, self.R) | {"hysteresis": hysteresis_columns(p, self.R)}
         if self.n <= STRUCTURED_POSES:
             effects |= structure_columns(p, self.R, self.R.mean(axis=0))
-        least = dict(zip(("gain", "cross_talk"), self.least_response, strict=True))
+        least = {}
+        if self.assumes_response:
+            shown = shown_by(p.p_sensor_com_m) ** 2 @ own_variances(self.gain_sigma)
+            least = {"gain": float(shown[: len(GAIN)].mean()), "cross_talk": float(shown[len(GAIN) :].mean())}
         linear = self.drift == "linear"
         return Linearised(J, r, (H, g), turn, self.cov, self.time, kept, linear, effects, lever, least)
 
     @property
-    def least_response(self) -> tuple[float, float]:
-        """Variances of gain and cross-talk that a sensor has, whatever a few poses show."""
-        few = self.n < FEW_POSES_FOR_GAIN
-        return (self.gain_sigma**2, (CROSS_TALK_SHARE * self.gain_sigma) ** 2) if few else (0.0, 0.0)
+    def assumes_response(self) -> bool:
+        """Whether gain and cross-talk are at least as large as usual, because too few poses show how large."""
+        return self.gain_sigma > 0 and self.n < FEW_POSES_FOR_GAIN
 
     def _groups(self) -> list[range]:
         return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
@@ -180,13 +182,13 @@ class Session:
             always = [component("white", FORCE), component("white", TORQUE)]
         if self.drift == "random-walk":
             always += [component("walk", group) for group in (FORCE, TORQUE)]
-        if any(self.least_response):
+        if self.assumes_response:
             always += RESPONSE
         return always
 
     def candidates(self) -> list[Component]:
         """Components that the data may show."""
-        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not any(self.least_response) else []
+        found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not self.assumes_response else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
             walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []

@@ -10,8 +10,9 @@ orientation, so that the standard deviation is that of the error itself: a share
 
 import numpy as np
 
+from ftcalib.known import USUAL_ORIENTATION_DEG
 from ftcalib.likelihood.response import LEVER_M
-from ftcalib.model import Array, Parameters, gravity_wrench, jacobian
+from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
 # More poses need too much memory for so many unknowns; what is smooth then shows in poses that are left out in blocks.
 MOST_POSES = 1000
@@ -34,6 +35,75 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
         "cable": _of_each_channel(away),
         "kinematics": np.einsum("nck,ni->ncki", turn, away).reshape(len(turn), 6, -1),
     }
+
+
+# Errors of the orientation that a session hides, in sigmas of the flange: on the side of the base, and smooth ones.
+_OF_BASE, _SMOOTH = 5 / 3, 2 / 3
+# One sigma of the sag of adapter and mount under the moment of the tool, and of the shift of a soft tool's centre.
+_SAG_RAD_PER_NM, _SOFT_M = 3e-4, 1e-4
+
+
+def hidden_columns(
+    parameters: Parameters,
+    R_base_flange: Array,
+    middle: Array,
+    orientation_rad: float = np.deg2rad(USUAL_ORIENTATION_DEG),
+) -> Array:
+    """Give what arm and mounts do to the wrenches (n, 6, k), each column for one standard deviation of its cause.
+
+    It resembles a change of mounting, direction of gravity, bias and centre of mass, so that a session shows little.
+
+    Parameters
+    ----------
+    parameters : Parameters
+    R_base_flange : array, shape (n, 3, 3)
+    middle : array, shape (3, 3)
+        As in `structure_columns`.
+    orientation_rad : float
+        One standard deviation of an axis of the arm's orientation; 0 for an exact arm with rigid mounts.
+    """
+    n = len(R_base_flange)
+    if orientation_rad == 0:
+        return np.zeros((n, 6, 0))
+    turn = jacobian(parameters, R_base_flange)[..., :3]
+    weight = gravity_wrench(parameters, R_base_flange)
+    moment_flange_Nm = weight[:, None, 3:] @ parameters.R_flange_sensor.T
+    direction = weight[:, :3] / max(parameters.weight_N, 1e-12)
+    soft = np.zeros((n, 6, 3, 3))  # by the axis of the shift, and of the weight that causes it
+    soft[:, 3:] = np.einsum("nci,nj->ncij", -skew(weight[:, :3]), direction)
+    return np.concatenate(
+        [
+            orientation_rad * turn,
+            _OF_BASE * orientation_rad * np.einsum("nci,nji->ncj", turn, R_base_flange),
+            _SMOOTH * orientation_rad * structure_columns(parameters, R_base_flange, middle)["kinematics"],
+            _SAG_RAD_PER_NM * turn * moment_flange_Nm,
+            _SOFT_M * soft.reshape(n, 6, 9),
+        ],
+        axis=2,
+    )
+
+
+def hidden_in_any_poses(parameters: Parameters, orientation_rad: float) -> Array:
+    """Return the covariance (15, 15) of mounting and gravity from errors of the arm's orientation, whatever the poses.
+
+    Arguments as in `hidden_columns`, which also has what the mounts do in given poses.
+    """
+    hidden = np.zeros((15, 15))
+    gravity = skew(parameters.gravity_force_base_N)
+    hidden[:3, :3] = (1 + _SMOOTH**2) * np.eye(3)
+    hidden[3:6, 3:6] = (_OF_BASE**2 + _SMOOTH**2) * gravity @ gravity.T
+    return np.asarray(orientation_rad**2 * hidden)
+
+
+def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> Array:
+    """Return the error (2,) of force and torque, root mean square, where the base joints are not those of the session.
+
+    The error of the orientation on the side of the base was part of the direction of gravity in the session. Half of
+    its variance, and the smooth errors of both places, are others there. Arguments as in `hidden_columns`.
+    """
+    turn_rad = orientation_rad * np.sqrt(_OF_BASE**2 / 2 + 2 * _SMOOTH**2)
+    force_N = parameters.weight_N * turn_rad * np.sqrt(2.0)  # two axes across the weight
+    return np.asarray(force_N * np.array([1.0, np.sqrt(2 / 3) * np.linalg.norm(parameters.p_sensor_com_m)]))
 
 
 def _load_columns(parameters: Parameters, R_base_flange: Array) -> Array:

@@ -159,14 +159,12 @@ class Linearised:
 
         An error of the gain acts on the torque of the weight too, as cross-talk at the lever of the centre of mass.
         """
-        return LARGEST.get(c.kind, np.inf) * self._at_lever(c)
+        at_lever = (1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0
+        return LARGEST.get(c.kind, np.inf) * at_lever
 
     def smallest(self, c: Component) -> float:
         """Variance that the sensor or the arm may have, whatever too few data show."""
-        return self.least.get(c.kind, 0.0) * self._at_lever(c)
-
-    def _at_lever(self, c: Component) -> float:
-        return (1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0
+        return self.least.get(c.kind, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

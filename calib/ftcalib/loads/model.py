@@ -16,8 +16,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.display import Displayed
+from ftcalib.likelihood.response import ranges
 from ftcalib.model import Array, cross, rotation_of, skew
-from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.sensor_matrix import SensorMatrix
 
 # All places share an error of the sensor origin, one sigma.
 ORIGIN_M = 0.0005

@@ -18,9 +18,10 @@ from ftcalib.errors import NotObservable
 from ftcalib.files import JSON
 from ftcalib.findings import Finding, Verdict, ordered, verdict_of
 from ftcalib.known import Setup
+from ftcalib.likelihood.response import ranges
 from ftcalib.loads.model import SIZES, Evaluated, LoadModel, LoadRun, Mistake, sizes_of
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
-from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.sensor_matrix import SensorMatrix
 from ftcalib.solver import solve
 
 # By which minus twice the logarithm of the likelihood falls, for a mistake to count; per pose it could be in many.

@@ -16,6 +16,7 @@ from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
+from ftcalib.likelihood.structure import hidden_in_any_poses
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
 from ftcalib.motion.mistakes import (
@@ -164,6 +165,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     return CalibrationResult(
         parameters=best.load.static,
         covariance=best.covariance[:15, :15],
+        hidden_covariance=hidden_in_any_poses(best.load.static, setup.orientation_rad),
         residuals=best.residuals[judged],
         chi2=best.chi2,
         dof=max(6 * int(best.kept.sum()) - 23, 1),

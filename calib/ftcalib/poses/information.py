@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from ftcalib.judge.observability import second_minimum
 from ftcalib.likelihood.rotation_minima import given_rotation
+from ftcalib.likelihood.structure import hidden_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
 from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
 from ftcalib.sensor_matrix import SensorMatrix
@@ -116,7 +117,8 @@ def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
 def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
 
-    Mounting, weight and centre of mass have what errors of the sensor hide in them, if those are guessed too.
+    If the errors of the sensor are guessed too, mounting, weight and centre of mass have what these, and errors of arm
+    and mounts, hide in them.
 
     Parameters
     ----------
@@ -134,7 +136,10 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     rows = np.concatenate([np.eye(15), _weight_and_tilt_rows(guess)])
     total = variance(rows)
     if guess.sensor is not None:
-        hidden = guess.sensor.hidden_covariance(guess.parameters)
+        columns = hidden_columns(guess.parameters, R_base_flange, R_base_flange.mean(axis=0))
+        columns = (columns / guess.wrench_sigma[:, None]).reshape(len(J), -1)
+        moved = guess.scale[:, None] * np.linalg.lstsq(J, columns)[0]
+        hidden = guess.sensor.hidden_covariance(guess.parameters) + moved @ moved.T
         total = total + np.einsum("ki,ij,kj->k", rows, hidden, rows)
     std, (weight, alpha, beta) = np.sqrt(total[:15]), np.sqrt(total[15:]).tolist()
     everywhere = jacobian(guess.parameters, special(range(1, 25)))

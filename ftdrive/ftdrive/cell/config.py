@@ -65,6 +65,13 @@ class RobotConfig:
     tip_speed_mm_s: float = entry(
         "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
     )
+    orientation_accuracy_deg: float | None = entry(
+        "of the flange, one standard deviation of an axis; 0.06 is assumed if it is not set, as for an arm with its "
+        "own factory kinematics; 0 declares an exact arm with rigid mounts",
+        None,
+        "deg",
+        (0, 5),
+    )
     driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
     control: str = entry(
         "auto, ur-rtde or script: what moves the arm; auto takes ur-rtde where it is installed and the controller has "

@@ -414,6 +414,7 @@ def circumstances_of(run: Run) -> Circumstances:
             payload_kg=setup["payload_kg"],
             sensor_accuracy_percent=setup["accuracy_percent"],
             sensor_range=setup["range"],
+            orientation_accuracy_deg=config.get("robot", {}).get("orientation_accuracy_deg"),
             sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
         ),
         origin,

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.compare import MethodResult
 from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
+from ftcalib.likelihood.response import LEAST_COMMON_GAIN
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import find_moved, hints, names_of
@@ -39,7 +40,7 @@ _DERIVED = {"gravity_force_base_N"}
 
 
 SIGMA_OF_THE_TOOL = (
-    "that of mounting, weight and centre of mass includes what gain and cross-talk of the sensor hide in them; the "
+    "that of mounting, weight and centre of mass includes what errors of sensor, arm and mounts hide in them; the "
     "compensation error does not, because there they cancel"
 )
 
@@ -74,8 +75,9 @@ def print_result(
     printed = " as published" if result.provenance.get("as_published") else ""
     answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}{printed}"))
     answer.print(_table(result, truth))
-    if result.response is not None:
+    if (mass := mass_in_words(result)) is not None:
         answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))
+        answer.print(hanging(" mass as read: ", mass, answer))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, f"compensation error {error_in_words(result)}", answer))
     if result.verdict != "rejected":
@@ -155,6 +157,17 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
         answer.print(hanging(" drift in the fit: ", words, answer))
         if (ahead := drift_in_use(result)) is not None:
             answer.print(hanging(" next use: ", f"{ahead}. Tare before use.", answer))
+
+
+def mass_in_words(result: CalibrationResult) -> str | None:
+    """Describe the mass with both parts of its sigma; None if it was known, or the sensor is declared perfect."""
+    session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
+    if session_kg < FIXED_BELOW * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
+        return None
+    scale = f"{100 * result.scale_sigma:.2g} % (scale of the sensor)"
+    return (
+        f"{to_place_of(result.mass_kg, session_kg)} kg ± {scale} ± {to_place_of(session_kg, session_kg)} (this session)"
+    )
 
 
 def error_in_words(result: CalibrationResult) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftdrive.live.samples import Block, Stages, StreamInfo, WrenchFrame
@@ -37,7 +37,7 @@ def dataset() -> CalibrationDataset:
 
 @cache
 def calibration() -> CalibrationResult:
-    return solve(dataset())
+    return solve(dataset(), setup=Setup(orientation_accuracy_deg=0.0))
 
 
 @cache

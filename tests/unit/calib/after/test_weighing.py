@@ -13,9 +13,9 @@ from ftcalib.after.state import Calibrated, tare
 from ftcalib.after.weighing import Weight, drift_since, holding, known_contact, true_tool, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
-from ftcalib.likelihood.response import Response, predicted_covariance
+from ftcalib.likelihood.response import Response, predicted_covariance, ranges
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.sensor_matrix import SensorMatrix
 from tests.first_order import assert_same, propagated
 from tests.loaded_sensor import LEVER_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor
 from tests.loaded_sensor import NOISE as LOAD_NOISE

@@ -588,7 +588,7 @@ def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
         sigma = np.repeat([0.05, 0.04 * lever_m * WEIGHT_N / np.sqrt(3)], 3)
         wrench = noisy(np.random.default_rng(31), R24, truth, sigma)
         loud = fit(R24, wrench, white(24, sigma), start=truth, weights=used.astype(float))
-        largest, (finding,), left_out = _errors(loud, used, WEIGHT_N)
+        largest, (finding,), left_out = _errors(loud, used, WEIGHT_N, few=False)
         length = [np.sqrt(np.mean(np.sum(part[used] ** 2, axis=1))) for part in np.hsplit(loud.left_out_residuals, 2)]
         assert left_out == pytest.approx(tuple(length))
         residual_Nm = np.sqrt(np.mean(np.sum(loud.residuals[used, 3:] ** 2, axis=1)))

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationResult, Parameters
+from ftcalib import CalibrationResult, Parameters, SensorMatrix
 from ftdrive.checks.arm import RATED_KG, flange_load, margin_in_words
 
 Array = NDArray[np.float64]
@@ -25,8 +25,9 @@ def calibrated(
     weight = -mass_kg * G_M_S2 * np.array(up_base)
     parameters = Parameters(R_flange_sensor, weight, np.zeros(3), np.array(p_sensor_com_m), np.zeros(3))
     covariance = np.zeros((15, 15)) if covariance is None else covariance
+    sensor = SensorMatrix.usual(gain_sigma)
     return CalibrationResult(
-        parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", (), gain_sigma=gain_sigma
+        parameters, covariance, np.zeros((6, 6)), 1.0, 21, "measured", G_M_S2, "ml", (), sensor=sensor
     )
 
 

@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
 from ftcalib.model import predict
 from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftdrive.checks.check import Check
@@ -205,7 +205,9 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     cov = np.tile(np.diag(np.repeat([2e-3, 1e-4], 3) ** 2), (24, 1, 1))
     known = Known(mass_kg=0.6)  # too much
     calibration = solve(
-        CalibrationDataset(R, predict(truth, R) + off, cov, np.zeros(24, np.int64), np.full(24, np.nan)), known=known
+        CalibrationDataset(R, predict(truth, R) + off, cov, np.zeros(24, np.int64), np.full(24, np.nan)),
+        known=known,
+        setup=Setup(orientation_accuracy_deg=0.0),
     )
     headline = calibration.likely_error()
     assert (headline > 1.1 * np.array(calibration.predicted_error())).all()

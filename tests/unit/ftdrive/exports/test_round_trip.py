@@ -15,9 +15,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters
 from ftcalib.compensation import Compensator
-from ftcalib.likelihood.response import SIZE, Response
+from ftcalib.likelihood.response import SIZE, Response, ranges
 from ftcalib.model import Array
-from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.formats import FORMATS, Property
 from ftdrive.exports.registry import export

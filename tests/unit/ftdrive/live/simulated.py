@@ -40,7 +40,7 @@ def calibrated(poses: int = 24, seed: int = 1, samples: int = 400) -> Calibratio
     wrench = predict(TRUTH, R) + rng.normal(size=(poses, 6)) * sigma
     covariance = np.tile(np.diag(sigma**2), (poses, 1, 1))
     dataset = CalibrationDataset(R, wrench, covariance, np.zeros(poses, np.int64), np.full(poses, np.nan))
-    return solve(dataset, setup=Setup(sensor_accuracy_percent=0.0))
+    return solve(dataset, setup=Setup(sensor_accuracy_percent=0.0, orientation_accuracy_deg=0.0))
 
 
 def calibrated_from(truth: Mapping[str, Any], seed: int = 1) -> CalibrationResult:
@@ -52,7 +52,8 @@ def calibrated_from(truth: Mapping[str, Any], seed: int = 1) -> CalibrationResul
     R = Rotation.random(24, rng=rng).as_matrix()
     wrench = predict(parameters, R) + sigma * rng.normal(size=(24, 6))
     covariance = np.tile(np.diag(sigma**2), (24, 1, 1))
-    return solve(CalibrationDataset(R, wrench, covariance, np.zeros(24, np.int64), np.full(24, np.nan)))
+    exact = Setup(orientation_accuracy_deg=0.0)
+    return solve(CalibrationDataset(R, wrench, covariance, np.zeros(24, np.int64), np.full(24, np.nan)), setup=exact)
 
 
 def info(calibration: CalibrationResult, rate_Hz: float = 1000.0, *, height: bool = True) -> StreamInfo:

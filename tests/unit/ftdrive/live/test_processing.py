@@ -13,9 +13,10 @@ from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
 from ftcalib.after.series import BiasTemperature
+from ftcalib.likelihood.response import ranges
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
-from ftcalib.sensor_matrix import SensorMatrix, ranges
+from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
 from ftdrive.live.processing import Processor
 from ftdrive.live.samples import Axes, Block, FrameTransform, Paired, Point, Stages, WrenchFrame
