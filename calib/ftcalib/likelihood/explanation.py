@@ -31,6 +31,7 @@ from ftcalib.likelihood.variance_components import (
     NEGLIGIBLE,
     RESPONSE,
     ROTATION,
+    STRUCTURE,
     TORQUE,
     Component,
     Linearised,
@@ -257,6 +258,8 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
 
 # From here on single poses are looked at only when chi2 or `drift` asks for it.
 MANY_POSES = 20_000
+# Some of more poses show whether the bias walks, and errors that have a structure.
+MOST_SEARCHED, SEARCHED = 1000, 300
 # Fewer do not show that poses are bumped by the shape of the distribution.
 POSES_FOR_THE_SHAPE = 500
 # P-value below which more than the measured noise is looked for.
@@ -309,23 +312,66 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         session.cov = session.least_noise(minima[0].parameters)
     if _is_quiet(session, minima[0]):
         return plain, minima, minima[0].chi2
-    chosen = min(_explanations(session, minima, weights), key=lambda e: e.criterion)
-    if not session.measured:
-        chosen = _with_expected_noise(session, chosen)
+    of_some = _explanation_of_some(session) if session.n > MOST_SEARCHED else None
+    if of_some is None:
+        chosen = _with_expected_noise(session, min(_explanations(session, minima, weights), key=lambda e: e.criterion))
+    else:
+        chosen = _of_all_poses(session, of_some)
     static = minima if chosen.kept.all() else session.descent.minima(weights * chosen.kept[:, None, None])
     for _ in range(len(static)):
         found = _with_all_minima(session, chosen, static)
         if session.descent.same(found[0].parameters, chosen.parameters):
             break
-        other = _improve(session, found[0].parameters, chosen.kept)
+        if of_some is None:
+            other = _with_expected_noise(session, _improve(session, found[0].parameters, chosen.kept))
+        else:
+            other = _of_all_poses(session, replace(chosen, parameters=found[0].parameters))
         if other.criterion > chosen.criterion:
             break
-        chosen = other if session.measured else _with_expected_noise(session, other)
+        chosen = other
     return chosen, found, static[0].chi2
 
 
+def _explanation_of_some(session: Session) -> Explanation | None:
+    """Explain some of many poses; return None if they show neither a walk nor an error that has a structure.
+
+    Errors that neighbouring poses share look like walks of many axes, which take long to try in many poses. More poses
+    do not show the variance of errors with a structure any better.
+    """
+    some = session.some(SEARCHED)
+    e, _, _ = explain(some)
+    few_enough = session.n <= MANY_POSES
+    session.shown = tuple(c for c in e.components if few_enough or c not in STRUCTURE)
+    smooth = {"walk", "slope", *(c.kind for c in STRUCTURE)}
+    if not few_enough or smooth.isdisjoint(c.kind for c in e.components):
+        return None
+    # The variance of a walk is per mean interval, which is shorter between more poses.
+    shorter = np.array([(some.n - 1) / (session.n - 1) if c.kind == "walk" else 1.0 for c in e.components])
+    return Explanation(e.parameters, session.everything, e.components, e.theta * shorter)
+
+
+def _of_all_poses(session: Session, e: Explanation) -> Explanation:
+    """Estimate parameters and variances from all poses, and reject poses, with the components of an explanation."""
+    p, kept = e.parameters, e.kept
+    problem = session.linearise(p, kept)
+    at = select(problem, e.components, e.theta, (), len(session.always()))
+    for _ in range(ROUNDS):
+        distances = squared_length(*at.left_out())
+        before, kept = kept, _membership(session, kept, distances, at)
+        if (kept != before).any():
+            problem = session.linearise(p, kept)
+            at = point(problem.with_only(at.components), at.components, at.theta)
+        elif at.squared_step >= SETTLED:
+            p, problem, at = _settle(session, p, kept, problem, at)
+        else:
+            break
+    return Explanation(p, before, at.components, at.theta, _criterion(session, at, distances), noise=at.noise)
+
+
 def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
-    """Take the white noise that is expected instead of the likeliest."""
+    """Take the white noise that is expected instead of the likeliest, if it was not measured."""
+    if session.measured:
+        return e
     problem = session.linearise(e.parameters, e.kept)
     theta = expected_variances(problem, point(problem, e.components, e.theta))
     return replace(e, theta=theta, noise=None)

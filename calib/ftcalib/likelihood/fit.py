@@ -132,8 +132,9 @@ class Fit:
             return np.zeros(6)
         R, middle = Rotation.create_group("O").as_matrix(), self.R_base_flange[self.order].mean(axis=0)
         effects = sensor_columns(self.parameters, R) | structure_columns(self.parameters, R, middle)
-        everywhere = self.at.squares(jacobian(self.parameters, R) @ self.free, effects)
         problem = self.at.problem
+        effects = {kind: columns for kind, columns in effects.items() if kind in problem.effects}
+        everywhere = self.at.squares(jacobian(self.parameters, R) @ self.free, effects)
         return everywhere - self.at.squares(problem.J, {kind: problem.effects[kind] for kind in effects})
 
     def hidden_covariance(self, orientation_rad: float) -> Array:
@@ -283,7 +284,7 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         covariance=covariance,
         response=response,
         lag=None if lag is None else (lag, square),
-        at=at if session.n <= STRUCTURED_POSES else None,
+        at=at if session.n <= STRUCTURED_POSES or session.structure() else None,
     )
 
 

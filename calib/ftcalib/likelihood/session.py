@@ -45,6 +45,8 @@ FEW_POSES_FOR_HYSTERESIS = 12
 POSES_FOR_EACH_AXIS = 50
 # Times the rounding of the data: what a fit to data without noise leaves.
 EXACT = 100
+# Its multiples are spread evenly, and repeat no pattern.
+GOLDEN_RATIO = (1 + 5**0.5) / 2
 # Residuals of one kind, relative to the other at the usual ratio, are no less.
 UNEQUAL = 0.01
 # Least white noise where it was not measured, as a share of the residuals.
@@ -72,6 +74,8 @@ class Session:
     ) -> None:
         self.n = len(wrench)
         self.gain_sigma, self.structured = gain_sigma, True
+        # Of many poses: the components that some of them show; no other walk or structure is looked for.
+        self.shown: Sequence[Component] | None = None
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints
         self.measured = wrench_cov is not None
@@ -156,8 +160,10 @@ class Session:
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
         lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
         effects = sensor_columns(p, self.R) | {"hysteresis": hysteresis_columns(p, self.R)}
-        if self.n <= STRUCTURED_POSES:
-            effects |= structure_columns(p, self.R, self.R.mean(axis=0))
+        if self.n <= STRUCTURED_POSES or self.structure():
+            structure = structure_columns(p, self.R, self.R.mean(axis=0))
+            kinds = {c.kind for c in (STRUCTURE if self.n <= STRUCTURED_POSES else self.structure())}
+            effects |= {kind: columns for kind, columns in structure.items() if kind in kinds}
         least = {}
         if self.assumes_response:
             shown = shown_by(p.p_sensor_com_m) ** 2 @ own_variances(self.gain_sigma)
@@ -192,6 +198,7 @@ class Session:
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
             walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
+            walks = walks if self.shown is None else [c for c in walks if c in self.shown]
             found += [*white, ROTATION, *walks]
         if self.n >= FEW_POSES_FOR_HYSTERESIS:
             found.append(HYSTERESIS)
@@ -199,7 +206,20 @@ class Session:
 
     def structure(self) -> tuple[Component, ...]:
         """Errors with a structure that the data may show."""
-        return STRUCTURE if self.structured and FEW_POSES_FOR_HYSTERESIS <= self.n <= STRUCTURED_POSES else ()
+        if not self.structured or self.n < FEW_POSES_FOR_HYSTERESIS:
+            return ()
+        return STRUCTURE if self.n <= STRUCTURED_POSES else tuple(c for c in STRUCTURE if c in (self.shown or ()))
+
+    def some(self, count: int) -> "Session":
+        """Return the session of so many poses, one from each of as many parts of equal length."""
+        # At uneven places within the parts, because a tour may have been repeated at the pace of the parts.
+        k = np.arange(count)
+        places = ((k + k * GOLDEN_RATIO % 1) * self.n / count).astype(np.intp)
+        R, wrench = (x[self.order[places]] for x in self.given)
+        cov = self.cov[places] if self.measured else None
+        some = Session(R, wrench, cov, self.time[places], self.drift, self.constraints, self.gain_sigma)
+        some.structured = self.structured
+        return some
 
 
 def white(sigma_N: float, sigma_Nm: float) -> Array:

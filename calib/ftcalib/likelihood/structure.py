@@ -14,7 +14,7 @@ from ftcalib.known import USUAL_ORIENTATION_DEG
 from ftcalib.likelihood.response import LEVER_M
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
-# More poses need too much memory for so many unknowns; what is smooth then shows in poses that are left out in blocks.
+# Of more poses only the kinds that some of them show, because so many unknowns take memory and time.
 MOST_POSES = 1000
 
 

@@ -1,11 +1,15 @@
 """When poses stand out, and what it costs to reject them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.spatial.transform import Rotation, RotationSpline
 
+from ftcalib.likelihood import explanation
 from ftcalib.likelihood.descent import Kept, agreeing_poses, fewest_kept
-from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
+from ftcalib.likelihood.explanation import Explanation, _are_gaussian, _criterion, _limit, _membership, _stand_out
 from ftcalib.likelihood.session import Session, inverses
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
 from ftcalib.model import Array
@@ -115,3 +119,50 @@ def test_a_rejected_pose_costs_the_limit_and_beyond_it_a_logarithm(
     assert (distance > limit) == (scale > 1)
     gained = _criterion(own, rejected, np.where(others, 6.0, distance)) - _criterion(own, counts, np.full(24, 6.0))
     assert gained == pytest.approx(limit + 6 * np.log(max(distance / limit, 1.0)) - distance, abs=1e-4)
+
+
+def smooth_tour(n: int, *, measured: bool = True, bumped: int = 0) -> Session:
+    """Return poses along a path, whose residuals are a cable's and noise."""
+    rng = np.random.default_rng(5)
+    corners = Rotation.random(40, rng=rng)
+    R = RotationSpline(np.arange(40.0), corners)(np.linspace(0, 39, n)).as_matrix()
+    residuals = SIGMA * rng.normal(size=(n, 6)) + 4 * SIGMA * (R.reshape(n, 9) @ rng.normal(size=(9, 6)))
+    residuals[:bumped] += 100 * SIGMA
+    return session(R, measured=measured, residuals=residuals)
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_some_of_many_poses_show_errors_that_have_a_structure(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = list[int]()
+
+    def counted(own: Session, *arguments: Any) -> Explanation:
+        searched.append(own.n)
+        return improve(own, *arguments)
+
+    improve = explanation._improve
+    monkeypatch.setattr(explanation, "_improve", counted)
+    own = smooth_tour(1200, measured=measured, bumped=3)
+    found, minima, _ = explanation.explain(own)
+    assert set(searched) == {explanation.SEARCHED}
+    kinds = {c.kind for c in found.components}
+    assert "cable" in kinds
+    assert kinds.isdisjoint({"walk", "slope"})
+    assert minima[0].settled
+    assert set(np.flatnonzero(~found.kept)) >= {0, 1, 2}
+    assert found.kept.sum() > 1190
+    if not measured:
+        white = next(v for c, v in zip(found.components, found.theta, strict=True) if c.name == "white_force_N")
+        assert np.sqrt(white) == pytest.approx(SIGMA_N, rel=0.05)
+
+
+def test_a_thousand_poses_are_all_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Session, "some", lambda *_: pytest.fail("only some poses were searched"))
+    rng = np.random.default_rng(6)
+    explanation.explain(tour(1000, 2 * SIGMA * rng.normal(size=(1000, 6))))
+
+
+def test_some_poses_of_a_repeated_tour_have_all_orientations() -> None:
+    some = tour(24 * 100).some(300)
+    assert some.n == 300
+    assert len(np.unique(some.R.round(6), axis=0)) == 24
+    assert (np.diff(some.time) > 0).all()
