@@ -42,8 +42,8 @@ from ftcalib.model import (
 FEWEST_POSES = 10
 # Poses before and after.
 FEWEST_ON_A_SIDE = 3
-# Of longer sessions only every second, third, ... pose is looked at.
-MOST_POSES = 300
+# Of longer sessions only every second, third, ... pose is looked at; of those beyond 1000 poses, fewer.
+MOST_POSES, OF_MANY = 300, 150
 # A change must bring the mean square misfit below this share before the likelihood is asked.
 CLEARLY = 0.9
 # Residuals below this share of the weight are those of a change that is linear in its numbers.
@@ -119,7 +119,7 @@ def session_change(
         Whether steps of the bias count: not where the fit found no drift that they would look like.
     """
     # Negative floor division rounds the step up.
-    order = order[:: -(-len(order) // MOST_POSES)]
+    order = order[:: -(-len(order) // (MOST_POSES if len(order) <= 1000 else OF_MANY))]
     n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
     if n < FEWEST_POSES:
         return []

@@ -10,7 +10,15 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.judge.faults import rough_fit
-from ftcalib.judge.session_change import KINDS, _groups, bias_steps, likeliest_change, minus_two_log_likelihood
+from ftcalib.judge.session_change import (
+    KINDS,
+    SessionChange,
+    _groups,
+    bias_steps,
+    likeliest_change,
+    minus_two_log_likelihood,
+    session_change,
+)
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.response import SIZE, response_columns
 from ftcalib.likelihood.session import LEVER_M
@@ -318,3 +326,22 @@ def test_hysteresis_is_not_two_sensors_that_take_turns() -> None:
     t_s, samples = cell.dwells(q, 0.0)
     result = solve(CalibrationDataset.of(flange(q), samples.mean(axis=1), t_s=t_s))
     assert "sensors_alternate" not in {one.code for one in result.findings}
+
+
+@pytest.mark.parametrize(("n", "looked_at"), [(900, 300), (1800, 150)])
+def test_a_change_is_named_from_some_of_many_poses(n: int, looked_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    sizes = list[int]()
+
+    def counted(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
+        sizes.append(len(R))
+        return likeliest_change(parameters, R, wrench, scale)
+
+    monkeypatch.setattr("ftcalib.judge.session_change.likeliest_change", counted)
+    R = Rotation.random(n, rng=3).as_matrix()
+    wrench = predict(TOOL, R) + np.random.default_rng(4).normal(0, SIGMA, (n, 6))
+    wrench[n // 2 :] += predict(TARED, R[n // 2 :]) - predict(TOOL, R[n // 2 :])
+    found = fit(R, wrench, np.diag(SIGMA**2))
+    (finding,) = session_change(found, np.arange(n), np.arange(float(n)), SIGMA)
+    assert finding.code == "bias_stepped"
+    assert abs(finding.values["pose"] - n // 2) <= n // looked_at + 1
+    assert set(sizes) == {looked_at}
