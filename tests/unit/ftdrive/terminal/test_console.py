@@ -89,9 +89,7 @@ def test_a_command_in_backticks_stays_whole(before: int, monkeypatch: pytest.Mon
 
 
 def test_help_breaks_no_address_and_cuts_no_sentence() -> None:
-    assert {"ati-can://can0?bitrate=250000", "ati-serial:///dev/ttyUSB0."} <= set(
-        run("record", "--help").stdout.split()
-    )
+    assert {"ati-can://can0?bitrate=250000,", "bota:///dev/ttyUSB0"} <= set(run("record", "--help").stdout.split())
     assert "or play them to the driver" in run("transcript", "--help").stdout
     for command in ("export", "fleet", "loads", "transcript", "config"):
         assert "..." not in run(command, "--help").stdout.replace("[ARGS]...", "")
