@@ -164,10 +164,8 @@ def mass_in_words(result: CalibrationResult) -> str | None:
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
     if session_kg < FIXED_BELOW * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
         return None
-    scale = f"{100 * result.scale_sigma:.2g} % (scale of the sensor)"
-    return (
-        f"{to_place_of(result.mass_kg, session_kg)} kg ± {scale} ± {to_place_of(session_kg, session_kg)} (this session)"
-    )
+    mass, session = (to_place_of(value, session_kg) for value in (result.mass_kg, session_kg))
+    return f"{mass} kg ± {100 * result.scale_sigma:.2g} % (scale of the sensor) ± {session} kg (this session)"
 
 
 def error_in_words(result: CalibrationResult) -> str:

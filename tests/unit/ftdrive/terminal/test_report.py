@@ -154,6 +154,19 @@ def _share(result: CalibrationResult) -> float:
     return float(np.trace(C[:, :3, :3], axis1=1, axis2=2).mean())
 
 
+def test_the_mass_has_both_parts_of_its_sigma_unless_it_is_known(capsys: pytest.CaptureFixture[str]) -> None:
+    result = solve(tilted())
+    print_result(result)
+    printed = re.search(r"mass as read: (\S+) kg ± (\S+) % \(scale of the sensor\) ± (\S+) kg", capsys.readouterr().out)
+    assert printed is not None
+    mass_kg, scale_percent, session_kg = map(float, printed.groups())
+    assert mass_kg == pytest.approx(result.mass_kg, abs=session_kg)
+    total_kg = np.hypot(mass_kg * scale_percent / 100, session_kg)
+    assert total_kg == pytest.approx(result.sigma["mass_kg"], rel=0.05)
+    print_result(solve(tilted(), known=Known(mass_kg=0.5)))
+    assert "mass as read" not in capsys.readouterr().out
+
+
 def test_beside_the_truth_the_report_says_what_a_free_tool_reads(capsys: pytest.CaptureFixture[str]) -> None:
     result = solve(tilted())
     print_result(result, truth=result.to_dict())
