@@ -362,8 +362,9 @@ class CalibrationResult(Displayed):
 
         They are those of `tool_covariance`.
         """
-        std = np.sqrt(np.maximum(np.diag(self.tool_covariance), 0.0))
-        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, self.tool_covariance[3:6, 3:6])
+        covariance = self.tool_covariance
+        std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, covariance[3:6, 3:6])
         return {
             "R_flange_sensor": std[0:3],
             "gravity_force_base_N": std[3:6],

@@ -35,9 +35,9 @@ from ftcalib.likelihood.response import (
     LEVER_M,
     Response,
     gain_at,
+    mounting_turn,
     own_variances,
     ranges,
-    rotation_of,
     shown_by,
     vector_of,
 )
@@ -190,7 +190,7 @@ class SensorMatrix(Displayed):
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ shown).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
         turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
-        T = np.concatenate([rotation_of(ENTRIES, p).T, np.eye(36)])
+        T = np.concatenate([mounting_turn(ENTRIES, p).T, np.eye(36)])
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
@@ -276,7 +276,7 @@ class ContactResponse:
         """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
         if not self.error.any():
             return None
-        turn = skew(rotation_of(self.error, self.parameters.p_sensor_com_m))
+        turn = skew(mounting_turn(self.error, self.parameters.p_sensor_com_m))
         return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
@@ -352,7 +352,7 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
     a gain common to all axes a weight, with a centre of mass that is as much nearer. No orientation shows them.
     """
     p = parameters.p_sensor_com_m
-    turn, (_, torque) = rotation_of(ENTRIES, p), gain_at(ENTRIES, p)
+    turn, (_, torque) = mounting_turn(ENTRIES, p), gain_at(ENTRIES, p)
     (scale,) = _common_gain(p)
     columns = np.zeros((15, 36))
     columns[:3] = parameters.R_flange_sensor @ turn.T

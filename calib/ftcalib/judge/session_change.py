@@ -24,6 +24,7 @@ from ftcalib.likelihood.descent import FARTHEST, column_scale
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.response import response_columns
 from ftcalib.likelihood.session_noise import summed_products
+from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.variance_components import EFFECTS, GAIN, GAIN_OF_RESPONSE, squared_length
 from ftcalib.model import (
     BIASES,
@@ -119,7 +120,7 @@ def session_change(
         Whether steps of the bias count: not where the fit found no drift that they would look like.
     """
     # Negative floor division rounds the step up.
-    order = order[:: -(-len(order) // (MOST_POSES if len(order) <= 1000 else OF_MANY))]
+    order = order[:: -(-len(order) // (MOST_POSES if len(order) <= STRUCTURED_POSES else OF_MANY))]
     n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
     if n < FEWEST_POSES:
         return []

@@ -24,6 +24,7 @@ from ftcalib.likelihood.descent import (
 )
 from ftcalib.likelihood.session import LEVER_M, Session, inverses, white
 from ftcalib.likelihood.session_noise import Noise
+from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.variance_components import (
     EFFECTS,
     FORCE,
@@ -258,8 +259,8 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
 
 # From here on single poses are looked at only when chi2 or `drift` asks for it.
 MANY_POSES = 20_000
-# Some of more poses show whether the bias walks, and errors that have a structure.
-MOST_SEARCHED, SEARCHED = 1000, 300
+# So many of more than 1000 poses show whether the bias walks, and errors that have a structure.
+SEARCHED = 300
 # Fewer do not show that poses are bumped by the shape of the distribution.
 POSES_FOR_THE_SHAPE = 500
 # P-value below which more than the measured noise is looked for.
@@ -312,7 +313,7 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         session.cov = session.least_noise(minima[0].parameters)
     if _is_quiet(session, minima[0]):
         return plain, minima, minima[0].chi2
-    of_some = _explanation_of_some(session) if session.n > MOST_SEARCHED else None
+    of_some = _explanation_of_some(session) if session.n > STRUCTURED_POSES else None
     if of_some is None:
         chosen = _with_expected_noise(session, min(_explanations(session, minima, weights), key=lambda e: e.criterion))
     else:

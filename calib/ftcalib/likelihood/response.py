@@ -185,7 +185,7 @@ def vector_of(M: Array) -> Array:
     return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
 
 
-def rotation_of(E: Array, p: Array) -> Array:
+def mounting_turn(E: Array, p: Array) -> Array:
     """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
     return vector_of(gain_at(E, p)[0])
 
@@ -193,7 +193,7 @@ def rotation_of(E: Array, p: Array) -> Array:
 def shown_by(p: Array) -> Array:
     """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
     force, torque = gain_at(ENTRIES, p)
-    torque = torque - skew(p) @ skew(rotation_of(ENTRIES, p))
+    torque = torque - skew(p) @ skew(mounting_turn(ENTRIES, p))
     parts = [
         np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
         for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))

@@ -160,9 +160,8 @@ class Session:
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
         lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
         effects = sensor_columns(p, self.R) | {"hysteresis": hysteresis_columns(p, self.R)}
-        if self.n <= STRUCTURED_POSES or self.structure():
+        if kinds := {c.kind for c in (STRUCTURE if self.n <= STRUCTURED_POSES else self.structure())}:
             structure = structure_columns(p, self.R, self.R.mean(axis=0))
-            kinds = {c.kind for c in (STRUCTURE if self.n <= STRUCTURED_POSES else self.structure())}
             effects |= {kind: columns for kind, columns in structure.items() if kind in kinds}
         least = {}
         if self.assumes_response:

@@ -6,6 +6,9 @@
 
 The coefficients of a kind are unknowns of mean zero with one variance. Each basis has about the length 1 in every
 orientation, so that the standard deviation is that of the error itself: a share of the weight, N and N·m, rad.
+
+Errors of arm and mounts that resemble the parameters do not show in the data. Their sizes are assumed, and they belong
+to the sigmas of the parameters (`hidden_columns`).
 """
 
 import numpy as np
