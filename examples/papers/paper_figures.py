@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import ftcalib
-from ftcalib.model import Array, skew
+from ftcalib.model import Array, nearest_rotation, skew
 from ftcalib.poses.selection import paper_set
 from ftcalib.published.methods import Estimator, published
 
@@ -405,8 +405,7 @@ def pairwise_nullspace(A: Array, f: Array, *, successive: bool) -> Array:
     rows = np.einsum("nji,nk->nikj", A, f).reshape(-1, 3, 9)  # A_i^T (f_i^T (x) I): the gravity force in base axes
     r = np.linalg.svd((rows[first] - rows[second]).reshape(-1, 9))[2][-1]
     X = r.reshape(3, 3).T
-    U, _, Vt = np.linalg.svd(X * np.sign(np.linalg.det(X)))
-    return np.asarray(U @ Vt)
+    return nearest_rotation(X * np.sign(np.linalg.det(X)))
 
 
 def carlson_pairs(rng: np.random.Generator) -> Drawing:
