@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -36,6 +37,7 @@ class CommandLine:
             "COLUMNS": "200",
             "XDG_STATE_HOME": str(folder / "state"),
             "XDG_DATA_HOME": str(folder / "data"),
+            "PYTHONFAULTHANDLER": "1",  # `exit_code_of` has a process that hangs print where
         }
         self._started: list[subprocess.Popen[str]] = []
 
@@ -145,6 +147,16 @@ def wait_until(condition: Callable[[], bool], process: subprocess.Popen[str] | N
         assert process is None or process.poll() is None, process.communicate()
         assert time.monotonic() < deadline_s, "it never happens"
         time.sleep(0.02)
+
+
+def exit_code_of(process: "subprocess.Popen[str]", err: Path) -> int:
+    """Wait for the end of a process, whose stderr is a file; one that hangs prints the stacks of its threads."""
+    try:
+        return process.wait(_LONG_S)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)
+        process.wait()
+        pytest.fail(f"it hangs: {err.read_text()[-20_000:]}")
 
 
 def end_of(process: subprocess.Popen[str], typed: str = "") -> tuple[int, str]:
