@@ -43,7 +43,9 @@ from ftcalib.published.yu import weight_and_tilt
 from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.sensor_matrix import ContactResponse, SensorMatrix
 
-FORMAT = "ftdrive.calibration/1"
+FORMAT = "ftdrive.calibration/2"
+# The bias of a session with drift is its mean there.
+_EARLIER = "ftdrive.calibration/1"
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
 CONTRADICTS = 4.0
@@ -141,10 +143,12 @@ class CalibrationResult(Displayed):
     """
 
     parameters: Parameters
+    """With `drift` its biases are those at the end of the session."""
     covariance: Array
     """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not."""
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not, but its
+    mean."""
     chi2: float
     """Weighted sum of squared residuals of the used poses, with the measured noise alone, without drift or
     `components`. If the noise was not measured, with the noise estimated from the residuals."""
@@ -172,6 +176,9 @@ class CalibrationResult(Displayed):
     mount, and `slow_…` is noise of seconds."""
     drift: DriftResult | None = None
     """None: no drift was found, or `drift="none"`."""
+    mean_bias: Array | None = None
+    """(6,) mean of the bias over the session, N and N·m; None: no drift, or the mean is in `parameters`, as in files of
+    an earlier format."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
     gain_sigma: float = 0.0
@@ -186,8 +193,7 @@ class CalibrationResult(Displayed):
     quality: Mapping[str, JSON] = field(default_factory=dict)
     """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
     `next_use_force_rms_N` and `next_use_torque_rms_Nm`, the same for `workspace` and, where the tour shows a drift,
-    `hour` (`likely_error`), `last_bias_offset` (6; bias at the last pose
-    minus that of the result, the mean of the tour), `bias_growth_per_min` (6; its change in the minute after),
+    `hour` (`likely_error`), `bias_growth_per_min` (6; change of the bias in the minute after the last pose),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
     sensor: SensorMatrix | None = None
@@ -210,7 +216,7 @@ class CalibrationResult(Displayed):
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
             object.__setattr__(self, name, value)
-        for name, length in (("measured_sigma", 6), ("weights", n), ("cable_shift", 15)):
+        for name, length in (("measured_sigma", 6), ("weights", n), ("cable_shift", 15), ("mean_bias", 6)):
             if getattr(self, name) is not None:
                 value = read_only(getattr(self, name))
                 if value.shape != (length,) or not np.isfinite(value).all():
@@ -500,7 +506,7 @@ class CalibrationResult(Displayed):
 
         It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
         each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
-        bias from the mean of the tour to one minute after the last pose. In motion it is that of load and smooth
+        bias in the minute after the last pose. In motion it is that of load and smooth
         errors, at rest in the orientations of the recording. In the "workspace" it is that in any orientation, and
         after an "hour" that with the drift until then: NaN where the tour shows none.
         """
@@ -631,6 +637,7 @@ class CalibrationResult(Displayed):
             "drift": None
             if self.drift is None
             else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
+            "mean_bias": None if self.mean_bias is None else self.mean_bias.tolist(),
             "response": None if self.response is None else self.response.to_dict(),
             "gain_sigma": self.gain_sigma,
             "sensor": None if self.sensor is None else self.sensor.to_dict(),
@@ -664,9 +671,10 @@ class CalibrationResult(Displayed):
         ------
         BadCalibration
         """
-        check_format(document, FORMAT, BadCalibration)
+        if document.get("format") != _EARLIER:
+            check_format(document, FORMAT, BadCalibration)
         try:
-            apart = {"parameters", "hidden_covariance", "cable_shift", "sensor", "weighed_kg", "motion"}
+            apart = {"parameters", "hidden_covariance", "cable_shift", "sensor", "weighed_kg", "motion", "mean_bias"}
             plain = [field.name for field in fields(cls) if field.name not in apart]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
@@ -676,6 +684,7 @@ class CalibrationResult(Displayed):
                 cable_shift=document.get("cable_shift"),
                 sensor=document.get("sensor"),
                 weighed_kg=document.get("weighed_kg"),
+                mean_bias=document.get("mean_bias"),
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))

@@ -126,6 +126,7 @@ def solve(
     printed = {"as_published": True} if as_published else {}
     return CalibrationResult(
         parameters=judged.parameters,
+        mean_bias=None if judged.drift is None else best.on_average.bias,
         covariance=judged.covariance,
         hidden_covariance=best.hidden_covariance(setup.orientation_rad),
         residuals=judged.residuals,

@@ -62,7 +62,7 @@ def test_output_is_a_calibration_that_is_never_overwritten(solve: Solve, tmp_pat
     path.write_text("\n".join([HEADER, *rows(12)]))
     assert solve(path, "-o", output).returncode == 0
     saved = output.read_bytes()
-    assert json.loads(saved)["format"] == "ftdrive.calibration/1"
+    assert json.loads(saved)["format"] == "ftdrive.calibration/2"
     again = solve(path, "-o", output)
     assert again.returncode == 2
     assert "exists" in again.stderr

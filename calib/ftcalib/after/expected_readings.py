@@ -120,22 +120,22 @@ class Expected:
 def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
     """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
 
-    A random walk of variance q² a pose moves the bias by q² (N / 3 + 1) from its mean over the N poses of the tour to
-    the first new pose. A linear drift goes on for as long as the tour. If the fit found nothing, the measured noise has
-    the factor chi2 / dof of the fit.
+    A random walk of variance q² a pose moves the bias by q² to the first new pose, and from the mean of the N poses of
+    the tour, which earlier files have, by q² (N / 3 + 1). A linear drift goes on for as long as the tour. If the fit
+    found nothing, the measured noise has the factor chi2 / dof of the fit.
     """
     n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
     n_used = calibration.n_poses - len(calibration.rejected_poses)
     measured = np.zeros((n, 6, n, 6))
     measured[range(n), :, range(n)] = wrench_cov
-    parts, gap = [], np.zeros(6)
+    parts, gap, to_end = [], np.zeros(6), 0.0 if calibration.mean_bias is not None else n_used / 3
     for name, sigma in _components(calibration).items():
         kind, _, channels = name.partition("_")
         part, since = np.zeros((n, 6, n, 6)), np.zeros(6)
         c = _CHANNELS.get(channels, [])
         freedom = len(c) * calibration.dof / 6
         if kind == "walk":
-            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (n_used / 3 + 1)
+            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (to_end + 1)
             freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
         elif kind == "slope":
             part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2

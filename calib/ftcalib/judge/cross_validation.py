@@ -144,10 +144,8 @@ WARM_UP = 1200.0 / NEXT_USE_S
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftAhead:
-    """The bias at the next use, a minute after the last pose, less the mean bias of the tour; zero without drift."""
+    """The bias at the next use, a minute after the last pose, less that of the result; zero without drift."""
 
-    offset: Array
-    """(6,) at the last used pose, N and N·m."""
     growth_per_min: Array
     """(6,) change in the next minute: its size if the bias is linear in time, its standard deviation if it walks."""
     square: Array
@@ -166,13 +164,12 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
         When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
     """
     if fit.drift is None or fit.drift.course is None:
-        return DriftAhead(*np.zeros((4, 6)))
+        return DriftAhead(*np.zeros((3, 6)))
     n = len(fit.weights)
     timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
     time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
     used = np.flatnonzero(fit.weights > 0)
     first, last = used[np.argmin(time[used])], used[np.argmax(time[used])]
-    offset = fit.drift.course[last]
     intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):
@@ -181,6 +178,6 @@ def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
     linear = np.where(walk > 0, 0.0, fit.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.
     known = fit.drift.sigma**2 / 2
-    square = (offset + linear) ** 2 + walk + known
-    hour = (offset + WARM_UP * (1 - np.exp(-HOUR / WARM_UP)) * linear) ** 2 + HOUR * walk + known
-    return DriftAhead(offset, np.sqrt(walk + linear**2), square, hour)
+    square = linear**2 + walk + known
+    hour = (WARM_UP * (1 - np.exp(-HOUR / WARM_UP)) * linear) ** 2 + HOUR * walk + known
+    return DriftAhead(np.sqrt(walk + linear**2), square, hour)

@@ -128,7 +128,7 @@ def session_change(
     cov = None if sigma is None else np.diag(sigma**2)
     used = found.residuals[order][found.weights[order] > 0.5]
     changes = [
-        likeliest_change(found.parameters, R, wrench, np.repeat(_rms(used), 3)),
+        likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3)),
         bias_steps(R, wrench) if steps else None,
     ]
     costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
@@ -453,7 +453,7 @@ def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     if not FEWEST <= n <= MOST or dof < 1:
         return None
     R = fit.R_base_flange[fit.order]
-    J, r = jacobian(fit.parameters, R), fit.wrench[fit.order] - predict(fit.parameters, R)
+    J, r = jacobian(fit.parameters, R), fit.wrench[fit.order] - predict(fit.on_average, R)
     WX = fit.noise.solve(np.concatenate([J, r[..., None]], axis=2))
     WJ, C = WX[..., :15], fit.given_noise
     u = WX[..., 15] - WJ @ (C @ summed_products(J, WX[..., 15:])[:, 0])

@@ -92,7 +92,7 @@ class Quality:
     expected_rms: Array
     """(2,) from noise alone, over all orientations."""
     ahead: DriftAhead
-    """The drift from the mean of the tour to the next use."""
+    """The drift from the last pose to the next use."""
     noise_factor: float | None
     """Residuals over measured noise; None if the noise was not measured."""
     chi2_p: float | None
@@ -153,7 +153,6 @@ class Quality:
             "workspace_torque_rms_Nm": float(self.workspace_rms[1]),
             # A tour without drift does not show what an hour brings.
             **({f"hour_{unit}": float(self.hour_rms[k]) for k, unit in enumerate(_RMS)} if drifts else {}),
-            "last_bias_offset": self.ahead.offset.tolist(),
             "bias_growth_per_min": self.ahead.growth_per_min.tolist(),
             "worst_pose": self.worst_pose + 1,
             "residual_sigma": self.residual_sigma.tolist(),

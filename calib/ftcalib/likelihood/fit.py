@@ -1,7 +1,7 @@
 """Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -38,6 +38,7 @@ _SURE = 40.0
 _CLEARLY = 0.05
 # Such squares are rounding of data without noise.
 _EXACT = 1e-18
+_OF_BIAS = np.isin(np.arange(15), np.r_[6:9, 12:15])
 # Compensation does not know them.
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
@@ -47,7 +48,9 @@ class Fit:
     """Estimates and everything needed to judge them. Rejected poses count nowhere but in arrays with n rows."""
 
     parameters: Parameters
-    """With drift the biases are the mean over the poses."""
+    """With drift the biases are those at the last pose that counts."""
+    on_average: Parameters
+    """The same with the mean of the bias over the poses."""
     information: Array
     """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
     free: Array
@@ -108,9 +111,9 @@ class Fit:
 
     @cached_property
     def residuals(self) -> Array:
-        """(n, 6) measured minus predicted, gain and cross-talk included, drift not."""
+        """(n, 6) measured minus predicted with the mean bias, gain and cross-talk included."""
         added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
-        return np.asarray(self.wrench - predict(self.parameters, self.R_base_flange) - added)
+        return np.asarray(self.wrench - predict(self.on_average, self.R_base_flange) - added)
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
@@ -119,7 +122,7 @@ class Fit:
         for part, noise in self.noise.parts():
             rows = self.order[part]
             R = self.R_base_flange[rows]
-            r = self.wrench[rows] - predict(self.parameters, R)
+            r = self.wrench[rows] - predict(self.on_average, R)
             WX = noise.solve(np.concatenate([jacobian(self.parameters, R), r[..., None]], axis=2))
             # With a prior the best parameters leave some of J' W r.
             e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
@@ -252,28 +255,34 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
     given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
     response = lag = None
     measured_chi2 = static_chi2 if session.measured else float("nan")
-    if found or session.n <= STRUCTURED_POSES:
+    if found or drifts or session.n <= STRUCTURED_POSES:
         problem = session.linearise(best.parameters, e.kept)
+        if drifts:  # what is handed on is the bias at the end
+            problem = replace(problem, origin=int(np.flatnonzero(e.kept)[-1]))
         at = point(problem, e.components, e.theta)
     if session.measured and found.keys() & {*RESPONSE}:
         of_sensor = [c for c in e.components if c in RESPONSE]
         measured_chi2 = point(problem, of_sensor, np.array([found[c] for c in of_sensor])).chi2
     # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
-    if found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
+    parameters = best.parameters
+    if drifts or found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         x, C = estimates_of_unknown_variances(at)
         if session.n < POSES_THAT_SHOW_THE_NOISE:
             C = C + doubt(at, rivals(problem, at, [*session.candidates(), *session.structure()]))
-        if hidden := found.keys() & {*UNCOMPENSATED}:
-            lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
-            for c in hidden:
-                T = problem.X[..., problem.columns(c)]
-                lag[session.order] += at.effect(c)
-                square[session.order] += found[c] * T @ np.swapaxes(T, 1, 2)
+        if drifts:
+            parameters = parameters.moved(np.where(_OF_BIAS, Z @ x[:-SIZE], 0.0))
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
+    if hidden := found.keys() & {*UNCOMPENSATED}:
+        lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
+        for c in hidden:
+            T = problem.X[..., problem.columns(c)]
+            lag[session.order] += at.effect(c)
+            square[session.order] += found[c] * T @ np.swapaxes(T, 1, 2)
     return Fit(
-        parameters=best.parameters,
+        parameters=parameters,
+        on_average=best.parameters,
         information=best.information,
         free=session.constraints.free(best.parameters),
         minima=tuple(minima),

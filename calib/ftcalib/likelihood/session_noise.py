@@ -2,8 +2,8 @@
 
     V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
-K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias: the
-pseudo-inverse of the path's stiffness matrix. This matrix is tridiagonal.
+K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias; or less its
+value at one pose, so that it is the bias there. It follows from the stiffness of the path, a tridiagonal matrix.
 Woodbury's identity makes every operation O(n).
 """
 
@@ -41,6 +41,8 @@ class Noise:
         What acts on all poses at once, and the variances with which it does.
     kept : bool array, shape (n,), or None
         The poses that count. The others are as good as deleted: a walk sees a longer interval.
+    origin : int or None
+        Pose at which walk and slope are zero; None: their mean over all poses is.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Noise:
         slope: Array | None = None,
         effects: tuple[Array, Array] | None = None,
         kept: NDArray[np.bool_] | None = None,
+        origin: int | None = None,
     ) -> None:
         self.D = D
         self.n = len(D)
@@ -61,10 +64,10 @@ class Noise:
         if time is not None and walk is not None and walk.any():
             self._walking = np.flatnonzero(walk)
             self._s = walk[self._walking]
-            self._add_walk(_steps(time)[1:])
+            self._add_walk(_steps(time)[1:], origin)
         if time is not None and slope is not None and slope.any():
             sloping = np.flatnonzero(slope)
-            self.add_effects(centre(time)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
+            self.add_effects(centre(time, origin)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
         if effects is not None:
             self.add_effects(*effects)
 
@@ -86,8 +89,8 @@ class Noise:
             part = slice(first, first + CHUNK)
             yield part, Noise(self.D[part], kept=self.kept[part])
 
-    def _add_walk(self, dt: Array) -> None:
-        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep the mean of the walk at zero."""
+    def _add_walk(self, dt: Array, origin: int | None) -> None:
+        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep mean or origin at zero."""
         n, k, s = self.n, self._walking.size, self._s
         stiffness = 1 / dt
         blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
@@ -100,15 +103,15 @@ class Noise:
         banded[0, 1:] = -stiffness[:, None]
         self._blocks, self._stiffness = blocks, stiffness
         self._cholesky = np.asarray(dpbtrf(banded.reshape(k + 1, -1), overwrite_ab=1)[0])
-        ones = np.zeros((n, k, k))
-        ones[:, range(k), range(k)] = 1.0
-        M_ones = self._solve_walk(ones)
-        mean = M_ones.sum(axis=0)
-        Q = self.W[:, :, self._walking] @ (s[:, None] * M_ones)
-        self._low_rank.append((Q, np.linalg.inv(mean)))
-        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(mean)[1])
-        # The pseudo-determinant of the path: its mean is removed.
-        self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n)))
+        zero = np.zeros((n, k, k))
+        zero[slice(None) if origin is None else origin, range(k), range(k)] = 1.0
+        M_zero = self._solve_walk(zero)
+        total = np.einsum("nij,nik->jk", zero, M_zero)
+        Q = self.W[:, :, self._walking] @ (s[:, None] * M_zero)
+        self._low_rank.append((Q, np.linalg.inv(total)))
+        self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(total)[1])
+        # The determinant of the path, of which one combination is fixed.
+        self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n if origin is None else 1)))
 
     def add_effects(self, T: Array, variance: Array) -> None:
         """Add what acts on all poses at once: T (n, 6, k), and the variances (k,) with which it does."""
@@ -226,6 +229,7 @@ def _following(X: Array) -> Array:
     return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
 
 
-def centre(time: Array) -> Array:
-    """Shift and scale time to mean zero and unit length."""
-    return np.asarray((time - time.mean()) / max(np.ptp(time), 1e-300))
+def centre(time: Array, origin: int | None = None) -> Array:
+    """Scale time to unit length, and shift it to mean zero or to zero at one pose."""
+    zero = time.mean() if origin is None else time[origin]
+    return np.asarray((time - zero) / max(np.ptp(time), 1e-300))

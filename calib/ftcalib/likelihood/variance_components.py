@@ -108,11 +108,14 @@ class Linearised:
     """Distance of the centre of mass, in levers of the cross-talk."""
     least: Mapping[str, float] = field(default_factory=dict)
     """Variances by kind that the data are too few to refute."""
+    origin: int | None = None
+    """Pose whose bias is that of the parameters; None: they have the mean over all poses."""
 
     @cached_property
     def X(self) -> Array:
         """(n, 6, M) by parameters, slopes and effects: all that acts on all poses; then residuals."""
-        slopes = np.broadcast_to(centre(self.time)[:, None, None] * np.eye(6), (len(self.time), 6, 6))
+        time = centre(self.time, self.origin)
+        slopes = np.broadcast_to(time[:, None, None] * np.eye(6), (len(time), 6, 6))
         return np.concatenate([self.J, slopes, *self.effects.values(), self.r[..., None]], axis=2)
 
     def with_only(self, components: Sequence[Component]) -> "Linearised":
@@ -350,7 +353,7 @@ def _own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float
             white += value * np.array(c.share)
     if white.any():
         D = D + np.diag(white) if D.strides[0] else np.broadcast_to(D[0] + np.diag(white), D.shape)
-    return Noise(D, problem.time, np.sqrt(walk), kept=problem.kept)
+    return Noise(D, problem.time, np.sqrt(walk), kept=problem.kept, origin=problem.origin)
 
 
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:

@@ -132,7 +132,10 @@ class MotionFit:
     distance: Array
     """(n,) squared, of each residual from 0: chi2 with 6 degrees of freedom without contact."""
     drift: DriftResult | None
-    """From the first row to the last, with the course of the bias minus that of the load; None without a walk."""
+    """From the first row to the last, with the course of the bias minus that of the load, which is the last one; None
+    without a walk."""
+    mean_bias: Array | None = None
+    """(6,) with drift, over the rows."""
     components: Mapping[str, float] = field(default_factory=dict)
     second_basin_chi2: float | None = None
     chi2: float = 0.0
@@ -160,20 +163,21 @@ class _Problem:
         self.fixed[INERTIA] = point_mass
         count = int(np.clip(round(self.duration_s / KNOT_S), 1, MOST_KNOTS - 1)) + 1
         self.knots = np.linspace(rows.t_s[0], rows.t_s[-1], count)
-        centred = np.linalg.svd(np.ones((1, count)))[2][1:].T  # a drift of mean 0: the bias is that of the mean
-        steps = np.diff(np.eye(count), axis=0) @ centred
+        before_end = np.eye(count)[:, :-1]  # a drift that ends at 0: the bias is that of the end
+        steps = np.diff(np.eye(count), axis=0) @ before_end
         self.walk = steps.T @ steps / (self.knots[1] - self.knots[0])
         self.courses = count + len(zeroed_s)
         count = int(np.clip(round(self.duration_s / SLOW_KNOT_S), 1, MOST_SLOW - 1)) + 1
         self.slow_knots = np.linspace(rows.t_s[0], rows.t_s[-1], count)
         self.functions = SmoothFunctions.of(nearest_rotation(rows.motion.R_base_flange))
         self.groups, self.others = self._group()
-        self.centred = block_diag(np.kron(block_diag(centred, np.eye(len(zeroed_s))), np.eye(6)), np.eye(self.others))
+        courses = block_diag(before_end, np.eye(len(zeroed_s)))
+        self.basis = block_diag(np.kron(courses, np.eye(6)), np.eye(self.others))
 
     def _group(self) -> tuple[dict[str, tuple[NDArray[np.intp], Array]], int]:
         """Places of each component in load and effects, with their precision at size 1, and how many effects are other.
 
-        Effects are the courses of the bias, centred, then the others: noise of seconds, turns, cable and lever.
+        Effects are the courses of the bias without its end, then the others: noise of seconds, turns, cable and lever.
         """
         distance = self.slow_knots[1] - self.slow_knots[0]
         lags = np.abs(np.subtract.outer(self.slow_knots, self.slow_knots))
@@ -256,9 +260,9 @@ class _Problem:
 
     @property
     def smooth_effects(self) -> slice:
-        """Places of turns and cable among the effects, centred."""
-        start = self.centred.shape[1] - self.others + 6 * len(self.slow_knots)
-        return slice(start, self.centred.shape[1] - 3)
+        """Places of turns and cable among the numbers of `basis`."""
+        start = self.basis.shape[1] - self.others + 6 * len(self.slow_knots)
+        return slice(start, self.basis.shape[1] - 3)
 
     def unseen(self, load: Load, residuals: Array) -> Array:
         """Root (n, 6, k) of the covariance that smooth errors give the rows: of an arm, and of a cable.
@@ -271,7 +275,7 @@ class _Problem:
         beyond = np.sum((values.T @ residuals) ** 2, axis=0) - noise
         pull = np.sqrt(np.maximum(beyond.reshape(2, 3).sum(axis=1) / beyond.size * 2, 0) / len(residuals))
         sizes = {"rotation_rad": EXPECTED["rotation_rad"], "cable_N": pull[0], "cable_Nm": pull[1]}
-        variance = np.zeros(SIZE + self.centred.shape[1])
+        variance = np.zeros(SIZE + self.basis.shape[1])
         for name, size in sizes.items():
             variance[self.groups[name][0]] = size**2
         return np.asarray(self.smooth_columns(load, motion) * np.sqrt(variance[SIZE:][self.smooth_effects]))
@@ -285,8 +289,8 @@ class _Problem:
         still = Motion(R, np.zeros((len(R), 3)), np.zeros((len(R), 3, 3)))
         J = jacobian(load, still, still.earlier(1.0, still))
         smooth = self.smooth_columns(load, still)
-        error = smooth @ (self.centred.T @ effects)[self.smooth_effects]
-        places = np.r_[0:SIZE, SIZE + np.arange(self.centred.shape[1])[self.smooth_effects]]
+        error = smooth @ (self.basis.T @ effects)[self.smooth_effects]
+        places = np.r_[0:SIZE, SIZE + np.arange(self.basis.shape[1])[self.smooth_effects]]
         basis, inverse_root = solved.root
         square = np.sum((np.concatenate([J, smooth], axis=2) @ basis[places] @ inverse_root) ** 2, axis=2) + error**2
         return np.asarray(np.sqrt(square.mean(axis=0).reshape(2, 3).sum(axis=1)))
@@ -324,8 +328,8 @@ class _Problem:
     def rough(self, load: Load) -> tuple[Load, float]:
         """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
         rows = self.rows[:: max(1, len(self.rows) // _ROUGH_ROWS)]
-        limit, size = np.inf, SIZE + self.centred.shape[1]
-        no_effects, H, b = np.zeros(len(self.centred)), np.zeros((size, size)), np.zeros(size)
+        limit, size = np.inf, SIZE + self.basis.shape[1]
+        no_effects, H, b = np.zeros(len(self.basis)), np.zeros((size, size)), np.zeros(size)
         for _ in range(40):
             r = rows.wrench - self.predict(load, rows)
             scale, weight, limit = robust_weights(r, limit)
@@ -344,7 +348,7 @@ class _Problem:
         """Information, gradient and chi2 of load and effects, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
         state, place = state[kept], runs(rows.t_s, rows.row_s)
-        size = SIZE + len(self.centred)
+        size = SIZE + len(self.basis)
         others = np.arange(SIZE + 6 * self.courses, size)
         H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
         for start in range(0, len(rows), _CHUNK):
@@ -362,7 +366,7 @@ class _Problem:
             H[np.ix_(places, places)] += gram[:-1, :-1]
             b[places] += gram[:-1, -1]
             chi2 += float(gram[-1, -1])
-        T = block_diag(np.eye(SIZE), self.centred)
+        T = block_diag(np.eye(SIZE), self.basis)
         return T.T @ H @ T, T.T @ b, chi2
 
     def absorb(self, load: Load, rows: Rows, solved: "_Step") -> Array:
@@ -372,11 +376,11 @@ class _Problem:
         basis, inverse_root = solved.root
         J, others = self.columns(load, rows)
         by_effects = np.concatenate([_on_channels(self.hats(rows.t_s)), others], axis=2)
-        return np.asarray(np.concatenate([J, by_effects @ self.centred], axis=2) @ (basis @ inverse_root))
+        return np.asarray(np.concatenate([J, by_effects @ self.basis], axis=2) @ (basis @ inverse_root))
 
     def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, NDArray[np.bool_], float]:
         """Prior precision of load and effects, which of them are estimated, and -log det of that of the components."""
-        total = SIZE + self.centred.shape[1]
+        total = SIZE + self.basis.shape[1]
         P, on, log_det = np.zeros((total, total)), np.ones(total, np.bool_), 0.0
         for name, (places, precision) in self.groups.items():
             if size := sizes.get(name, 0.0):
@@ -402,7 +406,7 @@ class _Problem:
         """Solve the sums for load and effects with these sizes of the components, and rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
-        value = np.concatenate([load.vector, self.centred.T @ effects])
+        value = np.concatenate([load.vector, self.basis.T @ effects])
         removed = np.where(on, 0.0, -value)  # a component that is off goes to 0
         chi2 += float(removed @ H @ removed - 2 * b @ removed)
         b, value = b - H @ removed, np.where(on, value, 0.0)
@@ -440,7 +444,7 @@ class _Problem:
         H, b, _ = sums
         places, precision = self.groups[name]
         P, on, _ = self.components({**sizes, name: 0.0}, load)
-        value = np.concatenate([load.vector, self.centred.T @ effects])
+        value = np.concatenate([load.vector, self.basis.T @ effects])
         rows, residuals = self.constraints.measurements(load.static)
         # About the present load and effects of 0.
         value[:15] = 0.0
@@ -520,7 +524,7 @@ def fit(
     load, _ = roughs[0]
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
-    effects, sizes = np.zeros(len(problem.centred)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
+    effects, sizes = np.zeros(len(problem.basis)), {**ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
     solved = _Step.none()
     for stage in range(_STAGES):
         state = states(rows.speed_rad_s, kept)
@@ -541,7 +545,7 @@ def fit(
             sizes = _choose_sizes(problem, sizes, sums, load, effects)
         solved = problem.solve(sizes, sums, load, effects)
         load = load.moved(solved.step[:SIZE])
-        effects = effects + problem.centred @ solved.step[SIZE:]
+        effects = effects + problem.basis @ solved.step[SIZE:]
         r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _untouched(r) if guarded else _without_contact(distance)
@@ -558,25 +562,26 @@ def fit(
             there = problem.sums(other, effects, noise, kept, state)
             # What one linear step would leave at the other mounting, less the chi2 of this one.
             others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, effects).step) - chi2)
-    walk = None
+    walk, course = None, problem.hats(rows.t_s) @ problem.drift(effects)
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
         last = len(problem.knots) - 1
-        ends = np.zeros((6, SIZE + len(problem.centred)))
+        ends = np.zeros((6, SIZE + len(problem.basis)))
         ends[:, SIZE + 6 * last : SIZE + 6 * last + 6] += np.eye(6)
         ends[:, SIZE : SIZE + 6] -= np.eye(6)
-        ends = ends @ block_diag(np.eye(SIZE), problem.centred)
+        ends = ends @ block_diag(np.eye(SIZE), problem.basis)
         sigma = np.sqrt(np.einsum("ij,jk,ik->i", ends, solved.covariance, ends))
         drift = problem.drift(effects)
-        walk = DriftResult(drift[last] - drift[0], sigma, problem.hats(rows.t_s) @ drift)
+        walk = DriftResult(drift[last] - drift[0], sigma, course)
     return MotionFit(
         load=load,
         covariance=solved.covariance[:SIZE, :SIZE],
         kept=kept,
-        residuals=rows.wrench - problem.predict(load, rows) - problem.hats(rows.t_s) @ problem.drift(effects),
+        residuals=rows.wrench - problem.predict(load, rows) - course,
         next_use=problem.next_use(load, effects, solved),
         sigma=noise.scale[state],
         distance=distance,
         drift=walk,
+        mean_bias=None if walk is None else load.static.bias + course.mean(axis=0),
         components={name: size for name, size in sizes.items() if 0 < size < np.inf},
         second_basin_chi2=max(min(others), 0.0) if others else None,
         chi2=chi2,
@@ -604,7 +609,7 @@ def _join(
             known = prior.rows(load.static, load.response[: 11 * prior.has_response], kept)
             solved = problem.solve(sizes, sums, load, effects, known)
             load = load.moved(solved.step[:SIZE])
-            effects = effects + problem.centred @ solved.step[SIZE:]
+            effects = effects + problem.basis @ solved.step[SIZE:]
             if abs(before - solved.cost) < _SETTLED:
                 break
             before = solved.cost

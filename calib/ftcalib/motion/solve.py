@@ -164,6 +164,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if responding else None
     return CalibrationResult(
         parameters=best.load.static,
+        mean_bias=best.mean_bias,
         covariance=best.covariance[:15, :15],
         hidden_covariance=hidden_in_any_poses(best.load.static, setup.orientation_rad),
         residuals=best.residuals[judged],

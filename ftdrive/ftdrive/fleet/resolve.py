@@ -1,6 +1,6 @@
 """Solve runs again with this version, and compare each result with the run's own calibration.
 
-solved-<version>.json   ftdrive.calibration/1, in the run folder: the result of that version. It never replaces the
+solved-<version>.json   ftdrive.calibration/2, in the run folder: the result of that version. It never replaces the
                         calibration of the run.
 """
 

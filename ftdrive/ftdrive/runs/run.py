@@ -7,9 +7,9 @@ motion.npz        ftdrive.motion/1: every sample of sensor and arm while the too
 motion/1.npz ...  the same in parts, each on disk within seconds, of a recording that may end at any time
 poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
-calibration.json  ftdrive.calibration/1: the result; calibration-2.json likewise. Of a verification: the accepted update
+calibration.json  ftdrive.calibration/2: the result; calibration-2.json likewise. Of a verification: the accepted update
 verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verification`
-solved-0.1.0.json ftdrive.calibration/1: the result of a later version; see `ftdrive.fleet.resolve`
+solved-0.1.0.json ftdrive.calibration/2: the result of a later version; see `ftdrive.fleet.resolve`
 lock              which process adds poses, or did so last
 
 Damage is refused: JSON files have a checksum, each line of events.ndjson a CRC-32, and each array of a pose too.

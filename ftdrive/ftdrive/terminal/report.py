@@ -181,7 +181,7 @@ def error_in_words(result: CalibrationResult) -> str:
     elif not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
         sources.append(f"cross-validated, as {why}")
-    if any(result.quality.get("last_bias_offset", ())):
+    if result.drift is not None:
         sources.append("a minute after the tour, with the drift")
     for words, where in _ELSEWHERE:
         error = result.likely_error(where)
@@ -231,17 +231,15 @@ def contact_in_words(result: CalibrationResult) -> str:
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:
-    """Describe how far the bias was from that of the result at the last pose, and how it moves; None without drift."""
-    offset, growth = (np.array(result.quality.get(k, np.zeros(6))) for k in ("last_bias_offset", "bias_growth_per_min"))
-    if not offset.any():
+    """Describe how the bias moves after the last pose, at which the result has it; None without drift."""
+    if result.mean_bias is None:
         return None
-    (off_N, off_Nm), (grow_N, grow_Nm) = (
-        [float(np.linalg.norm(part)) for part in np.split(values, 2)] for values in (offset, growth)
+    growth = np.array(result.quality["bias_growth_per_min"])
+    off, grow = (
+        "{} N, {} N·m".format(*(_in_brief(float(np.linalg.norm(part))) for part in np.split(values, 2)))
+        for values in (result.parameters.bias - result.mean_bias, growth)
     )
-    return (
-        f"at the last pose the bias was {_in_brief(off_N)} N, {_in_brief(off_Nm)} N·m off its mean, which the result "
-        f"has; it moves {_in_brief(grow_N)} N, {_in_brief(grow_Nm)} N·m a minute"
-    )
+    return f"the result has the bias of the last pose, {off} off the mean; it moves {grow} a minute"
 
 
 def poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:

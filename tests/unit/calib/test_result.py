@@ -38,7 +38,7 @@ RESULT = solve(DATA, g_m_s2=9.81, setup=EXACT, provenance={"serial": "FT1", "arg
 
 def test_every_promised_key_is_in_the_file_with_its_value() -> None:
     document: dict[str, Any] = json.loads(json.dumps(RESULT.to_dict(), allow_nan=False))
-    assert document["format"] == "ftdrive.calibration/1"
+    assert document["format"] == "ftdrive.calibration/2"
     assert document["schema_version"] == 1
     assert document["method"] == "ml"
     assert document["n_poses"] == 10
@@ -148,6 +148,16 @@ def without(name: str) -> str:
     return json.dumps({k: v for k, v in RESULT.to_dict().items() if k != name})
 
 
+def test_a_file_of_the_first_version_has_no_mean_of_the_bias() -> None:
+    document = RESULT.to_dict()
+    del document["mean_bias"]
+    earlier = CalibrationResult.from_dict({**document, "format": "ftdrive.calibration/1"})
+    assert earlier.mean_bias is None
+    assert earlier.id == RESULT.id
+    drifting = CalibrationResult.from_dict(replace(RESULT, mean_bias=np.arange(6.0)).to_dict())
+    np.testing.assert_array_equal(drifting.mean_bias, np.arange(6.0))
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
@@ -156,7 +166,7 @@ def without(name: str) -> str:
         ("3", "a JSON int"),
         ("{}", "the field 'format' is missing"),
         (json.dumps(DATA.to_dict()), "the format is 'ftdrive.dataset/1'"),
-        ('{"format": "ftdrive.calibration/2"}', "version '2' of ftdrive.calibration"),
+        ('{"format": "ftdrive.calibration/3"}', "version '3' of ftdrive.calibration"),
         (without("chi2"), "lacks the field chi2"),
         (json.dumps({**RESULT.to_dict(), "covariance": [[1]]}), "covariance must be"),
         (json.dumps({**RESULT.to_dict(), "covariance": (-np.eye(15)).tolist()}), "not positive definite"),

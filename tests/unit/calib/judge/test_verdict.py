@@ -633,12 +633,12 @@ def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_th
     change: list[float], is_cause: bool, found: tuple[str, float, float] | None
 ) -> None:
     drift = DriftResult(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
-    ahead = DriftAhead(*np.zeros((4, 6)))
+    ahead = DriftAhead(*np.zeros((3, 6)))
     findings = _drift(drift, ahead, 20.0, is_cause=is_cause)
     named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
     assert named == ([] if found is None else [found])
     if change[4]:
-        still = DriftAhead(np.zeros(6), np.zeros(6), *[np.array([0, 0, 0, 0, 0.041**2, 0])] * 2)
+        still = DriftAhead(np.zeros(6), *[np.array([0, 0, 0, 0, 0.041**2, 0])] * 2)
         assert _drift(drift, still, 20.0, is_cause=True)[0].severity == "limit"
 
 
@@ -671,7 +671,7 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
     change, sigma = np.array([0.0, 0.1, 0.0, 0.0, 0.0, 3e-20]), np.array([0.01] * 3 + [1e-21] * 3)
     drift, zero = DriftResult(change, sigma, np.zeros((2, 6))), np.zeros(6)
     for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
-        ahead = DriftAhead(zero, zero, *[np.array([0.0, at_next_use_N**2, 0, 0, 0, 0])] * 2)
+        ahead = DriftAhead(zero, *[np.array([0.0, at_next_use_N**2, 0, 0, 0, 0])] * 2)
         (finding,) = _drift(drift, ahead, 20.0, is_cause=True)
         assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
 
@@ -692,9 +692,11 @@ def test_a_linear_drift_goes_on_for_the_next_minute(timed: bool) -> None:
     result = solve(CalibrationDataset(R24, wrench, None, np.zeros(24, np.int64), times), drift="linear")
     steps = 3 if timed else 6  # of 20 s; of 10 s where no time is known
     at_the_end = np.array([0.3, 0, 0.4, 0, 0.01, 0])
-    np.testing.assert_allclose(result.quality["last_bias_offset"], at_the_end, atol=0.02)
+    assert result.mean_bias is not None
+    np.testing.assert_allclose(result.parameters.bias - result.mean_bias, at_the_end, atol=0.02)
+    np.testing.assert_allclose(result.parameters.bias, TRUTH.bias + at_the_end, atol=0.02)
     np.testing.assert_allclose(result.quality["bias_growth_per_min"], steps * at_the_end * 2 / 23, atol=0.02)
-    np.testing.assert_allclose(result.likely_error(), (1 + steps * 2 / 23) * np.array([0.5, 0.01]), rtol=0.1)
+    np.testing.assert_allclose(result.likely_error(), steps * 2 / 23 * np.array([0.5, 0.01]), rtol=0.1)
 
 
 @pytest.mark.slow

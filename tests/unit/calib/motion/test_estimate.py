@@ -90,7 +90,7 @@ class Dense:
         J = np.concatenate([jacobian(load, motion, rows.rate), on_knots, lever], axis=2)
         self.J = (J / SIGMA[:, None]).reshape(6 * len(rows), -1)
         self.steps = np.tril(np.ones((knots, knots)), -1)[:, :-1] * np.sqrt(np.diff(problem.knots)[0])
-        self.mean_free = np.eye(knots) - 1 / knots
+        self.since_end = np.eye(knots) - np.eye(knots)[-1]
         self.value = np.concatenate([load.vector, drift.ravel(), np.zeros(3)])
         self.mass_kg = load.mass_kg
 
@@ -104,7 +104,7 @@ class Dense:
         )
         variance[GAINS], variance[CROSS_TALK] = sizes["gain"] ** 2, sizes["cross_talk"] ** 2
         walk = np.diag(np.repeat([sizes["walk_N"] ** 2, sizes["walk_Nm"] ** 2], 3))
-        root = self.mean_free @ self.steps
+        root = self.since_end @ self.steps
         lever = sizes["cross_talk"] ** 2 * LEVER_M**2 / 2 * np.eye(3)
         return np.asarray(block_diag(np.diag(variance[15:]), np.kron(root @ root.T, walk), lever))
 
@@ -130,8 +130,8 @@ def posed() -> tuple[_Problem, Load, Array]:
     rng = np.random.default_rng(1)
     near = truth.moved(1e-3 * rng.normal(size=SIZE))
     drift = rng.normal(size=(len(problem.knots), 6)) * np.repeat([0.05, 2e-3], 3)
-    effects = np.zeros(len(problem.centred))
-    effects[: drift.size] = (drift - drift.mean(axis=0)).ravel()
+    effects = np.zeros(len(problem.basis))
+    effects[: drift.size] = (drift - drift[-1]).ravel()
     return problem, near, effects
 
 
@@ -156,7 +156,7 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
     assert sums[2] == pytest.approx(float(dense.r @ dense.r))
     found = problem.solve(sizes, sums, load, effects)
     values, covariance, cost, criterion = dense.solution(sizes)
-    by_effects = problem.centred @ found.step[SIZE:]
+    by_effects = problem.basis @ found.step[SIZE:]
     of_knots = len(dense.value) - SIZE - 3
     assert not by_effects[of_knots:-3].any()
     step = np.concatenate([found.step[:SIZE], by_effects[:of_knots], by_effects[-3:]])
@@ -174,7 +174,7 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
     none = problem.solve({}, sums, load, effects).criterion
     assert none - found.criterion == pytest.approx(dense.solution(dict.fromkeys(ALL_ON, 0.0))[3] - criterion, abs=1e-5)
     taken = problem.absorb(load, problem.rows[:20], found)
-    T = block_diag(np.eye(SIZE), np.vstack([problem.centred[:of_knots], problem.centred[-3:]]))
+    T = block_diag(np.eye(SIZE), np.vstack([problem.basis[:of_knots], problem.basis[-3:]]))
     J = dense.J[:120].reshape(20, 6, -1) * SIGMA[:, None] @ T
     np.testing.assert_allclose(
         np.einsum("nik,njk->nij", taken, taken), J @ found.covariance @ np.swapaxes(J, 1, 2), rtol=1e-6, atol=1e-9
@@ -262,7 +262,7 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load,
     _, load, _ = posed
     rows = rows_of(1010, load, seed=4)
     wide = _Problem(rows, None, G, point_mass=False)
-    effects = np.zeros(len(wide.centred))
+    effects = np.zeros(len(wide.basis))
     kept = all_kept(rows)
     kept[990:995] = False
     filters = np.zeros((2, 6, 2))

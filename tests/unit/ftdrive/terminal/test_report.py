@@ -419,18 +419,19 @@ def test_a_drift_is_that_of_a_minute_if_it_exceeds_the_noise(drift: DriftCheck, 
 def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: pytest.CaptureFixture[str]) -> None:
     drift = DriftResult(np.array([0.3, 0.0, 0.4, 0.0, 0.03, 0.04]), np.array([0.01, 0.02, 0.01, 1e-3, 2e-3, 1e-3]))
     quality = {
-        "last_bias_offset": [0.0, 0.25, 0, 0, 0, 0.01],
         "bias_growth_per_min": [0, 0.3, 0.4, 0, 0, 0.002],
         "worst_pose": 3,
         "residual_sigma": [1.0, 1.0, 2.34],
         "loo_force_rms_N": 0.01,
         "loo_torque_rms_Nm": 0.001,
     }
-    print_result(replace(followed(), drift=drift, quality=quality), drift=drifted(0.5))
+    moved = followed()
+    mean_bias = moved.parameters.bias - [0.0, 0.25, 0, 0, 0, 0.01]
+    print_result(replace(moved, drift=drift, mean_bias=mean_bias, quality=quality), drift=drifted(0.5))
     lines = " ".join(capsys.readouterr().out.split())
     assert "drift: first pose again" in lines
     assert "drift in the fit: 0.500 ± 0.020 N, 0.0500 ± 0.0020 N·m from the first pose to the last" in lines
-    assert "next use: at the last pose the bias was 0.25 N, 0.010 N·m off its mean" in lines
+    assert "next use: the result has the bias of the last pose, 0.25 N, 0.010 N·m off the mean; it moves" in lines
     assert "it moves 0.50 N, 0.0020 N·m a minute. Tare before use." in lines
     assert drift_in_use(followed()) is None
     assert (poses_in_words(replace(followed(), quality=quality)) or "").startswith("pose 3, 2.3 sigma; each pose")
