@@ -228,15 +228,10 @@ def _scale(unit_N: Sequence[float] | None) -> str:
     )
 
 
-def _compensated(factor: float) -> str:
-    """Write the share of the weight that a controller takes away where the weight accelerates as in shorter times."""
-    return f", or if a controller compensates {100 * (1 - factor**2):.0f} % of the weight" if factor < 1 else ""
-
-
 # Forms of values that files of earlier versions lack.
 _OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
-    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale, "compensated": _compensated,
+    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale,
 }  # fmt: skip
 
 
@@ -400,8 +395,13 @@ CODES: Final[Mapping[str, Code]] = {
         "zero it before the recording only"),
     "positions_unit": Code(_REJECT, "the positions look given in {unit}, because they spread over {spread_m:.3g} and "
         "accelerate as much too fast for the weight", "give them in m"),
+    "wrench_compensated": Code(_REJECT_OR_LIMIT, "the load weighs {weight_N:.2g}, but has the inertia of "
+        "{mass_kg:.2g}, as if a controller had compensated the weight, or a part of it", "record the wrench as the "
+        "sensor measures it, or set the controller's payload to 0 before"),
+    "clocks_differ": Code(_REJECT, "the wrench follows the poses if its times are divided by {ratio:.4g}",
+        "give the true rate of wrench and poses"),
     "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and the acceleration of the poses agree if all times are "
-        "{factor:~sigma} times as long (sigma {sigma:~sigma}){factor:compensated}", "give the true rate, which is "
+        "{factor:~sigma} times as long (sigma {sigma:~sigma})", "give the true rate, which is "
         "{rate:.4g} times the stated one, the unit of the times, or the wrench as the sensor measures it"),
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
         "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
@@ -417,8 +417,9 @@ CODES: Final[Mapping[str, Code]] = {
     "height_impossible": Code(_REJECT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
         "{sigma_mm:~sigma_mm}), where none is", "check that the poses are those of the flange, then the axes and units "
         "of wrench and poses, then the clock"),
-    "wrench_compensated": Code(_REJECT, "the load weighs {weight_N:.2g}, but has the inertia of {mass_kg:.2g}, as if a "
-        "controller had compensated or zeroed the wrench", "record the wrench as the sensor measures it"),
+    "motion_coarse": Code(_LIMIT, "the poses are too few for their motion, or their times are not those of the "
+        "samples: from the poses beside it each one is {off_deg:.2g} off, so only the parts at rest count "
+        "({share_percent:.0f})", "record poses and wrench at 50 Hz or more, each with its own time"),
     "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned through {range_deg:.0f} only, which leaves the mounting "
         "{mounting_deg:.2g} and the weight {weight_N:.2g} uncertain (1 sigma)",
         "turn wrist 2 and wrist 3 by 60° or more"),

@@ -192,7 +192,7 @@ def _zeroed_moving(one: Drawn, rng: Generator) -> Recorded:
 MISTAKES: Mapping[str, tuple[Callable[[Drawn, Generator], Recorded], frozenset[str]]] = {
     "zeroed": (_zeroed, frozenset(["zeroed"])),
     "zeroed in motion": (_zeroed_moving, frozenset(["zeroed"])),
-    "compensated in part": (_compensated, frozenset(["wrench_compensated", "clock_rate"])),
+    "compensated in part": (_compensated, frozenset(["wrench_compensated"])),
     "hand on the tool": (_held, frozenset(["mostly_contact", "other_recording", "force_error", "torque_error"])),
     "poses of a TCP": (_tcp, frozenset(["poses_of_tcp"])),
     "torques about a TCP": (_torques_about_tcp, frozenset(["torques_about_tcp"])),
@@ -202,7 +202,8 @@ MISTAKES: Mapping[str, tuple[Callable[[Drawn, Generator], Recorded], frozenset[s
     "pounds": (_pounds, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
     "kgf": (_kgf, frozenset(["com_too_far", "com_too_near", "weight_implausible"])),
     "delay": (_delay, frozenset(["clock_offset"])),
-    "rate": (_rate, frozenset(["clock_rate"])),
+    # Times that are too long look like a weight that a controller compensates in part.
+    "rate": (_rate, frozenset(["clock_rate", "wrench_compensated"])),
     "time unit": (_time_unit, frozenset(["BadDataset"])),
 }  # fmt: skip
 

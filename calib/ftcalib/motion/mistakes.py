@@ -169,11 +169,16 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     factor = 1 / float(np.sqrt(max(found, 1e-12)))
     off, share = abs(found - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
     values = {"factor": factor, "sigma": factor * sigma_scale / max(found, 1e-12) / 2, "rate": 1 / factor}
+    # A weight that is too small for the acceleration has two causes, and times are rarely wrong.
+    weight_N = load.static.weight_N
+    parted = {"weight_N": weight_N, "mass_kg": found * weight_N / load.g_m_s2} if found > 1 else None
     if off > _SIGMAS and share > _CLOCK_SHARE:
         scale, unit = found, _unit(found, spread_m)
         turning = 1.0 if unit else found
-        by_clock = Finding.of("clock_rate", "reject", **values)
-        findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m) if unit else by_clock)
+        if unit:
+            findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m))
+        else:
+            findings += _by_clock("reject", values, parted)
     # Forces have the lever to the centre of mass, torques that from their own point.
     seen = Q @ load.static.p_sensor_com_m
     to_com, com = signs[0] * (np.append(free.error.aside_m, load.height_m) + seen) / turning, signs.prod() * seen
@@ -184,8 +189,14 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     aside_m = (to_com - com)[:2] if other else np.zeros(2)
     findings += other
     if not findings and off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE:
-        findings.append(Finding.of("clock_rate", "limit", **values))
+        findings += _by_clock("limit", values, parted)
     return Undone(tuple(findings), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+
+
+def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping[str, float] | None) -> list[Finding]:
+    """Name a controller that takes a part of the weight away, where that may be the cause, and then the clock."""
+    compensated = [] if parted is None else [Finding.of("wrench_compensated", severity, **parted)]
+    return [*compensated, Finding.of("clock_rate", severity, **of_clock)]
 
 
 def _axes(rows: Rows, change: Array) -> tuple[Finding, ...]:

@@ -232,11 +232,7 @@ def rows_of(
         raise BadDataset(
             f"wrench and poses have {max(last - first, 0):.1f} s in common: give files of one recording, on one clock"
         )
-    quaternion = Rotation.from_matrix(poses[1][:, :9].reshape(-1, 3, 3)).as_quat()
-    turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
-    # q and -q are one rotation: interpolation needs neighbours of equal sign.
-    quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
-    poses = t_p, np.hstack([quaternion, poses[1][:, 9:]])
+    poses = t_p, np.hstack([_continuous_quaternions(poses[1]), poses[1][:, 9:]])
     parts = [
         _chunk((t_w, wrench[1]), poses, first + MEAN_S * np.arange(start * step, end * step + 2 * reach), kernel, step)
         for start in range(0, count // step, _CHUNK)
@@ -245,6 +241,29 @@ def rows_of(
     ]
     t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
     return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, row_s)
+
+
+def interpolation_error_rad(poses: tuple[Array, Array]) -> float:
+    """Return the error of the orientations, root mean square, where each second sample is interpolated from the others.
+
+    It is large where the poses are too few for their motion, and where their times are not those of the samples.
+    """
+    t_s, quaternion = poses[0], _continuous_quaternions(poses[1])
+    inner = slice(1, len(t_s) - 1 - len(t_s) % 2, 2)
+    if len(t_s) < 9:
+        return 0.0
+    between = _at(t_s[inner], t_s[::2], quaternion[::2])[0]
+    between /= np.linalg.norm(between, axis=1, keepdims=True)
+    return float(np.sqrt(np.mean(np.sum((2 * _conjugate_product(between, quaternion[inner])) ** 2, axis=1))))
+
+
+def _continuous_quaternions(values: Array) -> Array:
+    """Return quaternions (m, 4) of orientations that are given row by row, with equal signs of neighbours."""
+    quaternion = Rotation.from_matrix(values[:, :9].reshape(-1, 3, 3)).as_quat()
+    # q and -q are one rotation: interpolation needs neighbours of equal sign.
+    turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
+    quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
+    return np.asarray(quaternion)
 
 
 def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:

@@ -1,6 +1,7 @@
 """A calibration from a recording in motion."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -34,7 +35,15 @@ from ftcalib.motion.mistakes import (
     without_steps,
 )
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, require_seconds, rows_of
+from ftcalib.motion.samples import (
+    NARROW_S,
+    WIDE_S,
+    Means,
+    Rows,
+    interpolation_error_rad,
+    require_seconds,
+    rows_of,
+)
 from ftcalib.result import CalibrationResult, MotionResult
 
 LEAST_S = 5.0
@@ -48,6 +57,12 @@ ALIGNED_S = 0.02
 LINEAR_S = 2e-3
 # Fastest parts that count without positions, because their acceleration is unknown.
 SLOW_RAD_S = 0.15
+# Share of its change that a wrench leaves which follows the poses, and of what another rate of one clock leaves.
+_FOLLOWS, _OTHER_RATE = 0.03, 0.5
+# Rates of two clocks that differ by more, and how far their ratio may be from that of the durations.
+_SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
+# Poses whose neighbours miss them by more are too coarse for their motion. Then only parts at rest count.
+_COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
 # Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions.
 REACH_M = 1.0
 NARROW_DEG = 45.0
@@ -113,19 +128,23 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     """
     prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()
-    require_seconds(data[0][0], "the times of the wrench")
-    require_seconds(data[1][0], "the times of the poses")
-    positions = data[1][1].shape[1] == 12
+    for (t_s, _), name in zip(data, ("wrench", "poses"), strict=True):
+        require_seconds(t_s, f"the times of the {name}")
+    coarse_rad = interpolation_error_rad(data[1])
+    is_coarse = coarse_rad > _COARSE_RAD
+    # At rest positions say nothing.
+    positions = data[1][1].shape[1] == 12 and not is_coarse
+    limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
-    delay_s, row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
+    data, ratio = _on_one_clock(*data)
+    (delay_s, _), row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
     undone = _undo(data, rows, known, g_m_s2) if positions else Undone()
-    rows = undone.of(rows)
-    delay_s += rough_delay(_select_rows(rows, positions), known, g_m_s2)
+    delay_s += rough_delay(_select_rows(undone.of(rows), limit_rad_s), known, g_m_s2)
     # The model is linear in the delay only near that of the rows: far from it they are filtered again.
     for _ in range(3):
         rows = undone.of(rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s))
-        used = _select_rows(rows, positions)
+        used = _select_rows(rows, limit_rad_s)
         massless = point_mass or not positions
         best = fit(used, known, g_m_s2, prior=prior, point_mass=massless, guarded=guarded, zeroed_s=zeroed_s)
         delay_s = rows.delay_s + best.load.delay_s
@@ -146,15 +165,20 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     )
     quality, judged = _judge(used, best, setup, known, g_m_s2)
     causes = list(undone.findings)
-    if len(zeroed_s):
-        causes.append(Finding.of("zeroed", at_s=zeroed_s - data[0][0][0]))
+    if ratio != 1:  # the other clock has that of the motion
+        causes = [one for one in causes if one.code not in ("clock_rate", "wrench_compensated")]
+        causes.append(Finding.of("clocks_differ", ratio=ratio))
+    causes += [Finding.of("zeroed", at_s=zeroed_s - data[0][0][0])] if len(zeroed_s) else []
     aligned = used
     if abs(best.load.delay_s) > LINEAR_S:
         others = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
-        aligned = _select_rows(undone.of(others), positions)
+        aligned = _select_rows(undone.of(others), limit_rad_s)
     findings = [*quality.findings, *_mistakes(used, aligned, best, quality.findings)]
     findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
-    findings += _findings(rows, used, best, motion, height_m, positions=positions)
+    findings += _findings(rows, used, best, motion, height_m, limit_rad_s=limit_rad_s)
+    if is_coarse:
+        values = {"off_deg": np.degrees(coarse_rad), "share_percent": 100 * len(used) / len(rows)}
+        causes.append(Finding.of("motion_coarse", **values))
     if positions and verdict_of([*findings, *causes]) != "rejected":
         findings += impossible(best)
     findings = [*causes, *(one for one in findings if not _explained(one, causes))]
@@ -189,8 +213,30 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     )
 
 
-def _coarse_delay(rows: Rows) -> float:
-    """Delay, in whole rows, at which a linear function of the motion explains the wrench best."""
+def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], float]:
+    """Return the streams with times that run alike, and how many times as long those of the wrench were; 1 as given.
+
+    Files of one recording begin and end together within some seconds, so another rate shows in their durations.
+    """
+    t_w, t_p = wrench[0], poses[0]
+    left = _coarse_delay(rows_of(wrench, poses))[1]
+    best, limit = ((wrench, poses), 1.0), _OTHER_RATE * left
+    if left < _FOLLOWS:
+        return best
+    for ratio in float(np.ptp(t_w) / np.ptp(t_p)) * _RATIOS:
+        alike = wrench, (t_w[0] + ratio * (t_p - t_p[0]), poses[1])
+        with suppress(BadDataset):  # too short
+            left = _coarse_delay(rows_of(*alike))[1]
+            if abs(ratio - 1) > _SAME_RATE and left < limit:
+                best, limit = (alike, float(ratio)), left
+    return best
+
+
+def _coarse_delay(rows: Rows) -> tuple[float, float]:
+    """Return the delay, in whole rows, at which a linear function of the motion explains the wrench best.
+
+    Also how much it leaves, as a share of the change.
+    """
     if len(rows) * rows.row_s < LEAST_S:
         raise BadDataset(f"{len(rows) * rows.row_s:.1f} s of motion without a gap are too short: record 20 s or more")
     index = np.round((rows.t_s - rows.t_s[0]) / rows.row_s).astype(np.int64)
@@ -208,14 +254,22 @@ def _coarse_delay(rows: Rows) -> float:
             residual = target - X @ np.linalg.lstsq(X, target, rcond=1e-9)[0]
             left[shift] = float(np.median(np.abs(residual)))
     best = min(left, key=lambda shift: left[shift], default=0)
-    return rows.delay_s + best * rows.row_s if left and left[best] < 0.8 * left[0] else rows.delay_s
+    if not left or left[best] >= 0.8 * left[0]:
+        return rows.delay_s, left.get(0, np.inf)
+    return rows.delay_s + best * rows.row_s, left[best]
 
 
-def _select_rows(rows: Rows, positions: bool) -> Rows:
-    """Return the rows that count: without positions the slow ones."""
-    if positions:
+def _select_rows(rows: Rows, limit_rad_s: float) -> Rows:
+    """Return the rows that count: without positions the slow ones, and of poses that are too coarse those at rest."""
+    if np.isinf(limit_rad_s):
         return rows
-    slow = rows[rows.speed_rad_s < SLOW_RAD_S]
+    slow = rows[rows.speed_rad_s < limit_rad_s]
+    if len(slow) * rows.row_s < LEAST_S and limit_rad_s < SLOW_RAD_S:
+        raise NotObservable(
+            "the poses are too few for their motion, or their times are not those of the samples, and the parts at "
+            f"rest are only {len(slow) * rows.row_s:.1f} s long: record at 50 Hz or more, or rest for a second in each "
+            "of six orientations"
+        )
     if len(slow) * rows.row_s < LEAST_S:
         raise BadDataset(
             f"without positions only slow parts count, and these are {len(slow) * rows.row_s:.1f} s long: give the "
@@ -292,18 +346,23 @@ def _means(best: MotionFit, rows: int) -> Array:
 
 
 def _findings(
-    rows: Rows, used: Rows, best: MotionFit, motion: MotionResult, height_m: float | None, *, positions: bool
+    rows: Rows, used: Rows, best: MotionFit, motion: MotionResult, height_m: float | None, *, limit_rad_s: float
 ) -> list[Finding]:
     """Findings that only a recording in motion has."""
     sigma, findings = np.sqrt(np.diag(best.covariance)), list[Finding]()
-    if abs(motion.delay_s) > OFFSET_S:
+    if abs(motion.delay_s) > OFFSET_S and limit_rad_s != _REST_RAD_S:
         findings.append(Finding.of("clock_offset", delay_s=motion.delay_s))
-    if not positions:
+    positions = bool(np.isinf(limit_rad_s))
+    if limit_rad_s == SLOW_RAD_S:
         turned = np.linalg.norm(used.motion.Omega_rad2_s2, ord=2, axis=(1, 2))
         bound_N = best.load.mass_kg * REACH_M * float(np.sqrt(np.mean(turned**2)))
         share = len(used) / max(len(rows), 1)
         findings.append(Finding.of("positions_missing", share_percent=100 * share, force_N=bound_N))
-    elif height_m is not None and abs(best.load.height_m - height_m) > max(5 * sigma[HEIGHT], WRONG_HEIGHT_M):
+    elif (
+        positions
+        and height_m is not None
+        and abs(best.load.height_m - height_m) > max(5 * sigma[HEIGHT], WRONG_HEIGHT_M)
+    ):
         values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
         findings.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
     if motion.contacts:
@@ -327,7 +386,7 @@ def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Strea
         at_s, steps = at_s[staying], steps[staying]
     if len(at_s):
         wrench = without_steps(wrench, at_s, steps)
-        rows = rows_of(wrench, poses, _coarse_delay(rows_of(wrench, poses)))
+        rows = rows_of(wrench, poses, _coarse_delay(rows_of(wrench, poses))[0])
         wrench = without_steps(wrench, at_s, bias_steps(rows, at_s))
     return (wrench, poses), at_s
 
@@ -368,7 +427,7 @@ def _mistakes(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Findin
     follows = variance < _UNEXPLAINED**2 * np.mean(y.var(axis=0))
     light = weight_N < COMPENSATED * mass_kg * best.load.g_m_s2
     if follows and light and mass_kg > SIGNIFICANT_SIGMAS * sigma_kg:
-        return [Finding.of("wrench_compensated", weight_N=weight_N, mass_kg=mass_kg)]
+        return [Finding.of("wrench_compensated", "reject", weight_N=weight_N, mass_kg=mass_kg)]
     change = used.wrench[best.kept, :3].var(axis=0)
     left = float(np.sqrt(np.mean(best.residuals[best.kept, :3] ** 2) / np.mean(change)))
     if left > _UNEXPLAINED and not any(one.code in OF_AXES for one in named):

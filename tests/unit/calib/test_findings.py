@@ -45,7 +45,6 @@ def test_words_come_from_the_table_and_the_values() -> None:
             {"payload_kg": 3, "load_kg": 1.5, "sensor_kg": None, "set_kg": 1.5},
             "own mass is not configured: set the payload in the controller to 1.50 kg plus the mass",
         ),
-        ("clock_rate", {"factor": 0.5, "sigma": 0.01, "rate": 2.0}, ", or if a controller compensates 75 % of the"),
         ("clock_rate", {"factor": 2.0, "sigma": 0.01, "rate": 0.5}, "long (sigma 0.010): give"),
     ],
 )

@@ -121,7 +121,9 @@ def test_torques_about_a_tcp_are_not_taken_for_reversed_ones(point_m: tuple[floa
 )
 def test_a_wrong_clock_is_named_with_its_factor(factor: float) -> None:
     rows = with_motion(RIGHT, factor**2, factor**2)
-    (one,) = found(rows).findings
+    *compensated, one = found(rows).findings
+    # A controller that takes a part of the weight away is likelier than times that are too short.
+    assert [cause.code for cause in compensated] == (["wrench_compensated"] if factor < 1 else [])
     assert one.code == "clock_rate"
     assert abs(one.values["factor"] - factor) < 5 * one.values["sigma"]
     assert one.values["rate"] == pytest.approx(1 / factor, rel=0.02)

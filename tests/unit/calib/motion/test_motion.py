@@ -20,7 +20,7 @@ from ftcalib.motion.model import (
 )
 from ftcalib.motion.samples import Means, Motion, rows_of
 from ftcalib.motion.solve import solve_motion
-from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
+from tests.moving_load import HOME, Array, Recorded, Truth, means_of, programme, record, sweep
 
 TRUTH = Truth()
 QUIET = Truth(noise=(0, 0), vibration=(0, 0), joint_noise_rad=0)
@@ -159,6 +159,40 @@ def test_wrong_data_are_named(swept: Recorded, change: object, code: str) -> Non
     found = solve_motion(*means_of(change(swept)))  # type: ignore[operator]
     assert code in {one.code for one in found.findings if one.severity != "note"}
     assert found.verdict != "good"
+
+
+@pytest.mark.parametrize("ratio", [1.02, 2.0])
+def test_another_rate_of_one_clock_is_named_and_undone(swept: Recorded, ratio: float) -> None:
+    found = solve_motion(*means_of(replace(swept, t_s=3.0 + ratio * swept.t_s)))
+    assert found.findings[0].code == "clocks_differ"
+    assert found.findings[0].values["ratio"] == pytest.approx(ratio, rel=2e-3)
+    assert not {"clock_offset", "clock_rate"} & {one.code for one in found.findings}
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 0.04])
+def test_of_ten_poses_a_second_the_rests_count(jitter_s: float) -> None:
+    """Fast moves between rests; the times of both streams are off by up to the jitter."""
+    rng = np.random.default_rng(5)
+    postures = HOME + rng.uniform(-1, 1, (12, 6)) * [0.4, 0.2, 0.2, 1.0, 1.0, 1.3]
+
+    def joints(t: Array) -> Array:
+        stop = np.clip(np.floor(t / 2.0).astype(int), 0, 10)
+        x = np.clip((t - 2.0 * stop - 1.4) / 0.6, 0, 1)[:, None]
+        return np.asarray(postures[stop] + (postures[stop + 1] - postures[stop]) * x**3 * (10 - 15 * x + 6 * x**2))
+
+    whole = record(TRUTH, joints, 22.0, 2)
+    t_s, t_pose_s = (t + rng.uniform(-jitter_s, jitter_s, len(t)) for t in (whole.t_s[::50], whole.t_pose_s[17::50]))
+    poses = t_pose_s, whole.R_base_flange[17::50], whole.p_base_flange_m[17::50]
+    found = solve_motion(*means_of(Recorded(t_s, whole.wrench[::50], *poses)))
+    assert found.verdict == "usable"
+    assert found.findings[0].code == "motion_coarse"
+    assert found.mass_kg == pytest.approx(TRUTH.mass_kg, abs=2 * float(found.sigma["mass_kg"]))
+
+
+def test_too_few_poses_without_rests_are_refused() -> None:
+    fast = means_of(record(TRUTH, sweep(SWEEP_S, hz=(0.4, 0.6, 0.8)), SWEEP_S, 1, rates_Hz=(500.0, 10.0)))
+    with pytest.raises(NotObservable, match=r"parts at rest are only .* s long: record at 50 Hz"):
+        solve_motion(*fast)
 
 
 def test_a_motion_about_one_axis_determines_nothing() -> None:

@@ -14,6 +14,7 @@ from ftcalib.model import Array
 from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, wrench_of
 from ftcalib.motion.samples import Motion, Rows
 from ftcalib.motion.solve import (
+    SLOW_RAD_S,
     _coarse_delay,
     _contacts,
     _findings,
@@ -44,14 +45,14 @@ def test_a_delay_is_found_in_whole_rows_beside_gaps_and_contact(by: int) -> None
     rows.wrench[60:68] += 10.0
     kept = np.ones(150, np.bool_)
     kept[[20, 21, 22, 100]] = False
-    assert _coarse_delay(rows[kept]) == pytest.approx(0.5 + by * ROW_S)
+    assert _coarse_delay(rows[kept])[0] == pytest.approx(0.5 + by * ROW_S)
 
 
 def test_a_delay_that_explains_little_more_is_none() -> None:
     rows = shifted(rows_of(150, TRUTH), 20)  # farther than is looked for
-    assert _coarse_delay(rows) == 0.0
+    assert _coarse_delay(rows)[0] == 0.0
     noisy = rows_of(150, TRUTH, sigma=np.repeat([30.0, 3.0], 3))
-    assert _coarse_delay(shifted(noisy, 3)) == 0.0
+    assert _coarse_delay(shifted(noisy, 3))[0] == 0.0
     with pytest.raises(BadDataset, match=r"4\.9 s of motion without a gap are too short"):
         _coarse_delay(rows[:41])
 
@@ -59,10 +60,10 @@ def test_a_delay_that_explains_little_more_is_none() -> None:
 def test_without_positions_slow_rows_count() -> None:
     rows = rows_of(100, TRUTH)
     rows = replace(rows, speed_rad_s=np.where(np.arange(100) < 42, 0.14, 0.16))
-    assert _select_rows(rows, True) is rows
-    assert len(_select_rows(rows, False)) == 42
+    assert _select_rows(rows, np.inf) is rows
+    assert len(_select_rows(rows, SLOW_RAD_S)) == 42
     with pytest.raises(BadDataset, match=r"these are 4\.9 s long"):
-        _select_rows(rows[1:], False)
+        _select_rows(rows[1:], SLOW_RAD_S)
 
 
 def best_of(**values: Any) -> Any:
@@ -132,7 +133,10 @@ def motion_result(delay_s: float = 0.0, contacts: tuple[Any, ...] = ()) -> Motio
 
 def found(best: Any, motion: MotionResult, *, positions: bool = True, height_m: float | None = None) -> dict[str, Any]:
     rows = rows_of(100, TRUTH)
-    return {one.code: one for one in _findings(rows, rows[:80], best, motion, height_m, positions=positions)}
+    return {
+        one.code: one
+        for one in _findings(rows, rows[:80], best, motion, height_m, limit_rad_s=np.inf if positions else SLOW_RAD_S)
+    }
 
 
 def test_what_a_recording_lacks_is_a_finding() -> None:
