@@ -221,7 +221,7 @@ def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) ->
     """Give other explanations that the data do not exclude, with their shares of the probability; `best` has the rest.
 
     They are: all candidates that were not found, as large as slope and curvature at zero promise; gain and cross-talk
-    as large as the larger of both; hysteresis in place of inexact orientations.
+    as large as the larger of both; hysteresis in place of inexact orientations; no drift, or white noise in its place.
     """
     waiting = [c for c in candidates if c not in best.components]
     found = dict(zip(best.components, best.theta, strict=True))
@@ -234,6 +234,15 @@ def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) ->
         components = [HYSTERESIS if c == ROTATION else c for c in best.components]
         start = np.where([c == HYSTERESIS for c in components], USUAL_HYSTERESIS**2, best.theta)
         others.append((maximise(problem, components, start), ROTATION.needed - HYSTERESIS.needed))
+    drifts = [c for c in best.components if c.kind == "slope" or (c.kind == "walk" and c in candidates)]
+    if drifts:
+        noise = {w for c in drifts for w in waiting if w.kind == "white" and np.dot(c.share, w.share)}
+        for instead in ([], [c for c in candidates if c in noise]):
+            components = [*(c for c in best.components if c not in drifts), *instead]
+            start = np.array([found.get(c, 0.0) for c in components])
+            start = np.where(start > 0, start, NEGLIGIBLE * units(problem, best, components))
+            bonus = sum(c.needed for c in drifts) - sum(c.needed for c in instead)
+            others.append((maximise(problem, components, start), bonus))
     odds = [float(np.exp(min(one.loglik - best.loglik + bonus, 0.0))) for one, bonus in others]
     return [(one, odd / (1 + sum(odds))) for (one, _), odd in zip(others, odds, strict=True)]
 

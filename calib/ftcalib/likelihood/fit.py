@@ -267,10 +267,14 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
     parameters = best.parameters
     if drifts or found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         x, C = estimates_of_unknown_variances(at)
+        step = Z @ x[:-SIZE]
         if session.n < POSES_THAT_SHOW_THE_NOISE:
-            C = C + doubt(at, rivals(problem, at, [*session.candidates(), *session.structure()]))
+            others = rivals(problem, at, [*session.candidates(), *session.structure()])
+            C = C + doubt(at, others)
+            # A drift that the data show hardly better than none counts for its share.
+            step = step + sum(share * (Z @ one.step - step) for one, share in others)
         if drifts:
-            parameters = parameters.moved(np.where(_OF_BIAS, Z @ x[:-SIZE], 0.0))
+            parameters = parameters.moved(np.where(_OF_BIAS, step, 0.0))
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
