@@ -38,10 +38,15 @@ class SensorErrors:
 
     @classmethod
     def drawn(cls, seed: int, gain: float, cross_talk: float, nonlinear: float) -> Self:
-        """Draw errors of these sizes: one standard deviation each, relative to the ranges."""
+        """Draw errors of these sizes: one standard deviation each, relative to the ranges.
+
+        Half of the variance of the gain is common to all axes, as of calibration masses, ageing and temperature.
+        """
         rng = np.random.default_rng([seed, 12])
+        drawn, bent, common = rng.standard_normal((6, 6)), rng.standard_normal((6, 2)), rng.standard_normal()
+        np.fill_diagonal(drawn, (np.diag(drawn) + common) / np.sqrt(2))
         sizes = np.where(np.eye(6) > 0, gain, cross_talk) * RANGE[:, None] / RANGE
-        return cls(sizes * rng.standard_normal((6, 6)), nonlinear * rng.standard_normal((6, 2)))
+        return cls(sizes * drawn, nonlinear * bent)
 
     def of(self, load: Array) -> Array:
         """Return the errors of readings, with the shape of the loads (6,) or (n, 6), N and N·m."""

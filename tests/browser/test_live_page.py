@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import Page
 
 PUSH = {"do": "push", "wrench": [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]}
-PUSHED = re.compile(r"contact 8\.\d N")
+PUSHED = re.compile(r"contact [78]\.\d N")
 
 
 def wait_for_force(page: "Page", least_N: float, most_N: float) -> None:

@@ -38,6 +38,8 @@ def test_the_seed_draws_errors_of_the_sizes_relative_to_the_ranges() -> None:
     scaled *= np.repeat([1.0, 15.0], 3)[:, None]
     expected = np.where(np.eye(6) > 0, 0.02, 0.01)
     np.testing.assert_allclose(scaled.std(axis=0), expected, rtol=0.15)
+    gains = np.einsum("nii->ni", scaled)
+    np.testing.assert_allclose(np.corrcoef(gains.T)[~np.eye(6, dtype=bool)], 0.5, atol=0.2)
     assert np.isclose(np.std([one.nonlinearity for one in drawn]), 0.003, rtol=0.1)
     np.testing.assert_array_equal(drawn[7].error, SensorErrors.drawn(7, 0.02, 0.01, 0.0).error)
 
