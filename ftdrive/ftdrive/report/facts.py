@@ -29,6 +29,7 @@ from ftdrive.terminal.report import (
     drift_in_words,
     error_in_words,
     force_sigma_at_tip,
+    mass_in_words,
     sensor_in_words,
     tip_of,
 )
@@ -224,6 +225,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "correlation": _correlation(result.covariance),
         "cross_validation": _cross_validation(subject),
         "poses": _poses(subject),
+        "mass": mass_in_words(result),
         "drift": _drift(subject),
         "noise": _noise(subject),
         "coverage": None if R_base_flange is None else _coverage(subject, R_base_flange),

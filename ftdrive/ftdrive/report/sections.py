@@ -35,8 +35,9 @@ def estimates(facts: Facts) -> Section:
         "hardly separate two parameters: add other orientations.",
     )
     tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
+    if facts["mass"] is not None:
+        text.append(f"Sigma: {SIGMA_OF_THE_TOOL}. Mass as read: {facts['mass']}.")
     if result["response"] is not None:
-        text.append(f"Sigma: {SIGMA_OF_THE_TOOL}.")
         columns = ("entry", "value", "± 1 sigma")
         tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)

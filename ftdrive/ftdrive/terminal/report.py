@@ -75,7 +75,7 @@ def print_result(
     printed = " as published" if result.provenance.get("as_published") else ""
     answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}{printed}"))
     answer.print(_table(result, truth))
-    if (mass := _mass_in_words(result)) is not None:
+    if (mass := mass_in_words(result)) is not None:
         answer.print(hanging(" sigma: ", SIGMA_OF_THE_TOOL, answer))
         answer.print(hanging(" mass as read: ", mass, answer))
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
@@ -159,7 +159,7 @@ def _print_drift(result: CalibrationResult, drift: DriftCheck | None) -> None:
             answer.print(hanging(" next use: ", f"{ahead}. Tare before use.", answer))
 
 
-def _mass_in_words(result: CalibrationResult) -> str | None:
+def mass_in_words(result: CalibrationResult) -> str | None:
     """Describe the mass with both parts of its sigma; None if it was known, or the sensor is declared perfect."""
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
     if session_kg < FIXED_BELOW * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:

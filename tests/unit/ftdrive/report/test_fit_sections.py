@@ -34,7 +34,8 @@ def test_a_drift_is_said_as_far_as_it_is_known() -> None:
 
 
 def estimated(result: Any, strong: Any = (), motion: Any = None) -> Any:
-    return estimates({"result": result.to_dict(), "correlation": {"strong": strong}, "motion": motion})
+    seen = {"correlation": {"strong": strong}, "motion": motion, "mass": "1.2 kg ± 1.6 %"}
+    return estimates({"result": result.to_dict(), **seen})
 
 
 def test_only_what_was_known_beforehand_is_fixed() -> None:
@@ -62,6 +63,7 @@ def test_the_strongest_correlations_are_named() -> None:
     assert text[1].count("mounting") == 5
     assert estimated(calibration(), motion={}).text[0].count("24 parts of the motion") == 1
     assert estimated(calibration()).text[1].startswith("No two parameters")
+    assert estimated(calibration()).text[2].endswith("there they cancel. Mass as read: 1.2 kg ± 1.6 %.")
 
 
 def test_gain_and_cross_talk_have_their_units() -> None:
