@@ -2,6 +2,7 @@
 
 import pytest
 
+from ftcalib.poses.information import Guess
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.checks.sensor import check_noise, check_stream
@@ -33,7 +34,7 @@ def test_rate_losses_and_status(stream: tuple[FtSamples, Health], url: str) -> N
 
 def test_noise(stream: tuple[FtSamples, Health]) -> None:
     samples, _ = stream
-    checks = check_noise(samples.wrench, DURATION_S, average_s=2.0, mass_kg=1.0, sensor=SensorMatrix.usual())
+    checks = check_noise(samples.wrench, DURATION_S, 2.0, Guess(1.0, 1.0, 1.0, sensor=SensorMatrix.usual()))
     assert [check for check in checks if check.state != "ok"] == []
 
 

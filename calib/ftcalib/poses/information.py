@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftcalib.judge.observability import second_minimum
+from ftcalib.known import NOTHING
 from ftcalib.likelihood.rotation_minima import given_rotation
 from ftcalib.likelihood.structure import hidden_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
@@ -45,6 +46,8 @@ class Guess:
     g_m_s2: float = STANDARD_GRAVITY_M_S2
     sensor: SensorMatrix | None = None
     """What is known of the sensor's own errors. None: predicted from noise alone, as for a perfect sensor."""
+    orientation_rad: float = NOTHING.orientation_rad
+    """One standard deviation of an axis of the arm's orientation."""
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
@@ -136,7 +139,7 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     rows = np.concatenate([np.eye(15), _weight_and_tilt_rows(guess)])
     total = variance(rows)
     if guess.sensor is not None:
-        columns = hidden_columns(guess.parameters, R_base_flange, R_base_flange.mean(axis=0))
+        columns = hidden_columns(guess.parameters, R_base_flange, R_base_flange.mean(axis=0), guess.orientation_rad)
         columns = (columns / guess.wrench_sigma[:, None]).reshape(len(J), -1)
         moved = guess.scale[:, None] * np.linalg.lstsq(J, columns)[0]
         hidden = guess.sensor.hidden_covariance(guess.parameters) + moved @ moved.T

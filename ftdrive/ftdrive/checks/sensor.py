@@ -3,6 +3,7 @@
 import math
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib import CalibrationDataset
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.poses.information import Guess, predicted_sigma, special
-from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig
 from ftdrive.checks.check import Check, State, who
 from ftdrive.checks.computer import SensorAddress, latency_command
@@ -258,9 +258,7 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
     return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
 
 
-def check_noise(
-    wrench: Array, duration_s: float, average_s: float, mass_kg: float, sensor: SensorMatrix
-) -> list[Check]:
+def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess) -> list[Check]:
     """Check the noise of a sensor at rest, and predict the accuracy of a calibration from it.
 
     Parameters
@@ -269,17 +267,15 @@ def check_noise(
         `duration_s` seconds of N and N·m.
     average_s : float
         How long each pose is averaged.
-    mass_kg : float
-        Expected, of all that hangs on the sensor.
-    sensor : SensorMatrix
-        What is known of the sensor's own errors.
+    guess : Guess
+        Mass, and accuracy of sensor and arm; its noise is not used.
     """
     level = check_level(wrench)
     if level.state == "failed":
         return [level]
     variance = np.diag(mean_and_covariance(wrench).covariance) * duration_s / average_s
     force_N, torque_Nm = (float(np.sqrt(variance[axes].mean())) for axes in (slice(3), slice(3, 6)))
-    guess = Guess(mass_kg, force_N, torque_Nm, sensor=sensor)
+    guess = replace(guess, sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
     expected = predicted_sigma(special(range(1, 25)), guess)
     com_mm, turn_deg = (
         factor * float(np.max(np.abs(expected.sigma[key])))
@@ -288,7 +284,7 @@ def check_noise(
     mass_g = 1e3 * float(np.max(expected.sigma["mass_kg"]))
     off = f"a sensor whose gain is {100 * guess.gain_sigma:.2g} % off"
     accuracy = (
-        f"for {mass_kg:g} kg, 24 poses of {average_s:g} s and {off}, "
+        f"for {guess.mass_kg:g} kg, 24 poses of {average_s:g} s and {off}, "
         f"one sigma: mass {mass_g:.2g} g, centre of mass {com_mm:.2g} mm, mounting {turn_deg:.2g}°"
     )
     return [level, Check("noise.accuracy", "ok", accuracy)]

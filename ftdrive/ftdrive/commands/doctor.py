@@ -13,7 +13,8 @@ import click
 import numpy as np
 from rich.text import Text
 
-from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftcalib.poses.information import Guess
+from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station, sensor_reached
 from ftdrive.checks import computer
@@ -54,7 +55,7 @@ from ftdrive.commands.common import (
     write_json,
 )
 from ftdrive.errors import NotAccepted
-from ftdrive.planning.planner import expected_errors
+from ftdrive.planning.planner import guess_of_devices
 from ftdrive.runs.source import read_calibration
 from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, messages, working
@@ -124,9 +125,10 @@ def doctor(
             found, arm = _examine_robot(cell, stack)
         permissions = computer.check_permissions(address)
         blame = partial(check_sensor_error, address=address, permissions=permissions)
-        mass_kg = mass_kg or cell.tool.mass_kg or USUAL_KG
+        guess = guess_of_devices(cell)
+        guess = replace(guess, mass_kg=mass_kg or guess.mass_kg)
         with working("Reading the sensor"):
-            of_sensor, alive = _examine_sensor(device, address, cell, mass_kg, blame, stack)
+            of_sensor, alive = _examine_sensor(device, address, cell, guess, blame, stack)
         model = cell.robot.model if arm is None else arm.identify().model
         workcell = [computer.check_workcell(cell, model)] if cell.robot.host else []
         found += [*of_sensor, *workcell, computer.check_disk(runs), *permissions]
@@ -220,7 +222,7 @@ def _check_clock(arm: RobotArm, clock: Clock) -> Check:
 
 
 def _examine_sensor(
-    device: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, mass_kg: float, blame: Blame, stack: ExitStack
+    device: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, guess: Guess, blame: Blame, stack: ExitStack
 ) -> tuple[list[Check], bool]:
     found: list[Check] = []
     name = "sensor.identity"
@@ -242,7 +244,7 @@ def _examine_sensor(
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *check_stream(samples, health, address, _LOOK_S),
-        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, mass_kg, expected_errors(cell.sensor)),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, guess),
     ], True
 
 

@@ -15,7 +15,7 @@ from ftcalib.known import Setup
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive.cell.config import USUAL_KG, CellConfig, SensorConfig
+from ftdrive.cell.config import USUAL_KG, CellConfig
 from ftdrive.cell.units import side_of
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, HungLoad
@@ -51,26 +51,23 @@ Found = tuple[Sequence[int], Array]
 Attempt = tuple[str, Sequence[str], Found | None]
 
 
-def expected_errors(sensor: SensorConfig) -> SensorMatrix:
-    """Return the errors of a sensor as its data sheet or its kind has them."""
-    both = None if not (sensor.range_N and sensor.range_Nm) else (sensor.range_N, sensor.range_Nm)
-    return SensorMatrix.declared(Setup(sensor_accuracy_percent=sensor.accuracy_percent, sensor_range=both))
-
-
 def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
-    """Return a prior: mass of tool and accuracy of sensor as described, centre of mass at half the tool length.
-
-    Noise, and what is not described, as usual.
-    """
+    """Return a prior: `guess_of_devices`, with the centre of mass at half the tool length, and the lean of the base."""
     length_m = max(part.to_m for part in certifier.arm.tool)
-    return Guess(
-        (cell and cell.tool.mass_kg) or USUAL_KG,
-        0.05,
-        0.003,
-        (0.0, 0.0, length_m / 2),
-        tilt_beta_rad=certifier.scene.lean_rad,
-        sensor=SensorMatrix.usual() if cell is None else expected_errors(cell.sensor),
+    guess = Guess(USUAL_KG, 0.05, 0.003, sensor=SensorMatrix.usual()) if cell is None else guess_of_devices(cell)
+    return replace(guess, p_sensor_com_m=(0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
+
+
+def guess_of_devices(cell: CellConfig) -> Guess:
+    """Return a prior: mass of tool, and accuracy of sensor and arm, as described; the noise as usual."""
+    sensor = cell.sensor
+    setup = Setup(
+        sensor_accuracy_percent=sensor.accuracy_percent,
+        sensor_range=(sensor.range_N, sensor.range_Nm) if sensor.range_N and sensor.range_Nm else None,
+        orientation_accuracy_deg=cell.robot.orientation_accuracy_deg,
     )
+    errors = SensorMatrix.declared(setup)
+    return Guess(cell.tool.mass_kg or USUAL_KG, 0.05, 0.003, sensor=errors, orientation_rad=setup.orientation_rad)
 
 
 def plan_tour(

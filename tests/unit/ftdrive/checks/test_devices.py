@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult
+from ftcalib.poses.information import Guess
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.checks import arm as of_arm
@@ -307,22 +308,25 @@ def test_a_polled_sensor_may_lose_samples_to_a_busy_computer() -> None:
     assert "fewer programs" not in str(streaming)
 
 
+GUESS = Guess(1.2, 1.0, 1.0, sensor=SensorMatrix.usual())
+
+
 def test_noise_at_rest_under_a_hand_and_none_at_all() -> None:
     noise = np.random.default_rng(0).normal(size=(2000, 6)) * ([0.03] * 3 + [0.001] * 3)
-    level, accuracy = of_sensor.check_noise(noise, 2.0, 2.0, 1.2, SensorMatrix.usual())
+    level, accuracy = of_sensor.check_noise(noise, 2.0, 2.0, GUESS)
     assert (level.state, accuracy.state) == ("ok", "ok")
     assert "σ (0.03" in level.found
     assert "1.2 kg" in accuracy.found
     hand = noise.copy()
     hand[1000:, 2] += 0.5
-    assert of_sensor.check_noise(hand, 2.0, 2.0, 1.2, SensorMatrix.usual())[0].state == "warning"
-    (dead,) = of_sensor.check_noise(np.ones((2000, 6)), 2.0, 2.0, 1.2, SensorMatrix.usual())
+    assert of_sensor.check_noise(hand, 2.0, 2.0, GUESS)[0].state == "warning"
+    (dead,) = of_sensor.check_noise(np.ones((2000, 6)), 2.0, 2.0, GUESS)
     assert dead.state == "failed"
     one_axis, no_number = noise.copy(), noise.copy()
     one_axis[:, 4] = 0.3
     no_number[7, 1] = np.nan
     for bad, words in ((noise[:10], "10 samples"), (one_axis, "Ty did not change"), (no_number, "not numbers")):
-        (check,) = of_sensor.check_noise(bad, 2.0, 2.0, 1.2, SensorMatrix.usual())
+        (check,) = of_sensor.check_noise(bad, 2.0, 2.0, GUESS)
         assert (check.state, words in check.found) == ("failed", True)
 
 
