@@ -134,7 +134,7 @@ def postures(R: Array, first: Array) -> Array:
 
 
 def drifts(rng: np.random.Generator, n: int, size: Mapping[str, float]) -> Array:
-    """Change of the bias (n + NEXT, 6) since its mean over the tour: n poses of the tour, and those that continue it."""
+    """Change of the bias (n + NEXT, 6) since its mean over the n poses of the tour, for them and those that go on."""
     more = n + NEXT
     moving = size["walk"] * np.cumsum(2 * SIGMA * rng.normal(size=(more, 6)), axis=0)
     direction = rng.normal(size=(2, 3))
