@@ -10,6 +10,7 @@ import numpy as np
 from ftcalib.after.series import Estimated
 from ftcalib.known import CROSS_TALK_SHARE, USUAL_GAIN
 from ftcalib.likelihood.response import LEVER_M, USUAL, Response, response_columns
+from ftcalib.likelihood.structure import alike
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 from ftcalib.result import CalibrationResult
 
@@ -19,8 +20,6 @@ GAIN, CROSS = USUAL_GAIN, CROSS_TALK_SHARE * USUAL_GAIN
 LOAD = 0.005
 # Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
 TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
-# Correlation of their effects a quarter turn apart.
-_CORRELATED = 0.5
 
 
 def known_response(calibration: Estimated, found: Response | None) -> Response | None:
@@ -73,8 +72,7 @@ def _products(A: Array, v: Array, sigma: Array) -> Array:
 
 def smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
     """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
-    cosine = np.einsum("nij,mij->nm", R_base_flange, others)
-    alike = _CORRELATED ** ((3 - cosine) / 2)
+    correlated = alike(R_base_flange, others)
     turn, turn_other = (jacobian(p, R)[..., :3] * TURN_RAD for R in (R_base_flange, others))
-    of_arm = np.einsum("nm,nik,mjk->nimj", alike, turn, turn_other)
-    return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(alike, np.diag(CABLE**2))])
+    of_arm = np.einsum("nm,nik,mjk->nimj", correlated, turn, turn_other)
+    return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(correlated, np.diag(CABLE**2))])

@@ -40,6 +40,16 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
     }
 
 
+# Angle over which an error of the arm, or the pull of a cable, changes.
+SMOOTH_RAD = 1.2
+
+
+def alike(R_base_flange: Array, others: Array) -> Array:
+    """Return the correlation (n, m) of smooth errors at two orientations."""
+    cosine = R_base_flange.reshape(-1, 9) @ others.reshape(-1, 9).T
+    return np.asarray(np.exp((cosine - 3) / (2 * SMOOTH_RAD**2)))
+
+
 # Errors of the orientation that a session hides, in sigmas of the flange: on the side of the base, and smooth ones.
 _OF_BASE, _SMOOTH = 5 / 3, 2 / 3
 # One sigma of the sag of adapter and mount under the moment of the tool, and of the shift of a soft tool's centre.

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
+from ftcalib.likelihood.structure import alike
 from ftcalib.model import Array, Parameters, cross, skew
 from ftcalib.motion.samples import Motion, Rows
 
@@ -159,8 +160,6 @@ def lever_columns(load: Load, motion: Motion) -> Array:
     return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-# Angle over which an error of the arm, or the pull of a cable, changes.
-SMOOTH_RAD = 1.2
 # Share of the variance below which a function is left out, and orientations that the functions rest on.
 _NEGLIGIBLE, _RESTING_ON = 1e-3, 200
 
@@ -183,23 +182,18 @@ class SmoothFunctions:
     def of(cls, R_base_flange: Array) -> Self:
         """Choose for the orientations (n, 3, 3) of a recording."""
         at = R_base_flange[:: -(-len(R_base_flange) // _RESTING_ON)]
-        alike = _alike(at, at)
-        centred = alike - alike.mean(axis=0)
+        correlated = alike(at, at)
+        centred = correlated - correlated.mean(axis=0)
         value, vector = np.linalg.eigh(centred - centred.mean(axis=1, keepdims=True))
         large = value > _NEGLIGIBLE * len(at)
-        return cls(at, vector[:, large] / np.sqrt(value[large]), alike.mean(axis=0))
+        return cls(at, vector[:, large] / np.sqrt(value[large]), correlated.mean(axis=0))
 
     def __len__(self) -> int:
         return int(self.weights.shape[1])
 
     def __call__(self, R_base_flange: Array) -> Array:
         """Return their values (n, k)."""
-        return np.asarray((_alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
-
-
-def _alike(R: Array, others: Array) -> Array:
-    """Correlation (n, m) of the values at two orientations."""
-    return np.asarray(np.exp((R.reshape(-1, 9) @ others.reshape(-1, 9).T - 3) / (2 * SMOOTH_RAD**2)))
+        return np.asarray((alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
 
 
 def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
