@@ -82,15 +82,17 @@ def hidden_columns(
     weight = gravity_wrench(parameters, R_base_flange)
     moment_flange_Nm = weight[:, None, 3:] @ parameters.R_flange_sensor.T
     direction = weight[:, :3] / max(parameters.weight_N, 1e-12)
-    soft = np.zeros((n, 6, 3, 3))  # by the axis of the shift, and of the weight that causes it
-    soft[:, 3:] = np.einsum("nci,nj->ncij", -skew(weight[:, :3]), direction)
+    # A force along i shifts the centre along j by as much as one along j along i.
+    i, j = np.triu_indices(3)
+    soft, across = np.zeros((n, 6, 6)), -skew(weight[:, :3])
+    soft[:, 3:] = across[..., i] * direction[:, None, j] + (i != j) * across[..., j] * direction[:, None, i]
     return np.concatenate(
         [
             orientation_rad * turn,
             _OF_BASE * orientation_rad * np.einsum("nci,nji->ncj", turn, R_base_flange),
             _SMOOTH * orientation_rad * structure_columns(parameters, R_base_flange, middle)["kinematics"],
             _SAG_RAD_PER_NM * turn * moment_flange_Nm,
-            _SOFT_M * soft.reshape(n, 6, 9),
+            _SOFT_M * soft,
         ],
         axis=2,
     )
