@@ -75,27 +75,31 @@ def hidden_columns(
     orientation_rad : float
         One standard deviation of an axis of the arm's orientation; 0 for an exact arm with rigid mounts.
     """
-    n = len(R_base_flange)
     if orientation_rad == 0:
-        return np.zeros((n, 6, 0))
+        return np.zeros((len(R_base_flange), 6, 0))
+    turn = jacobian(parameters, R_base_flange)[..., :3]
+    return np.concatenate(
+        [
+            orientation_rad * turn,
+            _OF_BASE * orientation_rad * np.einsum("nci,nji->ncj", turn, R_base_flange),
+            _SMOOTH * orientation_rad * structure_columns(parameters, R_base_flange, middle)["kinematics"],
+            yielding_columns(parameters, R_base_flange),
+        ],
+        axis=2,
+    )
+
+
+def yielding_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give what mounts and tool do to the wrenches (n, 6, 9) that yield to the weight, as `hidden_columns`."""
     turn = jacobian(parameters, R_base_flange)[..., :3]
     weight = gravity_wrench(parameters, R_base_flange)
     moment_flange_Nm = weight[:, None, 3:] @ parameters.R_flange_sensor.T
     direction = weight[:, :3] / max(parameters.weight_N, 1e-12)
     # A force along i shifts the centre along j by as much as one along j along i.
     i, j = np.triu_indices(3)
-    soft, across = np.zeros((n, 6, 6)), -skew(weight[:, :3])
+    soft, across = np.zeros((len(turn), 6, 6)), -skew(weight[:, :3])
     soft[:, 3:] = across[..., i] * direction[:, None, j] + (i != j) * across[..., j] * direction[:, None, i]
-    return np.concatenate(
-        [
-            orientation_rad * turn,
-            _OF_BASE * orientation_rad * np.einsum("nci,nji->ncj", turn, R_base_flange),
-            _SMOOTH * orientation_rad * structure_columns(parameters, R_base_flange, middle)["kinematics"],
-            _SAG_RAD_PER_NM * turn * moment_flange_Nm,
-            _SOFT_M * soft,
-        ],
-        axis=2,
-    )
+    return np.concatenate([_SAG_RAD_PER_NM * turn * moment_flange_Nm, _SOFT_M * soft], axis=2)
 
 
 def hidden_in_any_poses(parameters: Parameters, orientation_rad: float) -> Array:

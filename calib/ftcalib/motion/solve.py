@@ -17,8 +17,8 @@ from ftcalib.judge.observability import assess
 from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.response import Response
-from ftcalib.likelihood.structure import hidden_in_any_poses
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, nearest_rotation, predict
+from ftcalib.likelihood.structure import hidden_in_any_poses, yielding_columns
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
 from ftcalib.motion.mistakes import (
     COMPENSATED,
@@ -190,7 +190,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         parameters=best.load.static,
         mean_bias=best.mean_bias,
         covariance=best.covariance[:15, :15],
-        hidden_covariance=hidden_in_any_poses(best.load.static, setup.orientation_rad),
+        hidden_covariance=_hidden_covariance(used, best, setup.orientation_rad),
         residuals=best.residuals[judged],
         chi2=best.chi2,
         dof=max(6 * int(best.kept.sum()) - 23, 1),
@@ -291,6 +291,21 @@ def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> Non
     if observability.ambiguities:
         reason = ": ".join(observability.ambiguities[:2])
         raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
+
+
+def _hidden_covariance(rows: Rows, best: MotionFit, orientation_rad: float) -> Array:
+    """Return the covariance (15, 15) from errors that the motion does not show: of arm, mounts and a soft tool.
+
+    The smooth errors of the arm are a part of the fit.
+    """
+    static, R = best.load.static, _orientations(rows)
+    if orientation_rad == 0:
+        return np.zeros((15, 15))
+    sigma = best.sigma.mean(axis=0)[:, None]
+    J, columns = ((each / sigma).reshape(6 * len(R), -1) for each in (jacobian(static, R), yielding_columns(static, R)))
+    scale = np.linalg.norm(J, axis=0)
+    moved = np.linalg.lstsq(J / scale, columns, rcond=1e-9)[0] / scale[:, None]
+    return np.asarray(hidden_in_any_poses(static, orientation_rad) + moved @ moved.T)
 
 
 def _orientations(rows: Rows) -> Array:
