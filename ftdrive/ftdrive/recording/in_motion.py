@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
+from ftcalib.known import NOMINAL_ORIENTATION_DEG
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
@@ -54,6 +55,7 @@ def solve_recording(
         The motion does not determine the parameters, or contradicts the earlier result.
     """
     provenance, height_m, g_m_s2, any_zero = made_now(), None, STANDARD_GRAVITY_M_S2, False
+    accuracy_deg = None
     if isinstance(source, Path | Recording):
         wrench, poses, header = _read_in_motion(source)
         devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
@@ -63,12 +65,13 @@ def solve_recording(
         any_zero = header.info.sensor.has_arbitrary_zero
     else:
         wrench, poses = (_means_of(rows) for rows in (source[0].wrenches(), source[1].poses()))
+        accuracy_deg = NOMINAL_ORIENTATION_DEG if source[1].has_nominal_kinematics else None
         names = [table.name for table in source]
         provenance |= {"wrench": names[0], "orientation": names[1]} if len(set(names)) == 2 else {"recording": names[0]}
         provenance |= {"table": words} if (words := table_words(source)) else {}
     if earlier is not None:
         require_same_cell(earlier, provenance)
-    setup = Setup(up_in_base=up_in_base, sensor_has_arbitrary_zero=any_zero)
+    setup = Setup(up_in_base=up_in_base, sensor_has_arbitrary_zero=any_zero, orientation_accuracy_deg=accuracy_deg)
     if known is not None and known.gravity_direction_base is not None:
         known = replace(known, gravity_direction_base=-setup.up)
     return solve_motion(

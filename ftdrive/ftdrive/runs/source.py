@@ -12,6 +12,7 @@ from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadCalibration, BadDataset, NotObservable
+from ftcalib.known import NOMINAL_ORIENTATION_DEG
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
@@ -138,6 +139,8 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         dataset = table.dataset(options.orientation)
         recognised = {"table": table.words} if table.words else {}
         found = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
+        if table.has_nominal_kinematics:
+            found = replace(found, setup=replace(found.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
         if table.gravity_is_measured:  # its direction is that of the base by definition
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
@@ -414,11 +417,18 @@ def circumstances_of(run: Run) -> Circumstances:
             payload_kg=setup["payload_kg"],
             sensor_accuracy_percent=setup["accuracy_percent"],
             sensor_range=setup["range"],
-            orientation_accuracy_deg=config.get("robot", {}).get("orientation_accuracy_deg"),
+            orientation_accuracy_deg=_orientation_accuracy_deg(config.get("robot", {})),
             sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
         ),
         origin,
     )
+
+
+def _orientation_accuracy_deg(robot: Mapping[str, Any]) -> float | None:
+    """Return that of an arm as declared, else that of the nominal kinematics if its joints are topics with a URDF."""
+    nominal = NOMINAL_ORIENTATION_DEG if "urdf=" in str(robot.get("host")) else None
+    declared: float | None = robot.get("orientation_accuracy_deg")
+    return nominal if declared is None else declared
 
 
 def _described(run: Run, config: Mapping[str, Any], load: Load | None) -> dict[str, Any]:

@@ -226,6 +226,12 @@ class Table:
         return "; ".join(filter(None, [self.source.words, *named, *self._guesses]))
 
     @property
+    def has_nominal_kinematics(self) -> bool:
+        """Whether orientations follow from joint angles with the nominal kinematics of a model."""
+        orientation = self._found["orientation"]
+        return orientation is not None and orientation.form == "joints"
+
+    @property
     def gravity_is_measured(self) -> bool:
         """Whether the orientation is a direction of gravity, so that nothing turns about the vertical."""
         orientation = self._found["orientation"]

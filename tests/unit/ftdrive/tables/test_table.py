@@ -143,6 +143,7 @@ def test_joint_angles_with_a_model_are_poses() -> None:
     table = columns("fx fy fz tx ty tz", np.ones((5, 6))) | columns("q1 q2 q3 q4 q5 q6", np.degrees(4 * q_rad))
     found = Table(table, TableOptions(forward=forward)).dataset()
     np.testing.assert_allclose(found.R_base_flange, forward(4 * q_rad)[0], atol=1e-9)
+    assert Table(table, TableOptions(forward=forward)).has_nominal_kinematics
 
 
 MOVING = wrench(RECORDING) | quaternion(RECORDING)
