@@ -481,6 +481,7 @@ def _noise(fit: Judged, quality: Quality) -> list[Finding]:
     if quality.fits_measured_noise:
         return []
     minor = quality.noise_factor <= NOISE_FACTOR and quality.largest_share <= NOISY_SHARE
+    minor = minor and not (fit.fit is not None and fit.fit.may_bend)
     components = {name: value for name, value in fit.components.items() if value > 0}
     return [
         Finding.of("noise_exceeded", "note" if minor else "limit", factor=quality.noise_factor, components=components)

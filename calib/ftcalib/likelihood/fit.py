@@ -88,6 +88,8 @@ class Fit:
     not know them; None where none were found."""
     at: Point | None
     """Restricted likelihood of all unknowns; None in many poses."""
+    may_bend: bool = False
+    """Whether noise stands for a response that is not linear, which the data show, but not clearly."""
 
     @property
     def wrench_cov(self) -> Array:
@@ -227,7 +229,24 @@ def fit(
     # Compensation knows gain and cross-talk, and no structure. A few numbers more of it may only take their place.
     is_unsure = without.criterion - e.criterion < _SURE
     displaced = is_unsure and _left_out_error(plain) < _left_out_error(best) - _CLEARLY
-    return plain if displaced else best
+    return _beside(plain, best) if displaced else best
+
+
+def _beside(found: Fit, other: Fit) -> Fit:
+    """Return a fit with a covariance that another one, which may be the right one as well, has a half of."""
+    off, Z = found.parameters.difference(other.parameters), found.free
+    more = Z.T @ (other.covariance - found.covariance + np.outer(off, off)) @ Z / 2
+    scale = column_scale(Z.T @ found.covariance @ Z)
+    value, vector = np.linalg.eigh(more / np.outer(scale, scale))
+    root = Z @ (scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0)))
+    more = root @ root.T
+    response = found.response
+    if response is not None:
+        joint = response.covariance.copy()
+        joint[:15, :15] += more
+        response = replace(response, covariance=joint)
+    bends = any(name.startswith("load") for name in other.components)  # and adds to the bias
+    return replace(found, covariance=found.covariance + more, response=response, may_bend=bends)
 
 
 def _left_out_error(found: Fit) -> float:
