@@ -118,7 +118,7 @@ def test_step_mode_moves_at_each_enter_and_a_completed_plan_may_run_by_itself(
     found = {one["code"]: one["values"] for one in answer["findings"]}
     payload, lean = found["payload_mismatch"], found["base_leans"]
     assert (answer["verdict"], answer["hints"]) == ("usable", [])
-    assert (payload["payload_kg"], payload["load_kg"]) == (1.5, pytest.approx(0.64, abs=0.01))
+    assert (payload["payload_kg"], payload["load_kg"]) == (1.5, pytest.approx(0.651, abs=0.01))
     assert lean["lean_deg"] == pytest.approx(1.63, abs=0.03)
     assert lean["side"] == "+y"  # gravity has a share along +y: alpha is 1.59°
     # The same posture gives the same plan, which has run to its end now.
