@@ -183,7 +183,7 @@ def record(
     torque = y[:, 3:] + y[:, :3] @ truth.cross_talk_m.T
     y = np.hstack([y[:, :3] @ (np.eye(3) + truth.gain).T, torque]) + truth.bias
     walk = np.cumsum(rng.standard_normal(y.shape), axis=0) / np.sqrt(rates_Hz[0])
-    y += truth.drift_N_per_s * np.r_[1, 1, 1, 0.02, 0.02, 0.02] * (walk - walk.mean(axis=0))
+    y += truth.drift_N_per_s * np.r_[1, 1, 1, 0.02, 0.02, 0.02] * (walk - walk[-1])  # the bias is that of the end
     y += np.repeat(truth.noise, 3) * rng.standard_normal(y.shape)
     return Recorded(t, y, t_pose, R, p)
 

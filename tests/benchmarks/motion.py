@@ -17,6 +17,7 @@ from typing import Any
 
 import click
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
 from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
@@ -81,6 +82,46 @@ def _sigmas(runs: int) -> Iterator[Row]:
             delay_ms = 1e3 * float(np.abs(errors[:, DELAY]).max())
             yield Row("inertia, of 2e-3 kg m², 95 %", f"{100 * inertia:.2f} %", "3 %", inertia <= 0.03)
             yield Row("delay, worst", f"{delay_ms:.3f} ms", ".1 ms", delay_ms <= 0.1)
+
+
+def _hidden(runs: int) -> Iterator[Row]:
+    """What a recording hides, drawn from its prior: gain, half of it common, cross-talk, and errors of the arm."""
+    errors: dict[str, list[np.ndarray]] = {}
+    beyond, good = 0, 0
+    for seed in range(runs):
+        rng = np.random.default_rng([seed, 97])
+        gain = 0.01 * rng.standard_normal((3, 3))
+        np.fill_diagonal(gain, 0.014 * (rng.standard_normal(3) + rng.standard_normal()))
+        truth = Truth(
+            mass_kg=rng.uniform(0.6, 2.5),
+            gain=gain,
+            cross_talk_m=0.01 * 0.05 * rng.standard_normal((3, 3)),
+            posture_error_rad=np.radians(0.04),
+        )
+        phase = rng.uniform(0, 2 * np.pi, 3)
+        recorded = record(truth, sweep(SWEEP_S, phase=(phase[0], phase[1], phase[2])), SWEEP_S, seed)
+        flange, base = (Rotation.from_rotvec(np.radians(size) * rng.standard_normal(3)) for size in (0.06, 0.1))
+        turned = base.as_matrix() @ recorded.R_base_flange @ flange.as_matrix()
+        result = solve_motion(*means_of(replace(recorded, R_base_flange=turned)))
+        R_error = Rotation.from_matrix(truth.R_flange_sensor.T @ result.R_flange_sensor).as_rotvec()
+        off = {
+            "R_flange_sensor": truth.R_flange_sensor @ R_error,
+            "gravity_force_base_N": result.gravity_force_base_N - truth.mass_kg * truth.gravity_m_s2,
+            "mass_kg": np.array([result.mass_kg - truth.mass_kg * np.linalg.norm(truth.gravity_m_s2) / G_M_S2]),
+            "force_bias_N": result.force_bias_N - truth.bias[:3],
+            "p_sensor_com_m": result.p_sensor_com_m - truth.p_sensor_com_m,
+            "torque_bias_Nm": result.torque_bias_Nm - truth.bias[3:],
+        }
+        in_sigma = {name: error / result.sigma[name] for name, error in off.items()}
+        for name, values in in_sigma.items():
+            errors.setdefault(name, []).append(values)
+        good += result.verdict == "good"
+        beyond += result.verdict == "good" and max(np.abs(values).max() for values in in_sigma.values()) > 3
+    for name, found in errors.items():
+        rms, inside = float(np.sqrt(np.mean(np.square(found)))), float(np.mean(np.abs(found) < 1.96))
+        figure = f"{rms:.2f}, {inside:.2f} within 1.96"
+        yield Row(f"hidden: {name}, error / sigma", figure, ".8 to 1.25", rms <= 1.25, runs)
+    yield Row("hidden: good beyond 3 sigma", f"{beyond} of {good}", "", True, runs)
 
 
 def _wrong(_runs: int) -> Iterator[Row]:
@@ -193,7 +234,7 @@ def _columns(one: Recorded) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(one.t_s, c) for c in one.wrench.T] + [(one.t_pose_s, c) for c in pose.T]
 
 
-PARTS = {"sigmas": _sigmas, "wrong": _wrong, "contacts": _contacts, "hour": _hour}
+PARTS = {"sigmas": _sigmas, "hidden": _hidden, "wrong": _wrong, "contacts": _contacts, "hour": _hour}
 
 
 @click.command()
