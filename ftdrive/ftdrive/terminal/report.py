@@ -181,7 +181,7 @@ def error_in_words(result: CalibrationResult) -> str:
     elif not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
         sources.append(f"cross-validated, as {why}")
-    if result.drift is not None:
+    if any(result.quality.get("bias_growth_per_min", ())):
         sources.append("a minute after the tour, with the drift")
     for words, where in _ELSEWHERE:
         error = result.likely_error(where)
@@ -231,10 +231,10 @@ def contact_in_words(result: CalibrationResult) -> str:
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:
-    """Describe how the bias moves after the last pose, at which the result has it; None without drift."""
-    if result.mean_bias is None:
+    """Describe how the bias moves after the last pose, at which the result has it; None without drift, or in motion."""
+    growth = np.array(result.quality.get("bias_growth_per_min", ()))
+    if result.mean_bias is None or not growth.size:
         return None
-    growth = np.array(result.quality["bias_growth_per_min"])
     off, grow = (
         "{} N, {} N·m".format(*(_in_brief(float(np.linalg.norm(part))) for part in np.split(values, 2)))
         for values in (result.parameters.bias - result.mean_bias, growth)

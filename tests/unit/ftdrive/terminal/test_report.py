@@ -434,6 +434,9 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
     assert "next use: the result has the bias of the last pose, 0.25 N, 0.010 N·m off the mean; it moves" in lines
     assert "it moves 0.50 N, 0.0020 N·m a minute. Tare before use." in lines
     assert drift_in_use(followed()) is None
+    # a recording in motion has no last pose from which the bias could go on
+    in_motion = replace(moved, drift=drift, mean_bias=mean_bias, quality={"loo_force_rms_N": 0.01, "worst_pose": 3})
+    assert drift_in_use(in_motion) is None
     assert (poses_in_words(replace(followed(), quality=quality)) or "").startswith("pose 3, 2.3 sigma; each pose")
     assert poses_in_words(followed()) is None
 
