@@ -506,9 +506,9 @@ class CalibrationResult(Displayed):
 
         It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
         each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
-        bias in the minute after the last pose. In motion it is that of load and smooth
-        errors, at rest in the orientations of the recording. In the "workspace" it is that in any orientation, and
-        after an "hour" that with the drift until then: NaN where the tour shows none.
+        bias in the minute after the last pose. In motion it is that of load and smooth errors, at rest in the
+        orientations of the recording. In the "workspace" it is that in any orientation, and after an "hour" that with
+        the drift until then: NaN where the tour shows none.
         """
         if not self.quality:
             return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)

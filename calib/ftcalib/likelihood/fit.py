@@ -30,7 +30,7 @@ from ftcalib.likelihood.variance_components import (
     left_out,
     point,
 )
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
+from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 
 # From this difference of the criterion on the data show a structure: real ones have 250 and more in 24 poses.
 _SURE = 40.0
@@ -38,7 +38,6 @@ _SURE = 40.0
 _CLEARLY = 0.05
 # Such squares are rounding of data without noise.
 _EXACT = 1e-18
-_OF_BIAS = np.isin(np.arange(15), np.r_[6:9, 12:15])
 # Compensation does not know them.
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
@@ -293,7 +292,7 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
             # A drift that the data show hardly better than none counts for its share.
             step = step + sum(share * (Z @ one.step - step) for one, share in others)
         if drifts:
-            parameters = parameters.moved(np.where(_OF_BIAS, step, 0.0))
+            parameters = parameters.moved(np.where(np.isin(np.arange(15), BIASES), step, 0.0))
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None

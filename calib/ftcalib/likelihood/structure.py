@@ -13,7 +13,6 @@ to the sigmas of the parameters (`hidden_columns`).
 
 import numpy as np
 
-from ftcalib.known import USUAL_ORIENTATION_DEG
 from ftcalib.likelihood.response import LEVER_M
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
@@ -60,7 +59,7 @@ def hidden_columns(
     parameters: Parameters,
     R_base_flange: Array,
     middle: Array,
-    orientation_rad: float = np.deg2rad(USUAL_ORIENTATION_DEG),
+    orientation_rad: float,
 ) -> Array:
     """Give what arm and mounts do to the wrenches (n, 6, k), each column for one standard deviation of its cause.
 

@@ -248,10 +248,10 @@ def interpolation_error_rad(poses: tuple[Array, Array]) -> float:
 
     It is large where the poses are too few for their motion, and where their times are not those of the samples.
     """
+    if len(poses[0]) < 9:
+        return 0.0
     t_s, quaternion = poses[0], _continuous_quaternions(poses[1])
     inner = slice(1, len(t_s) - 1 - len(t_s) % 2, 2)
-    if len(t_s) < 9:
-        return 0.0
     between = _at(t_s[inner], t_s[::2], quaternion[::2])[0]
     between /= np.linalg.norm(between, axis=1, keepdims=True)
     return float(np.sqrt(np.mean(np.sum((2 * _conjugate_product(between, quaternion[inner])) ** 2, axis=1))))

@@ -136,8 +136,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     positions = data[1][1].shape[1] == 12 and not is_coarse
     limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
-    data, ratio = _on_one_clock(*data)
-    (delay_s, _), row_s = _coarse_delay(rows_of(*data)), NARROW_S if guarded else WIDE_S
+    data, ratio, delay_s = _on_one_clock(*data)
+    row_s = NARROW_S if guarded else WIDE_S
     rows = rows_of(*data, delay_s, row_s)
     undone = _undo(data, rows, known, g_m_s2) if positions else Undone()
     delay_s += rough_delay(_select_rows(undone.of(rows), limit_rad_s), known, g_m_s2)
@@ -175,7 +175,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         aligned = _select_rows(undone.of(others), limit_rad_s)
     findings = [*quality.findings, *_mistakes(used, aligned, best, quality.findings)]
     findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
-    findings += _findings(rows, used, best, motion, height_m, limit_rad_s=limit_rad_s)
+    findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
     if is_coarse:
         values = {"off_deg": np.degrees(coarse_rad), "share_percent": 100 * len(used) / len(rows)}
         causes.append(Finding.of("motion_coarse", **values))
@@ -213,22 +213,22 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     )
 
 
-def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], float]:
-    """Return the streams with times that run alike, and how many times as long those of the wrench were; 1 as given.
+def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], float, float]:
+    """Return the streams with times that run alike, how many times as long those of the wrench were, and their delay.
 
     Files of one recording begin and end together within some seconds, so another rate shows in their durations.
     """
     t_w, t_p = wrench[0], poses[0]
-    left = _coarse_delay(rows_of(wrench, poses))[1]
-    best, limit = ((wrench, poses), 1.0), _OTHER_RATE * left
+    delay_s, left = _coarse_delay(rows_of(wrench, poses))
+    best, limit = ((wrench, poses), 1.0, delay_s), _OTHER_RATE * left
     if left < _FOLLOWS:
         return best
     for ratio in float(np.ptp(t_w) / np.ptp(t_p)) * _RATIOS:
         alike = wrench, (t_w[0] + ratio * (t_p - t_p[0]), poses[1])
         with suppress(BadDataset):  # too short
-            left = _coarse_delay(rows_of(*alike))[1]
+            delay_s, left = _coarse_delay(rows_of(*alike))
             if abs(ratio - 1) > _SAME_RATE and left < limit:
-                best, limit = (alike, float(ratio)), left
+                best, limit = (alike, float(ratio), delay_s), left
     return best
 
 
@@ -361,14 +361,20 @@ def _means(best: MotionFit, rows: int) -> Array:
 
 
 def _findings(
-    rows: Rows, used: Rows, best: MotionFit, motion: MotionResult, height_m: float | None, *, limit_rad_s: float
+    rows: Rows,
+    used: Rows,
+    best: MotionFit,
+    motion: MotionResult,
+    height_m: float | None,
+    *,
+    positions: bool,
+    is_coarse: bool = False,
 ) -> list[Finding]:
     """Findings that only a recording in motion has."""
     sigma, findings = np.sqrt(np.diag(best.covariance)), list[Finding]()
-    if abs(motion.delay_s) > OFFSET_S and limit_rad_s != _REST_RAD_S:
+    if abs(motion.delay_s) > OFFSET_S and not is_coarse:  # which rests do not show
         findings.append(Finding.of("clock_offset", delay_s=motion.delay_s))
-    positions = bool(np.isinf(limit_rad_s))
-    if limit_rad_s == SLOW_RAD_S:
+    if not (positions or is_coarse):
         turned = np.linalg.norm(used.motion.Omega_rad2_s2, ord=2, axis=(1, 2))
         bound_N = best.load.mass_kg * REACH_M * float(np.sqrt(np.mean(turned**2)))
         share = len(used) / max(len(rows), 1)

@@ -133,10 +133,7 @@ def motion_result(delay_s: float = 0.0, contacts: tuple[Any, ...] = ()) -> Motio
 
 def found(best: Any, motion: MotionResult, *, positions: bool = True, height_m: float | None = None) -> dict[str, Any]:
     rows = rows_of(100, TRUTH)
-    return {
-        one.code: one
-        for one in _findings(rows, rows[:80], best, motion, height_m, limit_rad_s=np.inf if positions else SLOW_RAD_S)
-    }
+    return {one.code: one for one in _findings(rows, rows[:80], best, motion, height_m, positions=positions)}
 
 
 def test_what_a_recording_lacks_is_a_finding() -> None:

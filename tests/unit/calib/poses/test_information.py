@@ -398,7 +398,7 @@ def test_prediction_with_errors_of_the_sensor_is_the_spread_of_what_they_hide() 
     E = rng.multivariate_normal(np.zeros(36), sensor.covariance[3:, 3:], 3000).reshape(-1, 6, 6)
     errors = np.einsum("nij,pj->npi", E, wrench) * weights
     found = (errors.reshape(len(E), -1) @ fit.T)[:, :15]
-    arm = hidden_columns(guess.parameters, ALL, ALL.mean(axis=0))
+    arm = hidden_columns(guess.parameters, ALL, ALL.mean(axis=0), guess.orientation_rad)
     errors = np.einsum("pik,nk->npi", arm, rng.normal(size=(len(E), arm.shape[-1]))) * weights
     found += errors.reshape(len(E), -1) @ np.linalg.pinv((tool * weights[:, None]).reshape(-1, 15)).T
     noisy, whole = predicted_sigma(ALL, replace(guess, sensor=None)).sigma, predicted_sigma(ALL, guess).sigma
