@@ -190,8 +190,6 @@ COMMON_SHARE: Final = 0.5
 CROSS_TALK_SHARE: Final = 0.5
 # One sigma, an axis, of the orientation of an arm that computes with its own factory kinematics.
 USUAL_ORIENTATION_DEG: Final = 0.06
-# The same of one that computes with the nominal kinematics of its model: 20 real arms are off by .13 to 1.04° in all.
-NOMINAL_ORIENTATION_DEG: Final = 0.3
 # Range of torque over range of force, of a sensor without data sheet.
 RANGE_LEVER_M: Final = 0.05
 

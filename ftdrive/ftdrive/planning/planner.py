@@ -15,7 +15,7 @@ from ftcalib.known import Setup
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
 from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive.cell.config import USUAL_KG, CellConfig
+from ftdrive.cell.config import USUAL_KG, CellConfig, orientation_accuracy_deg
 from ftdrive.cell.units import side_of
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, HungLoad
@@ -45,6 +45,8 @@ SPARE = 100
 # No move is faster, whatever a plan or an old configuration contains.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 
+# Of one axis in the mean of one pose, N and N·m.
+_NOISE = 0.05, 0.003
 # Numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
 # Kind of a tour, the reason for it, and the tour where there is one.
@@ -54,7 +56,7 @@ Attempt = tuple[str, Sequence[str], Found | None]
 def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
     """Return a prior: `guess_of_devices`, with the centre of mass at half the tool length, and the lean of the base."""
     length_m = max(part.to_m for part in certifier.arm.tool)
-    guess = Guess(USUAL_KG, 0.05, 0.003, sensor=SensorMatrix.usual()) if cell is None else guess_of_devices(cell)
+    guess = Guess(USUAL_KG, *_NOISE, sensor=SensorMatrix.usual()) if cell is None else guess_of_devices(cell)
     return replace(guess, p_sensor_com_m=(0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
 
@@ -64,10 +66,10 @@ def guess_of_devices(cell: CellConfig) -> Guess:
     setup = Setup(
         sensor_accuracy_percent=sensor.accuracy_percent,
         sensor_range=(sensor.range_N, sensor.range_Nm) if sensor.range_N and sensor.range_Nm else None,
-        orientation_accuracy_deg=cell.robot.orientation_accuracy_deg,
+        orientation_accuracy_deg=orientation_accuracy_deg(cell.robot.host, cell.robot.orientation_accuracy_deg),
     )
     errors = SensorMatrix.declared(setup)
-    return Guess(cell.tool.mass_kg or USUAL_KG, 0.05, 0.003, sensor=errors, orientation_rad=setup.orientation_rad)
+    return Guess(cell.tool.mass_kg or USUAL_KG, *_NOISE, sensor=errors, orientation_rad=setup.orientation_rad)
 
 
 def plan_tour(

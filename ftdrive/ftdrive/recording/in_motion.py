@@ -9,10 +9,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
-from ftcalib.known import NOMINAL_ORIENTATION_DEG
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
+from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG
 from ftdrive.errors import BadRecording
 from ftdrive.recording.compensation import NEEDED
 from ftdrive.recording.files import RecordingReader

@@ -12,10 +12,10 @@ from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
 from ftcalib.errors import BadCalibration, BadDataset, NotObservable
-from ftcalib.known import NOMINAL_ORIENTATION_DEG
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
+from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG, orientation_accuracy_deg
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.load import Load
@@ -395,7 +395,7 @@ def circumstances_of(run: Run) -> Circumstances:
     """Return what `solve` takes beside the data of a run, without reading them."""
     header = run.header()
     config = header["config"]
-    setup = _described(run, config, Load.of_header(header))
+    setup, robot = _described(run, config, Load.of_header(header)), config.get("robot", {})
     mounting, height_mm = setup["mounting"], setup["height_mm"]
     origin = {
         "devices": header.get("devices", {}),
@@ -417,18 +417,11 @@ def circumstances_of(run: Run) -> Circumstances:
             payload_kg=setup["payload_kg"],
             sensor_accuracy_percent=setup["accuracy_percent"],
             sensor_range=setup["range"],
-            orientation_accuracy_deg=_orientation_accuracy_deg(config.get("robot", {})),
+            orientation_accuracy_deg=orientation_accuracy_deg(robot.get("host"), robot.get("orientation_accuracy_deg")),
             sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
         ),
         origin,
     )
-
-
-def _orientation_accuracy_deg(robot: Mapping[str, Any]) -> float | None:
-    """Return that of an arm as declared, else that of the nominal kinematics if its joints are topics with a URDF."""
-    nominal = NOMINAL_ORIENTATION_DEG if "urdf=" in str(robot.get("host")) else None
-    declared: float | None = robot.get("orientation_accuracy_deg")
-    return nominal if declared is None else declared
 
 
 def _described(run: Run, config: Mapping[str, Any], load: Load | None) -> dict[str, Any]:
