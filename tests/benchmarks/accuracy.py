@@ -281,9 +281,7 @@ def _left_out(name: str, R: Array, y: Array, cov: Array | None, time_s: Array, f
         estimate = srom(*training)
     else:
         fit = likelihood.fit(*training, cov, t_s=time_s[kept])
-        estimate = fit.on_average
-        if fit.drift is not None and fit.drift.course is not None:
-            bias = np.stack([np.interp(time_s[fold], time_s[kept], column) for column in fit.drift.course.T], axis=1)
+        estimate, bias = fit.on_average, drifted(fit, time_s[kept], time_s[fold])
     return y[fold] - sim.readings(sim.as_truth(estimate), R[fold]) - bias
 
 
@@ -414,19 +412,19 @@ def real_data(lab: Lab) -> Iterator[Row]:
 
 def compensated_beside(dataset: CalibrationDataset, fold: NDArray[np.intp]) -> Array:
     """Compensate poses (m, 6) with a fit of all others, whose drift is followed at the times between."""
-    n = len(dataset)
-    kept, time_s = (
-        np.setdiff1d(np.arange(n), fold),
-        dataset.t_s if np.isfinite(dataset.t_s).all() else np.arange(1.0 * n),
-    )
-    R, cov = dataset.R_base_flange, None if dataset.wrench_cov is None else dataset.wrench_cov[kept]
-    found = likelihood.fit(R[kept], dataset.wrench[kept], cov, t_s=time_s[kept])
-    predicted = predict(found.on_average, R[fold])
-    if found.response is not None:
-        predicted += found.response.wrench(found.on_average, R[fold])
-    if found.drift is not None and found.drift.course is not None:
-        predicted += np.stack([np.interp(time_s[fold], time_s[kept], each) for each in found.drift.course.T], axis=1)
-    return np.asarray(dataset.wrench[fold] - predicted)
+    kept, R, y = np.setdiff1d(np.arange(len(dataset)), fold), dataset.R_base_flange, dataset.wrench
+    time_s = dataset.t_s if np.isfinite(dataset.t_s).all() else np.arange(float(len(dataset)))
+    cov = None if dataset.wrench_cov is None else dataset.wrench_cov[kept]
+    found = likelihood.fit(R[kept], y[kept], cov, t_s=time_s[kept])
+    response = 0.0 if found.response is None else found.response.wrench(found.on_average, R[fold])
+    return y[fold] - predict(found.on_average, R[fold]) - response - drifted(found, time_s[kept], time_s[fold])
+
+
+def drifted(found: likelihood.Fit, time_s: Array, at_s: Array) -> Array:
+    """Change of the bias (m, 6) from its mean at times between those of the fit."""
+    if found.drift is None or found.drift.course is None:
+        return np.zeros((len(at_s), 6))
+    return np.stack([np.interp(at_s, time_s, column) for column in found.drift.course.T], axis=1)
 
 
 SECTIONS: dict[str, Callable[[Lab], Iterator[Row]]] = {
