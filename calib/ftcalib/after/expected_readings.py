@@ -1,19 +1,12 @@
 """How far readings of an unchanged cell may be from their prediction, under each explanation of the fit's residuals.
 
-What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Five explanations are kept:
+What is estimated by a fit of few poses is uncertain, and so is what acts on its readings. Two explanations are kept:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
-* The measured noise, by a factor that only the residuals of the fit show, and inexact orientations, which a fit of few
-  poses does not separate from other noise, or not from none. Known is only the usual accuracy of arms.
-* The measured noise, by such a factor, and hysteresis: each channel is off by a share of the last change of its load.
-  A fit without it takes a part of it for weight, because the load changes most towards the poses that load a channel
-  most.
-* The measured noise, by such a factor, and a bias that walks, where a fit of 24 poses or fewer found a drift, which it
-  may have missed in the other three channels, or noise beyond the measured.
-* The measured noise, by such a factor, and what sensor, arm and cable usually do (`ftcalib.after.cell_errors`). The
-  residuals of the fit show its size, but not what other joint angles do in the same orientation.
+* The measured noise, by a factor that only the residuals of the fit show, and what sensor, arm and cable usually do
+  (`ftcalib.after.cell_errors`). The residuals show its size, but not what other joint angles do in one orientation.
 
-Under the last four, with the ratio of both variances given, the squared distance of new readings from their prediction
+Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
 over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
 1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
 predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
@@ -44,17 +37,9 @@ from ftcalib.likelihood.response import (
     response_columns,
     with_covariance,
 )
-from ftcalib.likelihood.session_noise import pose_times, summed_products
 from ftcalib.model import BIASES, Array, Parameters, jacobian, predict, read_only
 from ftcalib.result import CalibrationResult
 
-# Errors of an arm's orientations over which the average is taken. Before the fit, each is as likely as any other.
-USUAL_ERRORS_RAD = np.deg2rad(np.geomspace(0.005, 0.5, 20))
-# Shares of the last change of load over which the average is taken. Before the fit, each is as likely as any other.
-USUAL_SHARES = np.geomspace(1e-4, 5e-3, 9)
-# Steps of the bias from pose to pose, in sigma of the measured noise, over which the average is taken: of the forces,
-# and of the torques. Before the fit, each pair is as likely as any other.
-USUAL_WALKS = np.geomspace(0.3, 30, 5)
 # Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
 USUAL_GAINS = np.array([0.1, 1.0])
 USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
@@ -64,13 +49,8 @@ OTHER_JOINTS = 0.8
 BEYOND, LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
 # Of more poses every second, third, ... shows smooth errors.
 FEW_TO_SMOOTH = 100
-MANY_POSES = 1000
-# From more, the fit finds a walk in all channels that have one.
-FEW_POSES = 24
 # Least share of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
 LEAST_FACTOR = 0.1
-
-NO_WALK = (0.0, 0.0)
 
 _AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
 _CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
@@ -166,57 +146,13 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
     return Expected(_add_drift(calibration, gap), noise, 1 / spread if spread else np.inf)
 
 
-def expected_with_inexact_orientations(
-    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
-) -> list[Expected]:
-    """Explain the fit by scaled measured noise and inexact orientations, for each ratio of both; weights sum to 1.
-
-    Drift is not part of it. Gain, cross-talk and hysteresis have the variance that the fit found. Empty if the noise
-    was not measured, for parameters that were known or not estimated by maximum likelihood, and for so many poses that
-    the fit finds all that matters.
-
-    Parameters
-    ----------
-    calibration : CalibrationResult
-    fitted : CalibrationDataset
-        Poses of the fit, with measured noise.
-    R_base_flange : array, shape (n, 3, 3)
-        New poses, in the order of measuring.
-    wrench_cov : array, shape (n, 6, 6)
-        Covariance of the new readings.
-    """
-    share = calibration.components.get("hysteresis", 0.0)
-    usual = [(error_rad, share, NO_WALK) for error_rad in USUAL_ERRORS_RAD]
-    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
-
-
-def expected_with_hysteresis(
-    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
-) -> list[Expected]:
-    """Explain the fit by scaled measured noise and hysteresis; all else as `expected_with_inexact_orientations`."""
-    usual = [(0.0, share, NO_WALK) for share in USUAL_SHARES]
-    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
-
-
-def expected_with_walk(
-    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
-) -> list[Expected]:
-    """Explain the fit by scaled measured noise and a bias that walks on; all else as the other two.
-
-    Empty too if the fit found neither drift nor noise beyond the measured, or has more than 24 poses.
-    """
-    looks_so = any(name.startswith(("walk", "slope", "white")) for name in calibration.components)
-    if not looks_so or len(fitted) > FEW_POSES:
-        return []
-    share = calibration.components.get("hysteresis", 0.0)
-    usual = [(0.0, share, walk) for walk in product(USUAL_WALKS, repeat=2)]
-    return _weigh_explanations(calibration, fitted, R_base_flange, wrench_cov, usual)
-
-
 def expected_with_smooth_errors(
     calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
 ) -> list[Expected]:
-    """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable; all else as the others.
+    """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable of various sizes.
+
+    Empty if the noise was not measured, for parameters that were known or not estimated by maximum likelihood. The
+    weights sum to 1. Gain and cross-talk that the fit found have the variance that it gave them.
 
     What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
     Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
@@ -282,90 +218,6 @@ def _weighted(explanations: Sequence[Expected], likelihood: Sequence[float]) -> 
     """Give each explanation its share of the likelihood."""
     weights = np.exp(np.array(likelihood) - max(likelihood))
     return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
-
-
-def _weigh_explanations(
-    calibration: CalibrationResult,
-    fitted: CalibrationDataset,
-    R_base_flange: Array,
-    wrench_cov: Array,
-    usual: Sequence[tuple[float, float, tuple[float, float]]],
-) -> list[Expected]:
-    """Explain the fit with each error of the orientations (rad), share of the last change of load, and walk."""
-    p, response, kept = calibration.parameters, calibration.response, _kept(calibration, fitted)
-    if kept is None or fitted.wrench_cov is None or len(kept) > MANY_POSES:
-        return []
-    dof = calibration.dof
-    order = np.argsort(pose_times(fitted.t_s), kind="stable")
-    lag, order = hysteresis_columns(p, fitted.R_base_flange[order])[kept[order]], order[kept[order]]
-    R, D = fitted.R_base_flange[order], pooled_covariance(fitted.wrench_cov, fitted.n_samples)[order]
-    e = np.asarray(Compensator(p, response=response).batch(fitted.wrench[order], R), dtype=np.float64)
-    walk = _walk_columns(D) if usual[0][2] != NO_WALK else np.zeros((len(D), 6, 0))
-    J = np.concatenate([joint_jacobian(p, response, R), lag, walk], axis=2)
-    known = J.shape[2] - lag.shape[2] - walk.shape[2]
-    sizes, offset = np.full(15, np.inf), np.zeros(J.shape[2])
-    if response is not None:  # found coefficients: measured as zero, with the variance found
-        found = [calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")]
-        sizes, offset[15:known] = np.append(sizes, np.repeat(found, [5, 6])), response.coefficients
-    turn, turn_new = _turns(p, R), _turns(p, R_base_flange)
-    later = np.arange(1.0, len(R_base_flange) + 1)
-    walk_new = np.kron(np.minimum.outer(later, later), np.diag(np.einsum("ncc->c", D) / len(D)))
-    lag_new = hysteresis_columns(p, R_base_flange).reshape(6 * len(R_base_flange), -1)
-
-    explanations, likelihood = [], []
-    for error_rad, share, steps in usual:
-        each = np.repeat(steps, 3)
-        sigma = np.concatenate([sizes, np.full(lag.shape[2], share), np.tile(each, walk.shape[2] // 6)])
-        x, C, chi2, logdet = _posterior(J, D + error_rad**2 * turn, sigma, e, offset)
-        # Restricted likelihood with the factor of the noise at its best, chi2 / dof.
-        likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
-        factor = max(chi2 / dof, LEAST_FACTOR)
-        C += np.outer(x, x) / factor  # the calibration as stored is off by what this explanation moves its estimates
-        joint = with_covariance(response, C[:known, :known])
-        noise = np.asarray(block_diag(*(wrench_cov + error_rad**2 * turn_new)))
-        shares = C[known : known + 6, known : known + 6]  # the swing to the first new pose is unknown too
-        noise += lag_new @ block_diag(shares, np.diag(np.diag(shares))) @ lag_new.T
-        noise += walk_new * np.tile(each, len(later)) ** 2
-        explanations.append(Expected(Update(p, C[:15, :15], 0.0, 0, response=joint), noise, dof, factor))
-    return _weighted(explanations, likelihood)
-
-
-def _posterior(J: Array, V: Array, sigma: Array, e: Array, offset: Array) -> tuple[Array, Array, float, float]:
-    """Estimate what acts on residuals e (n, 6) through columns J (n, 6, k), under noise V (n, 6, 6).
-
-    Before, each has the mean `-offset` (k,) and the standard deviation `sigma` (k,): infinite if unknown, 0 if absent.
-
-    Returns
-    -------
-    x : array, shape (k,)
-    covariance : array, shape (k, k)
-    chi2 : float
-    logdet : float
-        Logarithm of the determinants that belong to the restricted likelihood.
-    """
-    seen = np.flatnonzero(sigma)
-    before, W = sigma[seen] ** -2, np.linalg.inv(V)
-    WJ = W @ J[..., seen]
-    H = summed_products(J[..., seen], WJ) + np.diag(before)
-    g = np.einsum("nij,ni->j", WJ, e) - before * offset[seen]
-    scale = np.outer(column_scale(H), column_scale(H))
-    x, C = np.zeros(len(sigma)), np.zeros((len(sigma), len(sigma)))
-    C[np.ix_(seen, seen)] = np.linalg.inv(H / scale) / scale
-    x[seen] = C[np.ix_(seen, seen)] @ g
-    chi2 = float(np.einsum("ni,nij,nj->", e, W, e) + before @ offset[seen] ** 2 - g @ x[seen])
-    logdet = np.linalg.slogdet(V)[1].sum() + np.linalg.slogdet(H)[1] - np.log(before[before > 0]).sum()
-    return x, C, chi2, float(logdet)
-
-
-def _walk_columns(D: Array) -> Array:
-    """Give the derivative (n, 6, 6n - 6) of readings by the steps of the bias between them, in sigma of their noise.
-
-    The bias is that of the last pose, which the next readings have, so earlier ones lack the steps after them.
-    """
-    n = len(D)
-    before = np.triu(np.ones((n, n)), 1)[:, 1:]
-    sigma = np.sqrt(np.einsum("ncc->c", D) / n)
-    return np.asarray(-before[:, None, :, None] * np.diag(sigma)[:, None]).reshape(n, 6, 6 * (n - 1))
 
 
 def _turns(p: Parameters, R_base_flange: Array) -> Array:

@@ -19,10 +19,7 @@ from ftcalib.after.expected_readings import (
     Expected,
     bias_change,
     expected_as_found,
-    expected_with_hysteresis,
-    expected_with_inexact_orientations,
     expected_with_smooth_errors,
-    expected_with_walk,
 )
 from ftcalib.after.state import BLOCKS, Update, reestimate
 from ftcalib.data.dataset import CalibrationDataset, finite
@@ -109,9 +106,9 @@ def verify(
 ) -> Verification:
     """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
 
-    An alarm is a p-value below `false_alarms` under each explanation of what acted on the fit: the components that it
-    found, inexact orientations, hysteresis, a walk, smooth errors of sensor, arm and cable. The change is named under
-    the one that makes the new readings likeliest.
+    An alarm is a p-value below `false_alarms` under both explanations of what acted on the fit: the components that it
+    found, and smooth errors of sensor, arm and cable. The change is named under the one that makes the new readings
+    likeliest.
 
     Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
     the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
@@ -148,18 +145,14 @@ def verify(
     if fitted is not None and len(fitted) != calibration.n_poses:
         raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
     explanations = [[expected_as_found(calibration, R_base_flange, wrench_cov)]]
-    if fitted is not None:
-        for expected in (expected_with_inexact_orientations, expected_with_hysteresis, expected_with_walk):
-            if others := expected(calibration, fitted, R_base_flange, wrench_cov):
-                explanations.append(others)
 
     def probability(kind: list[Expected]) -> float:
         return sum(one.weight * one.p_value(one.distance(R_base_flange, wrench)[2], 6 * n) for one in kind)
 
     p_values = [probability(kind) for kind in explanations]
-    # It is asked last, because its sigma is the largest.
+    # The second explanation has the larger sigma, so it is asked only where the first fails.
     smooth: list[Expected] = []
-    if fitted is not None and max(p_values) < false_alarms:
+    if fitted is not None and p_values[0] < false_alarms:
         smooth = expected_with_smooth_errors(calibration, fitted, R_base_flange, wrench_cov)
     if smooth:
         explanations.append(smooth)

@@ -1,7 +1,6 @@
 """What unchanged readings scatter by, under each explanation of a fit, against dense formulas."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -9,22 +8,13 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from ftcalib import CalibrationDataset, CalibrationResult, Setup, solve
+from ftcalib import CalibrationResult
 from ftcalib.after.expected_readings import (
-    USUAL_ERRORS_RAD,
-    USUAL_SHARES,
-    USUAL_WALKS,
     Expected,
-    _posterior,
-    _walk_columns,
     expected_as_found,
-    expected_with_hysteresis,
-    expected_with_inexact_orientations,
-    expected_with_walk,
 )
 from ftcalib.after.state import Update
-from ftcalib.model import BIASES, Array, DriftResult, gravity_wrench, jacobian, predict
-from ftcalib.poses.information import SUBSET_6, special
+from ftcalib.model import BIASES, Array, DriftResult, gravity_wrench, predict
 from tests.first_order import propagated
 from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
 
@@ -124,104 +114,3 @@ def test_p_value_and_deviance_follow_from_the_freedom_of_the_noise() -> None:
     np.testing.assert_allclose(residual, left)
     np.testing.assert_allclose(sigma, np.sqrt(2) * np.tile(SIGMA, (4, 1)))
     assert distance == pytest.approx(9 * 24)
-
-
-def test_a_posterior_is_that_of_dense_formulas() -> None:
-    rng = np.random.default_rng(3)
-    J, e = rng.normal(size=(5, 6, 12)), rng.normal(size=(5, 6))
-    roots = rng.normal(size=(5, 6, 6))
-    V = roots @ np.swapaxes(roots, 1, 2)
-    sigma, offset = np.r_[np.full(4, np.inf), 0.5, 2.0, 0.0, np.full(5, 0.1)], np.r_[np.zeros(4), rng.normal(size=8)]
-    x, C, misfit, logdet = _posterior(J, V, sigma, e, offset)
-    flat, known = J[..., :4].reshape(30, 4), J[..., 4:].reshape(30, 8)
-    S = block_diag(*V) + known @ np.diag(sigma[4:] ** 2) @ known.T
-    y = e.ravel() + known @ np.where(sigma[4:] > 0, offset[4:], 0.0)
-    W = np.linalg.inv(S)
-    cov = np.linalg.inv(flat.T @ W @ flat)
-    free = cov @ flat.T @ W @ y
-    left = y - flat @ free
-    np.testing.assert_allclose(x[:4], free)
-    np.testing.assert_allclose(C[:4, :4], cov)
-    shrunk = np.diag(sigma[4:] ** 2) @ known.T @ W @ left - np.where(sigma[4:] > 0, offset[4:], 0.0)
-    np.testing.assert_allclose(x[4:], shrunk, atol=1e-12)
-    assert misfit == pytest.approx(left @ W @ left)
-    assert logdet == pytest.approx(np.linalg.slogdet(S)[1] - np.linalg.slogdet(cov)[1])
-
-
-def test_the_bias_of_a_walk_is_that_of_the_last_pose() -> None:
-    rng = np.random.default_rng(4)
-    D = np.array([np.diag(row) for row in rng.uniform(0.5, 2, (4, 6))])
-    steps = rng.normal(size=(3, 6))
-    walk = np.concatenate(
-        [np.zeros((1, 6)), np.cumsum(steps * np.sqrt(D.diagonal(axis1=1, axis2=2).mean(axis=0)), axis=0)]
-    )
-    np.testing.assert_allclose(_walk_columns(D) @ steps.ravel(), walk - walk[-1], atol=1e-12)
-
-
-@pytest.fixture(scope="module")
-def fitted() -> tuple[CalibrationResult, CalibrationDataset]:
-    R = special(SUBSET_6)
-    rng = np.random.default_rng(5)
-    inexact = Rotation.from_rotvec(5e-4 * rng.normal(size=(6, 3))).as_matrix()
-    wrench = predict(TRUTH, R @ inexact) + SIGMA * rng.normal(size=(6, 6))
-    dataset = CalibrationDataset(
-        R, wrench, np.tile(np.diag(SIGMA**2), (6, 1, 1)), np.zeros(6, np.int64), np.full(6, np.nan)
-    )
-    return replace(
-        solve(dataset, setup=Setup(sensor_accuracy_percent=0.0)), components={"white_force_N": 1e-3}
-    ), dataset
-
-
-@pytest.mark.parametrize("kind", ["orientations", "hysteresis", "walk"])
-def test_explanations_have_the_likelihood_of_the_residuals(
-    fitted: tuple[CalibrationResult, CalibrationDataset], kind: str
-) -> None:
-    calibration, dataset = fitted
-    p, R = calibration.parameters, dataset.R_base_flange
-    e, J = (dataset.wrench - predict(p, R)).ravel(), jacobian(p, R).reshape(36, 15)
-    J_new = jacobian(p, NEW).reshape(24, 15)
-    swing = np.diff(gravity_wrench(p, R), axis=0)
-    lag = np.zeros((6, 6, 6))
-    lag[1:, range(6), range(6)] = swing
-    first = np.diag(np.concatenate([np.mean(swing**2, axis=0), np.zeros(30)]))
-    earlier = np.arange(5.0, -1.0, -1.0)
-    explain: Any = {
-        "orientations": expected_with_inexact_orientations,
-        "hysteresis": expected_with_hysteresis,
-        "walk": expected_with_walk,
-    }[kind]
-    found = explain(calibration, dataset, NEW, COV)
-    usual = {
-        "orientations": list(USUAL_ERRORS_RAD),
-        "hysteresis": list(USUAL_SHARES),
-        "walk": [(a, b) for a in USUAL_WALKS for b in USUAL_WALKS],
-    }[kind]
-    assert len(found) == len(usual)
-    logs = []
-    for one, size in zip(found, usual, strict=True):
-        S = np.kron(np.eye(6), np.diag(SIGMA**2))
-        if kind == "orientations":
-            turns = jacobian(p, R)[..., :3]
-            S += size**2 * block_diag(*(turns @ np.swapaxes(turns, 1, 2)))
-        elif kind == "hysteresis":
-            S += size**2 * (lag.reshape(36, 6) @ lag.reshape(36, 6).T + first)
-        else:
-            steps = np.repeat(size, 3) * SIGMA
-            S += np.kron(np.minimum.outer(earlier, earlier), np.diag(steps**2))
-            ahead = np.arange(1.0, 5.0)
-            noise = np.kron(np.minimum.outer(ahead, ahead), np.diag(steps**2)) + block_diag(*COV)
-            np.testing.assert_allclose(one.noise, noise, atol=1e-15)
-        W = np.linalg.inv(S)
-        C = np.linalg.inv(J.T @ W @ J)
-        x = C @ J.T @ W @ e
-        misfit = float((e - J @ x) @ W @ (e - J @ x))
-        logs.append(-0.5 * (np.linalg.slogdet(S)[1] - np.linalg.slogdet(C)[1] + 21 * np.log(misfit)))
-        assert one.freedom == 21
-        assert one.factor == pytest.approx(max(misfit / 21, 0.1), rel=1e-5)
-        covariance = C + np.outer(x, x) / one.factor
-        if kind != "hysteresis":  # there the shares are known from the fit, together with the parameters
-            np.testing.assert_allclose(
-                one.common(NEW), J_new @ covariance @ J_new.T, rtol=1e-4, atol=1e-4 * one.common(NEW).max()
-            )
-    weights = np.exp(np.array(logs) - max(logs))
-    np.testing.assert_allclose([one.weight for one in found], weights / weights.sum(), rtol=1e-4, atol=1e-9)
