@@ -1,1 +1,1 @@
-"""Many cells: their state, findings across them, solving again, metrics and messages."""
+"""Many cells: their state, findings across them, solving again, metrics."""

@@ -1,10 +1,9 @@
-"""The server of a fleet: reads its state again and again, and passes it to metrics and messages."""
+"""The server of a fleet: reads its state again and again, and passes it to the metrics."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from threading import Event
-from typing import Final, Protocol
+from typing import Final
 
 from ftdrive.errors import BadStore
 from ftdrive.fleet.state import Fleet
@@ -27,22 +26,14 @@ class FleetReading:
     store_up: bool = True
 
 
-class Sink(Protocol):
-    """Where readings go."""
-
-    def update(self, reading: FleetReading) -> None:
-        """Take the newest reading; returns at once. Raises `ConfigError` if the sink can never work."""
-
-
 def _utc_now() -> datetime:
     return datetime.now(UTC)
 
 
 def serve(
     fleet_at: Callable[[datetime], Fleet],
-    sinks: Sequence[Sink],
+    update: Callable[[FleetReading], None],
     clock: Clock,
-    wake: Event,
     *,
     say: Callable[[str], None],
     every_s: float = EVERY_S,
@@ -56,11 +47,10 @@ def serve(
     ----------
     fleet_at : callable
         Reads the state at a time, UTC.
-    sinks : sequence of Sink
+    update : callable
+        Takes the newest reading, and returns at once.
     clock : Clock
         Times the period.
-    wake : Event
-        A sink sets it to be updated at once.
     say : callable
         Takes a sentence for the operator.
     every_s : float
@@ -70,17 +60,13 @@ def serve(
     ------
     BadStore
         The store cannot be read at the start.
-    ConfigError
-        A sink can never work.
     """
     # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
     time = now()
     reading = FleetReading(fleet_at(time), time, time)
     while True:
-        for sink in sinks:
-            sink.update(reading)
-        clock.wait(wake, every_s)
-        wake.clear()
+        update(reading)
+        clock.sleep(every_s)
         was_up, time = reading.store_up, now()
         try:
             reading = FleetReading(fleet_at(time), time, time)

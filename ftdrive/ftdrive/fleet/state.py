@@ -1,4 +1,4 @@
-"""The state of a fleet, and its words: what the status, its page, the metrics and the messages show."""
+"""The state of a fleet, and its words: what the status, its page and the metrics show."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

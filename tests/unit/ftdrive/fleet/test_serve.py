@@ -1,8 +1,6 @@
 """The loop of the server, on a fake clock: when it reads, and what it does while the store cannot be read."""
 
-from collections.abc import Callable
 from datetime import datetime, timedelta
-from threading import Event
 
 import pytest
 
@@ -16,12 +14,12 @@ from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
 class Served:
     """A server whose store answers with these, and which Ctrl-C ends after the last."""
 
-    def __init__(self, *answers: Fleet | Exception, on_update: Callable[["Served"], None] = lambda _: None) -> None:
-        self.clock, self.wake = FakeClock(), Event()
+    def __init__(self, *answers: Fleet | Exception) -> None:
+        self.clock = FakeClock()
         self.readings: list[tuple[float, FleetReading]] = []
         self.said: list[str] = []
         self._answers = [*answers, KeyboardInterrupt()]
-        self._on_update, self._start_s = on_update, self.clock.now_s()
+        self._start_s = self.clock.now_s()
 
     @property
     def t_s(self) -> float:
@@ -29,13 +27,12 @@ class Served:
 
     def update(self, reading: FleetReading) -> None:
         self.readings.append((self.t_s, reading))
-        self._on_update(self)
 
     def run(self) -> None:
         def now() -> datetime:
             return NOW + timedelta(seconds=self.t_s)
 
-        serve(self._fleet_at, [self], self.clock, self.wake, say=self.said.append, now=now)
+        serve(self._fleet_at, self.update, self.clock, say=self.said.append, now=now)
 
     def _fleet_at(self, _now: datetime) -> Fleet:
         answer = self._answers.pop(0)
@@ -74,10 +71,3 @@ def test_a_store_that_cannot_be_read_at_the_start_ends_the_server() -> None:
     with pytest.raises(BadStore, match="password authentication"):
         served.run()
     assert not served.readings
-
-
-def test_a_sink_can_ask_to_be_updated_at_once() -> None:
-    served = Served(fleet(), fleet(), fleet(), on_update=lambda one: one.wake.set() if len(one.readings) == 1 else None)
-    with pytest.raises(KeyboardInterrupt):
-        served.run()
-    assert [t_s for t_s, _ in served.readings] == [0, 0, EVERY_S]
