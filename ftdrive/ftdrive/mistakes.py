@@ -34,7 +34,7 @@ KINDS: Final[Mapping[str, Kind]] = {
     "recording": Kind(
         "a recording",
         ("live --replay {}", "compensate {}", "convert {} -o NEW.csv"),
-        ("solve {}", "fleet compensate {}", "loads check --replay {}"),
+        ("solve {}", "loads check --replay {}"),
     ),
     "run": Kind(
         "a run folder",
@@ -49,12 +49,12 @@ KINDS: Final[Mapping[str, Kind]] = {
     "runs": Kind(
         "a folder of runs",
         ("history {}", "fleet solve {}"),
-        ("calibrate --runs {}", "fleet index {}", "history --index {}", "fleet compensate {}"),
+        ("calibrate --runs {}", "fleet index {}", "history --index {}"),
     ),
     "folder": Kind(
         "a folder without a run",
         ("calibrate --runs {}", "history"),
-        ("fleet index {}", "history {}", "fleet compensate {}"),
+        ("fleet index {}", "history {}"),
     ),
     "calibration": Kind(
         "a calibration",
@@ -71,7 +71,7 @@ KINDS: Final[Mapping[str, Kind]] = {
     "table": Kind(
         "a table or bag of another program",
         ("solve {}", "compensate {} --calibration PATH", "live --replay {} --calibration PATH"),
-        ("report {}", "solve --wrench {}", "solve --orientation-file {}", "solve --test {}", "fleet compensate {}"),
+        ("report {}", "solve --wrench {}", "solve --orientation-file {}", "solve --test {}"),
     ),
 }
 _TEXTS, _BINARIES = {".csv", ".tsv", ".txt", ".dat", ".log"}, {".parquet", ".db3", ".bag", ".mcap"}

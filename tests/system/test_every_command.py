@@ -195,7 +195,6 @@ ANSWERED: Mapping[str, tuple[str, str]] = {
     "export formats": ("", "ros2-control"),
     "export plan": ("--simulate --format csv", "# ftdrive.targets/1"),
     "fleet add": ("cells.toml", "1 added"),
-    "fleet compensate": ("{csv} -o {n}", "compensated"),
     "fleet index": ("{run}", "added to"),
     "fleet remove": ("press", "removed"),
     "fleet solve": ("{run}", "run"),

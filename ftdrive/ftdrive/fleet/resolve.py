@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from importlib.metadata import version
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -22,7 +21,15 @@ from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftdrive import __version__
-from ftdrive.fleet.workers import OtherVersion, Workers, answers, describe_error, folder_of_worker, require_version
+from ftdrive.fleet.workers import (
+    Call,
+    OtherVersion,
+    Workers,
+    answers,
+    describe_error,
+    folder_of_worker,
+    require_version,
+)
 from ftdrive.runs.run import Run, in_motion
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
@@ -170,11 +177,15 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
             yield folder, _compared(folder)
         else:
             rest.append(folder)
-    moved = dict.fromkeys(folder for folder in rest if in_motion(folder))
-    here = answers(_solved_motion, lambda folder: (folder, __version__), moved, workers)
-    there = answers(_solved_files, lambda folder: (*_files_of(folder), __version__), moved, replace(workers, group=1))
-    at_rest = answers(solve_task, task_of, (folder for folder in rest if folder not in moved), workers)
-    for folder, answer in chain(at_rest, here if workers.share_files else there):
+
+    def call_of(folder: Path) -> Call:
+        if not in_motion(folder):
+            return solve_task, *task_of(folder)
+        if workers.share_files:
+            return _solved_motion, folder, __version__
+        return _solved_files, *_files_of(folder), __version__
+
+    for folder, answer in answers(call_of, rest, workers):
         if isinstance(answer, OtherVersion):
             raise answer
         yield folder, describe_error(answer) if isinstance(answer, BaseException) else _compared(folder, answer)

@@ -1,15 +1,19 @@
 """Processes of this computer, or the workers of a Dask cluster: both take calls and give futures."""
 
 import logging
+import os
 import re
 import signal
-from collections.abc import Callable, Generator, Hashable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
-from typing import Any, Final, TypeVar
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from typing import Any, Final
 
 from ftcalib.errors import FtdriveError
 from ftdrive import __version__
@@ -32,14 +36,12 @@ _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
 # A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user.
 _LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
-_DIED: Final = "each worker that was given it died: `ftdrive solve` or `ftdrive compensate` may show the cause"
+_DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
 
-# Calls that a Dask worker gets at once: a message costs 15 ms of computing time, a solve 65 ms.
-GROUP: Final = 8
-
-Item = TypeVar("Item", bound=Hashable)
 # What a call returned or raised.
 Answer = bytes | BaseException
+# A function and its arguments.
+Call = tuple[Callable[..., bytes], *tuple[Any, ...]]
 
 
 class WorkerDied(FtdriveError):
@@ -80,12 +82,10 @@ class Workers:
     """Where calls run at once."""
 
     count: int
-    submit: Callable[..., "Future[list[Answer]]"]
+    submit: Callable[..., "Future[bytes]"]
     """Takes a function and its arguments."""
     death: type[Exception]
     """Exception of a future whose worker ended without an answer."""
-    group: int = 1
-    """Calls that a worker gets at once."""
     share_files: bool = False
     """Whether a path means the same file to each worker."""
     require_one: Callable[[], None] = lambda: None
@@ -95,24 +95,41 @@ class Workers:
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[Workers]:
     """Start processes, by default one for each core that this program may use; they end with the context, at once."""
+    if count is None:
+        count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    context = get_context("spawn")  # a fork would copy threads, and numpy with its threads
+    lifeline, ours = context.Pipe(duplex=False)
+    new_pool = partial(ProcessPoolExecutor, count, context, _begin_worker, (lifeline,))
+    pool = new_pool()
+
+    def submit(*call: Any) -> "Future[bytes]":
+        nonlocal pool
+        try:
+            return pool.submit(*call)
+        except BrokenExecutor:  # a worker was killed
+            pool = new_pool()
+            return pool.submit(*call)
+
     try:
-        from joblib.externals.loky import cpu_count, get_reusable_executor
-    except ModuleNotFoundError as error:
-        raise ConfigError(missing_extra("`fleet`", error.name or "", "fleet")) from None
-    count = count or cpu_count()
-    executor = partial(  # gives a working one also after a worker was killed
-        get_reusable_executor,
-        max_workers=count,
-        timeout=None,
-        # Ctrl-C reaches every process of a terminal, but only the parent must act on it.
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),
-        env=_ONE_THREAD,
-    )
-    try:
-        yield Workers(count, lambda *call: executor().submit(*call), BrokenExecutor, share_files=True)
+        yield Workers(count, submit, BrokenExecutor, share_files=True)
     finally:
-        executor().shutdown(kill_workers=True)
+        ours.close()
+        pool.shutdown(cancel_futures=True)
+        lifeline.close()
+
+
+def _begin_worker(lifeline: Connection) -> None:
+    """Prepare a process: one thread of BLAS, Ctrl-C is left to the parent, and the end of the parent ends it too."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.environ |= _ONE_THREAD  # numpy is not imported yet
+
+    def end() -> None:
+        try:
+            lifeline.poll(None)  # until the parent closes its end, or was killed
+        finally:
+            os._exit(1)
+
+    Thread(target=end, daemon=True).start()
 
 
 @contextmanager
@@ -133,7 +150,6 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     StreamBroken
         The scheduler was lost while calls were running.
     """
-    # Through Dask's own executor: the backend of joblib 1.6 waits forever when a call kills its workers.
     found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
     if found is None:
         raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
@@ -171,7 +187,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
         _require_same_versions(client.get_versions(packages=list(SAME)), address)
         try:
             submit = client.get_executor(pure=False).submit
-            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, GROUP, require_one=require_one)
+            yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, require_one=require_one)
         except CancelledError as error:
             raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
 
@@ -188,66 +204,41 @@ def _require_same_versions(found: Any, address: str) -> None:
                 )
 
 
-def answers(
-    function: Callable[..., bytes], arguments: Callable[[Item], Iterable[Any]], items: Iterable[Item], workers: Workers
-) -> Iterator[tuple[Item, Answer]]:
-    """Call a function for each item, and yield item and answer as they come.
+def answers(call_of: Callable[[Path], Call], items: Iterable[Path], workers: Workers) -> Iterator[tuple[Path, Answer]]:
+    """Make a call for each item, and yield item and answer as they come.
 
-    A call whose worker died is repeated: first among the others, because most workers are killed from outside, then
-    alone, so that the third death has one cause.
+    A call whose worker died is repeated alone, because the death of a process also breaks the calls that run beside it.
+    The cause of a second death is then the call itself.
 
     Parameters
     ----------
-    arguments : callable
-        Makes the arguments of an item when it is its turn, so that few are in memory.
+    call_of : callable
+        Returns the call of an item when it is its turn, so that few are in memory.
     """
-    left: Iterable[Item] = items
-    for at_once, group in ((2 * workers.count, workers.group), (2 * workers.count, 1), (1, 1)):
-        left = yield from _round(function, arguments, left, workers, at_once, group)
-    for item in left:
+    died = yield from _round(call_of, items, workers, 2 * workers.count)
+    died = yield from _round(call_of, died, workers, 1)
+    for item in died:
         yield item, WorkerDied(_DIED)
 
 
 def _round(
-    function: Callable[..., bytes],
-    arguments: Callable[[Item], Iterable[Any]],
-    items: Iterable[Item],
-    workers: Workers,
-    at_once: int,
-    group: int,
-) -> Generator[tuple[Item, Answer], None, list[Item]]:
-    """Call each item once, some groups at a time; return those whose worker died."""
-    waiting, running, died = iter(items), dict["Future[list[Answer]]", list[Item]](), list[Item]()
+    call_of: Callable[[Path], Call], items: Iterable[Path], workers: Workers, at_once: int
+) -> Generator[tuple[Path, Answer], None, list[Path]]:
+    """Make each call once, some at a time; return the items whose worker died."""
+    waiting, running, died = iter(items), dict["Future[bytes]", Path](), list[Path]()
     while True:
-        while len(running) < at_once and (new := list(islice(waiting, group))):
-            calls = dict[Item, Iterable[Any]]()
-            for item in new:
-                try:
-                    calls[item] = arguments(item)
-                except (FtdriveError, OSError) as error:
-                    yield item, error
+        while len(running) < at_once and (item := next(waiting, None)) is not None:
             try:
-                running[workers.submit(_each, function, list(calls.values()))] = list(calls)
-            except workers.death:
-                died += calls
+                running[workers.submit(*call_of(item))] = item
+            except (FtdriveError, OSError) as error:
+                yield item, error
         if not running:
             return died
         while not (done := wait(running, CHECK_S, FIRST_COMPLETED).done):
             workers.require_one()
         for future in done:
-            called, raised = running.pop(future), future.exception()
+            item, raised = running.pop(future), future.exception()
             if isinstance(raised, workers.death):
-                died += called
+                died.append(item)
             else:
-                yield from zip(called, future.result() if raised is None else [raised] * len(called), strict=True)
-
-
-def _each(function: Callable[..., bytes], calls: Sequence[Iterable[Any]]) -> list[Answer]:
-    return [_answer(function, call) for call in calls]
-
-
-def _answer(function: Callable[..., bytes], call: Iterable[Any]) -> Answer:
-    try:
-        return function(*call)
-    except Exception as error:
-        return error
+                yield item, raised or future.result()

@@ -77,7 +77,6 @@ def compensate_recording(
     output: Path | None = None,
     *,
     estimate_bias: bool = False,
-    overlap: bool = True,
     show: Callable[[str], object] = lambda _: None,
 ) -> Compensated:
     """Compensate a recording of any length with the calibration of its header, bias and gravity subtracted.
@@ -93,8 +92,6 @@ def compensate_recording(
         A new recording for the result, and for those events of the old one that still hold.
     estimate_bias : bool
         Whether `estimated_bias` replaces the bias of the calibration.
-    overlap : bool
-        Whether threads read and process the next blocks while one is written. A process of many does one after another.
     show : callable
         Gets what is done and how much of it, in words.
 
@@ -121,7 +118,7 @@ def compensate_recording(
     """
     header, change = source.header, None
     if estimate_bias:
-        header, change = estimated_bias(source, overlap=overlap, show=show)
+        header, change = estimated_bias(source, show=show)
     info = header.info
     processor = Processor(info, frame)
     processor.learn_noise(_beginning(source, round(_NOISE_S * info.sensor_rate_Hz)))
@@ -133,9 +130,9 @@ def compensate_recording(
             recorder = Recorder([output], info, header.configuration)
             stack.callback(recorder.discard)
         try:
-            blocks = _processed(read_ahead(source.blocks()) if overlap else source.blocks(), processor)
+            blocks = _processed(read_ahead(source.blocks()), processor)
             # so that no thread processes further
-            with closing(read_ahead(blocks) if overlap else blocks) as coming:
+            with closing(read_ahead(blocks)) as coming:
                 for block, old, new, share in coming:
                     found.add(block, old, new, recorder)
                     show(f"Compensating: {share:.0%}")
@@ -239,7 +236,7 @@ def _contact(event: StreamEvent, start_ns: int) -> dict[str, Any]:
 
 
 def estimated_bias(
-    source: Source, *, overlap: bool = True, show: Callable[[str], object] = lambda _: None
+    source: Source, *, show: Callable[[str], object] = lambda _: None
 ) -> tuple[Header, dict[str, list[float]]]:
     """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
 
@@ -266,7 +263,7 @@ def estimated_bias(
     waiting: list[Paired] = []
     # the pass that follows ends there too
     with suppress(BadRecording):
-        for samples, _, share in read_ahead(source.blocks()) if overlap else source.blocks():
+        for samples, _, share in read_ahead(source.blocks()):
             show(f"Estimating the bias: {share:.0%}")
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size

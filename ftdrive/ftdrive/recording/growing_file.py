@@ -47,11 +47,12 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Fsync the file and give it its name. Raises `OSError`."""
+        """Fsync the file and give it its name. Raises `OSError`, also if the name is taken."""
         # while it is locked, because it may take seconds
         os.fsync(self._file.fileno())
         self._file.close()
-        publish(self.partial, self.path)
+        require_new(self.path)
+        self.partial.rename(self.path)
 
     def discard(self) -> None:
         """Delete the file."""
@@ -67,14 +68,6 @@ class GrowingFile:
 
     def __exit__(self, *_: object) -> None:
         self.keep()
-
-
-def publish(written: Path, path: Path) -> None:
-    """Fsync a file and give it its name. Raises `OSError`, also if the name is taken."""
-    with written.open("r+b") as file:
-        os.fsync(file.fileno())
-    require_new(path)
-    written.rename(path)
 
 
 def _lock(file: IO[bytes]) -> bool:

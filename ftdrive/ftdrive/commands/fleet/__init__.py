@@ -3,7 +3,7 @@
 import click
 
 from ftdrive.commands.fleet.cells import add, index, remove
-from ftdrive.commands.fleet.solve import compensate, solve
+from ftdrive.commands.fleet.solve import solve
 from ftdrive.commands.fleet.status import serve, status
 from ftdrive.commands.fleet.verify import verify
 from ftdrive.terminal.text import Group
@@ -19,6 +19,5 @@ fleet.add_command(remove)
 fleet.add_command(index)
 fleet.add_command(status)
 fleet.add_command(solve)
-fleet.add_command(compensate)
 fleet.add_command(verify)
 fleet.add_command(serve)

@@ -1,62 +1,23 @@
-"""`ftdrive fleet solve` and `compensate`: many runs and recordings at once."""
+"""`ftdrive fleet solve`: many runs at once."""
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime, timedelta
 from math import isfinite
-from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ftcalib.rounding import counted
 from ftdrive import __version__
-from ftdrive.commands.common import FOLDER, FORCE, FRAME, JSON, STORE, open_store, read_frame, write_json
-from ftdrive.commands.compensate import BIAS, CALIBRATION
+from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
     from ftdrive.fleet.resolve import Comparison
-    from ftdrive.fleet.workers import Workers
-    from ftdrive.live.samples import Axes
-
-
-T = TypeVar("T")
-
-
-def _ENGINE(command: Callable[..., Any]) -> Callable[..., Any]:
-    for option in (
-        click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead."),
-        click.option(
-            "--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes.  [default: one per core]"
-        ),
-    ):
-        command = option(command)
-    return command
-
-
-def _open_workers(workers: int | None, cluster: str | None) -> AbstractContextManager["Workers"]:
-    """Start processes, or connect to a cluster; raises `ConfigError` if both are given."""
-    from ftdrive.errors import ConfigError
-    from ftdrive.fleet.workers import cluster_workers, local_workers
-
-    if workers and cluster:
-        raise ConfigError("--workers and --cluster exclude one another: leave one out")
-    return local_workers(workers) if cluster is None else cluster_workers(cluster)
-
-
-def _with_progress(title: str, found: Iterator[T], total: int) -> Iterator[T]:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from ftdrive.terminal.console import messages
-
-    columns = (TextColumn(title), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal) as progress:
-        yield from progress.track(found, total=total)
 
 
 def _runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | None = None) -> list[Path]:
@@ -99,136 +60,16 @@ def _how_to_finish(folder: Path) -> str:
     return "`ftdrive calibrate --resume RUN` finishes one"
 
 
-@click.command()
-@click.argument("paths", metavar="RECORDINGS...", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
-@click.option(
-    "-o",
-    "--output",
-    "folder",
-    metavar="FOLDER",
-    required=True,
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for the results; it is created if it is missing.",
-)
-@CALIBRATION
-@FORCE
-@BIAS
-@FRAME
-@_ENGINE
-@JSON
-def compensate(
-    paths: Sequence[Path],
-    folder: Path,
-    calibration: Path | None,
-    force: bool,
-    bias: str,
-    axes: "Axes",
-    about: str,
-    workers: int | None,
-    cluster: str | None,
-    as_json: bool,
-) -> None:
-    """Compensate many recordings with a calibration; no device is needed.
-
-    RECORDINGS are files of `ftdrive record` or folders of them. Each result becomes a new file of the same name in
-    FOLDER. Without --calibration each recording uses its own. A recording whose result exists is left out, whatever its
-    options were, so an interrupted command continues when it is repeated.
-
-    The exit code is 7 if a recording could not be compensated.
-    """
-    from ftdrive.errors import NotAccepted
-    from ftdrive.fleet.compensate import compensate_all, recordings_of, require_own_results, task_of
-
-    recordings = recordings_of(paths)
-    require_own_results(recordings, folder)
-    _mention_incomplete(paths)
-    task = task_of(calibration, read_frame(axes, about), bias, accept_edited=force)
-    left = [one for one in recordings if not (folder / one.name).exists()]
-    report = _Compensated(recordings=len(recordings), before=len(recordings) - len(left))
-    with _open_workers(workers, cluster) as pool:
-        folder.mkdir(parents=True, exist_ok=True)
-        for recording, found in _with_progress("Compensating", compensate_all(left, folder, task, pool), len(left)):
-            report.add(recording, found)
-    if as_json:
-        write_json(report.to_dict())
-    else:
-        echo("\n".join(report.words()))
-    if report.failed:
-        count = f"{len(report.failed)} of {len(recordings)} recordings"
-        raise NotAccepted(f"{count} could not be compensated: fix the reasons, and repeat")
-
-
-def _mention_incomplete(paths: Sequence[Path]) -> None:
-    """Print how many recordings of these folders were interrupted."""
-    from ftdrive.recording.files import ENDINGS
-    from ftdrive.terminal.console import messages
-
-    inside = [one for path in paths if path.is_dir() for one in path.glob("*.partial")]
-    if count := sum(Path(one.stem).suffix in ENDINGS for one in inside):
-        messages.print(f"Left out, because they are incomplete: {count} recordings; `ftdrive convert` saves one.")
-
-
-@dataclass(slots=True)
-class _Compensated:
-    recordings: int
-    before: int
-    compensated: list[dict[str, Any]] = field(default_factory=list)
-    failed: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, recording: Path, found: dict[str, Any] | str) -> None:
-        """Add a recording."""
-        here = {"recording": str(recording)}
-        if isinstance(found, str):
-            self.failed.append({**here, "reason": found})
-        else:
-            self.compensated.append({**here, **found})
-
-    @property
-    def samples(self) -> int:
-        """Samples of the recordings that were compensated now."""
-        return sum(one["samples"] for one in self.compensated)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return all as JSON, by recording."""
-        return {
-            "schema_version": 1,
-            "recordings": self.recordings,
-            "compensated_before": self.before,
-            "samples": self.samples,
-            "compensated": sorted(self.compensated, key=itemgetter("recording")),
-            "failed": sorted(self.failed, key=itemgetter("recording")),
-        }
-
-    def words(self) -> Iterator[str]:
-        """Give the numbers, then one line for each recording with contacts or gaps, and for each that failed."""
-        from ftcalib.rounding import counted
-
-        found = self.to_dict()
-        yield (
-            f"{counted(self.recordings, 'recording')}: {len(self.compensated)} compensated now, {self.before} before, "
-            f"{len(self.failed)} failed; {counted(self.samples, 'sample')}."
-        )
-        for one in found["compensated"]:
-            facts = list(map(str, one["marks"]))
-            if contacts := one["contacts"]:
-                facts.append(f"contacts: {len(contacts)}, largest {max(each['peak_N'] for each in contacts):.2f} N")
-            if one["gaps"]:
-                facts.append(f"gaps: {one['gaps']}")
-            if one["cut"]:
-                facts.append(f"incomplete: {one['duration_s']:.1f} s of it are used")
-            if facts:
-                yield f"{one['recording']}: {'; '.join(facts)}"
-        for one in found["failed"]:
-            yield f"failed: {one['recording']}: {one['reason']}"
-
-
 _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 
 
 @click.command()
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
 @click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
-@_ENGINE
+@click.option(
+    "--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes.  [default: one per core]"
+)
+@click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead.")
 @STORE
 @JSON
 def solve(
@@ -248,13 +89,21 @@ def solve(
 
     The exit code is 7 if a run could not be solved.
     """
-    from ftdrive.errors import NotAccepted
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from ftdrive.errors import ConfigError, NotAccepted
     from ftdrive.fleet.resolve import solve_again, solved_path
+    from ftdrive.fleet.workers import cluster_workers, local_workers
+    from ftdrive.terminal.console import messages
 
     runs = _runs_to_solve(folders, url, None if since is None else _time(since))
     report = _Solved(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
-    with _open_workers(workers, cluster) as pool:
-        for run, found in _with_progress("Solving", solve_again(runs, pool), len(runs)):
+    columns = (TextColumn("Solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    progress = Progress(*columns, console=messages, transient=True, disable=not messages.is_terminal)
+    if workers and cluster:
+        raise ConfigError("--workers and --cluster exclude one another: leave one out")
+    with local_workers(workers) if cluster is None else cluster_workers(cluster) as pool, progress:
+        for run, found in progress.track(solve_again(runs, pool), total=len(runs)):
             report.add(run, found)
     if as_json:
         write_json(report.to_dict())

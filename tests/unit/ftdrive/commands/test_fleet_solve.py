@@ -1,15 +1,18 @@
 """`fleet solve` as a command; the solver runs in this process."""
 
 import json
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ftcalib import Finding
-from ftdrive import __version__
+from ftdrive import __version__, cli
+from ftdrive.fleet import workers
+from ftdrive.fleet.workers import Workers
 from ftdrive.store.store import Store
 from tests.calibrated_runs import calibrated_run
 from tests.edited_files import edit
@@ -18,8 +21,24 @@ Ran = tuple[int, str, str]
 
 
 @pytest.fixture
-def run(fleet_here: Callable[..., Ran]) -> Callable[..., Ran]:
-    return partial(fleet_here, "solve")
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
+    """Run the command in an empty folder, its workers in this process; return exit code, stdout and stderr."""
+
+    @contextmanager
+    def here(_: int | None) -> Iterator[Workers]:
+        with ThreadPoolExecutor(1) as thread:
+            yield Workers(1, thread.submit, BrokenExecutor)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setattr(workers, "local_workers", here)
+
+    def call(*arguments: str | Path) -> Ran:
+        code = cli.run(["fleet", "solve", *map(str, arguments)])
+        out, err = capsys.readouterr()
+        return code, out, " ".join(err.split())
+
+    return call
 
 
 def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(

@@ -57,15 +57,12 @@ def add_6_N() -> None:
 
 USES = {
     "compensate": ["compensate", "peg.csv", "--calibration", "c.json"],
-    "fleet": ["fleet", "compensate", "peg.csv", "--calibration", "c.json", "-o", "out", "--workers", "1"],
     "export": ["export", "calibration", "c.json", "--format", "ros2-control"],
     "live": ["live", "--replay", "peg.csv", "--calibration", "c.json", "--once"],
 }
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "fleet" else name for name in USES]
-)
+@pytest.mark.parametrize("name", USES)
 def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
     name: str, run: Callable[..., Ran]
 ) -> None:
@@ -79,10 +76,7 @@ def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
     if name != "live":
         assert "EDITED BY HAND" in out
     code, out, err = run(*USES[name], "--force", "--json")
-    if name == "fleet":
-        assert "EDITED BY HAND" in Path("out/peg.csv").read_text(encoding="utf-8").partition("\n")[0]
-    else:
-        assert json.loads(out)["marks"] == ["EDITED BY HAND"]
+    assert json.loads(out)["marks"] == ["EDITED BY HAND"]
 
 
 def test_a_file_made_with_an_edited_calibration_says_so(run: Callable[..., Ran]) -> None:

@@ -68,7 +68,6 @@ MISSING = [
     ("diff run", 2, "ftdrive diff run B"),
     ("transcript play", 2, "--simulate"),
     ("transcript record", 2, "ftdrive transcript record --output FILE --sensor URL"),
-    ("fleet compensate", 2, "ftdrive fleet compensate RECORDINGS... --output FOLDER"),
     ("loads check", 2, "ftdrive loads check MASS --calibration PATH"),
     ("completion", 2, "bash|zsh|fish"),
 ]

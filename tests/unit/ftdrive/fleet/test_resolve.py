@@ -22,12 +22,12 @@ from ftdrive.fleet.resolve import (
     solved_path,
     task_of,
 )
-from ftdrive.fleet.workers import Answer, Workers
+from ftdrive.fleet.workers import Workers
 from tests.calibrated_runs import FIRST, calibrated_run, dataset, swept_run
 
 
-def at_once(function: Callable[..., list[Answer]], *arguments: Any) -> "Future[list[Answer]]":
-    future = Future[list[Answer]]()
+def at_once(function: Callable[..., bytes], *arguments: Any) -> "Future[bytes]":
+    future = Future[bytes]()
     try:
         future.set_result(function(*arguments))
     except Exception as error:
@@ -127,8 +127,8 @@ def test_a_failure_has_its_reason_and_concerns_one_run(tmp_path: Path) -> None:
 def test_an_unexpected_error_is_named(tmp_path: Path) -> None:
     folder = calibrated_run(tmp_path, "run")
 
-    def submit(*_: Any) -> "Future[list[Answer]]":
-        return at_once(lambda: [bytes(1 // 0)])
+    def submit(*_: Any) -> "Future[bytes]":
+        return at_once(lambda: bytes(1 // 0))
 
     assert again(folder, submit=submit) == {folder: "unexpected ZeroDivisionError: integer division or modulo by zero"}
 
@@ -138,7 +138,7 @@ def test_a_worker_of_another_version_ends_it(tmp_path: Path) -> None:
     data, task = task_of(folder)
     other = json.dumps(json.loads(task) | {"version": "0.0.1"}).encode()
     with pytest.raises(ConfigError, match=r"ftdrive 0\.0\.1: install the same"):
-        again(folder, submit=lambda each, function, _: at_once(each, function, [(data, other)]))
+        again(folder, submit=lambda function, *_: at_once(function, data, other))
     assert not solved_path(folder).exists()
 
 
