@@ -63,7 +63,7 @@ def test_commands_without_devices_need_no_posix(tmp_path: Path) -> None:
         ["export", "calibration", "runs/day-1", "--format", "json"],
         ["solve", "dataset.json", "--output", "c.json"],
         ["report", "dataset.json"],
-        ["report", "c.json", "--format", "md"],
+        ["report", "c.json", "--format", "json"],
         ["diff", "c.json", "runs/day-1"],
         ["history", "runs"],
         ["history", "--index", "runs"],

@@ -58,15 +58,13 @@ DEFAULT = Path("report.html")
     "-o",
     "--output",
     type=NewFile(),
-    help=f"New file. [default: {DEFAULT} in the run or beside SOURCE, or {DEFAULT.stem}-2; stdout for md and json]",
+    help=f"New file. [default: {DEFAULT} in the run or beside SOURCE, or {DEFAULT.stem}-2; stdout for json]",
 )
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["html", "md", "json"]),
-    default="html",
-    show_default=True,
-    help="Format: a page (needs ftdrive[report]), Markdown, or the facts as JSON.",
+    type=click.Choice(get_args(Format)),
+    help="A page (needs ftdrive[report]), or the facts as JSON.  [default: by the ending of --output, else html]",
 )
 @click.option(
     "--parent",
@@ -81,7 +79,7 @@ DEFAULT = Path("report.html")
 def report(
     source: Path | None,
     output: Path | None,
-    form: Format,
+    form: Format | None,
     parent: Path | None,
     method: Method,
     orientation: Orientation,
@@ -105,6 +103,7 @@ def report(
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
     chosen = output
+    form = form or _format_of(output)
     if output is None and form == "html":
         output = unused_path(_folder_of(source) / DEFAULT)
         try:
@@ -112,7 +111,7 @@ def report(
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
     if form == "html":
-        require_extra("report", "a report in HTML (not --format md)", "jinja2", "matplotlib")
+        require_extra("report", "a report in HTML (not --format json)", "jinja2", "matplotlib")
     given = known_values(mass_kg, level_deg, mounting_deg), up_direction(up)
     options = SolveOptions(method, orientation, drift, *given, table=table, words=_typed(click.get_current_context()))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
@@ -144,6 +143,15 @@ def report(
         write_json({**facts, "file": None if output is None else str(output)})
     elif output is None:
         echo(text, nl=False, fold=False)
+
+
+def _format_of(output: Path | None) -> Format:
+    """Return the format that the ending of a file names; raises `ConfigError` if none does."""
+    if output is None or output.suffix == ".html":
+        return "html"
+    if output.suffix != ".json":
+        raise ConfigError(f"{output} has no ending of a report: name it .html or .json, or give --format")
+    return "json"
 
 
 def _folder_of(source: Path | None) -> Path:

@@ -1,13 +1,13 @@
-"""One report as a page, as Markdown or as JSON."""
+"""One report as a page or as JSON."""
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 from ftdrive import __version__
 from ftdrive.errors import ConfigError
-from ftdrive.report.document import Section, Table, capital
+from ftdrive.report.document import Section, capital
 from ftdrive.report.figures import draw
 from ftdrive.report.sections import sections_of
 from ftdrivers.installation import missing_extra
@@ -17,54 +17,9 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 
-def _markdown(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
-    """Write the report; what a file or a device named cannot become markup."""
-    return "\n".join(_lines(facts, sections)) + "\n"
-
-
-def _lines(facts: Mapping[str, Any], sections: Sequence[Section]) -> Iterator[str]:
-    yield f"# Calibration {facts['id']}: {', '.join([facts['verdict'].upper(), *facts['marks']])}\n"
-    if facts["about"]:
-        yield f"{_escaped(facts['about'])}.\n"
-    yield f"Compensation error {_escaped(facts['error']['words'])}.\n"
-    if facts["trust"]:
-        yield f"{_escaped(capital(facts['trust']['words']))}.\n"
-    remarks = [*facts["marks"].values(), *(one["words"] for one in [*facts["findings"], *facts["hints"]])]
-    yield from (f"* {_escaped(capital(one))}" for one in remarks)
-    yield f"\n**Next:** {_escaped(facts['next_step'])}\n"
-    for section in sections:
-        yield f"## {section.title}\n"
-        yield from (f"{_escaped(one)}\n" for one in section.text)
-        for table in section.tables:
-            yield from _table(table)
-
-
-def _table(table: Table) -> Iterator[str]:
-    if table.caption:
-        yield f"{_escaped(table.caption)}:\n"
-    yield _row(table.columns)
-    numbers = "---:" if len(table.columns) > 2 else "---"
-    yield _row(["---", *[numbers] * (len(table.columns) - 1)], escape=False)
-    yield from map(_row, table.rows)
-    yield ""
-
-
-def _row(cells: Sequence[str], *, escape: bool = True) -> str:
-    return f"| {' | '.join(map(_escaped, cells) if escape else cells)} |"
-
-
-def _escaped(text: str) -> str:
-    """Keep code between backticks; escape the rest, and let nothing start a new line."""
-    parts = re.split(r"(`[^`<>|\n]*`)", " ".join(text.split()))
-    return "".join(
-        one if k % 2 else re.sub(r"([\\|*\[\]`#])", r"\\\1", one).replace("&", "&amp;").replace("<", "&lt;")
-        for k, one in enumerate(parts)
-    )
-
-
 def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
     """Write the page. Raises `ConfigError` without the extra `report`."""
-    environment = templates("ftdrive.report", "a report in HTML", "report", "--format md")
+    environment = templates("ftdrive.report", "a report in HTML", "report", "--format json")
     from markupsafe import Markup
 
     environment.filters["sentence"] = lambda text: with_code(capital(text))
@@ -101,7 +56,7 @@ def with_code(text: str) -> "Markup":
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
 
 
-Format = Literal["html", "md", "json"]
+Format = Literal["html", "json"]
 
 
 def report(facts: Mapping[str, Any], form: Format = "html") -> str:
@@ -111,12 +66,12 @@ def report(facts: Mapping[str, Any], form: Format = "html") -> str:
     ----------
     facts : mapping
         From `ftdrive.report.facts.facts_of`.
-    form : {"html", "md", "json"}
+    form : {"html", "json"}
 
     Returns
     -------
     str
-        A self-contained page, Markdown, or the facts as one JSON object.
+        A self-contained page, or the facts as one JSON object.
 
     Raises
     ------
@@ -125,5 +80,4 @@ def report(facts: Mapping[str, Any], form: Format = "html") -> str:
     """
     if form == "json":
         return json.dumps(facts, allow_nan=False) + "\n"
-    sections = sections_of(facts)
-    return _markdown(facts, sections) if form == "md" else page(facts, sections)
+    return page(facts, sections_of(facts))

@@ -28,8 +28,9 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.document import shown_poses
 from ftdrive.report.facts import about_of, compared, contact_error, error_map, facts_of, orientations
 from ftdrive.report.figures import VARIABLES
+from ftdrive.report.report import page as head_page
 from ftdrive.report.report import report
-from ftdrive.report.sections import sections_of
+from ftdrive.report.sections import comparison, contact, coverage, cross_validation, sections_of
 from ftdrive.report.subject import Subject, read_subject
 from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.source import SolveOptions
@@ -71,7 +72,7 @@ def test_the_head_names_arm_sensor_tool_and_date() -> None:
     known = {"devices": devices, "setup": {"tool": "gripper"}, "created_utc": "2026-11-23T07:58:25+00:00"}
     about = about_of(replace(result(), provenance=known))
     assert about == "UR5e 1, Mini45 FT9, tool gripper, 2026-11-23 07:58 UTC"
-    assert f"{about}." in report({**facts(), "about": about}, "md")
+    assert f"<p>{about}</p>" in head_page({**facts(), "about": about}, [])
     assert f"<p>{escape(facts()['about'])}</p>" in html()
 
 
@@ -114,21 +115,17 @@ def page() -> Page:
     return Page()
 
 
-def test_page_and_markdown_show_the_numbers_of_the_result() -> None:
-    markdown = report(facts(), "md")
-    captions = {table.caption for section in sections_of(facts()) for table in section.tables} - {""}
-    assert {line[:-1] for line in markdown.splitlines() if line.endswith(":")} == captions
-    for text in (markdown, page().text):
-        assert result().id in text
-        assert result().verdict.upper() in text
-        assert f"{result().quality['loo_force_rms_N']:.3g}" in text
-        assert str(result().provenance["dataset_sha256"]) in text
-    mass = next(line for line in markdown.splitlines() if line.startswith("| mass, kg"))
-    estimate, sigma = (float(cell) for cell in mass.split("|")[2:4])
+def test_the_page_shows_the_numbers_of_the_result() -> None:
+    text = page().text
+    assert {table.caption for section in sections_of(facts()) for table in section.tables} <= {"", *text.splitlines()}
+    assert result().id in text
+    assert result().verdict.upper() in text
+    assert f"{result().quality['loo_force_rms_N']:.3g}" in text
+    assert str(result().provenance["dataset_sha256"]) in text
+    estimate, sigma = map(float, text.partition("\nmass, kg\n")[2].split()[:2])
     assert sigma == pytest.approx(result().sigma["mass_kg"], rel=0.06)
     assert estimate == pytest.approx(result().mass_kg, abs=sigma / 10)
-    assert mass.split("|")[2].strip() in page().text.split()
-    assert markdown.count("\n| ml |") == 1
+    assert html().count('<th scope="row">ml</th>') == 1
     assert all(section.title in page().text for section in sections_of(facts()))
     assert [section.name for section in sections_of(facts())] == [
         *("estimates", "error", "contact", "cross-validation", "residuals", "drift"),
@@ -207,11 +204,6 @@ def test_figures_take_their_ink_from_the_page() -> None:
 
 def test_a_malicious_name_stays_text() -> None:
     assert page().text.count(EVIL) >= 3  # source, parent, serial number
-    markdown = report(facts(), "md")
-    assert "<script" not in markdown
-    assert "<img" not in markdown
-    row = next(line for line in markdown.splitlines() if line.startswith("| devices.sensor.serial"))
-    assert len(re.findall(r"(?<!\\)\|", row)) == 3
 
 
 def with_covariance(diagonal: Mapping[int, float]) -> CalibrationResult:
@@ -264,9 +256,9 @@ def test_a_contact_has_the_sigma_of_its_sensor_with_and_without_loads() -> None:
     assert assumed["sigma_N"][-1] == pytest.approx(each, rel=0.02)
     assert "errors of the sensor are assumed, not measured" in assumed["words"]
     assert "known from loads, sensor.json of 2026-11-20" in known["words"]
-    page = report({**facts(), "contact": known, "comparison": compared(now, before)}, "md")
-    assert f"the tool weighs {before.mass_kg / 1.02:.4f} kg" in page
-    assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 08:00 now" in page
+    assert any(f"the tool weighs {before.mass_kg / 1.02:.4f} kg" in one for one in contact({"contact": known}).text)
+    differences = comparison({**facts(), "comparison": compared(now, before)}).text
+    assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 08:00 now" in differences[1]
 
 
 def test_the_tip_is_the_far_end_of_the_described_tool() -> None:
@@ -350,12 +342,13 @@ def command(*arguments: str | Path) -> Any:
 @pytest.mark.usefixtures("no_other_methods")
 def test_a_rejected_run_gets_a_report_with_its_reasons(tmp_path: Path) -> None:
     run = recorded(tmp_path, noise=5.0)
-    outcome = command(run.folder, "--format", "md")
+    outcome = command(run.folder, "--format", "json")
     assert outcome.exit_code == 0, outcome.output
-    assert "REJECTED" in outcome.stdout
-    assert "Do not compensate" in outcome.stdout
-    assert "R103 was not steady" in outcome.stdout
-    assert "| sensor |" in outcome.stdout
+    found = json.loads(outcome.stdout)
+    assert found["verdict"] == "rejected"
+    assert "Do not compensate" in found["next_step"]
+    assert any("R103 was not steady" in one["words"] for one in found["hints"])
+    assert found["tour"]["devices"] == DEVICES
     assert not run.calibration_path.exists()
 
 
@@ -393,12 +386,19 @@ def test_the_named_parent_is_found_beside_the_result_or_its_absence_is_reported(
 def test_a_result_without_its_data_is_reported_as_far_as_it_goes(tmp_path: Path) -> None:
     path = tmp_path / "calibration.json"
     result().save(path)
-    outcome = command(path, "--format", "md", "-o", tmp_path / "report.md")
+    outcome = command(path, "-o", tmp_path / "report.json")
     assert outcome.exit_code == 0, outcome.output
-    text = (tmp_path / "report.md").read_text()
-    assert "report its run folder" in text
-    assert "Methods are not compared." in text
+    found = json.loads((tmp_path / "report.json").read_text())
+    assert "report its run folder" in coverage(found).text[0]
+    assert cross_validation(found).text[-1].startswith("Methods are not compared.")
     assert "does not" not in command(path, "--format", "json").output
+
+
+@pytest.mark.parametrize("name", ["report.md", "report"])
+def test_a_file_of_another_format_is_refused_before_any_work(name: str) -> None:
+    error = command("--simulate", "-o", name).exception
+    assert isinstance(error, ConfigError)
+    assert str(error) == f"{name} has no ending of a report: name it .html or .json, or give --format"
 
 
 def test_a_damaged_file_is_named(tmp_path: Path) -> None:
@@ -412,7 +412,7 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "verdicts", "words"),
     [
-        ("agimus_mini45_b", ("good", "usable"), "The bias drifted by 0.16 N"),
+        ("agimus_mini45_b", ("good", "usable"), "the bias drifted by 0.16 N"),
         pytest.param(
             "foamcutting_2013_06_12",
             ("rejected",),
@@ -424,10 +424,11 @@ def test_a_damaged_file_is_named(tmp_path: Path) -> None:
 def test_real_recordings_are_judged_and_explained(
     name: str, verdicts: Sequence[str], words: str, real_data: Path
 ) -> None:
-    outcome = command(real_data / name / "poses.csv", "--orientation", "R_flange_base", "--format", "md")
+    outcome = command(real_data / name / "poses.csv", "--orientation", "R_flange_base", "--format", "json")
     assert outcome.exit_code == 0
-    assert outcome.stdout.splitlines()[0].rpartition(" ")[2].lower() in verdicts
-    assert words in outcome.stdout
+    found = json.loads(outcome.stdout)
+    assert found["verdict"] in verdicts
+    assert words in " ".join(one["words"] for one in found["findings"])
 
 
 @pytest.mark.usefixtures("no_other_methods")
@@ -438,7 +439,7 @@ def test_no_report_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     (tmp_path / "report.html").write_text("mine")
     for n in (2, 3):
         assert f"Saved report-{n}.html" in command("dataset.json").stdout
-    for arguments in (("-o", "report.html"), ("--format", "md", "-o", "report.html")):
+    for arguments in (("-o", "report.html"), ("--format", "json", "-o", "report.html")):
         outcome = command("dataset.json", *arguments)
         assert isinstance(outcome.exception, ConfigError)
         assert "never overwritten" in str(outcome.exception)
@@ -450,7 +451,7 @@ def test_a_page_without_its_extra_is_a_matter_of_installation(missing: str, monk
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(ConfigError, match="of the extra report"):
         report(facts())
-    assert report(facts(), "md").startswith("# Calibration")
+    assert json.loads(report(facts(), "json"))["id"] == result().id
 
 
 @pytest.mark.usefixtures("no_other_methods")

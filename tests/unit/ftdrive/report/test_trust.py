@@ -62,9 +62,9 @@ def test_a_failed_verification_is_in_every_format_and_changes_the_next_step(cali
     document = json.loads(report(path, "--format", "json").stdout)
     assert document["trust"]["last_verification"]["reason"] == "the force bias has changed by 0.5 N"
     assert "accept the update" in document["next_step"]
-    for text in (report(path, "--format", "md").stdout, page(document, [provenance(document)])):
-        assert "VERIFICATION FAILED" in text
-        assert "the force bias has changed by 0.5 N" in text
+    text = page(document, [provenance(document)])
+    assert "VERIFICATION FAILED" in text
+    assert "the force bias has changed by 0.5 N" in text
 
 
 @pytest.mark.parametrize("trouble", ["damaged store", "locked store", "damaged configuration"])
