@@ -9,12 +9,14 @@ the result with our compensated wrench.
 | key | meaning |
 |---|---|
 | `R_flange_sensor` (3, 3), `p_flange_sensor_m` (3,) | mounting of the sensor, as in the target's robot model |
-| `g_m_s2` | gravity for targets that have it as a setting; CalaW and mc_rtc have it in their source |
+| `g_m_s2` | gravity for targets that have it as a setting; mc_rtc has it in its source |
 | `gravity_m_s2` (3,), optional | the same as a vector in base, for targets whose setting is a vector; default down |
 | `force_bias_N`, `torque_bias_Nm` (3,) | for targets that carry no bias |
 | `sensor_mass_kg`, `p_flange_sensor_com_m` (3,) | sensor and adapter, for targets whose payload includes them |
 | `p_sensor_com_m`, `gravity_force_base_N` (3,) | the load, for a target that carries only the mounting |
 | `R_flange_parent` (3, 3), optional | mc_rtc: axes of the sensor's parent body at the flange; default the flange |
+
+The firmware of Franka, UR and xArm is not public: their formula is taken from the manuals' words.
 
 World axes are those of the robot base, unless a file names `base_link`: UR's base turned by 180 deg about z.
 Frames named `tool0` are our flange; `flange` is ROS-Industrial's, with x out of the flange.
@@ -23,34 +25,23 @@ Frames named `tool0` are our flange; `flange` is ROS-Industrial's, with x out of
 import json
 import re
 import shlex
-from collections.abc import Callable, Mapping
+import xml.etree.ElementTree as ET
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tests.target_files import (
-    Array,
-    Context,
-    Data,
-    context_bias,
-    doubles,
-    force_at,
-    gravity_base,
-    in_sensor_axes,
-    mapping,
-    mass_kg,
-    mounting,
-    numbers,
-    six,
-    split,
-    tool0_from,
-    transform_arguments,
-    world_from_base,
-    xyz,
-)
-from tests.target_payloads import franka, mujoco, ur_payload, urdf
+Array = NDArray[np.float64]
+Context = Mapping[str, Any]
+Data = tuple[Array, Array, Context]
+"""R_base_flange, wrench and context of `evaluate`."""
+
+R_TOOL0_FLANGE = Rotation.from_euler("xyz", [np.pi / 2, 0, np.pi / 2]).as_matrix().T
+"""ur_description/urdf/ur_macro.xacro, joint `flange-tool0`: rpy = (pi/2, 0, pi/2)."""
+Pose = tuple[Array, Array]
 
 
 def evaluate(format_name: str, text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
@@ -115,20 +106,6 @@ def ros2_message(text: str, R_base_flange: Array, wrench: Array, context: Contex
     return _ft_calibration(file, xyz, (R_base_flange, wrench, context))
 
 
-def calaw(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
-    """CalaW/ft_tools_ros2, ft_compensation: ft_compensator.py and scripts/ft_compensation_node.py, 1ee0565.
-
-    `force = raw + g mass - f_bias; torque = raw - g x cog - t_bias`, g = (0, 0, -9.81) in world, constant.
-    The sign is that of a sensor that reports the reaction: with ours, `mass` and `cog` are negative. `cog` is the first
-    moment, mass times centre of mass in kg·m, as ft_calibration/ft_calibrator.py estimates it (6223d83, and its test).
-    """
-    file = mapping(yaml.safe_load(text))
-    mass, first_moment = numbers([file["mass"]], 1)[0], numbers(file["cog"], 3)
-    f_bias, t_bias = numbers(file["f_bias"], 3), numbers(file["t_bias"], 3)
-    g = in_sensor_axes(np.array([0.0, 0.0, -9.81]), R_base_flange, context)
-    return np.hstack([wrench[:, :3] + g * mass - f_bias, wrench[:, 3:] - np.cross(g, first_moment) - t_bias])
-
-
 def ros2_control(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
     """ros2_controllers force_torque_sensor_broadcaster with control_toolbox GravityCompensationWrench.
 
@@ -177,42 +154,18 @@ def admittance(text: str, R_base_flange: Array, wrench: Array, context: Context)
     return np.asarray((left @ R_world_sensor).reshape(-1, 6))
 
 
-def kit(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
-    """KITrobotics/force_torque_sensor, src/force_torque_sensor_handle.cpp, 1065d14, and iirob_filters, c482674.
+def cartesian_controllers(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """fzi cartesian_controllers of ROS 2, cartesian_force_controller.cpp `computeForceError`, 082b381.
 
-    handle: `raw - offset`. include/iirob_filters/gravity_compensation.h, in world axes: `f_z += force;
-    t_x += force cog_y; t_y -= force cog_x` with cog turned to world from the axes of the data. `force` is positive
-    newtons. The offset counts only with `Calibration/Offset/isStatic: true`, otherwise the node tares at start.
-    Both parts stand under the node's name: in one file, since both have a key `force`. `recalibrate` is not evaluated.
+    `net = R X ft_sensor_wrench + target`: the arm moves along the net force, so the topic needs what is exerted on the
+    sensor, without bias and weight. X moves it from ft_sensor_ref_link to the controlled link, and the header is not
+    read: that link must be the frame of the broadcaster before it. Returned is ft_sensor_wrench.
     """
-    file = mapping(yaml.safe_load(text))
-    offset, tool = mapping(file["Calibration"]["Offset"]), mapping(file["GravityCompensation"]["params"])
-    if tool["force_frame"] != tool["sensor_frame"]:
-        raise ValueError(f"force_frame {tool['force_frame']} is not the sensor_frame, and is not evaluated here")
-    if offset["isStatic"] is not True:
-        raise ValueError("isStatic is not true: the node would not use the offset")
-    force = numbers([tool["force"]], 1)[0]
-    R_world_sensor = world_from_base(tool["world_frame"]) @ R_base_flange @ mounting(context)[0]
-    unbiased = wrench - np.concatenate([xyz(offset["force"]), xyz(offset["torque"])], dtype=np.float64)
-    data = unbiased.reshape(-1, 2, 3) @ R_world_sensor.transpose(0, 2, 1)
-    cog = R_world_sensor @ numbers([tool["CoG_x"], tool["CoG_y"], tool["CoG_z"]], 3)
-    data[:, 0, 2] += force
-    data[:, 1, 0] += force * cog[:, 1]
-    data[:, 1, 1] -= force * cog[:, 0]
-    return np.asarray((data @ R_world_sensor).reshape(-1, 6))
-
-
-def code_iai(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
-    """code-iai/robot_wrist_ft_tools, wrist_ft_sensor_cleaner/.../ft_cleaner.py `load_params`, `ft_cb`, 379d5b1.
-
-    `clean = raw - offset; zeroed = clean - (m a, c m x a)`, a = gravity in sensor axes, pointing to the ground, from
-    tf_gravity_publisher.py, whose parameter `gravity_vector` is (0, 0, -9.8) unless set.
-    """
-    file = mapping(yaml.safe_load(text))
-    offset = np.concatenate([numbers(file["offset"][part], 3) for part in ("force", "torque")], dtype=np.float64)
-    m, c = numbers([file["mass"]], 1)[0], numbers(file["center_of_mass"], 3)
-    a = in_sensor_axes(gravity_base(context), R_base_flange, context)
-    return wrench - offset - force_at(c, m * a)
+    links = {parameters["ft_sensor_ref_link"] for parameters in _ros_parameters(text, "ft_sensor_ref_link")}
+    frames = {parameters["frame_id"] for parameters in _ros_parameters(text, "sensor_filter_chain")}
+    if links != frames:
+        raise ValueError(f"ft_sensor_ref_link {links} is not the frame_id {frames}")
+    return ros2_control(text, R_base_flange, wrench, context)
 
 
 def mc_rtc(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
@@ -279,17 +232,106 @@ def plain_yaml(text: str, R_base_flange: Array, wrench: Array, _: Context) -> Ar
     return _plain(yaml.safe_load(text), R_base_flange, wrench)
 
 
+def franka(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """franka_msgs/srv/SetLoad, libfranka include/franka/robot.h `setLoad(load_mass, F_x_Cload, load_inertia)`.
+
+    kg; m from the flange in flange axes; kg·m2 column-major.
+    """
+    fields = mapping(yaml.safe_load(text))
+    com, _ = numbers(fields["F_x_Cload"], 3), numbers(fields["load_inertia"], 9)
+    return _payload(mass_kg(fields["mass"]), com, (R_base_flange, wrench, context))
+
+
+def ur_payload(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """URScript manual, `set_target_payload(m, cog, inertia=[0, 0, 0, 0, 0, 0], transition_time=0)`, PolyScope >= 5.10.
+
+    kg; m from the tool mount in flange axes; inertia [Ixx, Iyy, Izz, Ixy, Ixz, Iyz].
+    """
+    pattern = r"^set_target_payload\(([-\d.]+), \[([^]]*)\], \[([^]]*)\]\)$"
+    ((mass, cog, inertia),) = re.findall(pattern, text, re.MULTILINE)
+    if len(split(cog)) != 3 or len(split(inertia)) != 6:
+        raise ValueError(f"not the arguments of URScript: {text}")
+    return _payload(float(mass), split(cog), (R_base_flange, wrench, context))
+
+
+def urdf(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """URDF specification, wiki.ros.org/urdf/XML: `<inertial><origin/><mass/>` of `<link>`, `<joint><origin/>`.
+
+    `<origin xyz rpy>` of a joint is the pose of the child in the parent, R = Rz(y) Ry(p) Rx(r); that of an inertial is
+    in the link. The root is the flange, and a link stands at the sensor. The reading of an ideal sensor is the weight
+    of the links after it.
+    """
+    robot = _parse(text)
+    joints = {_attribute(one, "child", "link"): (_attribute(one, "parent", "link"), one) for one in robot.iter("joint")}
+
+    def pose(link: str) -> Pose:
+        if link not in joints:
+            return tool0_from(link), np.zeros(3)
+        parent, joint = joints[link]
+        return _compose(pose(parent), _origin(joint))
+
+    if not any(_same(pose(link), mounting(context)) for link in joints):
+        raise ValueError("no link stands at the sensor")
+    ((mass, com),) = (
+        (float(_attribute(inertial, "mass", "value")), _apply(pose(link.attrib["name"]), _origin(inertial)[1]))
+        for link in robot.iter("link")
+        for inertial in link.findall("inertial")
+    )
+    return _payload(mass, com, (R_base_flange, wrench, context), with_sensor=False)
+
+
+def mujoco(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """MuJoCo XML reference, `body`, `body/inertial`, `site`: mujoco.readthedocs.io/en/stable/XMLreference.html.
+
+    `pos` and `quat` (w x y z) of a body are in its parent, those of `inertial` and `site` in the body. The outermost
+    body is tool0 or ROS-Industrial's flange by its name. The sensor's site belongs to the child: its whole body counts
+    as load. The simulated `force` and `torque` have the opposite sign to ours: MuJoCo 4.0.0 reads (0, 0, +m g) in world
+    of a load at rest. A load has no sign, so the file does not depend on it.
+    """
+    (flange,) = (body for holder in _parse(text).iter("worldbody") for body in holder.findall("body"))
+    (body,) = flange.findall("body")
+    at_flange = tool0_from(flange.attrib["name"]), np.zeros(3)
+    rotation = Rotation.from_quat(_floats(body.attrib["quat"]), scalar_first=True).as_matrix()
+    pose = _compose(at_flange, (rotation, _floats(body.attrib["pos"])))
+    if body.find("site") is None or not _same(pose, mounting(context)):
+        raise ValueError("no site stands at the sensor")
+    inertial = body.find("inertial")
+    assert inertial is not None
+    mass, com = float(inertial.attrib["mass"]), _apply(pose, _floats(inertial.attrib["pos"]))
+    return _payload(mass, com, (R_base_flange, wrench, context), with_sensor=False)
+
+
+def mujoco_plugin(text: str, R_base_flange: Array, wrench: Array, context: Context) -> Array:
+    """mujoco_ros2_control_plugins/src/fts_grav_comp_plugin.cpp, 145426f, ros-controls/mujoco_ros2_control PR #308.
+
+    In MuJoCo's sign, in the site of the sensor: `F + mass g; T + pos x (mass g)`, pos moved from the site `frame_id`.
+    The hardware interface then negates both. The parameters stand in a comment of the model, which must have a site
+    `frame_id`, and the sensors NAME_force and NAME_torque; here both are at one site.
+    """
+    (parameters,) = re.findall(r"<!--[^\n]*\n(/\*\*:.*?)-->", text, re.DOTALL)
+    plugins = yaml.safe_load(parameters)["/**"]["ros__parameters"]["mujoco_plugins"]
+    plugin = mapping(plugins["fts_grav_comp_plugin"])
+    if plugin["type"] != "mujoco_ros2_control_plugins/FtsGravCompPlugin":
+        raise ValueError(f"a plugin {plugin['type']}")
+    ((name, sensor),) = ((name, mapping(value)) for name, value in plugin.items() if name != "type")
+    model = _parse(text)
+    for kind in ("force", "torque"):
+        if [one.get("site") for one in model.iter(kind) if one.get("name") == f"{name}_{kind}"] != [sensor["frame_id"]]:
+            raise ValueError(f"no sensor {name}_{kind} at the site {sensor['frame_id']}")
+    mass, pos = doubles([sensor["CoG"]["mass"]], 1)[0], doubles(sensor["CoG"]["pos"], 3)
+    weight = mass * in_sensor_axes(gravity_base(context), R_base_flange, context)
+    return -(-(wrench - context_bias(context)) + force_at(pos, weight))
+
+
 TARGETS: dict[str, Callable[[str, Array, Array, Context], Array]] = {
     "kth": kth,
     "ft-tools": ft_tools,
-    "calaw": calaw,
     "ros2-control": ros2_control,
     "admittance": admittance,
+    "cartesian-controllers": cartesian_controllers,
     "mc-rtc": mc_rtc,
     "xarm": xarm,
     "franka": franka,
-    "kit": kit,
-    "code-iai": code_iai,
     "urdf": urdf,
     "mujoco": mujoco,
     "ur-payload": ur_payload,
@@ -298,6 +340,99 @@ TARGETS: dict[str, Callable[[str, Array, Array, Context], Array]] = {
     "json": plain_json,
     "yaml": plain_yaml,
 }
+
+
+def mounting(context: Context) -> tuple[Array, Array]:
+    """Rotation and position of the sensor in the flange."""
+    R, p = (np.asarray(context[key], dtype=np.float64) for key in ("R_flange_sensor", "p_flange_sensor_m"))
+    return R, p
+
+
+def context_bias(context: Context) -> Array:
+    """(6,) force, torque."""
+    return np.concatenate([context["force_bias_N"], context["torque_bias_Nm"]], dtype=np.float64)
+
+
+def gravity_base(context: Context) -> Array:
+    """(3,) in base, m/s2, pointing down."""
+    return np.asarray(context.get("gravity_m_s2", [0.0, 0.0, -context["g_m_s2"]]), dtype=np.float64)
+
+
+def in_sensor_axes(base: Array, R_base_flange: Array, context: Context) -> Array:
+    """(n, 3) from (3,) in base."""
+    return np.asarray(base @ (R_base_flange @ mounting(context)[0]))
+
+
+def force_at(point: Array, force: Array) -> Array:
+    """(n, 6) wrench about the origin of the forces (n, 3) at a point (3,)."""
+    return np.hstack([force, np.cross(point, force)], dtype=np.float64)
+
+
+def world_from_base(world_frame: str) -> Array:
+    """(3, 3) `base_link` is UR's base turned by 180 deg about z; any other name is UR's base.
+
+    ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint; names may have a prefix.
+    """
+    return np.diag([-1.0, -1.0, 1.0]) if world_frame.endswith("base_link") else np.eye(3)
+
+
+def tool0_from(flange_frame: str) -> Array:
+    """(3, 3) `flange` is ROS-Industrial's, x out of the flange; any other name is tool0. Names may have a prefix."""
+    return R_TOOL0_FLANGE if flange_frame.endswith("flange") else np.eye(3)
+
+
+def mapping(node: Any) -> Mapping[str, Any]:
+    if not isinstance(node, Mapping):
+        raise ValueError(f"expected a mapping, got {node!r}")  # noqa: TRY004 - what evaluate promises
+    return node
+
+
+def numbers(values: Any, count: int) -> Array:
+    """As Python reads them: YAML 1.1 makes a string of 1e-05."""
+    if len(values) != count or not all(type(value) in {int, float} for value in values):
+        raise ValueError(f"expected {count} numbers, got {values!r}")
+    return np.array(values, dtype=np.float64)
+
+
+def doubles(values: Any, count: int) -> Array:
+    """As rcl reads parameters of type double: no integers, but exponents without a point."""
+    if len(values) != count or any(type(value) is int for value in values):
+        raise ValueError(f"expected {count} doubles, got {values!r}")
+    return np.array([float(value) for value in values])
+
+
+def xyz(vector: Any) -> Array:
+    return numbers([vector[axis] for axis in "xyz"], 3)
+
+
+def six(parts: Mapping[str, Any], default: float) -> Array:
+    """(6,) of `force: {x, y, z}`, `torque: {x, y, z}`."""
+    return doubles([parts.get(part, {}).get(axis, default) for part in ("force", "torque") for axis in "xyz"], 6)
+
+
+def mass_kg(value: Any) -> float:
+    mass = float(numbers([value], 1)[0])
+    if mass < 0:
+        raise ValueError(f"the target rejects the mass {mass}")
+    return mass
+
+
+def split(values: str) -> Array:
+    """Numbers between commas."""
+    return np.array([float(value) for value in values.split(",") if value.strip()])
+
+
+def transform_arguments(words: Sequence[str]) -> tuple[str, Array, Rotation]:
+    """Return parent frame, position and rotation."""
+    o = {key.removeprefix("--"): value for key, value in zip(words[::2], words[1::2], strict=True)}
+    rotation = _unit([float(o[name]) for name in ("qx", "qy", "qz", "qw")])
+    return o["frame-id"], np.array([float(o[axis]) for axis in "xyz"]), rotation
+
+
+def _unit(xyzw: Sequence[float]) -> Rotation:
+    if abs(np.linalg.norm(xyzw) - 1) > 1e-6:
+        raise ValueError(f"the quaternion {xyzw} is not of unit length")
+    return Rotation.from_quat(xyzw)
 
 
 def _ros_parameters(text: str, key: str) -> list[Mapping[str, Any]]:
@@ -335,3 +470,52 @@ def _in_sensor(frame: str, point: Array, context: Context) -> Array:
         return point
     R_flange_sensor, p_flange_sensor = mounting(context)
     return np.asarray(R_flange_sensor.T @ (tool0_from(frame) @ point - p_flange_sensor))
+
+
+def _payload(mass: float, p_flange_com: Array, data: Data, *, with_sensor: bool = True) -> Array:
+    """Subtract bias and payload, less sensor and adapter if it includes them, from a wrench about the sensor origin."""
+    R_base_flange, wrench, context = data
+    g_flange = gravity_base(context) @ R_base_flange
+    load = force_at(p_flange_com, mass * g_flange)
+    if with_sensor:
+        load -= force_at(np.asarray(context["p_flange_sensor_com_m"]), context["sensor_mass_kg"] * g_flange)
+    R_flange_sensor, p_flange_sensor = mounting(context)
+    load[:, 3:] -= np.cross(p_flange_sensor, load[:, :3])
+    return wrench - context_bias(context) - (load.reshape(-1, 2, 3) @ R_flange_sensor).reshape(-1, 6)
+
+
+def _parse(text: str) -> ET.Element:
+    """Parse a document or a fragment of one."""
+    body = re.sub(r"<\?xml.*?\?>", "", text, flags=re.DOTALL)
+    return ET.fromstring(f'<fragment xmlns:xacro="http://www.ros.org/wiki/xacro">{body}</fragment>')
+
+
+def _origin(element: ET.Element) -> Pose:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    rotation = Rotation.from_euler("xyz", _floats(origin.get("rpy", "0 0 0")))
+    return rotation.as_matrix(), _floats(origin.get("xyz", "0 0 0"))
+
+
+def _attribute(element: ET.Element, child: str, name: str) -> str:
+    found = element.find(child)
+    if found is None:
+        raise ValueError(f"<{element.tag}> lacks <{child}>")
+    return found.attrib[name]
+
+
+def _floats(text: str) -> Array:
+    return np.array([float(word) for word in text.split()])
+
+
+def _compose(a: Pose, b: Pose) -> Pose:
+    return a[0] @ b[0], a[0] @ b[1] + a[1]
+
+
+def _apply(pose: Pose, point: Array) -> Array:
+    return np.asarray(pose[0] @ point + pose[1])
+
+
+def _same(a: Pose, b: Pose) -> bool:
+    return bool(np.allclose(a[0], b[0], atol=1e-6) and np.allclose(a[1], b[1], atol=1e-6))

@@ -155,7 +155,7 @@ def frames() -> Drawing:
             "ur-payload cog, franka center_of_mass, push:",
             "flange axes, from the flange; sensor and adapter included")),
         (336, 252, 278, BLUE, ("centre of mass of the tool: p_sensor_com_m",
-            "ros2-control, admittance, kth, kit, ft-tools, urdf, mujoco:",
+            "ros2-control, admittance, kth, ft-tools, urdf, mujoco:",
             "sensor axes, from the sensor",
             "xarm: flange axes, from the sensor; mc-rtc: from the flange")),
         (330, 322, 374, GREEN, ("weight of the tool: gravity_force_base_N, base axes",

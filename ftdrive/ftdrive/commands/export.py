@@ -1,6 +1,6 @@
 """`ftdrive export`: plans and calibrations as files of other programs."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -52,11 +52,9 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     The program asks before it moves, and stops unless the arm is near the first pose, because the approach is not
     planned. Unlike `ftdrive calibrate`, it has no guards.
     """
-    from ftcalib.files import write_new
     from ftdrive.errors import ConfigError
     from ftdrive.exports import urscript
     from ftdrive.planning.plan import Plan
-    from ftdrive.terminal.console import beside
 
     check_simulate(simulate, real={"PLAN.json": path})
     if simulate:
@@ -66,14 +64,7 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     else:
         raise ConfigError("which plan? Give the file that `ftdrive plan --output` has written, or --simulate")
     text = urscript.program(made, dwell_s=dwell_s) if target == "urscript" else urscript.table(made)
-    if output is not None:
-        write_new(output, text)
-        beside(as_json).print(f" Saved {output}")
-    if as_json:
-        about = {"format": target, "plan": made.sha256, "file": None if output is None else str(output)}
-        write_json({"schema_version": 1, **about, "text": text})
-    elif output is None:
-        echo(text, nl=False, fold=False)
+    _deliver(text, output, {"format": target, "plan": made.sha256}, as_json=as_json)
 
 
 @export.command()
@@ -155,12 +146,11 @@ def calibration(
     Signs, units, order and frames are those of the target. Notes on stderr say what must be set elsewhere, and what the
     target cannot express. The text is not written if the force would be wrong by more than --max-force-error.
     """
-    from ftcalib.files import write_new
     from ftdrive.exports import registry
     from ftdrive.exports.shared import Settings, recorded_sensor
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification import marks_of, verification_near
-    from ftdrive.terminal.console import beside, hanging, messages
+    from ftdrive.terminal.console import hanging, messages
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     with _calibrated(source, sensor, simulate=simulate) as path:
@@ -182,26 +172,9 @@ def calibration(
         messages.print(hanging(" note: ", note))
     if verification is not None and not verification.passed:
         messages.print(hanging(" note: ", f"the last verification of this calibration failed: {verification.reason}"))
-    if output is not None:
-        write_new(output, made.text)
-        beside(as_json).print(f" Saved {output}")
-    if as_json:
-        write_json(
-            {
-                "schema_version": 1,
-                "format": target,
-                "calibration": result.id,
-                "marks": list(marks_of(result)),
-                "file": None if output is None else str(output),
-                "max_force_error_N": made.max_force_error_N,
-                "max_torque_error_Nm": made.max_torque_error_Nm,
-                "notes": list(made.notes),
-                "elsewhere": dict(made.elsewhere),
-                "text": made.text,
-            }
-        )
-    elif output is None:
-        echo(made.text, nl=False, fold=False)
+    about = {"format": target, "calibration": result.id, "marks": list(marks_of(result))}
+    facts = {name: getattr(made, name) for name in ("max_force_error_N", "max_torque_error_Nm", "notes", "elsewhere")}
+    _deliver(made.text, output, about, facts, as_json=as_json)
 
 
 @export.command()
@@ -216,18 +189,9 @@ def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_
     ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and
     returns a state, never an old number.
     """
-    from ftcalib.files import write_new
     from ftdrive.exports.program_functions import functions
-    from ftdrive.terminal.console import beside
 
-    text = functions(first, example=example)
-    if output is not None:
-        write_new(output, text)
-        beside(as_json).print(f" Saved {output}")
-    if as_json:
-        write_json({"schema_version": 1, "file": None if output is None else str(output), "text": text})
-    elif output is None:
-        echo(text, nl=False, fold=False)
+    _deliver(functions(first, example=example), output, as_json=as_json)
 
 
 @export.command()
@@ -252,6 +216,28 @@ def formats(as_json: bool) -> None:
     width = max(map(len, FORMATS))
     for name, one in FORMATS.items():
         answer.print(hanging(f"{name:{width}}  ", one.description, answer))
+
+
+def _deliver(
+    text: str,
+    output: Path | None,
+    about: Mapping[str, object] = {},
+    facts: Mapping[str, object] = {},
+    *,
+    as_json: bool,
+) -> None:
+    """Save a text, or print it; `about` and `facts` stand before and after the name of the file in the JSON."""
+    from ftcalib.files import write_new
+    from ftdrive.terminal.console import beside
+
+    if output is not None:
+        write_new(output, text)
+        beside(as_json).print(f" Saved {output}")
+    if as_json:
+        file = None if output is None else str(output)
+        write_json({"schema_version": 1, **about, "file": file, **facts, "text": text})
+    elif output is None:
+        echo(text, nl=False, fold=False)
 
 
 @contextmanager

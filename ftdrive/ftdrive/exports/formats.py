@@ -1,8 +1,11 @@
-"""The formats by name, without numpy: help and completion must be fast."""
+"""The formats of an exported calibration as data: keys, units, signs and frames of each target.
+
+Without numpy, because help and completion must be fast. `registry.py` writes a row, and names the values in it.
+"""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final, Literal
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
 
 # What a calibration has: leaning base; turned sensor; gain and cross-talk of the sensor.
 Property = Literal["tilt", "rotation", "response"]
@@ -10,6 +13,8 @@ Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
 # By which the force of a target may differ from ours because it cannot express everything.
 MAX_FORCE_ERROR_N: Final = 0.1
+# mc_rtc/constants.h. The force must be right, so the mass for this gravity differs from ours by up to 0.3 %.
+MC_RTC_G_M_S2: Final = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +30,17 @@ class Format:
     """What the target has of the calibration, in the file or where it reads it; response: see `has_own_reading`."""
     comment: Comment = "#"
     """How the header is written."""
+    content: Any = None
+    """Of the file: a document that is written as YAML, or a text with values in braces; None: a function writes it.
+
+    In a document, "$name" stands for a value, and "*name" in a list for the numbers of a vector. A name is that of a
+    field of calibration or settings, or one of `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
+    components as ROS messages have them, and "name_words" its numbers with commas.
+    """
+    notes: tuple[str, ...] = ()
+    """Sentences for the user of the target, with values in braces."""
+    elsewhere: Mapping[str, str] = field(default_factory=dict)
+    """What the target reads from another place, by its name there, with "$name" as in `content`."""
 
     @property
     def has_own_reading(self) -> bool:
@@ -32,70 +48,259 @@ class Format:
         return "bias" not in self.subtracts and "response" in self.expresses
 
 
-# By name, as `--format` takes it.
+# A target that looks up frames trusts the robot model, so the note has the angles that it must have.
+_FRAMES: Final = (
+    "The robot model must turn {sensor_frame} against {flange_frame} by roll, pitch, yaw = ({rpy_rad_words}) rad: the "
+    "formats urdf and static-transform write it. {base_frame} must have the axes of {base_axes}."
+)
+# Parameters of ft_estimation_node, ft_tools/src/ft_estimation_node_parameters.yaml.
+_FT_ESTIMATION: Final = {
+    "calibration.reference_frame.id": "$base_frame",
+    "calibration.sensor_frame.id": "$sensor_frame",
+    "calibration.gravity_in_reference_frame": "$gravity_m_s2",
+}
+_BROADCASTER: Final = {
+    "force_torque_sensor_broadcaster": {
+        "ros__parameters": {
+            "frame_id": "$sensor_frame",
+            "sensor_name": "$sensor_frame",
+            "offset": {"force": "$minus_force_bias_N_xyz", "torque": "$minus_torque_bias_Nm_xyz"},
+            "sensor_filter_chain": {
+                "filter1": {
+                    "name": "gravity_compensation",
+                    "type": "control_filters/GravityCompensationWrench",
+                    "params": {
+                        "world_frame": "$base_frame",
+                        "sensor_frame": "$sensor_frame",
+                        "tool": {"CoG": "$p_sensor_com_m", "mass": "$mass_kg", "gravity_field": "$gravity_m_s2"},
+                    },
+                }
+            },
+        }
+    }
+}
+_OFFSET: Final = (
+    "offset is minus the bias, because the broadcaster adds it.",
+    "sensor_filter_chain needs ros2_controllers of September 2025 or newer; Humble has neither it nor offset.",
+)
+_OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
+
+# By name, as `--format` takes it; above each row project, file and version of its reader, and the reader's formula.
 FORMATS: Mapping[str, Format] = {
-    "kth": Format("ROS 1 node gravity_compensation of kth-ros-pkg/force_torque_tools", "ft_calib.yaml"),
-    "ft-tools": Format("ROS 2 node ft_estimation of ICube-Robotics/ft_tools_ros2", "calibration_parameters.yaml"),
-    "ros2-message": Format("ROS 2 message ft_msgs/FtCalibration, for the service set_calibration", "calibration.yaml"),
-    "calaw": Format(
-        "ROS 2 package ft_compensation of CalaW/ft_tools_ros2",
-        "ft_calibration.yaml",
-        expresses=("rotation",),
+    # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
+    # gravity_compensation.cpp, master since pull request 18 (2021-05). With a the acceleration that its IMU reports,
+    # turned into the sensor frame, which points up at rest:
+    #     force = raw - bias[:3] + gripper_mass a        torque = raw - bias[3:] + gripper_com x (gripper_mass a)
+    "kth": Format(
+        "ROS 1 node gravity_compensation of kth-ros-pkg/force_torque_tools",
+        "ft_calib.yaml",
+        content={
+            "bias": ["*force_bias_N", "*torque_bias_Nm"],
+            "gripper_com_frame_id": "$sensor_frame",
+            "gripper_com_child_frame_id": "$tool_frame",
+            "gripper_com_pose": ["*p_sensor_com_m", 0.0, 0.0, 0.0],
+            "gripper_mass": "$mass_kg",
+        },
+        notes=(
+            "The node waits for an IMU. Without one, publish sensor_msgs/Imu with the acceleration below, more than 10 "
+            "times a second. Versions before May 2021 need it with the opposite sign.",
+            _FRAMES,
+        ),
+        elsewhere={"imu header.frame_id": "$base_frame", "imu linear_acceleration": "$minus_gravity_m_s2"},
     ),
+    # ICube-Robotics/ft_tools_ros2, ft_tools/src/ft_parameters.cpp and ft_estimation.cpp, main. Signs are those of the
+    # code, which differ from its README. With g the parameter `gravity_in_reference_frame` in the sensor frame:
+    #     force = raw - mass g - force_offset            torque = raw - com x (mass g) - torque_offset
+    "ft-tools": Format(
+        "ROS 2 node ft_estimation of ICube-Robotics/ft_tools_ros2",
+        "calibration_parameters.yaml",
+        content={
+            "mass": "$mass_kg",
+            "sensor_frame_to_com": "$p_sensor_com_m",
+            "force_offset": "$force_bias_N",
+            "torque_offset": "$torque_bias_Nm",
+        },
+        notes=(_FRAMES,),
+        elsewhere=_FT_ESTIMATION,
+    ),
+    # As ft-tools: ft_msgs/msg/FtCalibration.msg, as `ros2 service call` and `ros2 topic pub` take it; the only field
+    # of a request of ft_msgs/srv/SetCalibration.
+    "ros2-message": Format(
+        "ROS 2 message ft_msgs/FtCalibration, for the service set_calibration",
+        "calibration.yaml",
+        content={
+            "mass": "$mass_kg",
+            "sensor_frame_to_com": "$p_sensor_com_m_xyz",
+            "force_offset": "$force_bias_N_xyz",
+            "torque_offset": "$torque_bias_Nm_xyz",
+        },
+        notes=(
+            "The request of the service ft_estimation_node/set_calibration has it in the field ft_calibration.",
+            _FRAMES,
+        ),
+        elsewhere=_FT_ESTIMATION,
+    ),
+    # ros-controls/ros2_controllers, force_torque_sensor_broadcaster.cpp, 5.0 or newer (offset: 4.16;
+    # sensor_filter_chain: September 2025), and ros-controls/control_toolbox, control_filters/gravity_compensation.hpp
+    # and .cpp, master (control_filters.md has older names). With g the vector `gravity_field`, turned from world_frame
+    # into sensor_frame:
+    #     force = raw + offset.force - mass g            torque = raw + offset.torque - CoG x (mass g)
     "ros2-control": Format(
-        "ros2_controllers force_torque_sensor_broadcaster with the gravity filter of control_toolbox", "ft.yaml"
+        "ros2_controllers force_torque_sensor_broadcaster with the gravity filter of control_toolbox",
+        "ft.yaml",
+        content=_BROADCASTER,
+        notes=(*_OFFSET, _FRAMES),
     ),
+    # ros-controls/ros2_controllers, admittance_controller/admittance_rule_impl.hpp, Humble to Kilted. In the axes of
+    # fixed_world_frame, with the weight CoG.force in N, positive; the controller subtracts no bias:
+    #     force_z = reading + CoG.force                  torque = reading - CoG.pos x [0, 0, -CoG.force]
     "admittance": Format(
         "ros2_controllers admittance_controller",
         "admittance.yaml",
         subtracts=("weight",),
         expresses=("rotation",),
+        content={
+            "admittance_controller": {
+                "ros__parameters": {
+                    "ft_sensor": {"name": "$sensor_frame", "frame": {"id": "$sensor_frame"}},
+                    "fixed_world_frame": {"frame": {"id": "$base_frame"}},
+                    "gravity_compensation": {
+                        "frame": {"id": "$sensor_frame"},
+                        "CoG": {"pos": "$p_sensor_com_m", "force": "$weight_N"},
+                    },
+                }
+            }
+        },
+        notes=(
+            "The controller subtracts no bias: subtract [{force_bias_N_words}, {torque_bias_Nm_words}] (N, N·m) where "
+            "the hardware interface reads the sensor.",
+            "If your version has the parameter sensor_filter_chain in place of gravity_compensation, copy the filter "
+            "of the format ros2-control.",
+            _FRAMES,
+        ),
     ),
-    "kit": Format(
-        "ROS nodes of KITrobotics: force_torque_sensor and iirob_filters", "ft.yaml", expresses=("rotation",)
+    # fzi-forschungszentrum-informatik/cartesian_controllers, cartesian_force_controller.cpp and
+    # cartesian_compliance_controller.cpp, ROS 2, which have neither bias nor weight. ft_sensor_wrench must be
+    # compensated, in the axes of ft_sensor_ref_link and about its origin; header.frame_id is not read. X moves it to
+    # end_effector_link (force) or compliance_ref_link, R turns it into the axes of robot_base_link, and the arm moves
+    # along the net force:
+    #     net = R X (raw + offset - weight) + target     with the broadcaster of ros2-control before it
+    "cartesian-controllers": Format(
+        "FZI cartesian_controllers of ROS 2 for force and compliance, with the broadcaster of ros2-control",
+        "controllers.yaml",
+        content={
+            **_BROADCASTER,
+            "cartesian_force_controller": {"ros__parameters": {"ft_sensor_ref_link": "$sensor_frame"}},
+            "cartesian_compliance_controller": {"ros__parameters": {"ft_sensor_ref_link": "$sensor_frame"}},
+        },
+        notes=(
+            "Sign test: activate the force controller with a small solver.error_scale, and push the tool gently. The "
+            "arm must yield along the push. If it moves against your hand, stop: the driver reports the reaction. "
+            "Negate it there, and calibrate again.",
+            "The controllers subtract neither bias nor weight: remap their topic ft_sensor_wrench to "
+            "/force_torque_sensor_broadcaster/wrench_filtered, or to the wrench of `ftdrive ros2 --axes sensor --about "
+            "sensor`. Add joints, gains and links of your cell.",
+            "ft_sensor_ref_link must be a link of the robot model between robot_base_link and end_effector_link, with "
+            "the origin of the sensor: use the format urdf. The controllers read neither static transforms nor "
+            "header.frame_id.",
+            "target_wrench is what the tool shall exert: in axes of end_effector_link, or of robot_base_link if "
+            "hand_frame_control is false.",
+            *_OFFSET,
+            _FRAMES,
+        ),
     ),
-    "code-iai": Format("ROS 1 node wrist_ft_sensor_cleaner of code-iai/robot_wrist_ft_tools", "params.yaml"),
+    # jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp, master; Robot.cpp gives it the gravity of constants.h. 13
+    # numbers, one a line: mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of a
+    # model whose sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its origin:
+    # here the flange. The offset has the couple first. With g along -z of the world, and p the place of the sensor:
+    #     force = raw - offset[3:] - mass g
+    #     couple = raw - offset[:3] - (com - p) x (mass g), in sensor axes
+    # White space must follow the last number. The reader stops there.
     "mc-rtc": Format(
         "mc_rtc, calib_data.NAME of a force sensor",
         "calib_data.ft_sensor",
         expresses=("rotation",),
         comment="# at the end",
+        content="{mc_rtc_mass_kg!r}\n"
+        + "".join(
+            f"{{{name}[{i}]!r}}\n"
+            for name in ("rpy_rad", "frame_com_m", "torque_bias_Nm", "force_bias_N")
+            for i in range(3)
+        ),
+        notes=(
+            "The parent body of the force sensor must be the flange ({flange_frame}), with the sensor at "
+            "({origin_m_words}) m and its axes. World z must point up.",
+            f"mass is weight / {MC_RTC_G_M_S2:g} m/s2, because mc_rtc multiplies it by that. Old versions have 9.81.",
+        ),
     ),
-    "xarm": Format("UFACTORY xArm, the ten numbers of ft_sensor_cali_load", "load.yaml", expresses=("tilt",)),
+    # xArm-Developer/xArm-Python-SDK, xarm/x3/ft_sensor.py, 1.11 or newer: mass (kg), centre of mass (mm), offsets of
+    # force (N) and torque (N·m). The origin of `com` is that of the sensor: with `association_setting_tcp_load`, the
+    # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is taken to be, with g of the
+    # calibration, and a sensor that has the axes of the flange:
+    #     force = raw - offset[:3] - mass g              torque = raw - offset[3:] - com x (mass g)
+    "xarm": Format(
+        "UFACTORY xArm, the ten numbers of ft_sensor_cali_load",
+        "load.yaml",
+        expresses=("tilt",),
+        content=["$mass_kg", "*com_mm", "*force_bias_N", "*torque_bias_Nm"],
+        notes=(
+            "The centre of mass is in mm. An SDK before 1.11 takes metres.",
+            "The formula of the firmware and the sign of the offsets are not public. Read the sensor without contact "
+            "in two poses before you use them.",
+        ),
+        elsewhere={"set_gravity_direction": "$gravity_direction"},
+    ),
+    # frankarobotics/libfranka, include/franka/robot.h, 0.8 or newer: mass (kg), centre of mass in flange axes from the
+    # flange (m), inertia about the centre of mass (kg m2, column by column), as the service SetLoad of franka_ros takes
+    # them. The load is all that the flange carries. Neither formula nor g of the firmware are public; g is along -z of
+    # the base, which cannot be changed:
+    #     force on the flange = mass g                   torque about the flange = F_x_Cload x (mass g)
     "franka": Format(
         "Franka libfranka setLoad, with the mass of the sensor",
         "load.yaml",
         subtracts=("weight",),
         expresses=("rotation", "response"),
+        content={"mass": "$payload_kg", "F_x_Cload": "$payload_com_m", "load_inertia": [0.0] * 9},
+        notes=(
+            "{assumed}",
+            "The inertia was not identified: zeros stand for a point mass. Put values of the CAD model there.",
+            "Franka names the centre of mass F_x_center_load in ROS 1 and center_of_mass in ROS 2.",
+            "The load has no bias. How the controller uses the load is not public: compare O_F_ext_hat_K without "
+            "contact in two poses.",
+        ),
     ),
     "ur-payload": Format(
         "Universal Robots URScript set_target_payload, with the mass of the sensor",
         "payload.script",
         subtracts=("weight",),
-        expresses=("tilt", "rotation", "response"),
+        expresses=_OWN_READING,
     ),
     "urdf": Format(
         "URDF links and fixed joints of sensor and tool",
         "tool.urdf",
         subtracts=("weight",),
-        expresses=("tilt", "rotation", "response"),
+        expresses=_OWN_READING,
         comment="<!-- -->",
     ),
     "mujoco": Format(
         "MuJoCo body of tool and sensor, with parameters for mujoco_ros2_control",
         "tool.xml",
         subtracts=("weight",),
-        expresses=("tilt", "rotation", "response"),
+        expresses=_OWN_READING,
         comment="<!-- -->",
     ),
-    "static-transform": Format("ROS 2 static_transform_publisher, flange to sensor", "transform.sh", subtracts=()),
-    "json": Format(
-        "JSON with everything that compensation needs",
-        "ft.json",
-        expresses=("tilt", "rotation", "response"),
-        comment="none",
+    # ros2/geometry2, tf2_ros static_transform_publisher, Humble or newer. Position (m) and quaternion map sensor
+    # coordinates to those of the frame-id: p = R(q) p_sensor + (x, y, z).
+    "static-transform": Format(
+        "ROS 2 static_transform_publisher, flange to sensor",
+        "transform.sh",
+        subtracts=(),
+        content="ros2 run tf2_ros static_transform_publisher "
+        "--x {origin_m[0]!r} --y {origin_m[1]!r} --z {origin_m[2]!r} "
+        "--qx {quaternion[0]!r} --qy {quaternion[1]!r} --qz {quaternion[2]!r} --qw {quaternion[3]!r} "
+        "--frame-id {flange_frame} --child-frame-id {sensor_frame}\n",
+        notes=("It has the place of the sensor only, no bias and no weight.",),
     ),
-    "yaml": Format(
-        "YAML with everything that compensation needs", "ft.yaml", expresses=("tilt", "rotation", "response")
-    ),
+    "json": Format("JSON with everything that compensation needs", "ft.json", expresses=_OWN_READING, comment="none"),
+    "yaml": Format("YAML with everything that compensation needs", "ft.yaml", expresses=_OWN_READING),
 }

@@ -1,9 +1,10 @@
-"""The function of each target, the complete JSON and YAML, and how far a target is from the calibration."""
+"""Writes the rows of `formats.py`, the complete JSON and YAML, and says how far a target is from the calibration."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from math import degrees
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -14,9 +15,20 @@ from ftcalib.files import JSON
 from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation, skew
 from ftdrive import __version__
 from ftdrive.errors import NotAccepted
-from ftdrive.exports import robots, ros
-from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, Comment, Format
-from ftdrive.exports.shared import Exported, Settings, plain, yaml_text
+from ftdrive.exports import robots
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format
+from ftdrive.exports.shared import (
+    Exported,
+    R_frame_sensor,
+    Settings,
+    gravity_in_frame_m_s2,
+    gravity_m_s2,
+    numbers,
+    plain,
+    quaternion_xyzw,
+    rpy_rad,
+    yaml_text,
+)
 from ftdrive.runs.verification import MARKS, VerificationRecord, marks_of
 
 FORMAT = "ftdrive.export/1"
@@ -28,11 +40,11 @@ _FIELDS = (
 )
 
 
-def _as_json(calibration: CalibrationResult, settings: Settings) -> Exported:
-    """Write a JSON object for a program of the user.
+def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
+    """Return all that compensation needs, for a program of the user.
 
-    Reader: none in particular. With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the
-    sensor frame, and zeros where there is no `response`:
+    With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros where
+    there is no `response`:
 
         force = raw - force_bias_N - u - force_gain u
         torque = raw - torque_bias_Nm - p_sensor_com_m x u - cross_talk_m u
@@ -40,15 +52,6 @@ def _as_json(calibration: CalibrationResult, settings: Settings) -> Exported:
 
     `decoder` (6 x 6) is null where no error of the sensor's matrix is known. Then the contact is (force, torque).
     """
-    return Exported(json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n")
-
-
-def _as_yaml(calibration: CalibrationResult, settings: Settings) -> Exported:
-    """Write the object of `as_json` as YAML, with the same fields and formula."""
-    return Exported(yaml_text(_document(calibration, settings)))
-
-
-def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
     result = calibration.to_dict()
     response, decoder = calibration.response, calibration.contact.decoder
     origin_m = None if settings.height_mm is None else settings.p_flange_sensor_m("json").tolist()
@@ -117,25 +120,70 @@ def _largest_norm(matrix: Array, offset: Array) -> float:
     return float(norms.max())
 
 
-TARGETS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
-    "kth": ros.kth,
-    "ft-tools": ros.ft_tools,
-    "ros2-message": ros.ros2_message,
-    "calaw": ros.calaw,
-    "ros2-control": ros.ros2_control,
-    "admittance": ros.admittance,
-    "kit": ros.kit,
-    "code-iai": ros.code_iai,
-    "mc-rtc": robots.mc_rtc,
-    "xarm": robots.xarm,
-    "franka": robots.franka,
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """The values that a row names: `_VALUES`, and fields of the calibration and of the settings."""
+
+    target: str
+    calibration: CalibrationResult
+    settings: Settings
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a value in the unit of its name; raises `ConfigError` if it was not measured."""
+        if name in _VALUES:
+            value = _VALUES[name](self)
+        elif name.endswith("_xyz"):  # as ROS messages have a vector
+            value = dict(zip("xyz", self[name.removesuffix("_xyz")], strict=True))
+        elif name.endswith("_words"):
+            value = ", ".join(map(str, self[name.removesuffix("_words")]))
+        elif name.startswith("minus_"):
+            value = -np.array(self[name.removeprefix("minus_")])
+        else:
+            value = getattr(self.calibration if hasattr(self.calibration, name) else self.settings, name)
+        return numbers(value) if isinstance(value, np.ndarray) else value
+
+    def filled(self, node: Any) -> Any:
+        """Return a part of a row with its values."""
+        if isinstance(node, Mapping):
+            return {key: self.filled(value) for key, value in node.items()}
+        if isinstance(node, list):
+            return [each for one in node for each in (self[one[1:]] if "*" in str(one) else [self.filled(one)])]
+        return self[node[1:]] if isinstance(node, str) and node.startswith("$") else node
+
+
+_VALUES: Mapping[str, Callable[[_Values], Any]] = {
+    "mc_rtc_mass_kg": lambda v: v.calibration.weight_N / MC_RTC_G_M_S2,
+    "com_mm": lambda v: 1e3 * v.calibration.p_sensor_com_m,
+    "gravity_m_s2": lambda v: gravity_in_frame_m_s2(v.calibration, v.settings),
+    "gravity_direction": lambda v: (g := gravity_m_s2(v.calibration)) / np.linalg.norm(g),
+    "rpy_rad": lambda v: rpy_rad(R_frame_sensor(v.calibration, v.settings)),
+    "quaternion": lambda v: quaternion_xyzw(R_frame_sensor(v.calibration, v.settings)),
+    "origin_m": lambda v: v.settings.p_frame_sensor_m(v.target),
+    "frame_com_m": lambda v: (
+        v.settings.p_frame_sensor_m(v.target) + R_frame_sensor(v.calibration, v.settings) @ v.calibration.p_sensor_com_m
+    ),
+    "payload_kg": lambda v: v.settings.payload(v.target, v.calibration)[0],
+    "payload_com_m": lambda v: v.settings.payload(v.target, v.calibration)[1],
+}
+
+
+_FUNCTIONS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
     "ur-payload": robots.ur_payload,
     "urdf": robots.urdf,
     "mujoco": robots.mujoco,
-    "static-transform": ros.static_transform,
-    "json": _as_json,
-    "yaml": _as_yaml,
+    "json": lambda c, s: Exported(json.dumps(_document(c, s), indent=1, allow_nan=False) + "\n"),
+    "yaml": lambda c, s: Exported(yaml_text(_document(c, s))),
 }
+
+
+def _written(name: str, calibration: CalibrationResult, settings: Settings) -> Exported:
+    """Write a target. Raises `ConfigError` if a value was not measured."""
+    if name in _FUNCTIONS:
+        return _FUNCTIONS[name](calibration, settings)
+    row, values = FORMATS[name], _Values(name, calibration, settings)
+    text = row.content.format_map(values) if isinstance(row.content, str) else yaml_text(values.filled(row.content))
+    notes = (note.format_map(values) for note in row.notes)
+    return Exported(text, tuple(note for note in notes if note), values.filled(row.elsewhere))
 
 
 def export(
@@ -162,7 +210,7 @@ def export(
             f"the calibration is rejected and not exported: {'; '.join(calibration.reasons)}. Calibrate again"
         )
     target = FORMATS[name]
-    exported = TARGETS[name](calibration, settings)
+    exported = _written(name, calibration, settings)
     force_N, torque_Nm = 0.0, 0.0
     notes = list(exported.notes)
     if target.subtracts:

@@ -112,13 +112,13 @@ class Settings:
         return load.mass_kg, load.p_flange_com_m
 
     @property
-    def assumed(self) -> tuple[str, ...]:
-        """Note about the centre of mass of the sensor, if it was not measured."""
+    def assumed(self) -> str:
+        """Note about the centre of mass of the sensor; empty if it was measured."""
         if not self.sensor_mass_kg or self.sensor_com_mm is not None:
-            return ()
+            return ""
         return (
             f"The centre of mass of sensor and adapter ({self.sensor_mass_kg:g} kg) is taken half way up, on the axis "
-            "of the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it.",
+            "of the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it."
         )
 
 
@@ -144,11 +144,6 @@ class Exported:
 def numbers(values: ArrayLike) -> list[float]:
     """Return plain floats without a negative zero."""
     return [float(value) + 0.0 for value in np.ravel(values)]
-
-
-def xyz(values: ArrayLike) -> dict[str, float]:
-    """Return a vector as ROS messages have it."""
-    return dict(zip("xyz", numbers(values), strict=True))
 
 
 def yaml_text(document: Mapping[str, Any] | list[float]) -> str:

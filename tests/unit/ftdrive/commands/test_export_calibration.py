@@ -78,19 +78,19 @@ def test_json_has_text_notes_and_what_is_set_elsewhere(saved: Path) -> None:
 
 def test_a_file_is_new_and_complete_or_absent(saved: Path, tmp_path: Path) -> None:
     path = tmp_path / "ft.yaml"
-    first = export("calibration", saved, "--format", "kit", "-o", path)
+    first = export("calibration", saved, "--format", "admittance", "-o", path)
     assert (first.exit_code, first.stdout) == (0, f" Saved {path}\n")
     text = path.read_text()
-    again = export("calibration", saved, "--format", "kit", "-o", path)
+    again = export("calibration", saved, "--format", "admittance", "-o", path)
     assert isinstance(again.exception, ConfigError)
     assert path.read_text() == text
     tilted(3).save(tmp_path / "tilted.json")
-    refused = export("calibration", tmp_path / "tilted.json", "--format", "kit", "-o", tmp_path / "new.yaml")
+    refused = export("calibration", tmp_path / "tilted.json", "--format", "admittance", "-o", tmp_path / "new.yaml")
     assert refused.exception is not None
     assert exit_code(refused.exception) == 7
     assert not list(tmp_path.glob("new*"))
     limit = ("--max-force-error", "1.1", "-o", tmp_path / "new.yaml")
-    assert export("calibration", tmp_path / "tilted.json", "--format", "kit", *limit).exit_code == 0
+    assert export("calibration", tmp_path / "tilted.json", "--format", "admittance", *limit).exit_code == 0
 
 
 def test_height_and_mass_come_from_the_run_unless_an_option_has_them(run: Path, saved: Path) -> None:

@@ -15,7 +15,7 @@ from ftcalib import CalibrationResult
 from ftcalib.result import MotionResult
 from ftdrive import __version__
 from ftdrive.exports.formats import FORMATS
-from ftdrive.exports.registry import TARGETS, export
+from ftdrive.exports.registry import export
 from ftdrive.exports.shared import Exported, Settings
 from tests.unit.ftdrive.exports.example import (
     MEASURED,
@@ -32,16 +32,6 @@ def made(name: str, settings: Settings = MEASURED, limit_N: float = 1e3) -> Expo
 
 def document(name: str, settings: Settings = MEASURED) -> Any:
     return yaml.safe_load(made(name, settings).text)
-
-
-def test_the_parameters_of_calaw_are_printed_in_the_order_of_its_file() -> None:
-    found = document("calaw")
-    assert made("calaw").elsewhere["calib_params"] == [
-        found["mass"],
-        *found["cog"],
-        *found["f_bias"],
-        *found["t_bias"],
-    ]
 
 
 PAYLOAD_COM = [2 * 0.02 / 2.5, 2 * 0.01 / 2.5, (2 * 0.083 + 0.5 * 0.015) / 2.5]
@@ -83,7 +73,7 @@ def test_two_yaml_readers_agree_and_a_small_number_is_a_number_to_both(name: str
     text = made(name).text
     one, other = yaml.safe_load(text), YAML(typ="safe").load(text)
     assert one == other
-    assert len(IN_YAML) == 11
+    assert len(IN_YAML) == 9
 
     def leaves(value: Any) -> list[Any]:
         if isinstance(value, dict):
@@ -94,7 +84,7 @@ def test_two_yaml_readers_agree_and_a_small_number_is_a_number_to_both(name: str
     assert not [leaf for leaf in leaves(one) if type(leaf) is int]  # rclcpp rejects 0 where it wants 0.0
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@pytest.mark.parametrize("name", FORMATS)
 def test_every_text_names_calibration_date_and_version(name: str) -> None:
     text = made(name).text
     for word in (calibration().id, "2026-11-14T08:00:00+00:00", f"ftdrive {__version__}"):
@@ -106,6 +96,15 @@ def test_a_name_that_yaml_would_read_as_true_is_quoted() -> None:
     filter1 = document("ros2-control", settings)["force_torque_sensor_broadcaster"]["ros__parameters"]
     assert filter1["sensor_name"] == "yes"
     assert filter1["sensor_filter_chain"]["filter1"]["params"]["world_frame"] == "on"
+
+
+def test_the_controllers_of_fzi_read_the_frame_of_the_broadcaster_and_the_file_has_a_sign_test() -> None:
+    settings = Settings(sensor_frame="ft")
+    found = document("cartesian-controllers", settings)
+    for name in ("cartesian_force_controller", "cartesian_compliance_controller"):
+        assert found[name]["ros__parameters"] == {"ft_sensor_ref_link": "ft"}
+    assert found.items() >= document("ros2-control", settings).items()
+    assert "\n# Sign test: " in made("cartesian-controllers", settings).text
 
 
 def numbers_after(words: str, notes: tuple[str, ...]) -> list[float]:
