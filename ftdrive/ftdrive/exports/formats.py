@@ -31,11 +31,11 @@ class Format:
     comment: Comment = "#"
     """How the header is written."""
     content: Any = None
-    """Of the file: a document that is written as YAML, or a text with values in braces; None: a function writes it.
+    """Of the file: a document that is written as YAML, or a text with values in braces; None for the complete result.
 
     In a document, "$name" stands for a value, and "*name" in a list for the numbers of a vector. A name is that of a
     field of calibration or settings, or one of `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
-    components as ROS messages have them, and "name_words" its numbers with commas.
+    components as ROS messages have them; `registry.py` has the other ends of names.
     """
     notes: tuple[str, ...] = ()
     """Sentences for the user of the target, with values in braces."""
@@ -83,6 +83,7 @@ _OFFSET: Final = (
     "offset is minus the bias, because the broadcaster adds it.",
     "sensor_filter_chain needs ros2_controllers of September 2025 or newer; Humble has neither it nor offset.",
 )
+_WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: turn it if those of the world differ."
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
 # By name, as `--format` takes it; above each row project, file and version of its reader, and the reader's formula.
@@ -269,25 +270,119 @@ FORMATS: Mapping[str, Format] = {
             "contact in two poses.",
         ),
     ),
+    # Universal Robots controller, URScript manual 5.10 or newer, set_target_payload(m, cog, inertia): kg, and m in
+    # flange axes from the flange, no exponents. The payload is all that the flange carries. The statement zeroes the
+    # sensor of an e-Series arm. The formula of the controller is not public, and taken to be, with g of `set_gravity`:
+    #     force on the flange = m g                      torque about the flange = cog x (m g)
     "ur-payload": Format(
         "Universal Robots URScript set_target_payload, with the mass of the sensor",
         "payload.script",
         subtracts=("weight",),
         expresses=_OWN_READING,
+        content="set_target_payload({payload_kg:.12f}, [{payload_com_m_fixed}], [{payload_inertia}])\n",
+        notes=(
+            "{assumed}",
+            "The controller zeroes its own force sensor when this runs: keep the tool free and the arm still.",
+            "{inertia_note} Needs PolyScope 5.10; set_payload before that.",
+            "The payload has no bias. How the controller uses it is not public: compare get_tcp_force() without "
+            "contact in two poses.",
+            "set_gravity takes the acceleration away from the earth, in base axes. The mounting in PolyScope sets it "
+            "too.",
+        ),
+        elsewhere={"set_gravity": "$minus_gravity_base_m_s2"},
     ),
+    # URDF 1.0, ros/urdfdom, to be included below the flange of a robot. The tool link has the frame of the sensor, so
+    # that `origin` of `inertial` is the centre of mass in the sensor frame. `rpy` is R = Rz(yaw) Ry(pitch) Rx(roll).
+    # With g the gravity of the simulation, in sensor axes:
+    #     force on the sensor = mass g                   torque about its origin = origin x (mass g)
     "urdf": Format(
         "URDF links and fixed joints of sensor and tool",
         "tool.urdf",
         subtracts=("weight",),
         expresses=_OWN_READING,
         comment="<!-- -->",
+        content="""\
+<robot name="{tool_frame}">
+  <link name="{flange_frame}" />
+  <link name="{sensor_frame}" />
+  <link name="{tool_frame}">
+    <inertial>
+      <origin xyz="{true_com_m_spaced}" rpy="0 0 0" />
+      <mass value="{true_kg!r}" />
+      {urdf_point_mass}<inertia ixx="{J[0]!r}" ixy="{J[1]!r}" ixz="{J[2]!r}" \
+iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
+    </inertial>
+  </link>
+  <joint name="{flange_frame}_to_{sensor_frame}" type="fixed">
+    <parent link="{flange_frame}" />
+    <child link="{sensor_frame}" />
+    <origin xyz="{origin_m_spaced}" rpy="{rpy_rad_spaced}" />
+  </joint>
+  <joint name="{sensor_frame}_to_{tool_frame}" type="fixed">
+    <parent link="{sensor_frame}" />
+    <child link="{tool_frame}" />
+    <origin xyz="0.0 0.0 0.0" rpy="0.0 0.0 0.0" />
+  </joint>
+</robot>
+""",
+        notes=(
+            "{inertia_note}",
+            "Leave out the link {flange_frame} if your robot has it.",
+            "The mass of the sensor itself is not in it, nor its bias.",
+            _WORLD,
+        ),
+        elsewhere={"gravity of the simulation": "$gravity_m_s2"},
     ),
+    # MuJoCo, whose element `attach` puts the body into the flange, and ros-controls/mujoco_ros2_control, which looks
+    # for the sensors NAME_force and NAME_torque. The plugin is fts_grav_comp_plugin.cpp of mujoco_ros2_control_plugins,
+    # pull request 308 of September 2026, newer than release 0.1.2 and wrong without the weight in the model. Without it
+    # the simulated sensor shows the weight, as a real one does. With g the gravity of the model in the axes of the
+    # sensor's site, the tool at rest reads
+    #     force = mass g                                 torque = pos x (mass g)
+    # and the plugin gives, with the reading as the hardware interface has it, which is minus that of MuJoCo:
+    #     force = reading - CoG.mass g                   torque = reading - CoG.pos x (CoG.mass g)
     "mujoco": Format(
         "MuJoCo body of tool and sensor, with parameters for mujoco_ros2_control",
         "tool.xml",
         subtracts=("weight",),
         expresses=_OWN_READING,
         comment="<!-- -->",
+        content="""\
+<mujoco model="{tool_frame}">
+  <!-- parameters of the plugin that removes the weight, for a file of their own:
+/**:
+  ros__parameters:
+    mujoco_plugins:
+      fts_grav_comp_plugin:
+        type: mujoco_ros2_control_plugins/FtsGravCompPlugin
+        {sensor_frame_yaml}:
+          frame_id: {sensor_frame_yaml}
+          CoG:
+            pos: {true_com_m_yaml}
+            mass: {true_kg_yaml}
+-->
+  <worldbody>
+    <body name="{tool_frame}" pos="{origin_m_spaced}" quat="{quaternion_wxyz_spaced}">
+      {mujoco_point_mass}<inertial pos="{true_com_m_spaced}" mass="{true_kg!r}" {mujoco_inertia} />
+      <site name="{sensor_frame}" />
+    </body>
+  </worldbody>
+  <sensor>
+    <force name="{sensor_frame}_force" site="{sensor_frame}" />
+    <torque name="{sensor_frame}_torque" site="{sensor_frame}" />
+  </sensor>
+</mujoco>
+""",
+        notes=(
+            "Attach the body {tool_frame} to {flange_frame}. A simulated sensor has no bias.",
+            "Plain MuJoCo sensors have the opposite sign: negate sensordata, as the hardware interface of "
+            "mujoco_ros2_control does, to get the wrench on the sensor.",
+            "{inertia_note} The mass of the sensor itself is not in it.",
+            "The plugin FtsGravCompPlugin needs a mujoco_ros2_control newer than 0.1.2 (pull request 308, September "
+            "2026).",
+            _WORLD,
+        ),
+        elsewhere={"option gravity": "$gravity_m_s2"},
     ),
     # ros2/geometry2, tf2_ros static_transform_publisher, Humble or newer. Position (m) and quaternion map sensor
     # coordinates to those of the frame-id: p = R(q) p_sensor + (x, y, z).

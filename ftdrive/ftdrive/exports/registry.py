@@ -4,26 +4,28 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import degrees
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from ftcalib.after.weighing import true_tool
 from ftcalib.compensation import Compensator
 from ftcalib.files import JSON
 from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation, skew
 from ftdrive import __version__
 from ftdrive.errors import NotAccepted
-from ftdrive.exports import robots
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format
 from ftdrive.exports.shared import (
     Exported,
     R_frame_sensor,
     Settings,
-    gravity_in_frame_m_s2,
     gravity_m_s2,
+    inertia_kg_m2,
+    inertia_note,
     numbers,
+    payload_inertia_kg_m2,
     plain,
     quaternion_xyzw,
     rpy_rad,
@@ -130,12 +132,11 @@ class _Values:
 
     def __getitem__(self, name: str) -> Any:
         """Return a value in the unit of its name; raises `ConfigError` if it was not measured."""
+        base, _, form = name.rpartition("_")
         if name in _VALUES:
             value = _VALUES[name](self)
-        elif name.endswith("_xyz"):  # as ROS messages have a vector
-            value = dict(zip("xyz", self[name.removesuffix("_xyz")], strict=True))
-        elif name.endswith("_words"):
-            value = ", ".join(map(str, self[name.removesuffix("_words")]))
+        elif form in _FORMS:
+            value = _FORMS[form](self[base])
         elif name.startswith("minus_"):
             value = -np.array(self[name.removeprefix("minus_")])
         else:
@@ -151,12 +152,22 @@ class _Values:
         return self[node[1:]] if isinstance(node, str) and node.startswith("$") else node
 
 
+_DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+# How a name ends that stands for a value in a certain form.
+_FORMS: Mapping[str, Callable[[Any], Any]] = {
+    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as ROS messages have a vector
+    "words": lambda value: ", ".join(map(str, value)),
+    "spaced": lambda value: " ".join(map(repr, value)),
+    "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # the URScript manual mentions no exponents
+    "yaml": lambda value: yaml_text(value).removesuffix("\n").removesuffix("\n..."),
+}
 _VALUES: Mapping[str, Callable[[_Values], Any]] = {
     "mc_rtc_mass_kg": lambda v: v.calibration.weight_N / MC_RTC_G_M_S2,
     "com_mm": lambda v: 1e3 * v.calibration.p_sensor_com_m,
-    "gravity_m_s2": lambda v: gravity_in_frame_m_s2(v.calibration, v.settings),
+    "gravity_m_s2": lambda v: v.settings.R_frame_base @ gravity_m_s2(v.calibration),
     "gravity_direction": lambda v: (g := gravity_m_s2(v.calibration)) / np.linalg.norm(g),
     "rpy_rad": lambda v: rpy_rad(R_frame_sensor(v.calibration, v.settings)),
+    "quaternion_wxyz": lambda v: np.roll(quaternion_xyzw(R_frame_sensor(v.calibration, v.settings)), 1),
     "quaternion": lambda v: quaternion_xyzw(R_frame_sensor(v.calibration, v.settings)),
     "origin_m": lambda v: v.settings.p_frame_sensor_m(v.target),
     "frame_com_m": lambda v: (
@@ -164,22 +175,39 @@ _VALUES: Mapping[str, Callable[[_Values], Any]] = {
     ),
     "payload_kg": lambda v: v.settings.payload(v.target, v.calibration)[0],
     "payload_com_m": lambda v: v.settings.payload(v.target, v.calibration)[1],
+    "payload_inertia": lambda v: (
+        "0, 0, 0, 0, 0, 0"
+        if (J := payload_inertia_kg_m2(v.calibration, v.settings, v.target)) is None
+        else _FORMS["fixed"](numbers(J[_DIAGONAL_FIRST]))
+    ),
+    "gravity_base_m_s2": lambda v: gravity_m_s2(v.calibration),
+    "true_kg": lambda v: true_tool(v.calibration)[0],
+    "true_com_m": lambda v: true_tool(v.calibration)[1],
+    "J": lambda v: np.zeros(9) if (J := inertia_kg_m2(v.calibration)) is None else J,
+    "inertia_note": lambda v: inertia_note(v.calibration),
+    "urdf_point_mass": lambda v: _point_mass(v.calibration, ""),
+    "mujoco_point_mass": lambda v: _point_mass(v.calibration, "inertia "),
+    "mujoco_inertia": lambda v: (
+        'diaginertia="0 0 0"'
+        if (J := inertia_kg_m2(v.calibration)) is None
+        else f'fullinertia="{_FORMS["spaced"](numbers(J[_DIAGONAL_FIRST]))}"'
+    ),
 }
 
 
-_FUNCTIONS: Mapping[str, Callable[[CalibrationResult, Settings], Exported]] = {
-    "ur-payload": robots.ur_payload,
-    "urdf": robots.urdf,
-    "mujoco": robots.mujoco,
-    "json": lambda c, s: Exported(json.dumps(_document(c, s), indent=1, allow_nan=False) + "\n"),
-    "yaml": lambda c, s: Exported(yaml_text(_document(c, s))),
-}
+def _point_mass(calibration: CalibrationResult, what: str) -> str:
+    """Return a comment of XML and the start of its next line, or nothing if the inertia was identified."""
+    if inertia_kg_m2(calibration) is not None:
+        return ""
+    return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
 
 
 def _written(name: str, calibration: CalibrationResult, settings: Settings) -> Exported:
     """Write a target. Raises `ConfigError` if a value was not measured."""
-    if name in _FUNCTIONS:
-        return _FUNCTIONS[name](calibration, settings)
+    if name == "json":
+        return Exported(json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n")
+    if name == "yaml":
+        return Exported(yaml_text(_document(calibration, settings)))
     row, values = FORMATS[name], _Values(name, calibration, settings)
     text = row.content.format_map(values) if isinstance(row.content, str) else yaml_text(values.filled(row.content))
     notes = (note.format_map(values) for note in row.notes)

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from ftcalib.after.weighing import true_tool
 from ftcalib.files import JSON
 from ftcalib.model import Array
 from ftdrive.checks.arm import flange_load
@@ -159,11 +160,6 @@ def gravity_m_s2(calibration: CalibrationResult) -> Array:
     return calibration.gravity_force_base_N / calibration.mass_kg
 
 
-def gravity_in_frame_m_s2(calibration: CalibrationResult, settings: Settings) -> Array:
-    """Return gravity (3,) in axes of the frame `settings.base_frame`, m/s²."""
-    return settings.R_frame_base @ gravity_m_s2(calibration)
-
-
 def R_frame_sensor(calibration: CalibrationResult, settings: Settings) -> Array:
     """Return the orientation (3, 3) of the sensor in the frame `settings.flange_frame`."""
     return settings.R_frame_flange @ calibration.R_flange_sensor
@@ -192,6 +188,38 @@ def inertia_kg_m2(calibration: CalibrationResult) -> Array | None:
     J = calibration.motion.inertia_kg_m2
     low, middle, high = np.linalg.eigvalsh(J)
     return J if low > 0 and high <= low + middle else None
+
+
+def payload_inertia_kg_m2(calibration: CalibrationResult, settings: Settings, target: str) -> Array | None:
+    """Return the inertia (3, 3) of all that the flange carries, about its centre of mass, flange axes; None as above.
+
+    The sensor itself counts as a point at its centre of mass.
+    """
+    J = inertia_kg_m2(calibration)
+    if J is None:
+        return None
+    mass_kg, p_flange_com_m = settings.payload(target, calibration)
+    Q, (tool_kg, p_sensor_com_m) = calibration.R_flange_sensor, true_tool(calibration)
+    tool_m = settings.p_flange_sensor_m(target) + Q @ p_sensor_com_m - p_flange_com_m
+    total, sensor_kg = Q @ J @ Q.T + tool_kg * _steiner(tool_m), mass_kg - tool_kg
+    if sensor_kg > 0:
+        total += sensor_kg * _steiner(-tool_kg / sensor_kg * tool_m)
+    return np.asarray(total)
+
+
+def inertia_note(calibration: CalibrationResult) -> str:
+    """Say whether the inertia was identified."""
+    motion = calibration.motion
+    if motion is None or inertia_kg_m2(calibration) is None:
+        why = "" if motion is None else " well enough"
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
+    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."
+
+
+def _steiner(p_m: Array) -> Array:
+    """Inertia per mass (3, 3) of a point about the origin."""
+    return np.asarray(p_m @ p_m * np.eye(3) - np.outer(p_m, p_m))
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:
