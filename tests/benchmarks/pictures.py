@@ -1,8 +1,8 @@
 """Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [NAME]...`, all without a name.
 
 demo      runs `ftdrive demo` in tmux at 80x40, copies its screen about once a second, and animates the screens as SVG
-live      runs the real app of `ftdrive live` with a stream without devices, and draws one SVG for each of its states
-weigh     runs the real app of `ftdrive weigh` with a weight
+live      draws the screen of `ftdrive live` with a stream without devices, one SVG for each of its states
+weigh     draws the screen of `ftdrive weigh` with a weight
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
 fleet     photographs the page of `ftdrive fleet status` for four cells, one of which drifts
 tour      stick figures of `ftdrive plan`, and the sweep of `ftdrive demo --sweep`
@@ -11,7 +11,6 @@ drawings  frames, signs, what to measure, files, data flow, and plots of tables 
 Tests of the browser draw the pages of --view: `PICTURES=docs/pictures uv run pytest -m browser tests/browser`.
 """
 
-import asyncio
 import os
 import re
 import shutil
@@ -30,18 +29,15 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from ftdrive.checks.check import Check
 from ftdrive.fleet.page import page
 from ftdrive.live.weighing import ScaleState
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.terminal.live_screen import LiveApp
-from ftdrive.terminal.live_view import Summary
-from ftdrive.terminal.weigh_screen import WeighApp
+from ftdrive.terminal.canvas import Canvas
 from tests.benchmarks.common import show
 from tests.benchmarks.drawings import DRAWINGS
 from tests.unit.ftdrive.fleet.fleet_records import cell, daily, fleet, observed, result
-from tests.unit.ftdrive.terminal.fake_stream import INFO, FakeStream, Scenario
-from tests.unit.ftdrive.terminal.test_weigh_screen import PART, FakeWeighing
+from tests.unit.ftdrive.terminal.fake_stream import INFO, Scenario
+from tests.unit.ftdrive.terminal.test_live_screen import Screen
+from tests.unit.ftdrive.terminal.test_weigh_screen import PART, FakeWeighing, Scale
 
 FOLDER = Path(__file__).parents[2] / "docs/pictures"
 COLUMNS, ROWS, DEMO_ROWS = 80, 24, 40
@@ -116,46 +112,17 @@ def animated(strip: list[str]) -> str:
 
 # The states of the live screen
 
-BLOCKS = 1200
 SCALE_ROWS = 12
-CHECKS = (
-    Check("calibration.devices", "ok", "verdict good, with these devices"),
-    Check("robot.payload", "ok", "robot 1.74 kg; weighed 1.44 kg + 0.30 kg sensor"),
-)
 DOTS = ((0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1), (3, 0), (3, 1))
 """Row and column of the dot of each bit."""
 
 
-async def picture(scenario: Scenario) -> str:
-    """Run the app in a state and draw it."""
-    stream = FakeStream(scenario, silent_after=BLOCKS if scenario == "stale" else None)
-    feed = Feed(stream)
-    summary = Summary(feed, CHECKS)
-    for _ in range(BLOCKS):
-        feed.step()
-    if scenario == "tare-refused":
-        feed.request("t")
-    feed.step()
-    app = LiveApp(feed, summary)
-    async with app.run_test(size=(COLUMNS, ROWS)) as pilot:
-        app.draw()
-        await pilot.pause()
-        return app.export_screenshot(simplify=True)
-
-
-async def scale() -> str:
-    """Run the scale with a part in the gripper and draw it."""
-    weighing = FakeWeighing(ScaleState(PART, None))
-    weighing.stream.info = INFO
-    app = WeighApp(weighing)
-    async with app.run_test(size=(COLUMNS, SCALE_ROWS)) as pilot:
-        while weighing.shown != weighing.given:
-            await pilot.pause(0.01)
-        app.draw()
-        await pilot.pause()
-        weighing.ends.set()
-        app.reader.join()
-        return app.export_screenshot(title="ftdrive weigh", simplify=True)
+def picture(screen: Canvas, rows: int, title: str) -> str:
+    """Draw a screen."""
+    console = Console(width=COLUMNS, record=True, file=StringIO(), force_terminal=True)
+    for line in screen.lines(COLUMNS, rows):
+        console.print(line.as_text(), crop=False)
+    return console.export_svg(title=title)
 
 
 def with_dots(svg: str) -> str:
@@ -196,11 +163,13 @@ def draw_demo() -> None:
 
 def draw_live() -> None:
     for scenario in get_args(Scenario):
-        write(f"live-{scenario}.svg", with_dots(asyncio.run(picture(scenario))))
+        write(f"live-{scenario}.svg", with_dots(picture(Screen(scenario).screen, ROWS, "ftdrive live")))
 
 
 def draw_weigh() -> None:
-    write("weigh.svg", with_dots(asyncio.run(scale())))
+    weighing = FakeWeighing(ScaleState(PART, None))
+    weighing.stream.info = INFO
+    write("weigh.svg", with_dots(picture(Scale(weighing).screen, SCALE_ROWS, "ftdrive weigh")))
 
 
 # What commands write into files

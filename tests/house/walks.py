@@ -69,11 +69,11 @@ WALKS = {
         ftdrive.live.samples               FrameTransform             turns to the chosen axes and point
         ftdrive.live.samples               Block                      has what a consumer may need
         ftdrive.terminal.live_feed         Feed.take                  hands the block to screen and recorder
-        ~ftdrive.terminal.live_screen      LiveApp.draw               draws ten times a second
+        ~ftdrive.terminal.canvas           Canvas.run                 sends the lines that changed
+        ftdrive.terminal.live_screen       LiveScreen.draw            draws ten times a second
         ftdrive.terminal.live_view         Summary.view               means, peaks and history so far
         ftdrive.terminal.live_screen       frame                      places the panels
         ftdrive.terminal.live_panels       table                      writes numbers with their digits
-        ftdrive.terminal.live_screen        Canvas.show                sends the lines that changed
     """,
     "From poses to a calibration": """
         ftdrive.commands.solve                    solve                    reads the options

@@ -43,7 +43,7 @@ from ftdrive.recording.recording import with_calibration
 from ftdrive.recording.table_pair import TablePair
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import SolveOptions, read_calibration
-from ftdrive.terminal.console import answer, messages
+from ftdrive.terminal.console import answer, has_screen, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.lines import BAD
 from ftdrive.terminal.live_feed import MEAN_S, Feed
@@ -110,8 +110,8 @@ def live(
     check_view(view, once=once, allow_control=allow_control)
     view.require()
     frame = read_frame(axes, about)
-    prints = once or as_json or not sys.stdout.isatty()
-    full_screen = not (prints or plain) and messages.is_terminal and sys.stdin.isatty()
+    prints = once or as_json or not sys.stdout.isatty() or answer.is_dumb_terminal
+    full_screen = not (prints or plain) and has_screen()
     with ExitStack() as stack:
         stream: CompensatedStream | ReplayedStream
         checks = list[Check]()
@@ -149,7 +149,7 @@ def live(
         else:
             from ftdrive.terminal.live_screen import run_live
 
-            run_live(feed, checks)
+            run_live(feed, checks, "" if page is None else page.url)
 
 
 def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> ReplayedStream:

@@ -1,7 +1,5 @@
 """`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
 
-import sys
-from collections.abc import Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -54,7 +52,7 @@ def weigh(
     from ftdrive.live.processing import SENSOR_FRAME
     from ftdrive.live.weighing import Weighing
     from ftdrive.recording import Recorder
-    from ftdrive.terminal.console import messages
+    from ftdrive.terminal.console import has_screen, messages
 
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
@@ -66,15 +64,12 @@ def weigh(
         if output is not None:
             recorder = Recorder([output], stream.info, stream.cell.to_dict())
             stack.callback(recorder.close)
-        on_screen = not (once or as_json) and sys.stdout.isatty()
-        # a screen would hide it
-        later: list[str] = []
-        stack.callback(_print_all, later)
-        log = open_log(source, stream, stack, later.append if on_screen else messages.print)
+        log = open_log(source, stream, stack, messages.print)
         weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving, log=log)
         if zero:
             messages.print(" Zero: the gripper must be empty.")
             weighing.zero()
+        on_screen = not (once or as_json) and has_screen()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
             from ftdrive.view.page import drawing
             from ftdrive.view.weigh_page import WeighPage
@@ -84,18 +79,11 @@ def weigh(
             say = partial(setattr, weighing, "note") if on_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:
-            from ftdrive.terminal.weigh_screen import run_weigh
+            from ftdrive.terminal.weigh_screen import WeighScreen
 
-            run_weigh(weighing)
+            WeighScreen(weighing, "" if page is None else page.url).run()
         else:
             _print(weighing, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
-
-
-def _print_all(texts: Sequence[str]) -> None:
-    from ftdrive.terminal.console import messages
-
-    for words in texts:
-        messages.print(words)
 
 
 def _answer_of(shown: "ScaleState", info: "StreamInfo") -> dict[str, Any]:

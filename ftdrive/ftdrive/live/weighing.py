@@ -34,6 +34,8 @@ WEIGH_S: Final = TARE_S
 """A weighing averages so long."""
 PATIENCE_S = 10.0
 """So long a zero, or the only weight, may take."""
+UNZEROED_KG: Final = 0.1
+"""With a larger smallest mass the drift since the calibration decides, and a zero helps."""
 # Between two weighings, each of the last half second.
 _STEP_S = 0.1
 # The variance of a mean comes from its own samples. With n of them it is raised by this over n.

@@ -1,8 +1,10 @@
 """Two consoles: `answer` prints what a command was asked for on stdout, `messages` all else on stderr."""
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from io import StringIO
 from threading import Timer
 from typing import Any, Final
 
@@ -58,6 +60,12 @@ answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=no
 """On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
 
 
+def has_screen() -> bool:
+    """Whether a screen can cover the terminal: a person reads and types there, and its cursor can be placed."""
+    are_terminals = all(one.isatty() for one in (sys.stdin, sys.stdout, sys.stderr))
+    return are_terminals and os.name == "posix" and not messages.is_dumb_terminal
+
+
 def beside(as_json: bool) -> CommandConsole:
     """Return where words about an answer go: to stdout, or to stderr if `--json` has its object there."""
     return messages if as_json else answer
@@ -68,6 +76,15 @@ def print_address(words: str, address: str) -> None:
     if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
         words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
+
+
+def qr_code(address: str) -> list[str]:
+    """Return the rows of the QR code of an address, light on dark; needs the extra viz, as the page does."""
+    import segno
+
+    code = StringIO()
+    segno.make(address, error="l").terminal(code, border=1, compact=True)
+    return code.getvalue().splitlines()
 
 
 def hanging(head: str | Text, words: str, console: Console = messages) -> Text:

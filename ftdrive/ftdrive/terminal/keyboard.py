@@ -1,6 +1,7 @@
-"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys only reach the session."""
+"""Single keys from a terminal, without Enter. Ctrl-C still interrupts; all other keys only reach the screen."""
 
 import atexit
+import codecs
 import os
 import re
 import select
@@ -14,7 +15,10 @@ from typing import Self
 from ftdrive.session.events import Key
 
 # Arrows and function keys arrive as escape, then letters that would be read as keys.
-_ESCAPE = re.compile(rb"\x1b(\[[0-?]*[ -/]*[@-~]|O.|.)?")
+_ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|O.|.)?")
+_STROKE = re.compile(f"{_ESCAPE.pattern}|[^\x1b]")
+_NAMES = {"\x1b": "escape", "\n": "enter", "\r": "enter", "\x7f": "backspace", "\b": "backspace"}
+_NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C", "right"), ("D", "left"))}
 _KEYS = {key.value: key for key in Key}
 # A letter within this time of another belongs to a word, such as an answer typed too late.
 _WORD_S = 0.3
@@ -23,7 +27,9 @@ _ALWAYS = {Key.PAUSE, Key.STOP}
 
 
 class Keyboard:
-    """Keys of the live screen, read by a thread. The terminal settings are restored on every exit from the context.
+    """Keys of a screen, read by a thread. The terminal settings are restored on every exit from the context.
+
+    A session takes requests (`pressed`), which letters of a word are not. Other screens take each stroke (`stroke`).
 
     Parameters
     ----------
@@ -34,6 +40,7 @@ class Keyboard:
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._keys: deque[Key] = deque()
+        self._strokes: deque[str] = deque(maxlen=1000)  # a session takes none
         self._before: list[int | list[bytes | int]] | None = None
         self._thread: Thread | None = None
         self._wake = -1
@@ -61,6 +68,10 @@ class Keyboard:
     def pressed(self) -> Key | None:
         """Take the oldest key that was not yet taken."""
         return self._keys.popleft() if self._keys else None
+
+    def stroke(self) -> str | None:
+        """Take the oldest stroke that was not yet taken: a character, or the name of a key such as "left"."""
+        return self._strokes.popleft() if self._strokes else None
 
     @property
     def waiting(self) -> tuple[Key, ...]:
@@ -104,6 +115,7 @@ class Keyboard:
             os.close(self._wake)
             thread.join()
         self._keys.clear()
+        self._strokes.clear()
 
     def _restore(self) -> None:
         if self._before is None:
@@ -120,6 +132,8 @@ class Keyboard:
 
     def _read(self, wake: int) -> None:
         word, typed_s = "", 0.0
+        # a character can arrive in two parts
+        decoder = codecs.getincrementaldecoder("utf-8")("replace")
         try:
             while True:
                 ready, _, _ = select.select([self._fd, wake], [], [])
@@ -128,7 +142,10 @@ class Keyboard:
                 typed = os.read(self._fd, 64)
                 if not typed:
                     return
-                letters = _ESCAPE.sub(b"", typed).decode(errors="replace").lower()
+                text = decoder.decode(typed)
+                names = [_NAMES.get(stroke, stroke) for stroke in _STROKE.findall(text)]
+                self._strokes += [name for name in names if name.isprintable()]
+                letters = _ESCAPE.sub("", text).lower()
                 now_s = time.monotonic()
                 word, typed_s = (word if now_s - typed_s < _WORD_S else ""), now_s
                 alone = not word and len(set(letters)) == 1

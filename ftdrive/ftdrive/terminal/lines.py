@@ -1,4 +1,4 @@
-"""What the live screen is drawn with: lines of styled text, and plots of Braille characters."""
+"""What screens are drawn with: lines of styled text, and plots of Braille characters."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -21,26 +21,24 @@ class Part(NamedTuple):
 
     text: str
     style: str = ""
-    key: str = ""
-    """The key that a click on it stands for."""
 
 
 class Line:
     """A line under construction."""
 
-    def __init__(self, text: str = "", style: str = "", key: str = "") -> None:
+    def __init__(self, text: str = "", style: str = "") -> None:
         self.parts: list[Part] = []
         self.width = 0
-        self.add(text, style, key)
+        self.add(text, style)
 
-    def add(self, text: str, style: str = "", key: str = "") -> Self:
+    def add(self, text: str, style: str = "") -> Self:
         """Append text."""
         text = visible(text)
         self.width += cell_len(text)
-        if self.parts and self.parts[-1][1:] == (style, key):
-            self.parts[-1] = Part(self.parts[-1].text + text, style, key)
+        if self.parts and self.parts[-1].style == style:
+            self.parts[-1] = Part(self.parts[-1].text + text, style)
         elif text:
-            self.parts.append(Part(text, style, key))
+            self.parts.append(Part(text, style))
         return self
 
     def to(self, column: int) -> Self:
@@ -65,7 +63,7 @@ class Line:
                 # a whole word or none of it
                 if not part.text.startswith(" ", len(text)):
                     text = text[: text.rfind(" ") + 1]
-                fitted.add(text, part.style, part.key)
+                fitted.add(text, part.style)
                 break
             fitted.add(*part)
         return fitted.add("…"[:width]).to(width)
@@ -82,7 +80,7 @@ class Line:
 
     def as_text(self) -> Text:
         """Return this line for rich."""
-        return Text.assemble(*((part.text, part.style) for part in self.parts), no_wrap=True)
+        return Text.assemble(*self.parts, no_wrap=True)
 
     def __str__(self) -> str:
         return "".join(part.text for part in self.parts)

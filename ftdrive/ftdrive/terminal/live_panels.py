@@ -54,7 +54,16 @@ _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD)
 # ---------------------------------------------------------------------------------------------------------- head
 
 
-def title(view: View, width: int) -> Line:
+def head(view: View, width: int, page: Line | None = None) -> list[Line]:
+    """Name devices, stages, calibration, and in the last line what is silent, or the page in the browser."""
+    rule = Line() if page is None else page.add(" ")
+    rule.add("─" * (width - rule.width), FAINT)
+    if view.silent:
+        rule = Line(f" {view.silent}", "bold white on red")
+    return [_title(view, width), _provenance(view, width), _state(view, width), rule.fit(width)]
+
+
+def _title(view: View, width: int) -> Line:
     """Name the devices, and whether the numbers are live."""
     line = Line(" ftdrive live", STRONG).add("  ")
     line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
@@ -62,21 +71,21 @@ def title(view: View, width: int) -> Line:
     for mark in view.info.marks:
         right.add(f" {mark} ", WARNING)
     if view.is_frozen:
-        right.add(" FROZEN ", "reverse bold", "z").add(" ")
+        right.add(" FROZEN ", "reverse bold").add(" ")
     if view.replay is not None:
         right.join(_replay(view.replay)).add(" ")
     if view.recording_s is not None:
-        right.add(f"● REC {_clock(view.recording_s)}", BAD, "r").add(" ")
+        right.add(f"● REC {_clock(view.recording_s)}", BAD).add(" ")
     return line.fit(max(width - right.width - 1, 0)).add(" ").join(right).fit(width)
 
 
 def _replay(replay: ReplayedStream) -> Line:
     state = "ended" if replay.has_ended else "paused" if replay.is_paused else f"x {replay.speed:g}"
     at, end = (f"{int(t_s // 60):02d}:{t_s % 60:04.1f}" for t_s in (replay.at_s, replay.duration_s))
-    return Line(f"REPLAY {at} of {end}, {state}", STRONG, "space")
+    return Line(f"REPLAY {at} of {end}, {state}", STRONG)
 
 
-def provenance(view: View, width: int) -> Line:
+def _provenance(view: View, width: int) -> Line:
     """Name the stages, what the numbers are, their axes and their reference point."""
     line = Line(" ")
     if view.reading is None:
@@ -89,11 +98,10 @@ def provenance(view: View, width: int) -> Line:
     for number, (name, is_on) in enumerate(_stages(stages), 1):
         if view.info.is_raw and number < _LOWPASS:
             continue
-        text = f"{number} {name}" if is_on else f"{number} {name}(off)"
-        chain.append(Part(text, "" if is_on else FAINT, str(number)))
+        chain.append(Part(f"{number} {name}") if is_on else Part(f"{number} {name}(off)", FAINT))
     usual = view.info.is_raw or (stages.bias and stages.gravity)
     right = Line("minus tare" if is_tared else meaning(stages), STRONG if usual else WARNING).add(", ")
-    right.add(frame.axes, STRONG, "x").add(" @ ").add(_point(frame), STRONG, "a").add(" ")
+    right.add(frame.axes, STRONG).add(" @ ").add(_point(frame), STRONG).add(" ")
     room = width - right.width - 2 - sum(cell_len(part.text) for part in chain)
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
     for i, part in enumerate(chain):
@@ -129,7 +137,7 @@ def _point(frame: WrenchFrame) -> str:
     return "({:g},{:g},{:g}) mm".format(*(1e3 * x for x in frame.about))
 
 
-def state(view: View, width: int) -> Line:
+def _state(view: View, width: int) -> Line:
     """Name the calibration, the tare and the drift of the bias."""
     calibration, status = view.info.calibration, view.status
     if view.info.is_raw:
@@ -177,13 +185,6 @@ def _now(info: StreamInfo, reading: ShownWrench) -> datetime:
     return datetime.fromtimestamp((reading.t_host_ns + info.utc_offset_ns) * 1e-9, UTC)
 
 
-def rule(view: View, width: int) -> Line:
-    """Separate the head; this line names a silent device."""
-    if view.silent:
-        return Line(f" {view.silent}", "bold white on red").fit(width)
-    return Line("─" * width, FAINT)
-
-
 # --------------------------------------------------------------------------------------------------------- table
 
 
@@ -203,7 +204,7 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
         head.to(_NUMBERS)
         head.join(_scale(full, unit, bar_cells))
         if trace_cells and first == 0:
-            head.to(_NUMBERS + bar_cells + 4).add(span(columns), FAINT, "g")
+            head.to(_NUMBERS + bar_cells + 4).add(span(columns), FAINT)
         lines.append(head.fit(width))
         for i in range(first, first + 3):
             line = _component(view, i, places)
@@ -266,7 +267,7 @@ def _peaks(view: View, i: int, places: int) -> Line:
     low, high = view.peaks.low[i], view.peaks.high[i]
     if low > high:
         return Line()
-    return Line(f"{_fixed(low, places - 1, 7):>8}{_fixed(high, places - 1, 7):>8}", "", "p")
+    return Line(f"{_fixed(low, places - 1, 7):>8}{_fixed(high, places - 1, 7):>8}")
 
 
 def _fixed(value: float, places: int, width: int) -> str:
@@ -283,7 +284,7 @@ def _size(view: View, first: int, places: int) -> Line:
         return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT)
     size, along = reading.size(first)
     line.add(f"{size:8.{places}f}", f"bold {CONTACT}" if reading.in_contact else STRONG)
-    return line.add(f"{digits(along, places):>8}", FAINT).add(" " * 8).add(f"{peak:8.{places - 1}f}", "", "p")
+    return line.add(f"{digits(along, places):>8}", FAINT).add(" " * 8).add(f"{peak:8.{places - 1}f}")
 
 
 def _scale(full: float, unit: str, cells: int) -> Line:
@@ -572,7 +573,7 @@ def _hanging(head: Line, words: Sequence[Part], width: int) -> list[Line]:
 
 
 def keys(view: View, width: int) -> Line:
-    """List the keys; a click on one presses it."""
+    """List the keys."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
     if view.info.is_raw:
         names = ["t tare", "u undo", "4 low-pass", "z freeze", "b mark", "r rec", "p peak", "g span"]
@@ -583,18 +584,11 @@ def keys(view: View, width: int) -> Line:
     last = ["? help", "q quit"] if sum(map(cell_len, names)) + len(names) + 15 <= width else ["?", "q"]
     room = width - sum(cell_len(name) + 1 for name in last)
     line = Line(" ")
-    for name in names:
-        if line.width + cell_len(name) + 1 <= room:
-            line.join(_key(name))
-    for name in last:
-        line.join(_key(name))
+    for name in (*names, *last):
+        if name in last or line.width + cell_len(name) + 1 <= room:
+            key, _, word = name.partition(" ")
+            line.add(key, STRONG).add(f" {word} " if word else " ", FAINT)
     return line.fit(width)
-
-
-def _key(name: str) -> Line:
-    key, _, word = name.partition(" ")
-    pressed = key if len(key) == 1 or key == "space" else ""
-    return Line(key, STRONG, pressed).add(f" {word} " if word else " ", FAINT, pressed)
 
 
 def _named(info: DeviceInfo) -> str:
@@ -618,12 +612,5 @@ def _short(duration_s: float) -> str:
 
 def plain(view: View, width: int) -> list[Line]:
     """Draw the table and the state of both links, without keys and events."""
-    return [
-        title(view, width),
-        provenance(view, width),
-        state(view, width),
-        rule(view, width),
-        *table(view, width, with_trace=True),
-        Line("─" * width, FAINT),
-        *links(view, width),
-    ]
+    separator = Line("─" * width, FAINT)
+    return [*head(view, width), *table(view, width, with_trace=True), separator, *links(view, width)]

@@ -1,31 +1,23 @@
-"""The live screen: the compensated wrench in a terminal, with keys and mouse.
+"""The live screen: the compensated wrench in a terminal, with keys.
 
-`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, `frame` draws its `View` as lines,
-and only the lines that changed are sent to the terminal.
+`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, and `frame` draws its `View` as
+lines.
 """
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
-from rich.segment import Segment
-from rich.style import Style
-from textual import events
-from textual.app import ComposeResult
-from textual.geometry import Region
-from textual.strip import Strip
-from textual.widget import Widget
-from textual.widgets import Input
 
 from ftdrive.checks.check import Check, check_calibration
 from ftdrive.checks.sensor import AXES
 from ftdrive.runs.verification import fitted_dataset
 from ftdrive.terminal import live_panels
-from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
+from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, Part, characters, envelope, level
+from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
 from ftdrive.terminal.live_feed import Feed, after
 from ftdrive.terminal.live_view import SPANS_S, PlotColumns, Summary, View
 
@@ -47,15 +39,15 @@ _HELP = """\
  Emulated cell: f push the tool with 8 N for 1 s
  Replay: space pause    ← → seek 5 s    . next samples    + - speed
  Sensor alone (--raw): t subtracts the present mean; r saves a .csv
+ Page in the browser (--view): v its QR code
 
  Plots: smallest and largest value of each column; dotted lines at 0 and at
         ± 1 sigma of a sample; ━ contact, ◆ mark, tare or change of stages
- The mouse works on stages, axes, point, peaks, span and keys.
 
  Any key returns."""
 
 
-def run_live(feed: Feed, checks: Sequence[Check] = ()) -> None:
+def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> None:
     """Show a stream until the user quits.
 
     Parameters
@@ -64,93 +56,57 @@ def run_live(feed: Feed, checks: Sequence[Check] = ()) -> None:
         Of an open stream, which is read here and closed by the caller.
     checks : sequence of Check
         Findings about the cell that the stream does not know, such as "robot.payload".
+    address : str
+        Of the page in the browser, if there is one.
 
     Raises
     ------
     DeviceError
         The stream had failed when the user quit.
+    SupervisorGone
+        The terminal was closed.
     """
     info = feed.stream.info
     dataset = None
     if not info.is_raw:
         checks = [check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor}), *checks]
         dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
-    app = LiveApp(feed, Summary(feed, checks, dataset))
-    feed.start()
+    screen = LiveScreen(feed, Summary(feed, checks, dataset), address)
     try:
-        app.run_on_terminal()
+        screen.run()
     finally:
-        feed.stop()
         for path in feed.recorded:
             messages.print(f" Recorded: {path}")
-    if feed.crash is not None:
-        raise feed.crash
     if feed.reader.failure is not None:
         raise feed.reader.failure
 
 
-class LiveApp(ClosableApp):
+class LiveScreen(Canvas):
     """Draws what a `Feed` knows."""
 
-    ENABLE_COMMAND_PALETTE = False
-    CSS = "Input { dock: bottom; height: 1; border: none; padding: 0 1; }"
-    BINDINGS: ClassVar = [("ctrl+c", "press('q')", "quit")]
-    TITLE = "ftdrive live"
-
-    def __init__(self, feed: Feed, summary: Summary) -> None:
-        # the terminal's own colours, light or dark
-        super().__init__(ansi_color=True)
-        self.theme = "ansi-dark"
+    def __init__(self, feed: Feed, summary: Summary, address: str = "") -> None:
+        super().__init__(address)
         self._feed, self._summary = feed, summary
-        self._canvas = Canvas()
-        self._helping = False
 
-    def compose(self) -> ComposeResult:
-        """Build the screen."""
-        yield self._canvas
-
-    def on_mount(self) -> None:
-        """Start to draw."""
-        self.set_interval(REFRESH_S, self.draw)
-
-    def on_resize(self) -> None:
-        """Draw at the new size."""
-        self.draw()
-
-    def draw(self) -> None:
-        """Draw the present state."""
+    def draw(self, width: int, height: int) -> list[Line]:
+        """Draw the present state; raises what has ended the thread that reads."""
         if self._feed.crash is not None:
-            self.exit()
-            return
-        width, height = self.size
-        view = self._summary.view()
-        if self._helping:
-            lines = [Line(text).fit(width) for text in _HELP.split("\n")]
-            self._canvas.show((lines + [Line().to(width)] * height)[:height])
-        else:
-            self._canvas.show(frame(view, width, height))
+            raise self._feed.crash
+        return frame(self._summary.view(), width, height, self.page())
 
-    def on_key(self, event: events.Key) -> None:
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Let the feed read."""
+        self._feed.start()
+        try:
+            yield
+        finally:
+            self._feed.stop()
+
+    def act(self, key: str) -> None:
         """Do what a key stands for."""
-        if not self.query(Input):
-            self.action_press(event.character if event.character and event.character > " " else event.key)
-        elif event.key == "escape":
-            self.query_one(Input).remove()
-
-    def on_input_submitted(self, event: Input.Submitted) -> None:
-        """Put the entered mark into the stream."""
-        event.input.remove()
-        if event.value:
-            self._feed.request("b", event.value)
-
-    def action_press(self, key: str) -> None:
-        """Do what a key stands for."""
-        if self._helping:
-            self._helping = False
-        elif key == "?":
-            self._helping = True
-        elif key == "q":
-            self.exit()
+        if key == "?":
+            self.cover = [Line(text) for text in _HELP.split("\n")]
         elif key == "z":
             self._summary.is_frozen = not self._summary.is_frozen
         elif key == "p":
@@ -158,11 +114,9 @@ class LiveApp(ClosableApp):
         elif key == "g":
             self._summary.span_s = after(self._summary.span_s, SPANS_S)[0]
         elif key == "b":
-            self.mount(entry := Input(placeholder="text of the mark, then Enter; Esc leaves"))
-            entry.focus()
+            self.entry = partial(self._feed.request, "b"), "text of the mark, then Enter; Esc leaves", ""
         else:
-            self._feed.request(key)
-        self.draw()
+            self._feed.request("space" if key == " " else key)
 
 
 # From this width on the plots stand beside the table.
@@ -173,20 +127,15 @@ _GUTTER = 7
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
-def frame(view: View, width: int, height: int) -> list[Line]:
-    """Draw the screen.
+def frame(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
+    """Draw the screen, with the address of a page in the browser.
 
     Returns
     -------
     list of Line
         `height` lines of `width` cells.
     """
-    head = [
-        live_panels.title(view, width),
-        live_panels.provenance(view, width),
-        live_panels.state(view, width),
-        live_panels.rule(view, width),
-    ]
+    head = live_panels.head(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
     body = _wide(view, width, rows) if width >= _WIDE else _narrow(view, width, rows)
@@ -250,7 +199,7 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
 
 def _time_axis(columns: PlotColumns, cells: int) -> Line:
     span, half = f"-{live_panels.span(columns)}", f"-{columns.span_s / 2:.0f}"
-    line = Line(" " * _GUTTER).add(span, FAINT, "g")
+    line = Line(" " * _GUTTER).add(span, FAINT)
     line.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT)
     return line.to(_GUTTER + cells - 3).add("now", FAINT)
 
@@ -293,35 +242,3 @@ def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, w
         line = Line(f"{label:>{_GUTTER - 1}} ", FAINT)
         lines.append(line.join(live_panels.layers(ink[row], paper[row], contact)))
     return lines
-
-
-# Lines instead of widgets, because one plot of textual-plotext takes 45 % of a core.
-class Canvas(Widget):
-    """Shows lines; only those that changed are drawn again."""
-
-    DEFAULT_CSS = "Canvas { width: 1fr; height: 1fr; }"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[list[Part]] = []
-
-    def show(self, lines: Sequence[Line]) -> None:
-        """Replace the lines."""
-        new, old = [line.parts for line in lines], self.lines
-        self.lines = new
-        width = self.size.width
-        changed = [Region(0, y, width, 1) for y, parts in enumerate(new) if y >= len(old) or parts != old[y]]
-        if changed:
-            self.refresh(*changed)
-
-    def render_line(self, y: int) -> Strip:
-        """Return a line as Textual draws it."""
-        if y >= len(self.lines):
-            return Strip.blank(self.size.width)
-        return Strip([Segment(part.text, _style(part.style, part.key)) for part in self.lines[y]])
-
-
-@lru_cache
-def _style(name: str, key: str) -> Style:
-    style = Style.parse(name)
-    return style + Style.from_meta({"@click": f"app.press('{key}')"}) if key else style

@@ -1,122 +1,102 @@
-"""The screen of `ftdrive weigh`: one large number, in the digits of Textual."""
+"""The screen of `ftdrive weigh`: one large number."""
 
 import threading
-from typing import ClassVar
-
-from textual.app import ComposeResult
-from textual.widgets import Digits, Static
+from collections.abc import Iterator
+from contextlib import contextmanager
+from textwrap import wrap
 
 from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
-from ftdrive.live.weighing import Weighing, line_of, worth_of
-from ftdrive.terminal.closable_app import REFRESH_S, ClosableApp
+from ftdrive.live.weighing import UNZEROED_KG, Weighing, line_of, worth_of
+from ftdrive.terminal.canvas import Canvas
+from ftdrive.terminal.lines import STRONG, Line
 
-# With a larger smallest mass the drift since the calibration decides, and a zero helps.
-_UNZEROED_KG = 0.1
-
-
-class _Reader(threading.Thread):
-    """Reads and weighs, because a screen that draws must not keep the stream waiting."""
-
-    def __init__(self, weighing: Weighing) -> None:
-        super().__init__(daemon=True)
-        self._weighing = weighing
-        self.failure: BaseException | None = None
-        self.ends = False
-
-    def run(self) -> None:
-        try:
-            for _ in self._weighing.states():
-                if self.ends:
-                    return
-        except BaseException as error:  # the main thread raises it
-            self.failure = error
+_FIGURES = "0123456789- "
+# Three rows of each figure, three characters wide.
+_ROWS = (
+    "█▀█ ▀█  ▀▀█ ▀▀█ █ █ █▀▀ █▀▀ ▀▀█ █▀█ █▀█",
+    "█ █  █  █▀▀ ▀▀█ ▀▀█ ▀▀█ █▀█   █ █▀█ ▀▀█ ▀▀▀",
+    "▀▀▀ ▀▀▀ ▀▀▀ ▀▀▀   ▀ ▀▀▀ ▀▀▀   ▀ ▀▀▀ ▀▀▀",
+)
 
 
-class WeighApp(ClosableApp):
-    """The scale.
+class WeighScreen(Canvas):
+    """The scale. What ends its reading ends the screen: an error of a device, or of the recording.
 
     Parameters
     ----------
     weighing : Weighing
+    address : str
+        Of the page in the browser, if there is one.
     """
 
-    ENABLE_COMMAND_PALETTE = False
-    CSS = "Screen { layout: vertical; } Digits { margin: 1 2 0 2; } Static { margin: 0 2; } #keys { dock: bottom; }"
-    BINDINGS: ClassVar = [
-        ("z", "zero", "zero"),
-        ("p", "poses", "poses"),
-        ("q", "quit", "quit"),
-        ("ctrl+c", "quit", "quit"),
-    ]
-
-    def __init__(self, weighing: Weighing) -> None:
-        super().__init__()
+    def __init__(self, weighing: Weighing, address: str = "") -> None:
+        super().__init__(address)
         self._weighing = weighing
-        self.reader = _Reader(weighing)
+        self._failure: BaseException | None = None
 
-    def compose(self) -> ComposeResult:
-        """Yield the widgets."""
-        info = self._weighing.stream.info
-        yield Static("   ".join(["ftdrive weigh", f"tool {info.tool}", *info.marks]), markup=False)
-        yield Digits("-", id="mass")
-        yield Static("", id="sigma")
-        yield Static("", id="line", markup=False)
-        yield Static("", id="note", markup=False)
-        keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
-        yield Static(f"{keys}q quit", id="keys")
-
-    def on_mount(self) -> None:
-        """Start reading."""
-        self.reader.start()
-        self.set_interval(REFRESH_S, self.draw)
-
-    def draw(self) -> None:
-        """Show the present state."""
-        # it closes: the widgets go before the timer
-        if not self.is_running:
-            return
-        if self.reader.failure is not None:
-            self.exit()
-            return
-        shown = self._weighing.shown
+    def draw(self, width: int, height: int) -> list[Line]:
+        """Draw the present state; raises what has ended the thread that reads."""
+        if self._failure is not None:
+            raise self._failure
+        info, shown = self._weighing.stream.info, self._weighing.shown
         weight = shown.measured
-        self.query_one("#mass", Digits).update(
-            "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
-        )
-        self.query_one("#sigma", Static).update("" if weight is None else self._sigma_line(weight, shown.count))
-        self.query_one("#line", Static).update(line_of(shown))
-        self.query_one("#note", Static).update(self._weighing.note)
+        mass = "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
+        sigma = "" if weight is None else self._sigma_line(weight, shown.count)
+        keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
+        title = "   ".join(["ftdrive weigh", f"tool {info.tool}", *info.marks])
+        lines = [Line(f"  {title}"), self.page() or Line(), Line()]
+        lines += [Line(f"  {row}", STRONG) for row in large(mass)]
+        for text in ("", sigma, line_of(shown), self._weighing.note):
+            lines += [Line(f"  {line}") for line in wrap(text, max(width - 4, 1)) or [""]]
+        return [*lines, *[Line()] * (height - 1 - len(lines)), Line(f"  {keys}q quit")]
 
-    def action_zero(self) -> None:
-        """Tare the empty gripper."""
-        if not self._weighing.moving:
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read and weigh."""
+        ends = threading.Event()
+
+        def read() -> None:
+            try:
+                for _ in self._weighing.states():
+                    if ends.is_set():
+                        return
+            except BaseException as error:  # the main thread raises it
+                self._failure = error
+
+        thread = threading.Thread(target=read, name="weigh screen", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ends.set()
+            # a zero may take seconds
+            thread.join(2.0)
+
+    def act(self, key: str) -> None:
+        """Tare the empty gripper, or begin or stop to join the poses of one load."""
+        if self._weighing.moving:
+            return
+        if key == "z":
             self._weighing.request_zero()
-
-    def action_poses(self) -> None:
-        """Join the poses of one load from now on, or stop that."""
-        if not self._weighing.moving:
+        elif key == "p":
             self._weighing.joins = not self._weighing.joins
 
     def _sigma_line(self, weight: Weight, count: int | None) -> str:
-        parts = "" if count is None else f"{counted(count, 'part')}   "
-        words = f"{parts}{worth_of(weight)}"
-        if self._weighing.moving:
-            return words
+        words = [worth_of(weight)] if count is None else [counted(count, "part"), worth_of(weight)]
         if self._weighing.joins:
-            words += f"   {counted(weight.poses, 'pose')} joined, turn the tool for more"
-        if weight.least_kg > _UNZEROED_KG:
-            words += "   not zeroed: press z with an empty gripper"
-        return words
+            words.append(f"{counted(weight.poses, 'pose')} joined, turn the tool for more")
+        if weight.least_kg > UNZEROED_KG and not self._weighing.moving:
+            words.append("not zeroed: press z with an empty gripper")
+        return "   ".join(words)
 
 
-def run_weigh(weighing: Weighing) -> None:
-    """Show the scale until the user quits. Raises what ends it otherwise: of a device, or of the recording."""
-    app = WeighApp(weighing)
-    try:
-        app.run_on_terminal()
-    finally:
-        app.reader.ends = True
-        app.reader.join(2.0)
-    if app.reader.failure is not None:
-        raise app.reader.failure
+def large(text: str) -> list[str]:
+    """Return figures as three rows of block characters; letters keep their size, in the last row."""
+    rows = ["", "", ""]
+    for one in text:
+        at = 4 * _FIGURES.find(one)
+        small = "▀ " if one == "." else one
+        for i, row in enumerate(_ROWS):
+            rows[i] += f"{row[at : at + 4]:4}" if at >= 0 else small if i == 2 else " " * len(small)
+    return rows

@@ -16,7 +16,6 @@ from functools import cache
 from html import escape
 from http import HTTPStatus
 from importlib.util import find_spec
-from io import StringIO
 from pathlib import Path
 from tempfile import mkdtemp
 from time import monotonic
@@ -261,15 +260,12 @@ def _reached_at(host: str) -> str:
 @contextmanager
 def announced(page: Page, address: Address | None = None) -> Iterator[None]:
     """Print the address of a page, as a QR code too for another device; open it where this computer has a screen."""
-    from ftdrive.terminal.console import messages, print_address
+    from ftdrive.terminal.console import messages, print_address, qr_code
 
     print_address("The page is shown until this command ends, at ", page.url)
     if address is not None and not is_loopback(address[0]):
-        import segno
-
-        code = StringIO()
-        segno.make(page.url, error="l").terminal(code, border=1, compact=True)
-        messages.print(code.getvalue(), end="")
+        for row in qr_code(page.url):
+            messages.print(row)
         messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
     elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
         with _only_ours(page.url) as file:

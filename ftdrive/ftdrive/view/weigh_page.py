@@ -4,14 +4,11 @@ from datetime import timedelta
 from math import isfinite
 
 from ftcalib.rounding import to_place_of
-from ftdrive.live.weighing import Weighing, line_of, worth_of
+from ftdrive.live.weighing import UNZEROED_KG, Weighing, line_of, worth_of
 from ftdrive.runs.verification import age_in_words
 from ftdrive.view import parts
 from ftdrive.view.live_page import BLANK, devices
 from ftdrive.view.page import Page
-
-# The screen of the terminal asks for a zero from the same smallest mass on.
-_UNZEROED_KG = 0.1
 
 
 class WeighPage:
@@ -38,7 +35,7 @@ def words(weighing: Weighing) -> dict[str, parts.Part | None]:
     if weight is not None:
         kg, sigma = (to_place_of(one, weight.mass_sigma_kg, "z") for one in (weight.mass_kg, weight.mass_sigma_kg))
         mass |= {"value": kg, "unit": "kg", "sigma": f"± {sigma} kg", "note": worth_of(weight)}
-        if zero and weight.least_kg > _UNZEROED_KG:
+        if zero and weight.least_kg > UNZEROED_KG:
             zero, tone = f"{zero}: zero {'again' if isfinite(zeroed_s) else 'the empty gripper'}", parts.WARN
     rows = [mass]
     if weighing.part_kg is not None:

@@ -120,17 +120,17 @@ def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) ->
 )
 def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: View) -> None:
     reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
-    line = text(live_panels.provenance(replace(view, reading=reading), 120))
+    line = text(live_panels.head(replace(view, reading=reading), 120)[1])
     assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View, width: int) -> None:
     foreign = replace(view, info=replace(view.info, foreign=True, emulated=True))
-    assert FOREIGN in text(live_panels.title(foreign, width))
-    styles = {part.text: part.style for part in live_panels.state(foreign, width).parts}
+    assert FOREIGN in text(live_panels.head(foreign, width)[0])
+    styles = {part.text: part.style for part in live_panels.head(foreign, width)[2].parts}
     assert styles["GOOD"] == WARNING
-    assert {part.text: part.style for part in live_panels.state(view, width).parts}["GOOD"] == GOOD
+    assert {part.text: part.style for part in live_panels.head(view, width)[2].parts}["GOOD"] == GOOD
 
 
 def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:

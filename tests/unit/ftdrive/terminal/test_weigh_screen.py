@@ -1,22 +1,20 @@
 """The scale as a user sees it: which number, with what beside it, and what its keys do."""
 
-import asyncio
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from textual.widgets import Digits, Static
 
 from ftcalib.after.weighing import Weight
 from ftdrive.errors import NotAccepted
-from ftdrive.live.weighing import WORDS, ScaleState, Weighing, line_of
-from ftdrive.terminal.weigh_screen import WeighApp, run_weigh
+from ftdrive.live.weighing import WORDS, ScaleState, Weighing
+from ftdrive.terminal.weigh_screen import WeighScreen, large
 from ftdrivers.errors import StreamBroken
 from tests.unit.ftdrive.terminal.fake_stream import INFO
+from tests.wire.waiting import wait_until
 
 COM_SIGMA_M = np.array([0.002, 0.003, 0.1])
 PART = Weight(
@@ -42,71 +40,67 @@ class FakeWeighing(Weighing):
         self.given, self.moving, self.joins, self.fails = shown, moving, False, fails
         self.zeros = 0
         self.refuses = False
-        self.in_zero, self.may_zero = threading.Event(), threading.Event()
-        self.ends = threading.Event()
+        self.in_zero: Callable[[], object] = lambda: None
 
     def _states(self, *, raises: bool) -> Iterator[tuple[ScaleState, bool]]:
         assert not raises
-        while not self.ends.wait(0.001):
+        while True:
             yield self.given, False
             if self.fails is not None:
                 raise self.fails
 
     def zero(self) -> None:
-        self.in_zero.set()
-        assert self.may_zero.wait(10)
         self.zeros += 1
+        self.in_zero()
         if self.refuses:
             raise NotAccepted("no zero: the arm moves")
 
 
 class Scale:
-    """The screen of a fake scale; with `keys` pressed, one after the other."""
+    """The screen of a fake scale, without a thread and a terminal; with `keys` pressed, one after the other."""
 
     def __init__(self, weighing: FakeWeighing, *keys: str) -> None:
-        self.weighing = weighing
-        self.app = WeighApp(cast("Any", weighing))
-        asyncio.run(self._run(keys))
+        self.screen, self.states = WeighScreen(weighing), weighing.states()
+        next(self.states)
+        self.press(*keys)
 
-    async def _run(self, keys: tuple[str, ...]) -> None:
-        async with self.app.run_test(size=(90, 20)) as pilot:
-            for key in keys:
-                await pilot.press(key)
-                if self.weighing._zero_requested or self.weighing.in_zero.is_set():
-                    assert self.weighing.in_zero.wait(10)
-                    self._read()
-                    self.during_zero = self.mass
-                    self.weighing.may_zero.set()
-                    while not self.weighing.note.startswith(("zero: the", "no zero")):
-                        await pilot.pause(0.001)
-            while self.weighing.shown != self.weighing.given:
-                await pilot.pause(0.001)
-            self._read()
-            self.weighing.ends.set()
-            self.app.reader.join()
+    def press(self, *keys: str) -> None:
+        for key in keys:
+            self.screen.press(key)
+            next(self.states)
+        self.read()
 
-    def _read(self) -> None:
-        self.app.draw()
-        self.mass = self.app.query_one(Digits).value
-        self.title, self.sigma, self.line, self.note, self.keys = (str(one.content) for one in self.app.query(Static))
+    def read(self) -> list[str]:
+        *rows, self.keys = (str(line).strip() for line in self.screen.lines(110, 20))
+        self.title, _, _, *self.mass, _, self.sigma, self.line, self.note = rows[:10]
+        return self.mass
 
 
-def test_a_screen_that_closes_is_not_drawn_any_more() -> None:
-    Scale(FakeWeighing(ScaleState(PART, None))).app.draw()
+def mass(text: str) -> list[str]:
+    return [row.strip() for row in large(text)]
+
+
+def test_figures_are_three_rows_high_and_letters_one() -> None:
+    assert [row.rstrip() for row in large("-4.06 kg")] == [
+        "    █ █   █▀█ █▀▀",
+        "▀▀▀ ▀▀█   █ █ █▀█",
+        "      ▀ ▀ ▀▀▀ ▀▀▀     kg",
+    ]
 
 
 def test_the_number_ends_where_its_sigma_does() -> None:
     scale = Scale(FakeWeighing(ScaleState(PART, None, 3)))
     assert scale.title == "ftdrive weigh   tool gripper_a   EMULATED"
-    assert scale.mass == " 0.8123 kg"
+    assert scale.mass == mass("0.8123 kg")
     assert scale.sigma == "3 parts   sigma 1.2 g, smallest mass 4.8 g"
     assert scale.line == "3 parts, 0.8123 ± 0.0012 kg at (10.0 ± 2.0, -20.0 ± 3.0, 150 ± 100) mm from the sensor origin"
     assert scale.keys == "z zero the empty gripper   p join poses of one load   q quit"
+    assert Scale(FakeWeighing(ScaleState(PART, None, 1))).line.startswith("1 part, 0.8123")
 
 
 def test_a_scale_without_a_zero_asks_for_one() -> None:
     scale = Scale(FakeWeighing(ScaleState(NOTHING, None)))
-    assert scale.mass == " 0.00 kg"  # neither -0 nor another place of the digits
+    assert scale.mass == mass("0.00 kg")  # neither -0 nor another place of the digits
     hint = "   not zeroed: press z with an empty gripper"
     assert scale.sigma == f"sigma 100 g, smallest mass 400 g{hint}"
     assert scale.line == "nothing: -0.00 ± 0.10 kg, less than 0.4 kg"
@@ -115,29 +109,28 @@ def test_a_scale_without_a_zero_asks_for_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("shown", "line"),
+    ("shown", "number", "line"),
     [
-        (ScaleState(PART, "contact"), f"not weighed: {WORDS['contact']}"),
-        (ScaleState(None, "moving"), f"not weighed: {WORDS['moving']}"),
-        (ScaleState(None, None, stale="[sensor] silent for 0.3 s"), "stale: [sensor] silent for 0.3 s"),
+        (ScaleState(PART, "contact"), "- - -", f"not weighed: {WORDS['contact']}"),
+        (ScaleState(None, "moving"), "- - -", f"not weighed: {WORDS['moving']}"),
+        (ScaleState(None, None, stale="[sensor] silent for 0.3 s"), "- - -", "stale: [sensor] silent for 0.3 s"),
+        (ScaleState(PART, "count"), "0.8123 kg", f"not weighed: {WORDS['count']}"),
     ],
 )
-def test_what_is_not_weighed_has_no_number(shown: ScaleState, line: str) -> None:
+def test_what_is_not_weighed_has_no_number_but_a_mass_that_cannot_be_counted(
+    shown: ScaleState, number: str, line: str
+) -> None:
     scale = Scale(FakeWeighing(shown))
-    assert (scale.mass, scale.sigma, scale.line) == ("- - -", "", line)
-
-
-def test_what_cannot_be_counted_has_a_mass() -> None:
-    scale = Scale(FakeWeighing(ScaleState(PART, "count")))
-    assert (scale.mass, scale.sigma) == (" 0.8123 kg", "sigma 1.2 g, smallest mass 4.8 g")
-    assert scale.line == f"not weighed: {WORDS['count']}"
+    assert (scale.mass, scale.line) == (mass(number), line)
+    assert scale.sigma == ("sigma 1.2 g, smallest mass 4.8 g" if "kg" in number else "")
 
 
 def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
-    scale = Scale(FakeWeighing(ScaleState(PART, None)), "p")
-    assert scale.weighing.joins
-    assert scale.sigma.endswith("4.8 g   1 pose joined, turn the tool for more")
-    assert not Scale(FakeWeighing(ScaleState(PART, None)), "p", "p").weighing.joins
+    weighing = FakeWeighing(ScaleState(PART, None))
+    assert Scale(weighing, "p").sigma.endswith("4.8 g   1 pose joined, turn the tool for more")
+    assert weighing.joins
+    Scale(weighing, "p")
+    assert not weighing.joins
 
 
 @pytest.mark.parametrize(
@@ -146,9 +139,12 @@ def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
 def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
     weighing = FakeWeighing(ScaleState(PART, None))
     weighing.refuses = refuses
-    scale = Scale(weighing, "z")
+    during = list[str]()
+    scale = Scale(weighing)
+    weighing.in_zero = lambda: during.extend(scale.read())
+    scale.press("z")
     assert weighing.zeros == 1
-    assert scale.during_zero == "- - -"
+    assert during == mass("- - -")
     assert scale.note == note
 
 
@@ -161,27 +157,9 @@ def test_in_motion_neither_zero_nor_poses_are_offered() -> None:
 
 
 @pytest.mark.parametrize("error", [StreamBroken("the cable is cut"), OSError(28, "No space left on device")])
-def test_what_ends_the_reading_ends_the_screen(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_ends_the_reading_ends_the_screen(error: Exception) -> None:
     """Else the last number would stay, as if it were live."""
-    weighing, run = FakeWeighing(ScaleState(PART, None), fails=error), WeighApp.run
-    monkeypatch.setattr(WeighApp, "run", lambda app: run(app, headless=True))
-    with pytest.raises(type(error)) as raised:
-        run_weigh(cast("Any", weighing))
+    screen = WeighScreen(FakeWeighing(ScaleState(PART, None), fails=error))
+    with pytest.raises(type(error)) as raised, screen.reading():
+        wait_until(lambda: screen.draw(80, 24) == [])
     assert raised.value is error
-
-
-@pytest.mark.parametrize("key", ["q", "ctrl+c"])
-def test_two_keys_end_it(key: str) -> None:
-    async def main() -> bool:
-        weighing = FakeWeighing(ScaleState(PART, None))
-        app = WeighApp(cast("Any", weighing))
-        async with app.run_test() as pilot:
-            await pilot.press(key)
-            weighing.ends.set()
-            return app._exit
-
-    assert asyncio.run(main())
-
-
-def test_one_part_is_no_plural() -> None:
-    assert line_of(ScaleState(PART, None, 1)).startswith("1 part, 0.8123")

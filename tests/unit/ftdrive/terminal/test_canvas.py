@@ -1,0 +1,156 @@
+"""What the screens of `live` and `weigh` share, on a pseudo-terminal: lines, keys, and every way out."""
+
+import os
+import select
+import signal
+import sys
+import termios
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+
+import pytest
+
+from ftdrive.terminal.canvas import Canvas
+from ftdrive.terminal.keyboard import Keyboard
+from ftdrive.terminal.lines import Line
+from tests.unit.ftdrive.terminal.test_screen import Shown, terminal
+from tests.wire.waiting import wait_until
+
+LEFT = "\x1b[?1049l\x1b[?25h"
+"""The screen of before, and its cursor."""
+
+
+class Counting(Canvas):
+    """Says how often it was drawn, and what it has heard; `fills` is what the other lines have."""
+
+    drawn = 0
+    is_reading = False
+
+    def __init__(self, address: str = "", fills: Callable[[int], str] = lambda _: "always the same") -> None:
+        super().__init__(address)
+        self.fills, self.heard = fills, list[str]()
+
+    def draw(self, width: int, height: int) -> list[Line]:
+        self.drawn += 1
+        return [Line(f"drawn {self.drawn}"), Line(f"for {width} x {height}"), *[Line(self.fills(width))] * 50]
+
+    def act(self, key: str) -> None:
+        self.heard.append(key)
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        self.is_reading = True
+        try:
+            yield
+        finally:
+            self.is_reading = False
+
+
+def run(canvas: Canvas, does: Callable[[int, int], Shown], size: tuple[int, int] = (4, 80)) -> str:
+    """Run a screen while `does` is what the person does; return what the terminal got, which is left as it was."""
+    shown: list[Shown] = []
+    with (
+        terminal(*size) as (person, program),
+        open(program, "w", closefd=False) as output,
+        open(program, closefd=False) as keys,
+    ):
+        before = termios.tcgetattr(program)
+        thread = threading.Thread(target=lambda: shown.append(does(person, program)))
+        thread.start()
+        try:
+            canvas.run(keys, output)
+        finally:
+            thread.join()
+            wait_until(lambda: LEFT in shown[0].text)
+            assert termios.tcgetattr(program) == before
+        return shown[0].text
+
+
+@pytest.fixture(autouse=True)
+def as_the_command_line(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "8")  # of a shell that exports its width at the start
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_lines_that_changed_are_sent_until_q_and_then_what_was_printed() -> None:
+    def does(person: int, program: int) -> Shown:
+        shown = Shown(person)
+        wait_until(lambda: "drawn 5" in shown.text)
+        sys.stderr.write("a warning")
+        termios.tcsetwinsize(program, (3, 40))
+        wait_until(lambda: "for 40 x 3" in shown.text)
+        os.write(person, b"xq")
+        return shown
+
+    text = run(canvas := Counting(), does)
+    first, again = text.split("\x1b[2J")[1:]
+    assert canvas.heard == ["x"]
+    assert (first.count("always the same"), again.count("always the same")) == (2, 1)
+    assert first.count("\x1b[1;1H") >= 5
+    assert text.index("a warning") > text.index(LEFT)
+
+
+def test_strokes_are_characters_and_names_of_keys() -> None:
+    heard: list[str] = []
+
+    def hears(*strokes: str) -> bool:
+        heard.extend(iter(keyboard.stroke, None))
+        return heard[-len(strokes) :] == list(strokes)
+
+    with terminal() as (person, program), Keyboard(program) as keyboard:
+        os.write(person, b"aA ?\xc3")  # amid a character
+        wait_until(lambda: hears(*"aA ?"))
+        os.write(person, b"\xa9\x1b[D\x1bOC\x7f\n\x1b[5~\x04\x1b[1;2Aq")  # page up, Ctrl-D and shift-up are no strokes
+        wait_until(lambda: hears("?", "é", "left", "right", "backspace", "enter", "q"))
+        os.write(person, b"\x1b")
+        wait_until(lambda: hears("q", "escape"))
+
+
+def test_the_key_v_shows_the_code_of_the_page_until_a_key() -> None:
+    canvas = Counting("http://127.0.0.1:8080/?token=abc")
+    assert str(canvas.page()) == "─ http://127.0.0.1:8080/?token=abc  v QR code"
+    canvas.press("v")
+    lines = [str(line).rstrip() for line in canvas.lines(80, 24)]
+    assert lines[0] == " http://127.0.0.1:8080/?token=abc"
+    assert "--view-address" in lines[1]
+    assert lines[2].startswith(" █▀▀▀▀▀▀▀█")
+    canvas.press("x")
+    assert str(canvas.lines(80, 24)[0]).startswith("drawn")
+    assert canvas.heard == []
+    canvas = Counting()
+    canvas.press("v")
+    assert (canvas.heard, canvas.page()) == (["v"], None)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_and_only_ctrl_c_does_as_q(number: signal.Signals) -> None:
+    def does(person: int, _: int) -> Shown:
+        wait_until(lambda: canvas.drawn > 2)
+        os.kill(os.getpid(), number)
+        return Shown(person)
+
+    handler, canvas = signal.getsignal(number), Counting()
+    with pytest.raises(KeyboardInterrupt) if number == signal.SIGTERM else nullcontext():
+        run(canvas, does)
+    assert signal.getsignal(number) is handler
+
+
+def test_an_error_of_the_drawing_is_raised_on_the_screen_of_before() -> None:
+    with pytest.raises(ZeroDivisionError):
+        run(Counting(fills=lambda _: f"{1 / 0}"), lambda person, _: Shown(person))
+
+
+def test_a_terminal_that_takes_nothing_keeps_neither_a_signal_nor_a_recording_waiting() -> None:
+    def does(person: int, program: int) -> Shown:
+        wait_until(lambda: canvas.drawn and not select.select([], [program], [], 0)[1])
+        os.kill(os.getpid(), signal.SIGTERM)
+        wait_until(lambda: not canvas.is_reading)
+        return Shown(person)
+
+    canvas = Counting(fills=lambda width: os.urandom(width // 2).hex())
+    with pytest.raises(KeyboardInterrupt):
+        run(canvas, does, (50, 200))
