@@ -32,8 +32,9 @@ _SEEK_S = 5.0
 _LOWPASS_HZ = 40.0
 # A reader that takes nothing for many seconds misses the oldest ones; a recording never does.
 _MOST_BLOCKS, _MOST_NOTES = 2000, 200
-# Keys that mean nothing for readings of a sensor alone.
-_OF_CALIBRATION = {"x", "a", "1", "2", "3"}
+# Keys of stages, and those that mean nothing for readings of a sensor alone.
+_STAGES = {"1": "bias", "2": "gravity", "3": "inertia"}
+_OF_CALIBRATION = {"x", "a", *_STAGES}
 # Events whose time the plots show; contact has a colour, and a change of frame clears them.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
 _STYLES = {
@@ -242,12 +243,8 @@ class Feed:
             self._set_frame([replace(stream.frame, axes=axes) for axes in after(stream.frame.axes, get_args(Axes))])
         elif key == "a":
             self._set_frame([replace(stream.frame, about=one) for one in after(stream.frame.about, get_args(Point))])
-        elif key == "1":
-            stream.stages = replace(stream.stages, bias=not stream.stages.bias)
-        elif key == "2":
-            stream.stages = replace(stream.stages, gravity=not stream.stages.gravity)
-        elif key == "3":
-            stream.stages = replace(stream.stages, inertia=not stream.stages.inertia)
+        elif name := _STAGES.get(key):
+            stream.stages = replace(stream.stages, **{name: not getattr(stream.stages, name)})
         elif key == "4":
             highest_Hz = min(_LOWPASS_HZ, stream.info.sensor_rate_Hz / 4)
             stream.stages = replace(stream.stages, lowpass_Hz=None if stream.stages.lowpass_Hz else highest_Hz)
@@ -261,16 +258,12 @@ class Feed:
             stream.speed = float(text)
         elif key == "space":
             (stream.resume if stream.is_paused else stream.pause)()
-        elif key == "left":
-            stream.seek(stream.at_s - _SEEK_S)
-        elif key == "right":
-            stream.seek(stream.at_s + _SEEK_S)
+        elif key in {"left", "right"}:
+            stream.seek(stream.at_s + (_SEEK_S if key == "right" else -_SEEK_S))
         elif key == ".":
             self.take(stream.step())
-        elif key in {"+", "="}:
-            stream.speed *= 2
-        elif key == "-":
-            stream.speed /= 2
+        elif key in {"+", "=", "-"}:
+            stream.speed *= 0.5 if key == "-" else 2
 
     def _set_frame(self, frames: Iterable[WrenchFrame]) -> None:
         """Choose the first frame that the cell has; the others say what to configure."""
