@@ -8,8 +8,7 @@ import subprocess
 import sys
 import termios
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
 from ftdrive.terminal.screen import Screen, SessionView, _drift, frame, open_operator
 from ftdrive.terminal.session_text import SessionText
+from tests.wire.waiting import wait_until
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
 VALUES: dict[str, Any] = {
@@ -294,13 +294,6 @@ def terminal(rows: int = 24, columns: int = 80) -> Iterator[tuple[int, int]]:
         os.close(person)
 
 
-def eventually(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
-    limit_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < limit_s, "it never happened"
-        time.sleep(0.005)
-
-
 class Shown:
     """What arrives at the person's end."""
 
@@ -324,7 +317,7 @@ def test_keys_arrive_without_enter_and_all_others_as_another_key(
     with terminal() as (person, program), Keyboard(program) as keyboard:
         for letter, key in zip(b"krspq", (Key.KEEP, Key.REDO, Key.SKIP, Key.PAUSE, Key.STOP), strict=True):
             os.write(person, bytes([letter]))
-            eventually(lambda: keyboard.waiting)
+            wait_until(lambda: keyboard.waiting)
             assert keyboard.pressed() is key
         # F4, keypad 1, shift-F5, up, escape; Space, Enter, Ctrl-D, Ctrl-Z, Ctrl-\, Ctrl-S, Ctrl-Q; letters
         for other in (
@@ -336,10 +329,10 @@ def test_keys_arrive_without_enter_and_all_others_as_another_key(
             *(b" \n\x04\x1a\x1c\x13\x11x1"[i : i + 1] for i in range(9)),
         ):
             os.write(person, other)
-            eventually(lambda: keyboard.waiting)
+            wait_until(lambda: keyboard.waiting)
             assert keyboard.pressed() is Key.OTHER
         os.write(person, b"Q")
-        eventually(lambda: keyboard.waiting)
+        wait_until(lambda: keyboard.waiting)
         assert keyboard.waiting == (Key.STOP,)
 
 
@@ -365,9 +358,9 @@ def test_letters_of_a_word_are_no_keys_but_those_that_stop(
     with terminal() as (person, program), Keyboard(program) as keyboard:
         for stroke in strokes:
             os.write(person, stroke.encode())
-            eventually(lambda: not select.select([program], [], [], 0)[0])
+            wait_until(lambda: not select.select([program], [], [], 0)[0])
         os.write(person, b"q")  # heard in a word too
-        eventually(lambda: Key.STOP in keyboard.waiting)
+        wait_until(lambda: Key.STOP in keyboard.waiting)
         assert list(keyboard.waiting) == [*heard, Key.STOP]
 
 
@@ -393,12 +386,12 @@ def test_the_terminal_is_restored_after_success_failure_and_while_suspended() ->
 def test_keys_pressed_before_a_question_do_not_answer_it() -> None:
     with terminal() as (person, program), Keyboard(program) as keyboard:
         os.write(person, b"q")
-        eventually(lambda: keyboard.waiting)
+        wait_until(lambda: keyboard.waiting)
         with keyboard.suspended():
             assert keyboard.pressed() is None
         assert keyboard.pressed() is None
         os.write(person, b"p")
-        eventually(lambda: keyboard.waiting == (Key.PAUSE,))
+        wait_until(lambda: keyboard.waiting == (Key.PAUSE,))
 
 
 def test_a_pipe_has_no_keys() -> None:
@@ -435,30 +428,30 @@ def test_the_screen_draws_asks_and_goes_on() -> None:
         with screen(person, program) as (operator, shown):
             for event in MIDDLE:
                 operator.show(event)
-            eventually(lambda: "SETTLE" in shown.text and RESUME in shown.text)
+            wait_until(lambda: "SETTLE" in shown.text and RESUME in shown.text)
             assert "6/25 R14: settled 0.9 s" in shown.text  # above the frame, to stay
             answers: list[str] = []
             asking = threading.Thread(target=lambda: answers.append(operator.ask(Question("Go? Type MOVE", ("MOVE",)))))
             asking.start()
-            eventually(lambda: "Go? Type MOVE: " in shown.text)
+            wait_until(lambda: "Go? Type MOVE: " in shown.text)
             assert termios.tcgetattr(program)[3] & termios.ECHO
             os.write(person, b"move\n")
-            eventually(lambda: "'move' is not MOVE: type it in capital letters" in shown.text)
+            wait_until(lambda: "'move' is not MOVE: type it in capital letters" in shown.text)
             os.write(person, b"MOVE\n")
             asking.join(10)
             assert answers == ["MOVE"]
-            eventually(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
-            eventually(lambda: "ftdrive calibrate" in shown.text.partition("\x1b[J")[2])
+            wait_until(lambda: not termios.tcgetattr(program)[3] & termios.ECHO)
+            wait_until(lambda: "ftdrive calibrate" in shown.text.partition("\x1b[J")[2])
             erased, drawn_again = shown.text.split("\x1b[J")
             used = len(drawn(view(*MIDDLE))) + 3  # the question twice, and a line about the wrong answer
             assert erased.endswith(f"\x1b[{used}F")
             assert "\x1b[1A" not in drawn_again.split("ftdrive calibrate")[0]  # what stands above stays
             os.write(person, b"p")
-            eventually(lambda: "PAUSE asked" in shown.text)
+            wait_until(lambda: "PAUSE asked" in shown.text)
             assert operator.pressed() is Key.PAUSE
             assert operator.pressed() is None
         assert termios.tcgetattr(program) == before
-        eventually(lambda: shown.text.count("\x1b[?25l") == shown.text.count("\x1b[?25h"))  # the cursor is back
+        wait_until(lambda: shown.text.count("\x1b[?25l") == shown.text.count("\x1b[?25h"))  # the cursor is back
 
 
 def test_a_person_is_asked_what_a_question_assumes_and_needs_no_keyboard() -> None:
@@ -567,15 +560,15 @@ def test_ctrl_c_and_sigterm_end_the_program_and_restore_the_terminal(
             env={**os.environ, "TERM": "xterm-256color", **environment},
         )
         try:
-            eventually(lambda: f"{kind} is here" in shown.text, 30)
+            wait_until(lambda: f"{kind} is here" in shown.text, 30)
             if kind == "Screen":
-                eventually(lambda: not termios.tcgetattr(program)[3] & termios.ICANON)
+                wait_until(lambda: not termios.tcgetattr(program)[3] & termios.ICANON)
             if how == "Ctrl-C":
                 os.write(person, b"\x03")
             else:
                 child.terminate()
             assert child.wait(20) == 130
-            eventually(lambda: "interrupted" in shown.text)
+            wait_until(lambda: "interrupted" in shown.text)
             assert termios.tcgetattr(program) == before
             if "NO_COLOR" in environment:
                 assert not any(f"\x1b[{colour}" in shown.text for colour in ("31m", "32m", "33m", "36m", "1;3"))

@@ -43,6 +43,7 @@ from ftdrive.view.session_page import SessionPage
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import MODEL, STATUS, Lab, Scripted
+from tests.wire.waiting import wait_until
 
 LONG_S = 30.0
 """What takes so long never happens."""
@@ -379,13 +380,6 @@ def test_a_sweep_is_one_motion(lab: Lab, page: Page) -> None:
 
 def failing(_: SessionPage) -> None:
     raise RuntimeError("no memory")
-
-
-def wait_until(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + LONG_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
 
 
 def test_a_session_whose_page_cannot_be_drawn_goes_on_and_says_so_once(

@@ -4,7 +4,7 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from http.client import HTTPConnection, HTTPResponse
@@ -16,6 +16,7 @@ import pytest
 from ftdrive.view.page import Page, drawing
 from ftdrive.view.parts import button, check, controls, lines, select, slider, text_field
 from ftdrive.view.site import announced, serve
+from tests.wire.waiting import wait_until
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
 JSON = "application/json"
@@ -66,13 +67,6 @@ def wait_for(event: threading.Event) -> None:
     event.wait()
 
 
-def until(condition: Callable[[], object]) -> None:
-    deadline_s = time.monotonic() + 30
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.005)
-
-
 def test_a_page_is_served_to_who_has_opened_its_address(page: Page) -> None:
     viewer = Viewer(page)
     shell = viewer.ask("GET", "/")
@@ -111,9 +105,9 @@ def test_parts_arrive_once_and_the_newest_counts(page: Page) -> None:
     assert seen["title"] == {"kind": "title", "text": "a <b>page</b>"}
     page.put({"state": lines("one"), "alert": None})
     assert next(event for event in events if event[0] == "message")[1] == {"alert": None}
-    until(lambda: page.viewers == 1)
+    wait_until(lambda: page.viewers == 1)
     events.close()  # type: ignore[attr-defined]
-    until(lambda: page.viewers == 0)
+    wait_until(lambda: page.viewers == 0)
 
 
 def test_the_last_state_arrives_before_the_end() -> None:
