@@ -525,7 +525,8 @@ signal.signal(signal.SIGTERM, signal.default_int_handler)
 try:
     with open_operator() as operator:
         operator.show(Noted(words=type(operator).__name__ + " is here"))
-        time.sleep(60)
+        while True:
+            time.sleep(0.1)  # a signal just before a sleep does not end it
 except KeyboardInterrupt:
     print("interrupted", file=sys.stderr)
     sys.exit(130)
