@@ -159,7 +159,7 @@ def compensated_samples(repeats: int, dtype: type[np.float64 | np.float32]) -> I
 
 
 def text_table(repeats: int) -> Iterator[Row]:
-    """Read a wrench of half a million rows, beside pyarrow on the whole file and `numpy.loadtxt` on a tenth of it."""
+    """Read a wrench of half a million rows, beside pyarrow on the whole file."""
     rows = np.round(np.random.default_rng(2).normal(size=(500_000, 7)), 6)
     rows[:, 0] = np.arange(len(rows)) / 7000
     with TemporaryDirectory() as folder:
@@ -172,13 +172,9 @@ def text_table(repeats: int) -> Iterator[Row]:
         def whole() -> object:
             return pyarrow.csv.read_csv(path, pyarrow.csv.ReadOptions(use_threads=False))
 
-        def by_numpy() -> object:
-            return np.loadtxt(path, delimiter=",", skiprows=1, max_rows=50_000)
-
-        ours, peer, plain = best_seconds(repeats, table, whole, by_numpy)
+        ours, peer = best_seconds(repeats, table, whole)
     yield Row("text table, rows a second", f"{len(rows) / ours:.2g}", ">= 4e5", len(rows) / ours >= 4e5, repeats)
     yield Row("  over pyarrow of the whole file", f"{ours / peer:.1f}", "<= 3", ours / peer <= 3, repeats)
-    yield Row("  of numpy.loadtxt", f"{ours / (10 * plain):.2f}", "<= .5", ours / (10 * plain) <= 0.5, repeats)
 
 
 def measure(*, quick: bool = False) -> Iterator[Row]:

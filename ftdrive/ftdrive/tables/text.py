@@ -94,44 +94,57 @@ class TextTable:
                 if len(text) >= _BLOCK + _LINE and not text.endswith("\n"):
                     cut = line + text.count("\n")
                     raise BadDataset(f"line {cut} is longer than {_LINE} characters: give one row a sample")
-                yield self._parsed(text.encode(), use, line), raw.tell() / size
+                yield self._parsed(text, use, line), raw.tell() / size
                 line += text.count("\n")
 
-    def _parsed(self, text: bytes, use: Sequence[int], line: int) -> Array:
-        import pyarrow as pa  # .1 s that other commands need not wait
-        from pyarrow import csv as arrow
-
-        separator = self.format.separator
+    def _parsed(self, text: str, use: Sequence[int], first: int) -> Array:
+        separator, lines = self.format.separator, text.split("\n")
+        rows = lines
+        if any(mark in text for mark in "#%/"):
+            rows = [line for line in lines if not _COMMENT.match(line)]
+        comments = len(lines) - len(rows)
         if separator == " ":
-            text = re.sub(rb"[ \t]+", b"\t", text)
-            text = re.sub(rb"(?m)^\t|\t$", b"", text)
-            separator = "\t"
-        names = [str(i) for i in range(len(self.names))]
-        wanted = [names[i] for i in use]
-        try:
-            table = arrow.read_csv(
-                pa.BufferReader(text),
-                arrow.ReadOptions(column_names=names, block_size=len(text) + 1, use_threads=False),
-                arrow.ParseOptions(delimiter=separator),
-                arrow.ConvertOptions(
-                    column_types={
-                        names[i]: pa.timestamp("ns") if i in self.format.dates else pa.float64() for i in use
-                    },
-                    include_columns=wanted,
-                    null_values=[""],
-                    decimal_point=self.format.decimal,
-                ),
-            )
-        except pa.ArrowInvalid:
-            return self._slowly_parsed(text, separator, use, line)
-        columns = [column.to_numpy() for column in table.columns]
-        return np.column_stack([seconds_of(column) if column.dtype.kind == "M" else column for column in columns])
+            separator, rows = "\t", ["\t".join(row.split()) for row in rows]
+        if self.format.decimal == ",":
+            rows = [row.replace(",", ".") for row in rows] if "." not in text else []
+        found = self._numbers(rows, separator, use)
+        if found is None:
+            plain = "\n".join(["", *rows, ""])
+            # The first two overlap where three cells in a row are blank.
+            for edge in (separator * 2, separator * 2, f"\n{separator}", f"{separator}\n"):
+                plain = plain.replace(edge, f"{edge[0]}nan{edge[1]}")
+            found = self._numbers(plain.split("\n"), separator, use)
+        if found is None:
+            return self._slowly_parsed(text, use, first)
+        self.comments += comments
+        return found
 
-    def _slowly_parsed(self, text: bytes, separator: str, use: Sequence[int], first: int) -> Array:
-        """Parse what pyarrow refuses, such as a comment or `+1`. Raises `BadDataset` with the line."""
+    def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
+        """Return some columns of lines as numpy reads them; None if it refuses a cell, as a blank one, or a row."""
+        if not (rows := list(filter(None, lines))):
+            return None
+        kinds = dict.fromkeys(range(len(self.names)), "U1") | dict.fromkeys(use, "f8")
+        kinds |= {i: "U40" for i in self.format.dates if i in use}
+        of_columns = [(str(i), kind) for i, kind in kinds.items()]
+        try:
+            found = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
+            columns = [found[str(i)] if kinds[i] == "f8" else self._dates(found[str(i)], self.names[i]) for i in use]
+            # An open quote takes the rows below into its cell.
+            return np.column_stack(columns) if len(found) == len(rows) else None
+        except (BadDataset, ValueError):
+            return None
+
+    def _dates(self, cells: NDArray[np.str_], name: str) -> Array:
+        """Return the seconds since 1970 of dates (n,). Raises `BadDataset` or `ValueError`."""
+        if all((match := _DATE.fullmatch(cell)) and not match[3] for cell in cells.tolist()):
+            return seconds_of(cells.astype("datetime64[ns]"))
+        return np.array([self._number(cell.strip(), name, 0) for cell in cells.tolist()])
+
+    def _slowly_parsed(self, text: str, use: Sequence[int], first: int) -> Array:
+        """Parse what numpy refuses, such as a separator in a quoted cell. Raises `BadDataset` with the line."""
         count, rows = len(self.names), []
-        for line, one in enumerate(text.decode().split("\n"), first):
-            row = _split(one, separator)
+        for line, one in enumerate(text.split("\n"), first):
+            row = _split(one, self.format.separator)
             if _COMMENT.match(one):
                 self.comments += 1
                 continue
@@ -142,7 +155,7 @@ class TextTable:
             if len(row) != count:
                 raise BadDataset(f"line {line} has {len(row)} values, other lines have {count}: correct or delete it")
             rows.append([self._number(row[i].strip(), self.names[i], line) for i in use])
-        return np.array(rows, float).reshape(-1, len(use))
+        return np.array(rows, float).reshape(len(rows), len(use))
 
     def _number(self, cell: str, name: str, line: int) -> float:
         if not cell:
