@@ -91,7 +91,7 @@ def record(
         messages.print(f" Recording, {frame}. Ctrl-C ends.")
         try:
             with working("Recording") as show:
-                _record_stream(stream, recorder, duration_s, count, lambda: show(_so_far(recorder)))
+                _record_stream(stream, recorder, duration_s, count, show)
         finally:
             if recorder.samples:
                 _report(recorder, frame, stream.info.calibration_name, as_json=as_json)
@@ -107,9 +107,9 @@ def _record_stream(
     recorder: "Recorder",
     duration_s: float | None = None,
     count: int | None = None,
-    written: Callable[[], None] = lambda: None,
+    show: Callable[[str], object] = lambda _: None,
 ) -> None:
-    """Record until the end or an exception, and complete the files; `written` is called after each block.
+    """Record until the end or an exception, and complete the files; `show` gets in words how far it is.
 
     Raises what the stream or a file raises.
     """
@@ -129,7 +129,7 @@ def _record_stream(
                 if left >= len(block) or event.t_host_ns < block.t_host_ns[left]:
                     recorder.event(event)
             recorder.write(block.rows(slice(left)))
-            written()
+            show(_so_far(recorder))
             if left < len(block) or recorder.samples == count:
                 return
     finally:
@@ -141,7 +141,7 @@ def _record_stream(
         )
         values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
         recorder.event(StreamEvent(recorder.last_ns, "delay", text, values))
-        recorder.close()
+        recorder.close(show)
 
 
 def _so_far(recorder: "Recorder") -> str:

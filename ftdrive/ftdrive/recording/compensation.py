@@ -127,7 +127,7 @@ def compensate_recording(
     with ExitStack() as stack:
         recorder = None
         if output is not None:
-            recorder = Recorder([output], info, header.configuration)
+            recorder = Recorder([output], info, header.configuration, repeatable=True)
             stack.callback(recorder.discard)
         try:
             blocks = _processed(read_ahead(source.blocks()), processor)

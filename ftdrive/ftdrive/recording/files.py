@@ -25,6 +25,7 @@ from ftdrive.recording.recording import (
     Recording,
     Rows,
     measured,
+    read_ahead,
 )
 from ftdrivers.installation import missing_extra
 
@@ -89,12 +90,14 @@ class Format(NamedTuple):
     """Gives the header first, with a piece without samples."""
     package: str
     """Needed for it."""
+    grows: bool = True
+    """Whether a part of a file can be read."""
 
 
 _FORMATS = {
     ".mcap": Format(McapFile, read_mcap, "mcap"),
     ".csv": Format(CsvFile, read_csv, "csv"),
-    ".parquet": Format(ParquetFile, read_parquet, "zstandard"),
+    ".parquet": Format(ParquetFile, read_parquet, "pyarrow", grows=False),
 }
 ENDINGS = tuple(_FORMATS)
 
@@ -111,12 +114,18 @@ def format_of(path: Path) -> Format:
     return _FORMATS[ending]
 
 
+def grown_as(path: Path) -> Path:
+    """Return the file that a stream is written to: of a format that cannot be read before its end, first as MCAP."""
+    return path if format_of(path).grows else path.with_name(f"{path.name}.mcap")
+
+
 def require_new_recordings(paths: Sequence[Path]) -> None:
-    """Raise `ConfigError` or `OSError` unless a recording can be written to all of these files."""
-    for path in paths:
+    """Raise `ConfigError` or `OSError` unless a stream can be recorded to all of these files."""
+    grown = [grown_as(path) for path in paths]
+    for path in (*paths, *grown):
         format_of(path)
         partial_of(path)
-    if len({path.absolute() for path in paths}) < len(paths):
+    if len({path.absolute() for path in grown}) < len(paths):
         raise ConfigError("two outputs name the same file: leave one out")
 
 
@@ -202,14 +211,14 @@ def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 
-def write_recording(path: str | Path, recording: Recording) -> None:
+def write_recording(path: str | Path, recording: Recording | RecordingReader) -> None:
     """Write a new file with all of a recording, or none.
 
     Parameters
     ----------
     path : str or Path
         Its ending names the format: .mcap, .csv or .parquet.
-    recording : Recording
+    recording : Recording or RecordingReader
 
     Raises
     ------
@@ -228,8 +237,9 @@ def write_recording(path: str | Path, recording: Recording) -> None:
     path = Path(path)
     file = format_of(path).new(path, recording.header)
     try:
-        for piece in recording.pieces():
-            file.append(piece.rows, piece.events)
+        with closing(read_ahead(recording.pieces())) as pieces:
+            for piece in pieces:
+                file.append(piece.rows, piece.events)
         file.complete()
     except BaseException:
         file.discard()

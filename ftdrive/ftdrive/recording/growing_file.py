@@ -105,6 +105,11 @@ def partial_of(path: Path) -> Path:
                 raise FileExistsError(
                     f"{_holder(file)} still records to {partial}: choose another name, or end that recording first"
                 )
+        if path.suffix == ".parquet":
+            raise FileExistsError(
+                f"{partial} exists, but its end is missing: delete it. If `record` of an earlier ftdrive was "
+                "interrupted, convert it with that version first"
+            )
         raise FileExistsError(
             f"{partial} exists: an earlier recording was interrupted. Save it with "
             f"`ftdrive convert {partial} NEW{path.suffix}`, then delete it"

@@ -13,7 +13,14 @@ import numpy as np
 from ftcalib.files import JSON
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import Block, StreamEvent, StreamInfo
-from ftdrive.recording.files import RecordingFile, RecordingReader, format_of, require_new_recordings
+from ftdrive.recording.files import (
+    RecordingFile,
+    RecordingReader,
+    format_of,
+    grown_as,
+    require_new_recordings,
+    write_recording,
+)
 from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, rows_of
 
 # Writing takes a few ms, in which the stream waits.
@@ -64,10 +71,7 @@ class RecordingFiles:
             except BaseException as error:
                 files, self._files = self._files, []
                 for file in files:
-                    file.keep()
-                    if not file.samples:
-                        file.discard()
-                self.partial = {file.partial: file.samples for file in files if file.samples}
+                    self._keep(file)
                 if isinstance(error, OSError):
                     raise self._named(error) from error
                 raise
@@ -88,7 +92,7 @@ class RecordingFiles:
                     file.complete()
                     self.saved.append(path)
                 except OSError as error:
-                    self.partial[file.partial] = file.samples
+                    self._keep(file)
                     failure = failure or error
         if failure is not None:
             raise self._named(failure)
@@ -98,6 +102,14 @@ class RecordingFiles:
         for file in self._files:
             file.discard()
         self._files = []
+
+    def _keep(self, file: RecordingFile) -> None:
+        """End a file without completing it; one without samples that can be read is deleted."""
+        file.keep()
+        if file.samples:
+            self.partial[file.partial] = file.samples
+        else:
+            file.discard()
 
     def _named(self, error: OSError) -> OSError:
         """Return an error of the same kind that names what is safe."""
@@ -109,7 +121,8 @@ class RecordingFiles:
 class Recorder:
     """Writes a stream to files, with everything since the first sample; a consumer of blocks and events.
 
-    Changes of frame and stages become events with the time of the first sample after them.
+    Changes of frame and stages become events with the time of the first sample after them. Parquet cannot be read
+    before its end: `x.parquet` is recorded as `x.parquet.mcap`, and converted when the recorder is closed.
 
     Parameters
     ----------
@@ -118,6 +131,8 @@ class Recorder:
     info : StreamInfo
     configuration : mapping
         Of the cell, for the header.
+    repeatable : bool
+        Whether the stream can be read again, as one from a file: then Parquet is written at once.
 
     Raises
     ------
@@ -127,11 +142,14 @@ class Recorder:
         A file exists, or its folder does not.
     """
 
-    def __init__(self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON]) -> None:
+    def __init__(
+        self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON], *, repeatable: bool = False
+    ) -> None:
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
         require_new_recordings(paths)
-        self._paths, self._info, self._configuration = paths, info, configuration
+        self._info, self._configuration = info, configuration
+        self._grown = {path if repeatable else grown_as(path): path for path in paths}
         self._files: RecordingFiles | None = None
         self._header: Header | None = None
         self._blocks: list[Block] = []
@@ -140,7 +158,7 @@ class Recorder:
     @property
     def saved(self) -> Sequence[Path]:
         """Files that are complete."""
-        return self._files.saved if self._files else ()
+        return [path for path in self._grown.values() if self._files and path in self._files.saved]
 
     @property
     def partial(self) -> Mapping[Path, int]:
@@ -183,17 +201,43 @@ class Recorder:
         if event.kind not in ("frame", "stages"):
             self._events.append(event)
 
-    def close(self) -> None:
+    def close(self, show: Callable[[str], object] = lambda _: None) -> None:
         """Complete all files that hold every sample; without a sample there is none.
+
+        Parameters
+        ----------
+        show : callable
+            Gets in words what is done, because a conversion may take a minute for each hour of samples.
 
         Raises
         ------
         OSError
-            A file could not be completed; the others were. It names what remains in which `.partial`.
+            A file could not be completed; the others were. It names what remains in which file.
         """
         self._flush()
         if self._files:
-            self._files.complete()
+            try:
+                self._files.complete()
+            finally:
+                for grown, path in self._grown.items():
+                    if grown != path and grown in self._files.saved:
+                        show(f"Converting to {path}")
+                        self._convert(self._files, grown, path)
+
+    def _convert(self, files: RecordingFiles, grown: Path, path: Path) -> None:
+        """Write a complete recording in another format, and delete it. After an error it remains. Raises `OSError`."""
+        files.saved.remove(grown)
+        try:
+            write_recording(path, RecordingReader(grown))
+        except (BadRecording, KeyboardInterrupt, OSError) as error:
+            files.partial[grown] = self.samples
+            kind = type(error) if isinstance(error, OSError) else OSError
+            raise kind(
+                f"{path} was not written ({error or 'interrupted'}): {grown} keeps {self.samples} samples, which "
+                f"`ftdrive convert {grown} {path}` saves"
+            ) from error
+        grown.unlink()
+        files.saved.append(path)
 
     def discard(self) -> None:
         """Delete what was written."""
@@ -205,7 +249,7 @@ class Recorder:
         t_ns = int(block.t_host_ns[0])
         if self._header is None:
             self._header, self.first_ns = Header(self._info, block.frame, block.stages, self._configuration), t_ns
-            self._files = RecordingFiles(self._paths, self._header)
+            self._files = RecordingFiles(list(self._grown), self._header)
         changes = []
         if block.frame != self._header.frame:
             text = f"The compensated wrench is in {block.frame}"

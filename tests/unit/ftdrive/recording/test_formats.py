@@ -1,12 +1,12 @@
 """Three formats hold the same bits, and other programs read them."""
 
+import gzip
 import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import duckdb
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -15,6 +15,7 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
+from pyarrow import parquet
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
@@ -233,8 +234,7 @@ def test_the_table_is_plain_to_other_programs(paths: Sequence[Path]) -> None:
     names = lines[0].split(",")
     assert names[:7] == ["t_s", "t_utc_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
     assert "base axes, about the tcp origin" in paths[1].read_text(encoding="utf-8").partition("\n")[0]
-    with duckdb.connect() as database:
-        table = database.execute(f"SELECT t_s, fz, q5, in_contact FROM '{paths[2]}'").fetchnumpy()
+    table = parquet.read_table(paths[2], columns=["t_s", "fz", "q5", "in_contact"])
     column = [float(line.split(",")[names.index("t_s")]) for line in lines[1:]]
     np.testing.assert_array_equal(table["t_s"], column)
     assert column[0] == 0.0
@@ -333,21 +333,44 @@ def test_csv_lines_without_a_checksum_are_not_collected_without_end(
         read_recording(path)
 
 
-@pytest.mark.parametrize(
-    ("ending", "more"),
-    [
-        (".mcap", bytes(9)),
-        (".mcap", b"\5" + (200_000_001).to_bytes(8, "little")),
-        (".parquet", b"FTDR" + (200_000_001).to_bytes(4, "little") + bytes(4)),
-    ],
-)
+@pytest.mark.parametrize("more", [bytes(9), b"\5" + (200_000_001).to_bytes(8, "little")])
 def test_records_that_no_file_of_ours_has_are_refused_before_they_are_read(
-    small: Sequence[Path], tmp_path: Path, ending: str, more: bytes
+    small: Sequence[Path], tmp_path: Path, more: bytes
 ) -> None:
-    path, content = tmp_path / f"a{ending}", small[ENDINGS.index(ending)].read_bytes()
-    path.write_bytes(content[: 8 if ending == ".mcap" else 4] + more + bytes(100))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(small[0].read_bytes()[:8] + more + bytes(100))
     with pytest.raises(BadRecording, match="the file is damaged"):
         read_recording(path)
+
+
+def test_parquet_of_the_writer_before_pyarrow_is_read_and_has_the_same_columns(
+    small: Sequence[Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "a.parquet"
+    path.write_bytes(gzip.decompress(Path(__file__).with_name("numpy_writer.parquet.gz").read_bytes()))
+    recording = read_recording(path)
+    first, second = recording.pieces()
+    for piece, measured in ((first, block(4, 0, step_ns=6 * 10**9)), (second, block(4, 4, step_ns=6 * 10**9))):
+        for name in ("t_host_ns", "t_device_s", "seq", "status", "raw", "wrench", "in_contact", "p_base_flange_m"):
+            np.testing.assert_array_equal(piece.rows[name], getattr(measured, name))
+    assert [piece.header.frame for piece in (first, second)] == [BASE_TCP, PUSH]
+    assert [event.kind for event in recording.events] == ["mark", "frame", "stages"]
+    assert parquet.read_schema(path) == parquet.read_schema(small[2])
+    assert {b"header", b"events"} < parquet.read_metadata(small[2]).metadata.keys()
+
+
+def test_parquet_that_pyarrow_has_copied_stays_a_recording_and_other_parquet_is_none(
+    paths: Sequence[Path], tmp_path: Path
+) -> None:
+    table = parquet.read_table(paths[2])
+    parquet.write_table(table, tmp_path / "a.parquet")
+    same(read_recording(paths[2]), read_recording(tmp_path / "a.parquet"))
+    parquet.write_table(table.replace_schema_metadata(None), tmp_path / "b.parquet")
+    with pytest.raises(BadRecording, match="no header of ftdrive: another program wrote it"):
+        read_recording(tmp_path / "b.parquet")
+    parquet.write_table(table.drop_columns(["fz"]), tmp_path / "c.parquet")
+    with pytest.raises(BadRecording, match="columns are not those of a recording"):
+        read_recording(tmp_path / "c.parquet")
 
 
 def test_an_mcap_file_of_another_program_without_checksums_is_read(

@@ -6,6 +6,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,12 +15,19 @@ from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder, read_recording, write_recording
 from ftdrive.recording.csv_file import CsvFile
-from ftdrive.recording.files import require_new_recordings
+from ftdrive.recording.files import grown_as, require_new_recordings
 from ftdrive.recording.growing_file import GrowingFile
+from ftdrive.recording.parquet_file import ParquetFile
 from ftdrive.recording.recording import Header
 from tests.unit.ftdrive.recorded import BASE_TCP, USUAL, block, info
 
 ENDINGS = (".mcap", ".csv", ".parquet")
+
+
+def partial_of(path: Path) -> Path:
+    """Return the file that holds the samples of a recording until it is complete."""
+    grown = grown_as(path)
+    return grown.with_name(f"{grown.name}.partial")
 
 
 class FullDisk:
@@ -72,7 +80,7 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
         assert found.cut
         assert 0 < len(found.rows) == samples < 5000
         np.testing.assert_array_equal(found.rows["seq"], found.rows["seq"][0] + np.arange(len(found.rows)))
-    assert list(recorder.partial) == [tmp_path / f"a{ending}.partial", tmp_path / "b.csv.partial"]
+    assert list(recorder.partial) == [partial_of(first), tmp_path / "b.csv.partial"]
 
 
 @pytest.mark.parametrize("ending", [".mcap", ".csv"])
@@ -133,7 +141,7 @@ def test_after_a_power_failure_the_partial_file_is_readable(ending: str, tmp_pat
     for start in range(26):
         recorder.write(block(1, start, step_ns=1_000_000_000))
         recorder.event(mark if start == 1 else StreamEvent(0, "frame", "the recorder notices it itself"))
-    found = read_recording(tmp_path / f"a{ending}.partial")
+    found = read_recording(partial_of(path))
     np.testing.assert_array_equal(found.rows["seq"], block(len(found.rows)).seq)
     assert len(found.rows) > 15
     assert list(found.events) == [mark]
@@ -151,9 +159,32 @@ def test_nothing_is_overwritten(ending: str, tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="never overwritten"):
         recorder.close()
     assert path.read_text() == "another program's"
-    assert len(read_recording(tmp_path / f"a{ending}.partial").rows) == 3
+    kept, samples = next(iter(recorder.partial.items()))
+    assert len(read_recording(kept).rows) == samples == 3
     with pytest.raises(FileExistsError, match="never overwritten"):
         Recorder([path], info(), {})
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(errno.ENOSPC, "No space left on device")])
+def test_what_cannot_be_converted_to_parquet_stays_in_mcap(
+    failure: BaseException, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fill_disk: Callable[[int], None]
+) -> None:
+    path, kept = tmp_path / "a.parquet", tmp_path / "a.parquet.mcap"
+    recorder = Recorder([path, tmp_path / "b.csv"], info(), {})
+    recorder.write(block(1100))
+    if isinstance(failure, OSError):
+        fill_disk(100_000)
+    else:
+        monkeypatch.setattr(ParquetFile, "append", Mock(side_effect=failure))
+    with pytest.raises(OSError, match=rf"a\.parquet was not written .*`ftdrive convert {kept} {path}` saves"):
+        recorder.close()
+    assert (recorder.saved, recorder.partial) == ([tmp_path / "b.csv"], {kept: 1100})
+    assert sorted(tmp_path.iterdir()) == [kept, tmp_path / "b.csv"]
+    monkeypatch.undo()
+    with pytest.raises(FileExistsError, match="never overwritten"):
+        require_new_recordings([path])
+    write_recording(path, read_recording(kept))
+    assert len(read_recording(path).rows) == 1100
 
 
 def test_without_a_sample_there_is_no_file(tmp_path: Path) -> None:
@@ -176,9 +207,11 @@ def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
 def test_an_unknown_ending_is_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"name it \.mcap, \.csv or \.parquet"):
         Recorder([tmp_path / "a.bag"], info(), {})
+    with pytest.raises(ConfigError, match="two outputs name the same file"):
+        Recorder([tmp_path / "a.parquet", tmp_path / "a.parquet.mcap"], info(), {})
 
 
-@pytest.mark.parametrize(("missing", "ending"), [("mcap", ".mcap"), ("zstandard", ".parquet")])
+@pytest.mark.parametrize(("missing", "ending"), [("mcap", ".mcap"), ("pyarrow", ".parquet")])
 def test_a_missing_package_is_named_with_its_extra(
     missing: str, ending: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
