@@ -18,6 +18,7 @@ import sys
 import tarfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -62,17 +63,17 @@ def results(old: CommandLine) -> Iterator[tuple[str, str]]:
     for command in solved:
         yield command, text_of(json.loads(ended(old, f"{command} --json")[1] or "null"))
     for method in PUBLISHED:
-        yield method, text_or_error(lambda method=method: ftdrive.solve(dataset(), method).to_dict())
+        yield method, text_or_error(partial(solution, dataset(), method))
     for recording in ("rest.mcap", "pushed.mcap", "held.mcap"):
         stream = replayed(
             old.folder / recording, old.folder / "quick", WrenchFrame("sensor"), speed=math.inf, force=True
         )
-        yield f"weigh {recording}", text_or_error(lambda stream=stream: asdict(ftdrive.weigh(stream, timeout_s=1.0)))
+        yield f"weigh {recording}", text_or_error(partial(weighed, stream))
     for name in CASES:
         case, table, poses = read(name, old.folder)
         if table is poses:
             path = old.folder / "wrench.csv"
-            yield name, text_or_error(lambda path=path, case=case: ftdrive.solve(path, table=case.options).to_dict())
+            yield name, text_or_error(partial(solution, path, table=case.options))
         else:
             rows = [*table.wrenches(), *poses.poses()]
             yield name, "\n".join(digest_of(str(k), one.values) for k, one in enumerate(rows))
@@ -100,6 +101,14 @@ def blocks(old: CommandLine) -> Iterator[tuple[str, str]]:
         for column in columns:
             lines.append(digest_of(column, np.concatenate([getattr(block, column) for block in read])))
         yield name, "\n".join(lines)
+
+
+def solution(source: Any, method: Any = "ml", **options: Any) -> dict[str, Any]:
+    return dict(ftdrive.solve(source, method, **options).to_dict())
+
+
+def weighed(stream: Any) -> dict[str, Any]:
+    return asdict(ftdrive.weigh(stream, timeout_s=1.0))
 
 
 def text_or_error(call: Callable[[], Any]) -> str:

@@ -56,7 +56,7 @@ def write_files(ftdrive: CommandLine) -> None:
 
 def main() -> None:
     packed, sys.argv = Path(sys.argv[1]).absolute(), ["ftdrive"]
-    load._SWING_S = 0.5  # the emulated weight swings as much faster as the emulated arm moves
+    vars(load)["_SWING_S"] = 0.5  # the emulated weight swings as much faster as the emulated arm moves
     folder = Path("/tmp/cell")  # its name is in the files
     folder.mkdir()
     write_files(CommandLine(folder))
