@@ -16,12 +16,12 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 74547,
-    "files": 318,
-    "dataclasses": 240,
-    "public functions and classes": 1473,
-    "import statements inside functions": 431,
-    "test lines": 84112,
+    "product lines": 73518,
+    "files": 314,
+    "dataclasses": 239,
+    "public functions and classes": 1443,
+    "import statements inside functions": 417,
+    "test lines": 83014,
 }
 ROOMS = {
     "a: calibrate, to the first move": 72,
@@ -83,8 +83,8 @@ def faults(sources: dict[str, str]) -> Iterator[str]:
             yield f"{path} has {lines} lines: take it out of LONGER in {Path(__file__).name}."
         for node in ast.walk(ast.parse(source)):
             for name in node.names if isinstance(node, ast.ImportFrom) else ():
-                if name.name.startswith("_") and not name.name.startswith("__") and node.module != "__future__":
-                    yield f"{path}:{node.lineno} imports {name.name}: give it a public name, or move what uses it."
+                if name.name.startswith("_") and not name.name.startswith("__"):
+                    yield f"{path}:{name.lineno} imports {name.name}: give it a public name, or move what uses it."
 
 
 def product() -> dict[str, str]:
