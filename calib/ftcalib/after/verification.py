@@ -149,16 +149,15 @@ def verify(
     def probability(kind: list[Expected]) -> float:
         return sum(one.weight * one.p_value(one.distance(R_base_flange, wrench)[2], 6 * n) for one in kind)
 
-    p_values = [probability(kind) for kind in explanations]
+    p_values = [probability(explanations[0])]
     # The second explanation has the larger sigma, so it is asked only where the first fails.
-    smooth: list[Expected] = []
     if fitted is not None and p_values[0] < false_alarms:
         smooth = expected_with_smooth_errors(calibration, fitted, R_base_flange, wrench_cov)
-    if smooth:
-        explanations.append(smooth)
-        p_values.append(probability(smooth))
+        if smooth:
+            explanations.append(smooth)
+            p_values.append(probability(smooth))
     likeliest = [max(kind, key=lambda one: one.weight) for kind in explanations]
-    # An alarm needs all explanations to fail: the sensor that passes under one of them may be unchanged.
+    # An alarm needs both explanations to fail: the sensor that passes under one of them may be unchanged.
     p_value = max(p_values)
     if p_value >= false_alarms:
         return _compare(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
