@@ -1,4 +1,4 @@
-"""Compare this tree with what is kept here, or keep it anew: see README.md.
+"""Compare this tree with what is kept here, or keep what it gives now: see README.md.
 
     uv run python -m tests.baselines results blocks texts [--write]
 
@@ -15,7 +15,6 @@ import math
 import re
 import shlex
 import sys
-import tarfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
 from functools import partial
@@ -30,6 +29,7 @@ import tests.conftest  # the configuration and the terminal of the user do not m
 from ftcalib.published.methods import PUBLISHED
 from ftdrive.commands.live import replayed
 from ftdrive.live.samples import Block, Stages, WrenchFrame
+from tests.baselines.pack import unpack
 from tests.system.command_line import CommandLine
 from tests.unit.ftdrive.recorded import dataset
 from tests.unit.ftdrive.tables.test_layouts import CASES, read
@@ -38,13 +38,6 @@ HERE = Path(__file__).parent
 KEPT_LINES, LONGEST_ROW = 40, 250
 PASSING = ("age", "argv", "created", "path", "run", "utc", "versions")
 """Parts of the names of values that depend on the day, the folder or the computer."""
-
-
-def unpack(folder: Path) -> CommandLine:
-    """Unpack the old files into a folder, and return a command line there."""
-    with tarfile.open(HERE / "old_files.tar.xz") as packed:
-        packed.extractall(folder, filter="data")
-    return CommandLine(folder)
 
 
 # ---------------------------------------------------------------------------------------------------------------- kinds
@@ -96,11 +89,9 @@ def blocks(old: CommandLine) -> Iterator[tuple[str, str]]:
         read = list[Block]()
         while not stream.has_ended:
             read.append(stream.read())
-        columns = (name for name in Block.__slots__ if isinstance(getattr(read[0], name), np.ndarray))
-        lines = []
-        for column in columns:
-            lines.append(digest_of(column, np.concatenate([getattr(block, column) for block in read])))
-        yield name, "\n".join(lines)
+        columns = [name for name in Block.__slots__ if isinstance(getattr(read[0], name), np.ndarray)]
+        whole = ((column, np.concatenate([getattr(block, column) for block in read])) for column in columns)
+        yield name, "\n".join(digest_of(*one) for one in whole)
 
 
 def solution(source: Any, method: Any = "ml", **options: Any) -> dict[str, Any]:

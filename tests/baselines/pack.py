@@ -1,4 +1,4 @@
-"""Write `old_files.tar.xz`: files of this version of ftdrive, from commands on an emulated cell.
+"""Write and unpack `old_files.tar.xz`: files of a version of ftdrive, from commands on an emulated cell.
 
 Run it only to add files of a later version: `uv run python -m tests.baselines.pack NEW.tar.xz`.
 """
@@ -12,8 +12,16 @@ from ftdrive.cell.emulated import Station
 from ftdrive.runs import load
 from tests.system.command_line import CommandLine
 
+ARCHIVE = Path(__file__).with_name("old_files.tar.xz")
 YES = "yes\n" * 8 + "MOVE\n" + "yes\n" * 4
 LOAD_KG = 2.0
+
+
+def unpack(folder: Path) -> CommandLine:
+    """Unpack the old files into a folder, and return a command line there."""
+    with tarfile.open(ARCHIVE) as packed:
+        packed.extractall(folder, filter="data")
+    return CommandLine(folder)
 
 
 def write_files(ftdrive: CommandLine) -> None:

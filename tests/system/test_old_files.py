@@ -1,8 +1,5 @@
 """Every file that an earlier version has written is read by this one."""
 
-import tarfile
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,17 +7,13 @@ import ftdrive
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
+from tests.baselines.pack import unpack
 from tests.system.command_line import CommandLine
-
-ARCHIVE = Path(__file__).parents[1] / "baselines/old_files.tar.xz"
 
 
 @pytest.fixture(scope="module")
 def old(tmp_path_factory: pytest.TempPathFactory) -> CommandLine:
-    folder = tmp_path_factory.mktemp("old")
-    with tarfile.open(ARCHIVE) as packed:
-        packed.extractall(folder, filter="data")
-    return CommandLine(folder)
+    return unpack(tmp_path_factory.mktemp("old"))
 
 
 @pytest.mark.parametrize(
