@@ -1,12 +1,7 @@
-"""Count the modules that four real commands walk through: `uv run python tests/house/rooms.py [a b c d] [--list]`.
-
-    a  calibrate --simulate --minimal, until the arm driver's first move
-    b  live --replay of a recording
-    c  solve of a CSV file of poses
-    d  solve of a recording in motion
+"""Trace four real commands, and write the modules that they pass: `uv run python -m tests.house.rooms`.
 
 A module counts if a function of it ran, of ftcalib, ftdrivers or ftdrive. Functions that run only because a module is
-imported are not counted. The counts are those of one run; threads are included.
+imported are not counted. The counts are those of one run; threads are included. The page is docs/contributing/walks.md.
 """
 
 import json
@@ -15,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import redirect_stdout
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,7 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+PAGE = Path(__file__).parents[2] / "docs/contributing/walks.md"
 PACKAGES = ("ftcalib", "ftdrivers", "ftdrive")
+WALKS = {
+    "a": "`calibrate --simulate --minimal`, until the arm's first move",
+    "b": "`live --replay` of a recording",
+    "c": "`solve` of a CSV file of poses",
+    "d": "`solve` of a recording in motion",
+}
 FIRST_MOVE = "move_to"
 """The method of the arm driver at which walk (a) ends."""
 
@@ -34,6 +36,7 @@ FIRST_MOVE = "move_to"
 def traced(arguments: Sequence[str], *, to_the_first_move: bool) -> None:
     """Run a command in this process, and print the modules, functions and calls between modules as JSON."""
     functions, edges = set[tuple[str, str]](), set[tuple[str, str]]()
+    rooms = dict[str, tuple[str | None, str]]()  # each with the module that called it first, and the function
     ended = False
 
     def profile(frame: FrameType, event: str, _: object) -> None:
@@ -53,7 +56,11 @@ def traced(arguments: Sequence[str], *, to_the_first_move: bool) -> None:
                     return
                 caller = caller or name
             back = back.f_back
-        functions.add((module, code.co_qualname.split(".<locals>")[0]))
+        function = code.co_qualname.split(".<locals>")[0]
+        functions.add((module, function))
+        if function == "__create_fn__":  # a method that `dataclass` has written
+            function = type(next(iter(frame.f_locals.values()))).__name__
+        rooms.setdefault(module, (caller, function))
         if caller and caller != module:
             edges.add((caller, module))
         if to_the_first_move and module.startswith("ftdrivers.ur") and code.co_name == FIRST_MOVE:
@@ -67,7 +74,6 @@ def traced(arguments: Sequence[str], *, to_the_first_move: bool) -> None:
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):
         code = run([*arguments])
     sys.setprofile(None)
-    rooms = sorted({module for module, _ in functions})
     counts = {"rooms": rooms, "functions": len(functions), "edges": len(edges), "exit_code": code}
     print(json.dumps(counts), flush=True)  # noqa: T201
     os._exit(0)  # the threads of a command that was interrupted do not matter
@@ -104,29 +110,53 @@ def prepare(folder: Path) -> dict[str, list[str]]:
     }
 
 
-def walks(names: Sequence[str] = "abcd") -> dict[str, dict[str, Any]]:
+def walks() -> dict[str, dict[str, Any]]:
     """Run each command in a process of its own, and return what it passed."""
-    found = {}
+    passed = {}
     with TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_DATA_HOME": folder, "XDG_STATE_HOME": folder, "XDG_CONFIG_HOME": folder}
         for name, command in prepare(Path(folder)).items():
-            if name in names:
-                walk = [sys.executable, __file__, "--traced", name, *command]
-                nothing = subprocess.DEVNULL
-                done = subprocess.run(walk, env=environment, stdin=nothing, capture_output=True, check=True)
-                found[name] = json.loads(done.stdout)
-                assert found[name]["exit_code"] == (130 if name == "a" else 0), done.stderr
-    return found
+            walk = [sys.executable, __file__, "--traced", name, *command]
+            nothing = subprocess.DEVNULL
+            done = subprocess.run(walk, env=environment, stdin=nothing, capture_output=True, check=True)
+            passed[name] = json.loads(done.stdout)
+            assert passed[name]["exit_code"] == (130 if name == "a" else 0), done.stderr
+    return passed
 
 
-def counts() -> dict[str, int]:
-    """Count the modules of each walk."""
-    return {name: len(walk["rooms"]) for name, walk in walks().items()}
+def tree(rooms: dict[str, tuple[str | None, str]]) -> str:
+    """Write each module below the one that called it first, with the function that was called."""
+    depths = dict[str, int]()
 
+    def below(caller: str | None) -> Iterator[str]:
+        for module, (by, function) in rooms.items():
+            if by == caller:
+                depths[module] = depths[caller] + 1 if caller else 0
+                yield f"{'  ' * depths[module] + module:<56} {function}"
+                yield from below(module)
+
+    return "\n".join(below(None))
+
+
+def page(passed: dict[str, dict[str, Any]]) -> str:
+    """Write the page of contributors."""
+    parts = [HEAD]
+    for name, walk in passed.items():
+        counts = f"{len(walk['rooms'])} modules, {walk['functions']} functions, {walk['edges']} calling pairs"
+        parts.append(f"## {WALKS[name]}\n\n{counts}.\n\n```text\n{tree(walk['rooms'])}\n```\n")
+    return "\n".join(parts)
+
+
+HEAD = """# Four walks through the code
+
+Each list is the trace of one real command: every module of which a function ran, below the module that called it first,
+with the first function called. Modules at the left edge were entered by the command line or by a thread.
+`uv run python -m tests.house.rooms` traces them again; `tests/house/test_counts.py` has the ceilings of their numbers.
+
+[Architecture](../explanation/architecture.md) has the packages and what each may import.
+"""
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--traced"]:
         traced(sys.argv[3:], to_the_first_move=sys.argv[2] == "a")
-    for key, walk in walks([one for one in sys.argv[1:] if one in "abcd"] or "abcd").items():
-        listed = walk.pop("rooms")
-        print(key, len(listed), walk, *(listed if "--list" in sys.argv else []), sep="\n  ")  # noqa: T201
+    PAGE.write_text(page(walks()), encoding="utf-8")
