@@ -6,7 +6,6 @@ weigh     draws the screen of `ftdrive weigh` with a weight
 report    calibrates an emulated cell, and photographs the head of `ftdrive report` in Chromium (group browser)
 fleet     photographs the page of `ftdrive fleet status` for four cells, one of which drifts
 tour      stick figures of `ftdrive plan`, and the sweep of `ftdrive demo --sweep`
-drawings  frames, signs, what to measure, files, data flow, and plots of tables of the figures, from `drawings.py`
 
 Tests of the browser draw the pages of --view: `PICTURES=docs/pictures uv run pytest -m browser tests/browser`.
 """
@@ -33,7 +32,6 @@ from ftdrive.fleet.page import page
 from ftdrive.live.weighing import ScaleState
 from ftdrive.terminal.canvas import Canvas
 from tests.benchmarks.common import show
-from tests.benchmarks.drawings import DRAWINGS
 from tests.unit.ftdrive.fleet.fleet_records import cell, daily, fleet, observed, result
 from tests.unit.ftdrive.terminal.fake_stream import INFO, Scenario
 from tests.unit.ftdrive.terminal.test_live_screen import Screen
@@ -237,11 +235,6 @@ def _run(folder: str, *command: str) -> None:
     subprocess.run([sys.executable, "-m", "ftdrive", *command], cwd=folder, env=here, check=True)
 
 
-def draw_drawings() -> None:
-    for name, draw in DRAWINGS.items():
-        write(f"{name}.svg", draw().svg())
-
-
 PICTURES: Mapping[str, Callable[[], None]] = MappingProxyType(
     {
         "demo": draw_demo,
@@ -250,7 +243,6 @@ PICTURES: Mapping[str, Callable[[], None]] = MappingProxyType(
         "report": draw_report,
         "fleet": draw_fleet,
         "tour": draw_tour,
-        "drawings": draw_drawings,
     }
 )
 

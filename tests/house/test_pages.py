@@ -1,6 +1,7 @@
 """What the pages for users say about commands, files and one another."""
 
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pytest
 
 import ftdrive
 from ftdrive.cli import cli
-from tests.benchmarks.drawings import DRAWINGS
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("[!.]*/**/*.md")]
@@ -83,13 +83,12 @@ def test_links_of_pages_exist() -> None:
     assert missing == []
 
 
-def test_drawings_are_those_of_the_code() -> None:
+def test_plots_are_those_of_the_tables() -> None:
     pictures = ROOT / "docs/pictures"
+    plots = runpy.run_path(str(ROOT / "docs/plots.py"))["PLOTS"]
     assert [
-        name
-        for name, draw in DRAWINGS.items()
-        if (pictures / f"{name}.svg").read_text(encoding="utf-8") != draw().svg()
-    ] == []
+        name for name, draw in plots.items() if (pictures / f"{name}.svg").read_text(encoding="utf-8") != draw()
+    ] == [], "run `uv run python docs/plots.py`"
 
 
 def test_pages_that_the_code_names_exist() -> None:
