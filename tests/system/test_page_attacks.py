@@ -24,7 +24,6 @@ from tests.unit.ftdrive.live.simulated import calibrated_from
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
 
-# It arrives; `tests/benchmarks/stop_on_page.py` measures how soon.
 STOP_S, GROWTH_MB, LARGE = 10.0, 50, 45_000_000
 # Until the arm stands, with braking, and an emulated cell on a busy computer.
 STANDS_S = 10.0
