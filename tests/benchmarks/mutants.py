@@ -174,9 +174,11 @@ def outcome(root: Path, mutant: Mutant, reach: CoverageData, limit_s: float, fir
             except subprocess.TimeoutExpired:
                 os.killpg(run.pid, signal.SIGKILL)
                 return "too slow"
+        # Pytest ends alike where a file cannot be imported and where a test is not there.
+        if failed := re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - |$)", said, re.MULTILINE):
+            return failed[1]
         if run.returncode not in NO_TESTS:
-            failed = re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - |$)", said, re.MULTILINE)
-            return failed[1] if failed else "its import"
+            return "its import"
     return ""
 
 
