@@ -65,8 +65,7 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        is_option = args[0].startswith("-")
-        if not is_option and not ctx.resilient_parsing and self.get_command(ctx, args[0]) is None:
+        if not (args[0].startswith("-") or ctx.resilient_parsing) and self.get_command(ctx, args[0]) is None:
             from ftdrive.mistakes import close_command
 
             ctx.fail(f"No such command '{args[0]}'.{close_command(args[0])}")
@@ -232,11 +231,7 @@ def _explain(error: click.ClickException, arguments: Sequence[str]) -> None:
         if other := _other_command(arguments, error.format_message()):
             _say(f"error: {in_one_line(other)}")
             return
-        if (
-            isinstance(error, click.BadParameter)
-            and error.param is not None
-            and isinstance(error.param.type, click.Path)
-        ):
+        if isinstance(error, click.BadParameter) and error.param and isinstance(error.param.type, click.Path):
             error = click.UsageError(error.format_message() + existing(cli, arguments), error.ctx)
     error.show(message := StringIO())
     echo(message.getvalue(), err=True, nl=False)

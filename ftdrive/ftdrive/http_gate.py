@@ -5,7 +5,6 @@ server on this computer. Programs send no `Origin`.
 """
 
 import asyncio
-import ipaddress
 import logging
 import os
 import random
@@ -71,9 +70,7 @@ def _is_bound(host: str, bound: str) -> bool:
     if (found := _HOST.fullmatch(host)) is None:
         return False
     name = (found["v6"] or found["name"]).lower()
-    is_local = bound in ("localhost", "0.0.0.0", "::")
-    with suppress(ValueError):
-        is_local |= ip_address(bound).is_loopback
+    is_local = bound in ("0.0.0.0", "::") or is_loopback(bound)
     if name == bound or (is_local and name == "localhost"):
         return True
     try:
@@ -275,7 +272,7 @@ def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> t
 def is_loopback(host: str) -> bool:
     """Whether only this computer reaches an address."""
     try:
-        return ipaddress.ip_address(host).is_loopback
+        return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 

@@ -81,8 +81,7 @@ def solve(
     setup = setup or Setup()
     source = as_source(source)
     if not isinstance(source, CalibrationDataset):
-        in_memory = isinstance(source, Recording)
-        moving = source if in_memory else moving_source(source, SolveOptions(table=table))
+        moving = source if isinstance(source, Recording) else moving_source(source, SolveOptions(table=table))
         if moving is not None:
             if method != "ml":
                 raise ValueError(f"method {method} is for poses at rest: leave it out for a recording")
@@ -301,8 +300,7 @@ def open_stream(
     else:
         chosen = _only_one(given, tool)
         cell = _cell(config, sensor, arm)
-    devices = sensor, arm
-    stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=devices)
+    stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=(sensor, arm))
     stream.track = track
     stream.on_contact = on_contact
     return stream
