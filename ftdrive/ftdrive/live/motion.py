@@ -75,9 +75,8 @@ class MotionTracker:
         n, k = len(R_base_flange), self._size
         if not n:
             return np.zeros(0, np.int8), np.zeros((0, 6))
-        p_base_com_m = np.nan_to_num(p_base_flange_m) + (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(
-            n, 3
-        )
+        turned_m = (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(n, 3)
+        p_base_com_m = np.nan_to_num(p_base_flange_m) + turned_m
         # (12, n), for sums along long rows
         poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])
         if self._earlier is None:
@@ -106,8 +105,7 @@ class MotionTracker:
         self._classes = classes[n:]
         w = len(classes) - n + 1
         rung = maximum_filter1d(classes, w, origin=(w - 1) // 2, mode="constant")[w - 1 :]  # with those before
-        states = np.where(moving, np.maximum(rung, 1), REST).astype(np.int8)
-        return states, felt
+        return np.where(moving, np.maximum(rung, 1), REST).astype(np.int8), felt
 
     @staticmethod
     def _rate(moved: Array) -> Array:

@@ -223,15 +223,15 @@ class DriftFilter:
                 if not self._moved:
                     readings = max((t_ns[stop - 1] - begin_ns) * 1e-9 / READING_S, 1.0)
                     variance = np.diag(noise.reading) / readings
-                    pose = R, uncertainty
-                    self._add(int(t_ns[stop - 1]), self._sum / self._n, variance, np.diag(noise.sample), pose)
+                    mean = self._sum / self._n
+                    self._add(int(t_ns[stop - 1]), mean, variance, np.diag(noise.sample), R, uncertainty)
                     added = True
                 self._begin = None
             start = stop
         return added
 
     def _add(
-        self, t_ns: int, residual: Array, variance: Array, sample_variance: Array, pose: tuple[Array, Array]
+        self, t_ns: int, residual: Array, variance: Array, sample_variance: Array, R: Array, uncertainty: Array
     ) -> None:
         """Add a mean (6,) with its variance (6,), and the variance (6,) of the prediction in this pose."""
         if self._t_ns is not None:
@@ -241,9 +241,9 @@ class DriftFilter:
             self._P = F @ self._P @ F.T
             self._P[:, 0, 0] += _WANDER**2 * sample_variance * dt_s / 60
             self._P[:, 1, 1] += self._rate_walk * dt_s
-        if self._R is not None and np.abs(pose[0] - self._R).max() > _TURN_RAD:
-            self._P[:, 0, 0] += 2 * pose[1]
-        self._t_ns, self._R = t_ns, pose[0]
+        if self._R is not None and np.abs(R - self._R).max() > _TURN_RAD:
+            self._P[:, 0, 0] += 2 * uncertainty
+        self._t_ns, self._R = t_ns, R
         innovation, S = residual - self._x[:, 0], self._P[:, 0, 0] + variance
         if float((innovation**2 / S).sum()) > _GATE:
             self._rejected += 1

@@ -325,8 +325,7 @@ class DelayEstimator:
         )
         if not (np.diff(t_s) > 0).all():
             return False
-        found = self._linearised(t_s, force, R, p)
-        if found is None:
+        if (found := self._linearised(t_s, force, R, p)) is None:
             return False
         H, y = found
         A, b = H.T @ H, H.T @ y

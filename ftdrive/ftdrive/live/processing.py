@@ -332,7 +332,6 @@ class Processor:
             return Paired.concatenate(list(self._recent)) if self._recent else None
 
     def _follow_load(self, rows: Paired, states: NDArray[np.int8]) -> None:
-        """Follow bias and part; apply them if that is wanted."""
         for tracked, events in self._following.add(rows, states, self._noise):
             for event in events:
                 # Without a part the contact test reports contacts; one that is not applied hides them from that test.

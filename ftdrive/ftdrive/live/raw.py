@@ -1,7 +1,6 @@
 """The readings of a sensor alone, as a stream: there is no arm and no calibration, and only a tare is subtracted."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -43,14 +42,9 @@ class RawStream(CompensatedStream):
     """
 
     def __init__(self, cell: CellConfig | Station, sensor: ForceTorqueSensor | None = None) -> None:
-        # the clock itself is known on entry
-        arm = _NoArm(self._now_ns)
         stages = Stages(bias=False, gravity=False)
-        super().__init__(cell, _NOTHING, stages=stages, devices=(sensor, arm))
+        super().__init__(cell, _NOTHING, stages=stages, devices=(sensor, _NoArm(self)))
         self._tare: tuple[Array, int] | None = None
-
-    def _now_ns(self) -> int:
-        return self.clock.now_ns()
 
     def _chosen(
         self, _arm: DeviceInfo, _sensor: DeviceInfo
@@ -73,11 +67,6 @@ class RawStream(CompensatedStream):
             frame=self.frame,
             stages=self.stages,
         )
-
-    def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0, *, loaded: bool = False) -> Array:
-        """Standard deviation (6,) by noise alone of the newest sample, or of the mean over `duration_s`."""
-        del loaded
-        return super().sigma_of_mean(R_base_flange, duration_s, loaded=False)
 
     def tare(self) -> StreamEvent:
         """Subtract the mean of the last half second from now on, whatever is on the sensor."""
@@ -116,12 +105,12 @@ class RawStream(CompensatedStream):
 class _NoArm(ReadOnlyArm):
     """Stands where a stream reads an arm: always in the same pose, joints and position unknown."""
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
-        self._now_ns = now_ns
+    def __init__(self, stream: RawStream) -> None:
+        self._stream = stream  # whose clock is known on entry
 
     def identify(self) -> DeviceInfo:
         return NO_ARM
 
     def state(self) -> ArmState:
         unknown = np.full(6, np.nan)
-        return ArmState(self._now_ns(), math.nan, unknown, unknown, np.eye(3), np.full(3, np.nan))
+        return ArmState(self._stream.clock.now_ns(), math.nan, unknown, unknown, np.eye(3), np.full(3, np.nan))

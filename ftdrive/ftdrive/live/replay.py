@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME
+from ftdrive.live.processing import SENSOR_FRAME
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -46,8 +46,6 @@ class ReplayedStream(ProcessedStream):
         1 is that of the recording, infinity as fast as it is read.
     clock : Clock
         Of the one who watches.
-    false_alarm_rate : float
-        Share of readings of a free tool beyond the limit; four of five begin a contact.
     """
 
     def __init__(
@@ -59,14 +57,13 @@ class ReplayedStream(ProcessedStream):
         stages: Stages | None = None,
         speed: float = 1.0,
         clock: Clock = REAL,
-        false_alarm_rate: float = FALSE_ALARM_RATE,
     ) -> None:
         if not len(rows):
             raise BadDataset("the recording has no samples: replay another one")
         self._rows = rows
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self.clock = clock
-        super().__init__(info, frame, stages, false_alarm_rate=false_alarm_rate)
+        super().__init__(info, frame, stages)
         self.learn_noise([rows])
         self._speed = speed
         # The first row that was not read.
@@ -146,8 +143,7 @@ class ReplayedStream(ProcessedStream):
             return self._until(next_s + STEP_S)
         due_s = (next_s + STEP_S - self._begin_s) / self._speed - (self.clock.now_ns() - self._begin_ns) * 1e-9
         self.clock.sleep(min(due_s, timeout_s))
-        now_s = self._begin_s + (self.clock.now_ns() - self._begin_ns) * 1e-9 * self._speed
-        return self._until(now_s)
+        return self._until(self._begin_s + (self.clock.now_ns() - self._begin_ns) * 1e-9 * self._speed)
 
     def _until(self, t_s: float) -> Block:
         end = max(self._next, int(np.searchsorted(self._seconds, t_s, "right")))

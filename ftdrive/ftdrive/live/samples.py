@@ -515,9 +515,7 @@ class Picked:
     def rows(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Return which samples (n,) to send, by their times in the order of measurement."""
         period = t_ns // self._period_ns
-        chosen = np.empty(len(period), bool)
+        chosen = np.asarray(np.diff(period, prepend=self._last) != 0)
         if len(period):
-            chosen[0] = period[0] != self._last
-            chosen[1:] = period[1:] != period[:-1]
             self._last = int(period[-1])
         return chosen

@@ -30,7 +30,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.contact import Contact
 from ftdrive.live.motion import REST
 from ftdrive.live.pairing import DelayEstimator, Pairing
-from ftdrive.live.processing import FALSE_ALARM_RATE, SENSOR_FRAME, Processor
+from ftdrive.live.processing import SENSOR_FRAME, Processor
 from ftdrive.live.samples import (
     Block,
     LinkStatus,
@@ -229,8 +229,6 @@ class CompensatedStream(ProcessedStream):
         Axes and reference point; may be set at any time.
     stages : Stages
         May be set at any time.
-    false_alarm_rate : float
-        Share of readings of a free tool beyond the limit; four of five begin a contact.
     devices : ForceTorqueSensor and RobotArm, optional
         Used in place of those that the cell names.
 
@@ -252,7 +250,6 @@ class CompensatedStream(ProcessedStream):
         force: bool = False,
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages | None = None,
-        false_alarm_rate: float = FALSE_ALARM_RATE,
         devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
     ) -> None:
         self._given = cell
@@ -260,14 +257,14 @@ class CompensatedStream(ProcessedStream):
         self._wanted = calibration
         self._name = name
         self._force = force
-        self._begin = frame, stages, false_alarm_rate
+        self._begin = frame, stages
         self._foreign = False
         self._hour_change: Array | None = None
         self.block_s = 0.003
         """A block has the samples of so long, because it costs about the same with one sample as with many. May be set
         at any time: longer blocks arrive later and take less of the processor."""
         self._stack = ExitStack()
-        self._follows: ExitStack | None = None
+        self._follows = ExitStack()
         # The device that has failed, "sensor" or "arm", and why.
         self._failure: tuple[str, DeviceError] | None = None
         self._silent_since_ns: int | None = None
@@ -302,14 +299,11 @@ class CompensatedStream(ProcessedStream):
             self.payload_kg = status.payload_kg
             """As configured in the controller; None where it is not reported."""
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
-            frame, stages, false_alarm_rate = self._begin
             # only now are the rates known that the processing needs
-            super().__init__(self.info, frame, stages, false_alarm_rate=false_alarm_rate, temperature=self._temperature)
+            super().__init__(self.info, *self._begin, temperature=self._temperature)
             delay_ms = self.cell.sensor.delay_ms
-            delay = (
-                DelayEstimator(self._calibration, self.info.p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
-            )
-            self._pairing = Pairing(nominal_Hz, delay)
+            estimator = DelayEstimator(self._calibration, self.info.p_flange_sensor_m)
+            self._pairing = Pairing(nominal_Hz, estimator if delay_ms is None else delay_ms / 1e3)
             self._pairing.add_states(states)
             self._pairing.add_samples(samples)
             self._stack = stack.pop_all()
@@ -384,8 +378,7 @@ class CompensatedStream(ProcessedStream):
     def _trusted(self) -> tuple[VerificationRecord | None, str]:
         """Return the last verification of the calibration, and what is said of its age and of that."""
         path = Path(self._name)
-        known = path.name and path.exists()
-        verification = verification_near(path, self._calibration.id) if known else None
+        verification = verification_near(path, self._calibration.id) if path.name and path.exists() else None
         marks = marks_of(self._calibration, emulated=self.cell.is_emulated, foreign=self._foreign)
         return verification, calibration_in_words(self._calibration, verification, datetime.now(UTC), marks)
 
@@ -529,9 +522,7 @@ class CompensatedStream(ProcessedStream):
             self._follows = stack.pop_all()
 
     def _unfollow(self) -> None:
-        follows, self._follows = self._follows, None
-        if follows is not None:
-            follows.close()
+        self._follows.close()
 
     def _first_samples(self) -> tuple[FtSamples, ArmStates]:
         samples, states = [], []

@@ -142,7 +142,7 @@ class Tracker:
         events: list[StreamEvent] = []
         dt_s = 0.0 if self._t_s is None else window.t_s - self._t_s
         self._t_s = window.t_s
-        self._grow(self._P, dt_s)
+        self._P[:, range(6), range(6)] += self._walk * dt_s
         self._likelihood *= np.exp(-dt_s / _FORGET_S)
         if self._open_s is None:
             self._follow(window)
@@ -153,20 +153,17 @@ class Tracker:
         events += doubts
         known = self._open_s is None
         part, part_P = (x[6:], P[6:, 6:]) if known else self._before
-        walk_N = float(self._weights @ _WALKS)
-        seen_s = window.t_s - self._seen_s
-        part_sigma_kg = float(np.sqrt(part_P[0, 0]))
         return Tracked(
-            window.t_s,
-            x[:6],
-            np.sqrt(variance),
-            float(part[0]),
-            part_sigma_kg,
-            known,
-            seen_s,
-            walk_N,
-            (part.copy(), part_P.copy()),
-            tuple(events),
+            t_s=window.t_s,
+            bias=x[:6],
+            sigma=np.sqrt(variance),
+            part_kg=float(part[0]),
+            part_sigma_kg=float(np.sqrt(part_P[0, 0])),
+            part_known=known,
+            last_seen_s=window.t_s - self._seen_s,
+            walk_N=float(self._weights @ _WALKS),
+            moment=(part.copy(), part_P.copy()),
+            events=tuple(events),
         )
 
     def trust(self) -> None:
@@ -294,9 +291,6 @@ class Tracker:
         gone = np.array([one.p_base_flange_m for one in run])
         turned = float((down @ down[0]).min()) < np.cos(_TURN_RAD)
         return turned or bool(np.linalg.norm(gone - gone[0], axis=1).max() > _TRAVEL_M)  # NaN: not known
-
-    def _grow(self, P: Array, dt_s: float) -> None:
-        P[:, range(6), range(6)] += self._walk * dt_s
 
     @property
     def _weights(self) -> Array:

@@ -277,11 +277,10 @@ def weigh(
             try:
                 if moving:
                     return weigh_in_motion(stream, since_ns)
-                found = scale.weigh(since_ns, more=True)
+                weight = scale.weigh(since_ns, more=True)
             except CannotWeigh as error:
                 refusal = error
             else:
-                weight = found
                 if weight.poses > before:
                     break
                 refusal = CannotWeigh("moving")
