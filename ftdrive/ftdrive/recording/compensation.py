@@ -295,10 +295,9 @@ def estimated_bias(
         old, force_bias_N=old.force_bias_N + change[:3], torque_bias_Nm=old.torque_bias_Nm + change[3:]
     )
     estimated = replace(calibration, parameters=parameters, covariance=covariance)
-    name = f"{info.calibration_name}, bias estimated"
     sigma = np.sqrt(np.diag(covariance)[BIASES])
-    change_dict = {"value": change.tolist(), "sigma": sigma.tolist()}
-    return with_calibration(source.header, estimated, name), change_dict
+    header = with_calibration(source.header, estimated, f"{info.calibration_name}, bias estimated")
+    return header, {"value": change.tolist(), "sigma": sigma.tolist()}
 
 
 def _free(reading: Array) -> NDArray[np.bool_]:

@@ -16,6 +16,7 @@ from ftcalib.files import open_file, parsed_json
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
+from ftdrive.recording.mcap_file import LEVEL
 from ftdrive.recording.recording import (
     COLUMNS,
     NUMBERS,
@@ -29,8 +30,6 @@ from ftdrive.recording.recording import (
     table_of,
 )
 
-_LEVEL: Final = -5
-"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 _GROUP_ROWS: Final = 1 << 14
 _END: Final = b"PAR1"
 
@@ -54,7 +53,7 @@ class ParquetFile(GrowingFile):
             PythonFile(self, "w"),
             _schema(),
             compression="zstd",
-            compression_level=_LEVEL,
+            compression_level=LEVEL,
             use_dictionary=False,
             write_statistics=False,
             write_page_checksum=True,

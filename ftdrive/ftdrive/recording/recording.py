@@ -260,8 +260,7 @@ class Recording(Displayed):
     @property
     def table(self) -> NDArray[np.void]:
         """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
-        names = self.rows.dtype.names or ()
-        return self.rows.view([(one, COLUMNS[one]) for name in names for one in NUMBERS[name]])
+        return self.rows.view([(one, COLUMNS[one]) for name in self.rows.dtype.names or () for one in NUMBERS[name]])
 
     def to_frame(self) -> Any:
         """Return the samples as a DataFrame of pandas, else of Polars.
@@ -276,8 +275,7 @@ class Recording(Displayed):
         UsageError
             Neither package is installed.
         """
-        names = self.table.dtype.names or ()
-        columns = {name: self.table[name] for name in names}
+        columns = {name: self.table[name] for name in self.table.dtype.names or ()}
         if "t_host_ns" in columns and len(self.rows):
             t_ns = columns["t_host_ns"]
             times = {"t_s": (t_ns - t_ns[0]) * 1e-9, "t_utc_s": (t_ns + self.header.info.utc_offset_ns) * 1e-9}
