@@ -335,12 +335,11 @@ class FoxgloveServer:
             self._sent[topic] += len(t_ns)
 
     def _state(self) -> dict[str, JSON]:
-        calibration = self._info.calibration
         return {
             "frame": str(self._stream.frame),
             "stages": asdict(self._stream.stages),
             "calibration": self._info.calibration_name,
-            "verdict": calibration.verdict,
+            "verdict": self._info.calibration.verdict,
             "marks": list(self._info.marks),
             "status": asdict(self._stream.status()),
             "sent": self._sent,
@@ -377,8 +376,6 @@ def _send_at_once(port: int) -> None:
                 continue
             with socket.socket(fileno=os.dup(int(name))) as found:
                 if found.family in (socket.AF_INET, socket.AF_INET6) and found.getsockname()[1] == port:
-                    # The SDK has no option for it, and a message would wait up to 40 ms for the confirmation of the
-                    # one before.
                     found.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
 

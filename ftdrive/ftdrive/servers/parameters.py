@@ -104,7 +104,9 @@ class NodeParameters:
         off = {name: 0.0 if value is None else value for name, value in asdict(Stages()).items()}
         given = {name: self._declare(name, value, _FRAME[name]) for name, value in frame.to_dict().items()}
         given |= {name: self._declare(name, value, _STAGES[name]) for name, value in off.items()}
-        self.frame, self.stages = _frame_and_stages(given)
+        usable: dict[str, Any] = {name: checked_value(name, value) for name, value in given.items()}
+        self.frame = WrenchFrame(**{name: usable[name] for name in _FRAME})
+        self.stages = Stages(**{name: usable[name] for name in _STAGES})
         self.tool = _checked_tool(self._declare("tool", tool, _TOOL))
         values = {item.name: self._declare(item.name, item.default, _FIXED[item.name]) for item in fields(Fixed)}
         self.fixed = _checked_fixed(values)
@@ -145,12 +147,6 @@ def _checked_tool(value: object) -> str:
     if not isinstance(value, str):
         raise ConfigError(f"tool cannot be {value!r}: set the name of a tool")
     return value
-
-
-def _frame_and_stages(values: dict[str, Any]) -> tuple[WrenchFrame, Stages]:
-    usable: dict[str, Any] = {name: checked_value(name, value) for name, value in values.items()}
-    stages = {name: usable.pop(name) for name in _STAGES}
-    return WrenchFrame(**usable), Stages(**stages)
 
 
 def _checked_fixed(values: dict[str, Any]) -> Fixed:

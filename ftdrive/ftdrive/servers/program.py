@@ -294,9 +294,8 @@ class ProgramService:
         mass = [weight.mass_kg if known else 0.0, weight.mass_sigma_kg, weight.least_kg]
         self._weight = np.array([*mass, *(_placed(weight, info) if known else np.zeros(6))])
         self._stream.hold(weight if known else None)
-        text = f"weighed for the program: {weight.mass_kg:.4f} kg"
         values = load_values(weight, info)
-        self._stream.note("load", text, values)
+        self._stream.note("load", f"weighed for the program: {weight.mass_kg:.4f} kg", values)
         if self._log is not None:
             self._log.weighed(values)
 

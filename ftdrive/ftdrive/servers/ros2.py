@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import partial
 from queue import Empty, SimpleQueue
 from threading import Event
 from typing import Any, Final, NamedTuple
@@ -168,10 +169,7 @@ class Averaged:
 class Level(IntEnum):
     """Levels of diagnostic_msgs/DiagnosticStatus."""
 
-    OK = 0
-    WARN = 1
-    ERROR = 2
-    STALE = 3
+    OK, WARN, ERROR, STALE = range(4)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,11 +200,10 @@ def reports_of(stream: ProcessedStream, warnings: tuple[str, ...], lost_before: 
     sensor = _link("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before)
     arm = _link("arm", status.arm, info.arm, 0)
     doubts = [*info.marks, *warnings]
-    calibration = info.calibration
-    usable = calibration.verdict != "rejected"
-    level = Level.ERROR if not usable else Level.WARN if doubts else Level.OK
+    verdict = info.calibration.verdict
+    level = Level.ERROR if verdict == "rejected" else Level.WARN if doubts else Level.OK
     text = "; ".join(doubts) or info.calibration_state
-    state = PartState("calibration", level, text, {"file": info.calibration_name, "verdict": calibration.verdict})
+    state = PartState("calibration", level, text, {"file": info.calibration_name, "verdict": verdict})
     failed = status.sensor.error or status.arm.error
     words = failed or f"{stream.frame}; {stages_in_words(stream.stages)}"
     whole = PartState("stream", Level.ERROR if failed else Level.OK, words, _values(stream, status, sent))
@@ -305,8 +302,8 @@ class Ros2Node:
         self._contact = node.create_publisher(self._bool, "~/contact", 10)
         self._status = node.create_publisher(self._diagnostics.DiagnosticStatus, "~/status", 10)
         self._overall = node.create_publisher(self._diagnostics.DiagnosticArray, "/diagnostics", 10)
-        node.create_service(self._trigger, "~/tare", self._tare)
-        node.create_service(self._trigger, "~/undo_tare", self._undo_tare)
+        node.create_service(self._trigger, "~/tare", partial(self._answer, lambda stream: stream.tare()))
+        node.create_service(self._trigger, "~/undo_tare", partial(self._answer, lambda stream: stream.undo_tare()))
         self._transforms = Transforms(node, self.fixed)
         self._stream: CompensatedStream | None = None
         self._averaged: Averaged | None = None
@@ -339,9 +336,9 @@ class Ros2Node:
                 break
         self.node.destroy_subscription(subscription)
         if received.is_set():
-            name = self.node.get_fully_qualified_name()
             raise ConfigError(
-                f"another node {name} runs already: stop it, or give this one a name: --ros-args -r __node:={NAME}_2"
+                f"another node {self.name} runs already: stop it, or give this one a name: "
+                f"--ros-args -r __node:={NAME}_2"
             )
 
     @property
@@ -474,13 +471,7 @@ class Ros2Node:
 
     # ---------------------------------------------------------------------------------------- what clients may request
 
-    def _tare(self, _: Any, response: Any) -> Any:
-        return self._answer(response, lambda stream: stream.tare())
-
-    def _undo_tare(self, _: Any, response: Any) -> Any:
-        return self._answer(response, lambda stream: stream.undo_tare())
-
-    def _answer(self, response: Any, action: Callable[[CompensatedStream], StreamEvent]) -> Any:
+    def _answer(self, action: Callable[[CompensatedStream], StreamEvent], _: Any, response: Any) -> Any:
         stream = self._stream
         if stream is None or self._failure:
             why = self._failure or "the devices are being opened"
