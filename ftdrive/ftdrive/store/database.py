@@ -150,15 +150,10 @@ class Database:
         """The file, or the address without its password."""
         return (self._is_sqlite and self._url.database) or self._url.render_as_string()
 
-    @property
-    def is_missing(self) -> bool:
-        """Whether it is a file that does not exist; connecting would create it."""
-        return self._file is not None and not self._file.exists()
-
     @contextmanager
     def reading(self) -> Iterator[Connection | None]:
         """Connect; None if there are no tables yet."""
-        if self.is_missing:
+        if self._file is not None and not self._file.exists():  # connecting would create it
             yield None
             return
         with self._connected("read") as connection:

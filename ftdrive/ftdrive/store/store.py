@@ -272,7 +272,6 @@ def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
 
 
 def _to_row(record: Record | StoredCell) -> dict[str, Any]:
-    """Return a record by columns."""
     row = record.to_store_dict() if isinstance(record, VerificationRecord) else asdict(record)
     row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
     for name in database.WRENCHES if isinstance(record, VerificationRecord) else ():
@@ -282,17 +281,14 @@ def _to_row(record: Record | StoredCell) -> dict[str, Any]:
 
 
 def _to_result(row: Row[Any]) -> StoredResult:
-    """Return a row of `results` as a record."""
     return StoredResult(**row._asdict())
 
 
 def _to_cell(row: Row[Any]) -> StoredCell:
-    """Return a row of `cells` as a record."""
     return StoredCell(**row._asdict())
 
 
 def _to_verification(row: Row[Any]) -> VerificationRecord:
-    """Return a row of `verifications` as a record."""
     values = dict(zip(_SINGLE, row, strict=False))
     path, _, created = values.pop("path"), values.pop("run"), values.pop("created_utc")
     return VerificationRecord(
@@ -306,14 +302,12 @@ def _to_verification(row: Row[Any]) -> VerificationRecord:
 
 
 def _to_weighings(row: Row[Any]) -> StoredWeighings:
-    """Return a row of `weighings` as a record."""
     values = row._asdict()
     refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
     return StoredWeighings(**values, refusals=refusals)
 
 
 def _to_check(row: Sequence[Any]) -> BriefVerification:
-    """Return a row with the columns `CHECK` as a check."""
     calibration_id, created_utc, passed, change, temperature_C, *bias = row
     return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
 

@@ -38,7 +38,6 @@ def calibration_of_tool(
     mount: str | None = None,
     *,
     url: str | None = None,
-    runs: Path = RUNS,
     force: bool = False,
 ) -> Tool:
     """Return the newest accepted calibration of a tool on these devices.
@@ -53,8 +52,6 @@ def calibration_of_tool(
         Label of the mounting, `[sensor] mount`.
     url : str, optional
         Of the store.
-    runs : Path
-        Folder of runs that the store may lack.
     force : bool
         If no calibration is of these devices, take the newest of any, also one that was edited by hand.
 
@@ -69,16 +66,17 @@ def calibration_of_tool(
     try:
         results = store.results()
     except BadStore as error:
-        warnings.append(f"the run folders in {runs} are searched, because {error}")
-    results += _unindexed(runs, {one.path for one in results})
+        warnings.append(f"the run folders in {RUNS} are searched, because {error}")
+    indexed = {one.path for one in results}
+    unindexed, _ = read_records(path for path in record_paths([RUNS]) if str(path) not in indexed)
+    results += [one for one in unindexed if isinstance(one, StoredResult)]
     accepted = sorted(
         (one for one in results if one.verdict != "rejected"), key=lambda one: one.created_utc or "", reverse=True
     )
     ours = [one for one in accepted if _may_belong(one, arm, sensor)]
     for one in (one for one in ours if one.tool == name):
         if (loaded := _load(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
-            found = _of_sensor(store, one, results)
-            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), *found)
+            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), *_of_sensor(store, one, results))
     if force:
         for one in (one for one in accepted if one.tool == name):
             if loaded := _load(one, accept_edited=True):
@@ -90,11 +88,6 @@ def calibration_of_tool(
         f"and {'no mount label' if mount is None else f'the mount {mount!r}'}: calibrate it with [tool] name = "
         f'"{name}"{instead}'
     )
-
-
-def _unindexed(runs: Path, known: set[str]) -> Iterator[StoredResult]:
-    records, _ = read_records(path for path in record_paths([runs]) if str(path) not in known)
-    yield from (one for one in records if isinstance(one, StoredResult))
 
 
 def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:

@@ -110,9 +110,6 @@ def _estimated(
     return kept
 
 
-_UNITS = ("N", "N·m")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorTemperature:
     """The bias of one sensor in one mounting against its temperature."""
@@ -143,7 +140,7 @@ class SensorTemperature:
     def lines(self) -> Iterator[str]:
         """Yield one line for the force and one for the torque."""
         fit = self.fit
-        for k, (quantity, unit) in enumerate(zip(("force bias", "torque bias"), _UNITS, strict=True)):
+        for k, (quantity, unit) in enumerate((("force bias", "N"), ("torque bias", "N·m"))):
             part = slice(3 * k, 3 * k + 3)
             slopes = ", ".join(
                 with_sigma(slope, sigma, "+") for slope, sigma in zip(fit.slope[part], fit.sigma[part], strict=True)

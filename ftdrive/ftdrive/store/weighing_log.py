@@ -144,12 +144,10 @@ class WeighingLog:
             self._store.put_weighings(weighings_of(self._file))
         self._is_new = False
 
-    def _attempt(self, failure: str, write: Callable[[], None]) -> bool:
+    def _attempt(self, failure: str, write: Callable[[], None]) -> None:
         try:
             write()
         except (OSError, DataError, ConfigError) as error:
             if failure not in self._said:
                 self._said.add(failure)
                 self._say(f" {failure}, because {error}.")
-            return False
-        return True
