@@ -200,10 +200,6 @@ class Observed:
             if recent or tool == cell.tool or one in last:
                 yield one
 
-    def is_cut(self, result: StoredResult) -> bool:
-        """Whether a calibration may have verifications that are too old to be read."""
-        return when(result) < self.now - WINDOW
-
 
 def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasChanges | None:
     """Return how the bias has changed since a calibration; None if no verification has this."""

@@ -159,14 +159,12 @@ class MetricsServer(Collector):
         info = GaugeMetricFamily(CELL_INFO, "1 for each tool of each cell.", labels=CELL_INFO_LABELS)
         for one in cells:
             about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
-            marked = "true" if one.emulated else "false"
-            info.add_metric(_labels(one.cell, one.tool, *about, marked), 1)
+            info.add_metric(_labels(one.cell, one.tool, *about, "true" if one.emulated else "false"), 1)
         yield info
         for name, (help_text, value_of) in OF_TOOL.items():
             family = GaugeMetricFamily(name, help_text, labels=TOOL)
             for one in cells:
-                value = value_of(one)
-                if value is not None:
+                if (value := value_of(one)) is not None:
                     family.add_metric(_labels(one.cell, one.tool), value)
             yield family
         weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day.", labels=TOOL)

@@ -5,7 +5,7 @@ from datetime import datetime
 import numpy as np
 
 from ftdrive import __version__
-from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
+from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed
 from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
 from ftdrive.report.report import templates, with_code
 from ftdrive.runs.verification import age_in_words
@@ -32,12 +32,10 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     from markupsafe import Markup
 
     environment.filters["with_code"] = with_code
-    results = {one.id: one for name in observed.results for one in observed.results[name]}
     rows = []
     for state in fleet.cells:
-        result = None if state.calibration_id is None else results[state.calibration_id]
-        changes = None if result is None else observed.changes.get(result.id)
-        drawn = "" if result is None or changes is None else _plot(changes, when(result), observed.now)
+        changes = observed.changes.get(state.calibration_id or "")
+        drawn = "" if changes is None or state.calibrated is None else _plot(changes, state.calibrated, observed.now)
         rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
         rows=rows,

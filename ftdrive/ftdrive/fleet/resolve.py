@@ -95,8 +95,7 @@ def solve_task(dataset: bytes, task: bytes) -> bytes:
         raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
     provenance = {**given["provenance"], "versions": _versions()}
     circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
-    result = solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance)
-    return _content(result)
+    return _content(solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance))
 
 
 def _files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
@@ -108,13 +107,11 @@ def _files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
 def _solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
     """Return the calibration file of a run in motion: a pure function as `solved`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
-        folder = Path(place) / name
-        (folder / "motion").mkdir(parents=True)
         for path, content in files.items():
-            (folder / path).write_bytes(content)
-        if not any(path.startswith("motion/") for path in files):
-            (folder / "motion").rmdir()
-        return _solved_motion(folder, version)
+            file = Path(place, name, path)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_bytes(content)
+        return _solved_motion(Path(place, name), version)
 
 
 def _solved_motion(folder: Path, version: str) -> bytes:

@@ -26,18 +26,13 @@ class FleetReading:
     store_up: bool = True
 
 
-def _utc_now() -> datetime:
-    return datetime.now(UTC)
-
-
 def serve(
     fleet_at: Callable[[datetime], Fleet],
     update: Callable[[FleetReading], None],
     clock: Clock,
     *,
     say: Callable[[str], None],
-    every_s: float = EVERY_S,
-    now: Callable[[], datetime] = _utc_now,
+    now: Callable[[], datetime] = lambda: datetime.now(UTC),
 ) -> None:
     """Read the state and pass it on until an exception ends it, such as `KeyboardInterrupt`.
 
@@ -53,8 +48,6 @@ def serve(
         Times the period.
     say : callable
         Takes a sentence for the operator.
-    every_s : float
-        Period, s.
 
     Raises
     ------
@@ -66,7 +59,7 @@ def serve(
     reading = FleetReading(fleet_at(time), time, time)
     while True:
         update(reading)
-        clock.sleep(every_s)
+        clock.sleep(EVERY_S)
         was_up, time = reading.store_up, now()
         try:
             reading = FleetReading(fleet_at(time), time, time)

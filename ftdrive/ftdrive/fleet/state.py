@@ -136,7 +136,7 @@ def summary(fleet: Fleet, now: datetime) -> str:
     counts = {
         "never calibrated": sum(one.calibration_id is None for one in tools),
         "failed": sum(one.passed is False for one in tools),
-        "drifting": sum(_drifts(one) for one in tools),
+        "drifting": sum(one.drift is not None and one.drift.found for one in tools),
         "due": sum(one.is_due(now) and one.calibration_id is not None for one in tools),
         "with a finding": len({cell for one in fleet.findings if one.kind != "overdue" for cell in one.cells}),
     }
@@ -160,7 +160,3 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
         if one.drift is not None and one.drift.found:
             found.append(f"{name}: {one.drift.words}: calibrate again, and check the sensor if it goes on")
     return found + [one.words for one in fleet.findings]
-
-
-def _drifts(one: CellState) -> bool:
-    return one.drift is not None and one.drift.found

@@ -16,7 +16,7 @@ from scipy.special import fdtrc as f_sf
 
 from ftcalib.after.series import drift_onset, spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
-from ftdrive.fleet.cells import BiasChanges, Observed, when
+from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
 from ftdrive.report.document import rounded
 from ftdrive.runs.verification import VerificationRecord
@@ -74,7 +74,7 @@ def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
 def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
     check: BriefVerification | VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
-    if check is None and observed.is_cut(result):
+    if check is None and calibrated < observed.now - WINDOW:  # its verifications may be too old to be read with it
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)
     temperatures = (None if check is None else check.temperature_C, result.temperature_C)
@@ -121,7 +121,6 @@ RECENT: Final = timedelta(days=3)
 
 
 def _findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
-    """Return all findings."""
     newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
     return (
         *_overdue(states, observed),
@@ -312,7 +311,6 @@ def _mm(point_m: Array | None) -> str:
 SURE_OF_TEMPERATURE: Final = 1e-5
 # Verifications of a calibration.
 FEWEST: Final = 8
-_UNITS = ("N", "N·m")
 
 
 @dataclass(slots=True, eq=False)
@@ -369,7 +367,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]
         [np.where(_p_values(one) < SURE_OF_TEMPERATURE, abs(one.xy / one.xx), 0.0) for one in following.values()],
         axis=0,
     )
-    largest = zip((slopes[:3].max(), slopes[3:].max()), _UNITS, strict=True)
+    largest = (slopes[:3].max(), "N"), (slopes[3:].max(), "N·m")
     size = " and ".join(f"{rounded(float(slope), 2)} {unit}" for slope, unit in largest if slope)
     yield FleetFinding(
         "temperature",
