@@ -37,8 +37,6 @@ def functions(first: int, *, example: bool = False) -> str:
         "LIMIT_S": str(LIMIT_S),
         "GONE": str(GONE),
         "LATE": str(LATE),
-        "READY": str(int(State.READY)),
-        "REFUSED": str(int(State.REFUSED)),
         "STALE": str(int(Condition.STALE)),
         "CODES": ", ".join(f"{number} {name or 'ready'}" for name, number in CODES.items()),
         "WRENCH": ", ".join(doubles[name] for name in DOUBLES[:6]),
@@ -47,7 +45,7 @@ def functions(first: int, *, example: bool = False) -> str:
         "AGE": doubles["bias_age"],
         "UNSEEN": str(UNSEEN),
         "ZEROS": ", ".join(["0.0"] * len(DOUBLES[6:])),
-        **{command.name: str(int(command)) for command in Command},
+        **{one.name: str(int(one)) for one in (*Command, *State)},
     }
     tracks = first + len(DOUBLES + TRACKED) <= LAST_REGISTER + 1
     text = _TEXT + (_BIAS if tracks else "") + (_EXAMPLE if example else "")

@@ -278,9 +278,7 @@ def _above(value: float) -> str:
 
 def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
     """Name what the calibration has and the target cannot express, beyond rounding."""
-    down = np.array([0.0, 0.0, -1.0])
-    gravity = calibration.gravity_force_base_N
-    tilt_rad = angle_between_vectors(down, gravity)
+    tilt_rad = angle_between_vectors(np.array([0.0, 0.0, -1.0]), calibration.gravity_force_base_N)
     turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
     if "tilt" not in target.expresses and tilt_rad > 1e-9:
         yield f"the base tilt of {degrees(tilt_rad):.3g}°"

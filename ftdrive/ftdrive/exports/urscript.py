@@ -25,15 +25,12 @@ def table(plan: Plan) -> str:
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
     _require_usable(plan)
-    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain(plan.description['model'])}{_emulated(plan)}", COLUMNS]
+    emulated = ", EMULATED cell: no real arm may follow this plan" if plan.emulated else ""
+    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain(plan.description['model'])}{emulated}", COLUMNS]
     for i, step in enumerate(plan.steps, start=1):
         numbers = (*step.q_rad, step.speed_rad_s, plan.acceleration_rad_s2, step.clearance_m)
         lines.append(",".join([str(i), str(step.number), *(f"{number:.9g}" for number in numbers)]))
     return "\n".join(lines) + "\n"
-
-
-def _emulated(plan: Plan) -> str:
-    return ", EMULATED cell: no real arm may follow this plan" if plan.emulated else ""
 
 
 APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
@@ -109,8 +106,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f"movej({first}, a={APPROACH_RAD_S2:.6f}, v={APPROACH_RAD_S:.6f})"
     for i, step in enumerate((*steps, steps[0]), start=1):
         if i > 1:
-            speed = steps[i - 2].speed_rad_s
-            yield f"movej({_joints(step.q_rad)}, a={plan.acceleration_rad_s2:.6f}, v={speed:.6f})"
+            yield f"movej({_joints(step.q_rad)}, a={plan.acceleration_rad_s2:.6f}, v={steps[i - 2].speed_rad_s:.6f})"
         where = f"pose {i} of {len(steps)}" if i <= len(steps) else "pose 1 again"
         yield f'textmsg("{name}: {where}, orientation R{step.number:02d}")'
         yield f"sleep({dwell_s:.3f})"
