@@ -16,6 +16,7 @@ from ftcalib.errors import NotObservable
 from ftcalib.judge.observability import assess, axes_along, largest_gap
 from ftcalib.judge.verdict import strong_correlations
 from ftcalib.model import PARAMETER_NAMES, Array
+from ftcalib.result import MotionResult
 from ftcalib.routine import drift_check
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
@@ -53,7 +54,6 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
         `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known exactly in both; `groups`: `name`, `chi2`,
         `dof`, `p_value`; `same_data`: whether both rest on one dataset, so that the test does not apply.
     """
-    # Results of the same data share their noise, so the test does not apply to them.
     found = difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
     tests = {NAMES[name]: test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
@@ -197,7 +197,8 @@ def facts_of(subject: Subject) -> dict[str, Any]:
     """
     # All formats are written from these facts, so they cannot disagree.
     result, dataset = subject.result, subject.dataset
-    R_base_flange = _swept(subject) if dataset is None else dataset.R_base_flange
+    sweep = _planned_sweep(subject.run)
+    R_base_flange = dataset.R_base_flange if dataset is not None else None if sweep is None else sweep.R_base_flange
     force_N, torque_Nm = result.likely_error().tolist()
     last = (subject.trust or {}).get("last_verification")
     failed = last is not None and not last["passed"] and result.verdict != "rejected"
@@ -229,7 +230,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "drift": _drift(subject),
         "noise": _noise(subject),
         "coverage": None if R_base_flange is None else _coverage(subject, R_base_flange),
-        "motion": None if result.motion is None else _motion(subject),
+        "motion": None if result.motion is None else _motion(result.motion, sweep),
         "tour": None if subject.run is None else _tour(subject.run, len(subject.records)),
         "comparison": None if subject.parent is None else compared(result, subject.parent),
         "compared_with": subject.parent_name,
@@ -343,22 +344,12 @@ def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
     }
 
 
-def _swept(subject: Subject) -> Array | None:
-    """Orientations (n, 3, 3) along the planned sweep; None for another source."""
-    run = subject.run
-    if run is None or not run.in_motion or not run.plan_path.is_file():
-        return None
-    return Plan.load(run.plan_path).R_base_flange
+def _planned_sweep(run: Run | None) -> Plan | None:
+    return Plan.load(run.plan_path) if run is not None and run.in_motion and run.plan_path.is_file() else None
 
 
-def _motion(subject: Subject) -> dict[str, Any] | None:
+def _motion(motion: MotionResult, planned: Plan | None) -> dict[str, Any]:
     """Return what a recording in motion gives beside the static model, and the planned sweep."""
-    motion = subject.result.motion
-    if motion is None:
-        return None
-    run, sweep = subject.run, None
-    if run is not None and run.in_motion and run.plan_path.is_file():
-        sweep = Plan.load(run.plan_path).to_dict().get("sweep")
     return {
         "inertia_kg_m2": motion.inertia_kg_m2.tolist(),
         "sigma": {name: np.asarray(value).tolist() for name, value in motion.sigma.items()},
@@ -366,7 +357,7 @@ def _motion(subject: Subject) -> dict[str, Any] | None:
         "height_m": motion.height_m,
         "used_share": motion.used_share,
         "contacts": [dict(one) for one in motion.contacts],
-        "sweep": sweep,
+        "sweep": None if planned is None else planned.to_dict().get("sweep"),
     }
 
 

@@ -15,16 +15,13 @@ import numpy as np
 from ftcalib.model import Array
 from ftdrive.errors import ConfigError
 from ftdrive.report.document import label_of, shown_poses
-from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS
+from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS, Facts
 from ftdrivers.installation import missing_extra
 from ftdrivers.sweep import WRISTS, Sweep
-
-Facts = Mapping[str, Any]
 
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
 SERIES = ("#050505", "#060606", "#070707")
 # Colour that stands for each variable of the page.
-# Placeholder colours of matplotlib become currentColor and CSS variables, so one figure serves light and dark pages.
 VARIABLES = {
     INK: "currentColor",
     PAPER: "var(--paper)",
@@ -107,11 +104,10 @@ def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
     found = facts["error_map"]
     elevation, azimuth = (np.radians(found[name]) for name in ("elevation_deg", "azimuth_deg"))
     axes = figure.add_subplot()
-    error = np.array(found[kind]["map"])
-    scale = 1e3
+    error = 1e3 * np.array(found[kind]["map"])
     x, y = _hammer(*np.meshgrid(elevation, azimuth, indexing="ij"))
-    levels = MaxNLocator(12).tick_values(0, scale * error.max() or 1.0)
-    filled = axes.contourf(x, y, scale * error, levels=levels, cmap="viridis", antialiased=False)
+    levels = MaxNLocator(12).tick_values(0, error.max() or 1.0)
+    filled = axes.contourf(x, y, error, levels=levels, cmap="viridis", antialiased=False)
     filled.set_edgecolor("face")
     with _globe(axes):
         if facts["coverage"] is not None:
@@ -286,10 +282,9 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
 
 def _noise(figure: Any, facts: Facts) -> None:
     rows = [pose["row"] - 1 for pose in shown_poses(facts["poses"])]
-    for axes, key, scale, label in zip(
-        figure.subplots(2, 1, sharex=True), ("force_N", "torque_Nm"), (1e3, 1e3), ("mN", "mN·m"), strict=True
-    ):
-        values = scale * np.array(facts["noise"][key])[rows]
+    both = figure.subplots(2, 1, sharex=True)
+    for axes, key, label in zip(both, ("force_N", "torque_Nm"), ("mN", "mN·m"), strict=True):
+        values = 1e3 * np.array(facts["noise"][key])[rows]
         axes.bar(np.arange(len(rows)), values, color=SERIES[0])
         axes.axhline(float(np.median(values)), color=INK, linewidth=1, linestyle="--")
         axes.grid(visible=False, axis="x")
@@ -323,10 +318,6 @@ def _comparison(figure: Any, facts: Facts) -> None:
     axes.set_xlabel("difference, sigma")
 
 
-def _methods_height(facts: Facts) -> float:
-    return 1.0 + 0.25 * len(facts["cross_validation"]["methods"])
-
-
 _Margins = tuple[float, float, float, float]
 # Height and margins (left, right, bottom, top) in inches and how to draw it, by name.
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
@@ -334,7 +325,7 @@ _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callabl
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
     "contact": (2.6, (0.65, 0.2, 0.5, 0.1), _contact),
     "correlation": (4.6, (1.05, 0.1, 1.05, 0.1), _correlation),
-    "methods": (_methods_height, (1.35, 0.2, 0.5, 0.1), _methods),
+    "methods": (lambda facts: 1.0 + 0.25 * len(facts["cross_validation"]["methods"]), (1.35, 0.2, 0.5, 0.1), _methods),
     "pose_residuals": (2.8, (0.55, 0.1, 0.65, 0.1), _pose_residuals),
     "time_residuals": (3.8, (0.65, 0.1, 0.5, 0.35), _time_residuals),
     "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _noise),

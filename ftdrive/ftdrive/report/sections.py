@@ -1,7 +1,7 @@
 """The sections of a report, in the order in which a reader needs them."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -67,8 +67,8 @@ def _response(result: Facts) -> list[tuple[str, str, str]]:
     ]
 
 
-def _pair(value: float, sigma: float) -> tuple[str, str]:
-    return to_place_of(value, sigma), to_place_of(sigma, sigma)
+def _pair(value: float, sigma: float, sign: str = "") -> tuple[str, str]:
+    return to_place_of(value, sigma, sign), to_place_of(sigma, sigma)
 
 
 def error(facts: Facts) -> Section:
@@ -248,39 +248,24 @@ def drift(facts: Facts) -> Section:
         text.append(
             f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
         )
+    tables = tuple[Table, ...]()
     if found is None:
         text.append("The fit found no drift of the bias.")
     else:
         model = "random walk" if any(name.startswith("walk") for name in seen["components"]) else "linear"
         text.append(f"The fit includes a drift of the bias ({model}), listed below. Good: within 3 sigma.")
+        rows = []
+        for k, (change, sigma) in enumerate(zip(found["change"], found["sigma"], strict=True)):
+            unit, scale = (("N", 1.0), ("mN·m", 1e3))[k // 3]
+            shown = ["-", "-", "-"]
+            if sigma > FIXED_BELOW:
+                shown = [*_pair(scale * change, scale * sigma, "+"), f"{change / sigma:+.1f}"]
+            rows.append((f"{'FT'[k // 3]}{_AXES[k % 3]}, {unit}", *shown))
+        columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
+        tables = (Table("Bias at the last pose minus bias at the first", columns, rows),)
     if seen["in_use"] is not None:
         text.append(f"{capital(seen['in_use'])}. Tare before use.")
-    rows = [
-        (
-            f"{name}, {unit}",
-            to_place_of(scale * change, scale * sigma, "+"),
-            to_place_of(scale * sigma, scale * sigma),
-            f"{change / sigma:+.1f}",
-        )
-        if sigma > FIXED_BELOW
-        else (f"{name}, {unit}", "-", "-", "-")
-        for name, unit, scale, change, sigma in (
-            ()
-            if found is None
-            else (
-                (f"{'FT'[k // 3]}{_AXES[k % 3]}", *(("N", 1.0), ("mN·m", 1e3))[k // 3], *pair)
-                for k, pair in enumerate(zip(found["change"], found["sigma"], strict=True))
-            )
-        )
-    ]
-    columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
-    return Section(
-        "drift",
-        "Drift",
-        text,
-        (),
-        [Table("Bias at the last pose minus bias at the first", columns, rows)] if rows else (),
-    )
+    return Section("drift", "Drift", text, (), tables)
 
 
 def noise(facts: Facts) -> Section:
@@ -330,6 +315,15 @@ def coverage(facts: Facts) -> Section:
 
 # One difference in 370 is larger by chance.
 LIMIT_SIGMAS = 3
+# What a plan predicts a sigma of: in words with its unit, factor to that, and key in plan and result.
+_PREDICTED = (
+    ("mass, g", 1e3, "mass_kg"),
+    ("centre of mass, mm", 1e3, "p_sensor_com_m"),
+    ("force bias, N", 1.0, "force_bias_N"),
+    ("torque bias, N·m", 1.0, "torque_bias_Nm"),
+    ("force compensation, N", 1.0, "force_rms_N"),
+    ("torque compensation, N·m", 1.0, "torque_rms_Nm"),
+)
 # Times the prediction: what is larger is named.
 _AS_PREDICTED = 1.2
 _AS_GOOD = "No sigma is more than 20 % larger than predicted."
@@ -345,8 +339,10 @@ def tour(facts: Facts) -> Section:
         return Section("tour", title, ["The source is not a run folder: it holds no plan, devices or settings."])
     started = f"{str(run['created_utc'])[:19]} UTC"
     text = [f"Run {run['run']}, started {started}, mode {run['mode']}, {run['stops']} stops."]
+    keys = ("model", "serial", "firmware")
+    devices = [(name, *(str(one.get(key, "-")) for key in keys)) for name, one in run["devices"].items()]
     tables = [
-        Table("Devices", ("device", "model", "serial", "firmware"), _devices(run["devices"])),
+        Table("Devices", ("device", *keys), devices),
         Table("Settings", ("setting", "value"), list(_flattened(run["config"])), folded=True),
     ]
     plan = run["plan"]
@@ -362,8 +358,9 @@ def tour(facts: Facts) -> Section:
         f"{'all' if plan['certified'] else 'NOT all'} proven clear, nearest {plan['min_clearance_mm']:.0f} mm."
     )
     rows, larger = [], []
-    for name, scale, key, got in _predicted(facts):
-        expected = _largest(plan["predicted_sigma"].get(key))
+    obtained = facts["result"]["sigma"] | facts["result"]["predicted_error"]
+    for name, scale, key in _PREDICTED:
+        expected, got = _largest(plan["predicted_sigma"].get(key)), _largest(obtained[key])
         rows.append((name, rounded(scale * expected, 2), rounded(scale * got, 2)))
         if got > _AS_PREDICTED * expected:
             larger.append(f"{name.partition(',')[0]} ({got / expected:.2g} times)")
@@ -372,26 +369,8 @@ def tour(facts: Facts) -> Section:
     return Section("tour", title, text, (), [Table(caption, ("sigma", "predicted", "obtained"), rows), *tables])
 
 
-def _predicted(facts: Facts) -> Iterator[tuple[str, float, str, float]]:
-    sigma, predicted = facts["result"]["sigma"], facts["result"]["predicted_error"]
-    for name, scale, key in (
-        ("mass, g", 1e3, "mass_kg"),
-        ("centre of mass, mm", 1e3, "p_sensor_com_m"),
-        ("force bias, N", 1.0, "force_bias_N"),
-        ("torque bias, N·m", 1.0, "torque_bias_Nm"),
-    ):
-        yield name, scale, key, _largest(sigma[key])
-    yield "force compensation, N", 1.0, "force_rms_N", predicted["force_rms_N"]
-    yield "torque compensation, N·m", 1.0, "torque_rms_Nm", predicted["torque_rms_Nm"]
-
-
 def _largest(values: Any) -> float:
     return float(np.max(np.array(values, dtype=np.float64)))
-
-
-def _devices(devices: Facts) -> list[Sequence[str]]:
-    keys = ("model", "serial", "firmware")
-    return [(name, *(str(one.get(key, "-")) for key in keys)) for name, one in devices.items()]
 
 
 def comparison(facts: Facts) -> Section:
@@ -530,7 +509,6 @@ def sections_of(facts: Mapping[str, Any]) -> list[Section]:
 
 
 def _p_value_in_words(p_value: float) -> str:
-    """Write a probability."""
     return "< 0.0001" if p_value < 1e-4 else f"{p_value:.2g}"
 
 
