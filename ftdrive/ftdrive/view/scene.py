@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.geometry.scene import Plane, Scene
+from ftdrive.planning.geometry.scene import Scene
 from ftdrive.view.parts import Part, plain
 from ftdrivers.ur.kinematics import Array
 
@@ -119,17 +119,16 @@ def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict
     parts: dict[str, Part | None] = {"scene/base": axes(0.25, named=True)}
     for i, plane in enumerate(scene.planes, start=1):
         colour = BAD if f"plane {i}" in bad else OBSTACLE
-        turn = turned_up(np.array(plane.normal))
-        parts[f"scene/plane {i}"] = box((size_m, size_m, 0.002), colour, at=_foot(plane), turn=turn, alpha=0.3)
+        normal = np.array(plane.normal)
+        foot_m, turn = plane.offset_m * normal, turned_up(normal)
+        parts[f"scene/plane {i}"] = box((size_m, size_m, 0.002), colour, at=foot_m, turn=turn, alpha=0.3)
     for i, one in enumerate(scene.boxes, start=1):
         low, high = np.array(one.low_m), np.array(one.high_m)
         parts[f"scene/box {i}"] = box(high - low, BAD if f"box {i}" in bad else OBSTACLE, at=(low + high) / 2)
     return parts
 
 
-def wrench_parts(
-    p_base_m: Array, wrench_base: Array, m_per_N: float = 0.01, m_per_Nm: float = 0.1
-) -> dict[str, Part | None]:
+def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: float) -> dict[str, Part | None]:
     """Return force and torque as arrows, and the line of action of the force.
 
     The wrench (6,) acts about a point (3,), N and N·m, base axes; a force or a torque of zero is not drawn.
@@ -177,7 +176,3 @@ def turned_up(axis: Array) -> Array:
 def turned(R: Array) -> Array:
     """Return the quaternion (4,), w first, of a rotation (3, 3)."""
     return np.asarray(Rotation.from_matrix(R).as_quat(scalar_first=True))
-
-
-def _foot(plane: Plane) -> Array:
-    return plane.offset_m * np.array(plane.normal)

@@ -93,11 +93,10 @@ class Site(Gate):
     async def serve(self, request: Request) -> None:
         """Answer a request of the page's own origin."""
         path, _, query = request.target.partition("?")
-        if path == "/" and request.method == "GET" and query.startswith("token="):
-            await self._open(request, query.removeprefix("token="))
-            return
         number = self._viewer_of(request.headers.get("Cookie", ""))
-        if number is None:
+        if path == "/" and request.method == "GET" and query.startswith("token="):
+            await self._open(request, query.removeprefix("token="), number)
+        elif number is None:
             await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
         elif request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
             await request.refuse(HTTPStatus.FORBIDDEN, "pages of others are not served")
@@ -108,8 +107,7 @@ class Site(Gate):
         elif path == "/parts":
             await self._follow(request, number)
         elif (file := _files().get(path)) is not None:
-            content = f"{_TYPES[file.suffix]}; charset=utf-8"
-            await request.answer(HTTPStatus.OK, file.read_bytes(), content, *_SAFE)
+            await request.answer(HTTPStatus.OK, file.read_bytes(), f"{_TYPES[file.suffix]}; charset=utf-8", *_SAFE)
         else:
             await request.refuse(HTTPStatus.NOT_FOUND, "there is no such page")
 
@@ -118,11 +116,10 @@ class Site(Gate):
         with suppress(TimeoutError):
             asyncio.run_coroutine_threadsafe(self._end_viewers(), self.loop).result(1.0)
 
-    async def _open(self, request: Request, token: str) -> None:
+    async def _open(self, request: Request, token: str, number: int | None) -> None:
         if not hmac.compare_digest(token.encode(), self.token.encode()):
             await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
             return
-        number = self._viewer_of(request.headers.get("Cookie", ""))
         if number is None:
             number, self._opened = self._opened, self._opened + 1
         # Browsers send the cookies of one port to all ports of a host. The page opens itself: after a redirect from
@@ -185,8 +182,7 @@ class Site(Gate):
         while True:
             await asyncio.sleep(_PERIOD_S)
             now_s = monotonic()
-            beats = now_s - beat_s > _BEAT_S
-            if beats:
+            if beats := now_s - beat_s > _BEAT_S:
                 beat_s = now_s
             self._send(now_s, beats=beats)
 
