@@ -112,8 +112,7 @@ class Redaction:
             if isinstance(document, dict) and "checksum" in document and not is_changed(document):
                 return object_text(self.json(document), allow_nan=True)
             return json.dumps(self.json(document), indent=1) + "\n"
-        lines = [self._line(line) for line in text.splitlines()]
-        return "\n".join(lines) + ("\n" if text.endswith("\n") else "")
+        return "\n".join(map(self._line, text.splitlines())) + ("\n" if text.endswith("\n") else "")
 
     def _line(self, line: str) -> str:
         document = _document(line)
@@ -201,8 +200,7 @@ def _document(text: str) -> JSON | None:
 
 def _strings(text: str) -> Iterator[str]:
     """Yield the texts of a file: those in its JSON without escapes, and lines that are none."""
-    documents = [text] if _document(text) is not None else text.splitlines()
-    for part in documents:
+    for part in [text] if _document(text) is not None else text.splitlines():
         document = _document(part)
         yield from [part] if document is None else _values(document)
 
@@ -309,8 +307,7 @@ def _unpack(source: Path, folder: Path) -> Path:
         raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle {MOST_BYTES / 1e9:g} GB at most: check the name")
     try:
         with open_file(source) as file, zipfile.ZipFile(file) as archive:
-            members = archive.infolist()
-            _require_harmless(members)
+            _require_harmless(archive.infolist())
             archive.extractall(folder)
         return _run_in(folder)
     except BadBundle as error:

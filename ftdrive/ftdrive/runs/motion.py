@@ -47,8 +47,7 @@ class MotionRecording:
         """Write a new file; returns when it is on disk."""
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
-        rate = np.array(self.nominal_rate_Hz)
-        arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": rate, **wrench, **poses}
+        arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": np.array(self.nominal_rate_Hz), **wrench, **poses}
         write_arrays(path, arrays, compressed=False)
 
     @classmethod

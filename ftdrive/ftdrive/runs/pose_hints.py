@@ -44,7 +44,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
         return tuple(found)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
-    pulled = [row for row in odd if _pulled(result, row)]
+    pulled = [row for row in odd if np.abs(result.residuals[row] / _sigma(result))[:3].max() > _SIGNIFICANT]
     for row in odd:
         force_N, torque_Nm = np.linalg.norm(result.residuals[row, :3]), np.linalg.norm(result.residuals[row, 3:])
         code = "load_swings" if row not in pulled else "pose_touched" if len(pulled) == 1 else "pose_off"
@@ -91,10 +91,6 @@ def _sigma(result: CalibrationResult) -> Array:
     typical = 1.4826 * np.median(np.abs(result.residuals), axis=0)
     least = np.zeros(6) if result.measured_sigma is None else result.measured_sigma
     return np.maximum(np.maximum(typical, least), 1e-9)
-
-
-def _pulled(result: CalibrationResult, row: int) -> bool:
-    return bool(np.abs(result.residuals[row, :3] / _sigma(result)[:3]).max() > _SIGNIFICANT)
 
 
 def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:

@@ -381,7 +381,6 @@ def _earlier_of(run: Run) -> CalibrationResult | None:
 
 
 def _dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
-    """Return a run's records as a dataset, and their circumstances."""
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
     found = circumstances_of(run)

@@ -168,8 +168,7 @@ def last_verification(place: Path) -> VerificationRecord | None:
 
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
     """Return the newest verification of a calibration as `last_verification`; its file need not be in that place."""
-    found = [record for record in _records_near(place) if record.calibration_id == calibration_id]
-    return newest(found)
+    return newest(record for record in _records_near(place) if record.calibration_id == calibration_id)
 
 
 def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:

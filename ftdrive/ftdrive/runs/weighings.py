@@ -78,8 +78,7 @@ class WeighingsFile:
             # A power failure may have cut off the last line.
             begin = end - len(tail) + tail.rfind(b"\n") + 1
             file.truncate(begin)
-            written = [*([] if begin else [self.header]), *lines]
-            append_lines(file, begin, written)
+            append_lines(file, begin, [*([] if begin else [self.header]), *lines])
             try:
                 os.fsync(file.fileno())
             except OSError:
