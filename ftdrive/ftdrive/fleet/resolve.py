@@ -98,12 +98,6 @@ def solve_task(dataset: bytes, task: bytes) -> bytes:
     return _content(solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance))
 
 
-def _files_of(folder: Path) -> tuple[str, dict[str, bytes]]:
-    """Return the name of a run in motion and the files of which its result is made, for another computer."""
-    found = {file for pattern in _IN_MOTION for file in folder.glob(pattern)}
-    return folder.name, {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
-
-
 def _solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
     """Return the calibration file of a run in motion: a pure function as `solved`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
@@ -180,7 +174,9 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
             return solve_task, *task_of(folder)
         if workers.share_files:
             return _solved_motion, folder, __version__
-        return _solved_files, *_files_of(folder), __version__
+        found = {file for pattern in _IN_MOTION for file in folder.glob(pattern)}
+        files = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
+        return _solved_files, folder.name, files, __version__  # for another computer
 
     for folder, answer in answers(call_of, rest, workers):
         if isinstance(answer, OtherVersion):
