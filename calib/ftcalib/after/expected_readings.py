@@ -12,12 +12,11 @@ over the mean square of the fit's residuals has exactly an F distribution (predi
 predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
@@ -37,7 +36,7 @@ from ftcalib.likelihood.response import (
     response_columns,
     with_covariance,
 )
-from ftcalib.model import BIASES, Array, Parameters, jacobian, predict, read_only
+from ftcalib.model import BIASES, Array, jacobian, predict, read_only
 from ftcalib.result import CalibrationResult
 
 # Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
@@ -121,7 +120,8 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
             part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
             freedom = len(c)
         elif kind == "rotation":  # turns about gravity do not show
-            part[range(n), :, range(n)] = sigma**2 * _turns(calibration.parameters, R_base_flange)
+            turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
+            part[range(n), :, range(n)] = sigma**2 * (turn @ np.swapaxes(turn, 1, 2))
             freedom = max(2 * n_used - 6, 2)
         elif kind == "white":  # with unmeasured noise all of it
             known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
@@ -158,8 +158,10 @@ def expected_with_smooth_errors(
     Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
     part, or its poses turn the wrist alone and cannot.
     """
-    p, response, kept = calibration.parameters, calibration.response, _kept(calibration, fitted)
-    if kept is None or fitted.wrench_cov is None:
+    p, response = calibration.parameters, calibration.response
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    complete = calibration.method == "ml" and calibration.dof == 6 * int(kept.sum()) - 15
+    if not complete or fitted.wrench_cov is None:
         return []
     rows = np.flatnonzero(kept)[:: -(-int(kept.sum()) // FEW_TO_SMOOTH)]
     R, dof = fitted.R_base_flange[rows], 6 * len(rows) - 15
@@ -204,26 +206,8 @@ def expected_with_smooth_errors(
         joint = with_covariance(response, joint_covariance(calibration.covariance, response) / factor)
         update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
         explanations.append(Expected(update, noise, dof, factor))
-    return _weighted(explanations, likelihood)
-
-
-def _kept(calibration: CalibrationResult, fitted: CalibrationDataset) -> NDArray[np.bool_] | None:
-    """Return which poses (n,) the fit used; None where its residuals are not those of all 15 parameters."""
-    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
-    complete = calibration.method == "ml" and calibration.dof == 6 * int(kept.sum()) - 15
-    return kept if complete else None
-
-
-def _weighted(explanations: Sequence[Expected], likelihood: Sequence[float]) -> list[Expected]:
-    """Give each explanation its share of the likelihood."""
     weights = np.exp(np.array(likelihood) - max(likelihood))
     return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
-
-
-def _turns(p: Parameters, R_base_flange: Array) -> Array:
-    """Give the covariance (n, 6, 6) of the readings for one rad² of variance of each orientation."""
-    turn = jacobian(p, R_base_flange)[..., :3]
-    return np.asarray(turn @ np.swapaxes(turn, 1, 2))
 
 
 def _components(calibration: CalibrationResult) -> Mapping[str, float]:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.cell_errors import LOAD, known_response, sensor_error_columns
+from ftcalib.after.cell_errors import LOAD, sensor_error_columns
 from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
@@ -212,8 +212,7 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
     """Fit all parameters; `kept` as of `CellPrior.rows`."""
     n, k = len(wrench), len(prior.coefficients)
     new, coefficients = _start(prior.earlier.parameters, R_base_flange, wrench), prior.coefficients
-    seen = known_response(prior.earlier, prior.earlier.response)
-    assert seen is not None  # noqa: S101 - of a result
+    seen = prior.earlier.shown_response
     sigma, unseen = np.sqrt(np.diag(seen.covariance)[15:]), np.zeros(38 if k else 38 + SIZE)
     for _ in range(_MOST_STEPS):
         errors = sensor_error_columns(prior.earlier.parameters, seen, new, R_base_flange)
@@ -307,7 +306,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     differences = [last.parameters.difference(one.parameters) for one in results]
     responses = []
     if any(one.response is not None for one in results):
-        responses = [one for each in results if (one := known_response(each, each.response)) is not None]
+        responses = [one.shown_response for one in results]
         covariances = [one.covariance for one in responses]
         differences = [
             np.append(off, one.coefficients - responses[-1].coefficients)

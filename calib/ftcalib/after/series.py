@@ -193,8 +193,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
         ahead = np.where(p_step < SIGNIFICANT, step - ramp, -np.inf)
         if ahead.max() <= CLEARLY:
             scatter = np.maximum((chi2 - ramp) / (len(t) - 3), 1.0)
-            found = p_ramp < SIGNIFICANT
-            return DriftOnset(found, t0, slope, slope_sigma * np.sqrt(scatter), p_ramp)
+            return DriftOnset(p_ramp < SIGNIFICANT, t0, slope, slope_sigma * np.sqrt(scatter), p_ramp)
         first += int(after[ahead.argmax()])
         known = np.zeros_like(known)
     return None
@@ -300,10 +299,9 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     dof = k * (n - 2)
     scatter = float(np.sum((readings - design @ x) ** 2)) / dof
     chi2 = float(slope @ np.linalg.solve(slope_cov, slope))
-    special = scipy.special
-    against_scatter = special.fdtrc(k, dof, chi2 / k / scatter) if scatter > 0 else 0.0
+    against_scatter = scipy.special.fdtrc(k, dof, chi2 / k / scatter) if scatter > 0 else 0.0
     sigma = np.sqrt(np.diag(slope_cov) * max(scatter, 1.0))
-    return Trend(slope / scale, sigma / scale, float(max(special.chdtrc(k, chi2), against_scatter)), n)
+    return Trend(slope / scale, sigma / scale, float(max(scipy.special.chdtrc(k, chi2), against_scatter)), n)
 
 
 # Bias of a sensor against its temperature, over calibrations and verifications, and whether that predicts anything.

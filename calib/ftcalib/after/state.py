@@ -158,7 +158,8 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
                     f"the weight of the payload, {weight_N:.3g} N, is not {SIGNIFICANT_SIGMAS:g} times its uncertainty "
                     f"of {sigma_N:.2g} N: hang something heavier on the sensor, or check the sign and the tare."
                 )
-        if float(x @ information @ x) < SETTLED * max(1.0, float(left @ np.linalg.solve(S, left))):
+        chi2 = float(left @ np.linalg.solve(S, left))
+        if float(x @ information @ x) < SETTLED * max(1.0, chi2):
             break
         new = _move(new, estimated, x, BLOCKS[kind])
     else:
@@ -170,15 +171,8 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     # The old error of a kept parameter goes into the new ones, so both are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
-    return Update(
-        new,
-        covariance[:15, :15],
-        float(left @ np.linalg.solve(S, left)),
-        6 * n - len(x),
-        kind,
-        left.reshape(n, 6),
-        with_covariance(response, covariance),
-    )
+    joint, dof = with_covariance(response, covariance), 6 * n - len(x)
+    return Update(new, covariance[:15, :15], chi2, dof, kind, left.reshape(n, 6), joint)
 
 
 def apply_update(
@@ -246,7 +240,6 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
             weight[9:12, 0] = -p.p_sensor_com_m / weight_N
         columns.append(weight)
     if "centre of mass" in blocks:
-        # The product of weight and centre of mass is estimated: readings are linear in it.
         columns.append(np.eye(15)[:, 9:12] / weight_N)
     if "bias" in blocks:
         columns.append(np.eye(15)[:, BIASES])
@@ -273,8 +266,7 @@ def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) 
         across = np.eye(3) - np.outer(after, after) / (after @ after)
         kept[3:6, 3:6] = np.linalg.norm(after) / np.linalg.norm(before) * across
     if "gravity direction" in blocks:
-        along = np.outer(after, before) / (before @ before)
-        kept[3:6, 3:6] = 0.0 if "weight" in blocks else along
+        kept[3:6, 3:6] = 0.0 if "weight" in blocks else np.outer(after, before) / (before @ before)
     return kept
 
 
@@ -393,13 +385,8 @@ def tare(
             "changed."
         )
     # What the fit does not know of the sensor acts on a part that is weighed after the tare.
-    known = Update(
-        calibration.parameters,
-        calibration.covariance,
-        0.0,
-        0,
-        response=known_response(calibration, calibration.response),
-    )
+    shown = known_response(calibration, calibration.response)
+    known = Update(calibration.parameters, calibration.covariance, 0.0, 0, response=shown)
     update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(

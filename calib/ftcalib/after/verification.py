@@ -25,7 +25,7 @@ from ftcalib.after.state import BLOCKS, Update, reestimate
 from ftcalib.data.dataset import CalibrationDataset, finite
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
-from ftcalib.model import BIASES, Array, Parameters, gravity_wrench, read_only, skew
+from ftcalib.model import BIASES, Array, Parameters, angle_between_vectors, gravity_wrench, read_only, skew
 from ftcalib.result import CalibrationResult
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
@@ -168,7 +168,6 @@ def verify(
 
 
 def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
-    """Compare the readings with what is expected of an unchanged cell."""
     residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
     n = len(wrench)
     return Verification(
@@ -219,8 +218,7 @@ def _explain(
         blocks = set(BLOCKS[single[0]])
         # A payload includes its weight: such a pair is no alternative, but more of the same.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
-        near = [SINGLE[kind] for kind in apart if found[kind][0] < least + INDISTINCT]
-        others = tuple(dict.fromkeys(near))
+        others = tuple(dict.fromkeys(SINGLE[kind] for kind in apart if found[kind][0] < least + INDISTINCT))
         reason = f"{_in_words(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
         if others:
             reason += (
@@ -257,7 +255,6 @@ def _turned_shift(calibration: CalibrationResult, new: Parameters, R_base_flange
 
 
 def _in_words(calibration: CalibrationResult, update: Update) -> str:
-    """Describe how much has changed."""
     old, new = calibration.parameters, update.parameters
     error = old.difference(new)
     words = []
@@ -272,7 +269,6 @@ def _in_words(calibration: CalibrationResult, update: Update) -> str:
     if error[:3].any():
         words.append(f"the sensor has turned on the flange by {np.rad2deg(np.linalg.norm(error[:3])):.2g}°")
     if update.kind in ("base", "all"):
-        across = float(np.linalg.norm(np.cross(old.gravity_force_base_N, new.gravity_force_base_N)))
-        along = float(old.gravity_force_base_N @ new.gravity_force_base_N)
-        words.append(f"gravity has turned in the base by {np.rad2deg(np.arctan2(across, along)):.2g}°")
+        turned_rad = angle_between_vectors(old.gravity_force_base_N, new.gravity_force_base_N)
+        words.append(f"gravity has turned in the base by {np.rad2deg(turned_rad):.2g}°")
     return ", ".join(words)

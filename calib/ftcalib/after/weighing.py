@@ -48,7 +48,6 @@ LEAST_SIGMAS = 4.0
 DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
 # Usual change of a bias within days, one standard deviation, N and N·m.
 USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
-_PASSES = 4
 
 # Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
 # near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone.
@@ -178,8 +177,7 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
         A[:, 3:, 0] += u @ response.cross_talk_m.T
 
     def covariance_of(x: Array, *, sensor: bool = True) -> Array:
-        x_N = x * g_m_s2
-        return _covariance(reference, x_N, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
+        return _covariance(reference, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
 
     fit = _fit(left, A, covariance_of, p_sensor_near_m)
     x, S, dof = fit.x, fit.S, 6 * n - 1
@@ -240,7 +238,7 @@ class _Fit:
 def _fit(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_sensor_near_m: Array) -> _Fit:
     """Estimate by generalised least squares; the covariance of the readings depends on what is held."""
     n, x = len(left), np.zeros(4)
-    for step in range(_PASSES):
+    for step in range(4):
         S = covariance_of(x)
         if step == 0:  # the force alone, to know how heavy it is
             rows = np.arange(6 * n).reshape(n, 6)[:, :3].ravel()
@@ -315,18 +313,14 @@ def known_contact(calibration: CalibrationResult) -> ContactResponse | None:
 
 def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:
     """Name what does not belong to one weight: first in each pose alone, then between poses."""
-    alone = []
-    for k in range(n):
-        part = S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        alone.append(_misfit(left[k, :3], A[k, :3, :1], part[:3, :3]))
+    parts = [S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]
+    alone = [_misfit(left[k, :3], A[k, :3, :1], part[:3, :3]) for k, part in enumerate(parts)]
     if min(chi2_sf(2, chi2) for chi2 in alone) < FALSE_ALARMS:
         return "contact"
     if p_value >= FALSE_ALARMS:
         return None
-    for k in range(n):
-        part = S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6]
-        if n == 1 or chi2_sf(3, _misfit(left[k], A[k], part)) < FALSE_ALARMS:
-            return "cable"
+    if n == 1 or any(chi2_sf(3, _misfit(left[k], A[k], part)) < FALSE_ALARMS for k, part in enumerate(parts)):
+        return "cable"
     return "changed"
 
 
