@@ -16,7 +16,7 @@ from ftcalib.judge.observability import axes_along, evenly_spread
 from ftcalib.judge.units import FARTHEST_COM_M
 from ftcalib.known import Known, Setup, turn_between, unit_vector
 from ftcalib.model import UP_IN_BASE, Array, Parameters
-from ftcalib.rounding import decimals
+from ftcalib.rounding import to_place_of
 
 # A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do.
 INSIDE_M = 0.01
@@ -71,15 +71,13 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
         code = "torques_reversed" if possible else "torques_about_point"
         findings.append(Finding.of(code, inside_mm=1e3 * inside_m))
     along = parameters.down
-    if setup.up_in_base is None:
-        if lean.is_other_mounting:
-            code = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
-            values = {"orders": _other_orders(along, setup.up, written)} if code == "mounting_undeclared" else {}
-            findings.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
-    elif lean.is_other_mounting:
-        orders = _other_orders(along, setup.up, written)
-        findings.append(Finding.of("gravity_off_mounting", off_deg=lean.deg, direction=along, orders=orders))
-    elif lean.is_significant:
+    is_declared = setup.up_in_base is not None
+    if lean.is_other_mounting:
+        undeclared = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
+        code = "gravity_off_mounting" if is_declared else undeclared
+        values = {} if code == "gravity_tilted" else {"orders": _other_orders(along, setup.up, written)}
+        findings.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
+    elif is_declared and lean.is_significant:
         findings.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return findings
 
@@ -135,9 +133,8 @@ class Lean:
         return self.deg >= max(LEAN_DEG, _SIGNIFICANT * self.sigma_deg)
 
     def __str__(self) -> str:
-        return "leans {:.{places}f}° (sigma {:.{places}f}°) towards its {}".format(
-            self.deg, self.sigma_deg, self.side, places=decimals(self.sigma_deg)
-        )
+        deg, sigma_deg = (to_place_of(one, self.sigma_deg) for one in (self.deg, self.sigma_deg))
+        return f"leans {deg}° (sigma {sigma_deg}°) towards its {self.side}"
 
 
 def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Lean:
@@ -174,7 +171,8 @@ def payload(
     if payload_kg is None:
         return []
     expected_kg, set_kg = payload_kg - (sensor_kg or 0.0), load_kg + (sensor_kg or 0.0)
-    if forces := _units(load_kg, expected_kg):
+    forces = units.by_mass(load_kg, expected_kg, UNIT_SHARE) if abs(expected_kg - load_kg) > UNIT_KG else []
+    if forces:
         suspects = [(force, "N·m") for force in forces] if parameters is None else units.suspects(parameters, forces)
         return [Finding.of("payload_units", load_kg=load_kg, expected_kg=expected_kg, units=suspects)]
     margin_kg = max(PAYLOAD_KG, PAYLOAD_SHARE * set_kg)
@@ -226,12 +224,7 @@ def _margin_kg(tool_kg: float) -> float:
     return max(TOOL_KG, TOOL_SHARE * tool_kg)
 
 
-def _units(load_kg: float, true_kg: float) -> list[str]:
-    return units.by_mass(load_kg, true_kg, UNIT_SHARE) if abs(true_kg - load_kg) > UNIT_KG else []
-
-
 def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> list[Finding]:
-    """Find a centre of mass outside the described tool."""
     if not setup.cylinders_m or (outside_m := _outside_m(parameters, covariance, setup)) <= COM_MARGIN_M:
         return []
     com_m, height_m = parameters.R_flange_sensor @ parameters.p_sensor_com_m, setup.sensor_height_m

@@ -82,8 +82,6 @@ def least_rms(R_base_flange: Array, force_N: Array) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rough:
-    """A rough fit and what it leaves."""
-
     parameters: Parameters
     weight_sensor_N: Array
     """(n, 3)"""
@@ -94,7 +92,6 @@ class _Rough:
 
     @classmethod
     def of(cls, R_base_flange: Array, wrench: Array) -> Self:
-        """Fit."""
         p = rough_fit(R_base_flange, wrench)
         gravity, torque_Nm = gravity_wrench(p, R_base_flange), wrench[:, 3:]
         e = wrench - predict(p, R_base_flange)
@@ -222,13 +219,8 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
     if written in ("", "quaternion"):
         quaternions = Rotation.from_matrix(R).as_quat()
         for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
-            values = {"order": order, "read_as": read_as}
-            yield (
-                "quaternion_order",
-                values,
-                Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix(),
-                wrench,
-            )
+            exchanged = Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix()
+            yield "quaternion_order", {"order": order, "read_as": read_as}, exchanged, wrench
     # Matrices are often computed from angles.
     for read_as in EULER_ORDERS if written in ("", "matrix") else []:
         yield from _other_orders(R, wrench, read_as)
@@ -264,7 +256,6 @@ def _other_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
 
 
 def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
-    """Find torque axes that disagree with the force axes."""
     fits = []
     for Q in SPECIAL_R_flange_base:
         P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
@@ -281,8 +272,7 @@ def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
     corrections = [by_torque] if mirrored or upwards else [by_torque, by_force]
     if mirrored and upwards:  # a mirrored force reads like a weight that pulls upwards
         corrections = [by_force]
-    residual_Nm = as_read.torque_rms_Nm
-    return [Finding.of("axes_disagree", corrections=corrections, residual_Nm=residual_Nm, corrected_Nm=rms)]
+    return [Finding.of("axes_disagree", corrections=corrections, residual_Nm=as_read.torque_rms_Nm, corrected_Nm=rms)]
 
 
 def channels(Q: Array) -> Sequence[str]:

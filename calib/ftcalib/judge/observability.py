@@ -233,7 +233,6 @@ def _with_second_gap(observability: Observability, R_base_flange: Array, paramet
 def _ambiguities(
     R_base_flange: Array, parameters: Parameters, information: Array, weak: Array, observability: Observability
 ) -> tuple[str, ...]:
-    """Sentences: the reason, then the parameters that cannot be separated."""
     different = observability.orientations
     if different == 1:
         return (
@@ -245,8 +244,7 @@ def _ambiguities(
             f"there are only {different} different orientations: several solutions explain them exactly, and bias, "
             "weight and mounting of the sensor cannot be separated",
         )
-    weight_N = parameters.weight_N
-    gravity_flange = parameters.gravity_force_base_N @ R_base_flange / weight_N  # unit vectors
+    gravity_flange = parameters.gravity_force_base_N @ R_base_flange / parameters.weight_N  # unit vectors
     turns = Rotation.from_matrix(np.swapaxes(R_base_flange[:1], 1, 2) @ R_base_flange).as_rotvec()
     _, spread, axes = np.linalg.svd(turns, full_matrices=False)
     if spread[1] < _THIN * spread[0]:
@@ -353,8 +351,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
     poses, words, motions = R_base_flange, list[str](), _motions()
     while len(words) < MOST_ADVISED:
         trials = [np.concatenate([poses, [R_base_flange[-1] @ turn]]) for _, turn in motions]
-        enough = (k for k, trial in enumerate(trials) if _is_sound(trial, parameters))
-        best = next(enough, None)
+        best = next((k for k, trial in enumerate(trials) if _is_sound(trial, parameters)), None)
         chosen = int(np.argmax([_worth(trial, parameters) for trial in trials])) if best is None else best
         poses = trials[chosen]
         words.append(motions[chosen][0])

@@ -279,8 +279,7 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         gram = total - means(bounds[:-1], bounds[1:]).sum(axis=0) + means(before, after)
         gram -= means(before, at) + means(at, after)
         square = square_left(gram, len(others) + 1)
-        possible = np.flatnonzero(np.minimum(at - before, after - at) >= FEWEST_BETWEEN)
-        for i in possible:
+        for i in np.flatnonzero(np.minimum(at - before, after - at) >= FEWEST_BETWEEN):
             yield tuple(sorted([*others, int(at[i])])), float(square[i])
 
     everything = total - means(np.array([0]), np.array([n]))

@@ -60,8 +60,7 @@ def by_mass(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
 
 def suspects(estimate: Parameters, forces: Collection[str]) -> Suspects:
     """Return these units of force, with those of torque that give a usual centre of mass."""
-    com_m = float(np.linalg.norm(estimate.p_sensor_com_m))
-    return by_com(com_m, forces) or [(force, "N·m") for force in forces]
+    return by_com(float(np.linalg.norm(estimate.p_sensor_com_m)), forces) or [(force, "N·m") for force in forces]
 
 
 def unit_of_force(mass: float, sigma: float, true_kg: float, tolerance_kg: float) -> tuple[float, float]:
@@ -105,11 +104,8 @@ def implausible(
     if weight_N > HEAVIEST_N:
         severity: Severity = "reject" if weight_N > IMPOSSIBLE_N else "limit"
         names = [unit for unit in ("gf", "mN") if LIGHTEST_N < weight_N * FORCE_UNITS_N[unit] <= HEAVIEST_N]
-        findings.append(
-            Finding.of(
-                "weight_implausible", severity, weight_N=weight_N, units=suspects(estimate, names), unit_N=unit_N
-            )
-        )
+        pairs = suspects(estimate, names)
+        findings.append(Finding.of("weight_implausible", severity, weight_N=weight_N, units=pairs, unit_N=unit_N))
     if com_m > FAR_COM_M and not described:
         values = {"distance_m": com_m, "most_m": FARTHEST_COM_M if com_m > FARTHEST_COM_M else FAR_COM_M}
         severity = "reject" if com_m > FARTHEST_COM_M else "limit"

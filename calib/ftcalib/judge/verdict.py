@@ -116,7 +116,6 @@ class Quality:
 
     @property
     def _is_noise(self) -> bool:
-        """Whether the errors are those of noise alone."""
         return self.fits_measured_noise and few_rejected(self.used)
 
     @property
@@ -143,16 +142,13 @@ class Quality:
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the statistics that a result keeps as its `quality`."""
-        drifts = bool(self.ahead.square.any())
+        later = {"next_use": self.next_use_rms, "workspace": self.workspace_rms}
+        if self.ahead.square.any():  # a tour without drift does not show what an hour brings
+            later["hour"] = self.hour_rms
         return {
             "loo_force_rms_N": self.loo_force_rms_N,
             "loo_torque_rms_Nm": self.loo_torque_rms_Nm,
-            "next_use_force_rms_N": float(self.next_use_rms[0]),
-            "next_use_torque_rms_Nm": float(self.next_use_rms[1]),
-            "workspace_force_rms_N": float(self.workspace_rms[0]),
-            "workspace_torque_rms_Nm": float(self.workspace_rms[1]),
-            # A tour without drift does not show what an hour brings.
-            **({f"hour_{unit}": float(self.hour_rms[k]) for k, unit in enumerate(_RMS)} if drifts else {}),
+            **{f"{when}_{unit}": float(rms[k]) for when, rms in later.items() for k, unit in enumerate(_RMS)},
             "bias_growth_per_min": self.ahead.growth_per_min.tolist(),
             "worst_pose": self.worst_pose + 1,
             "residual_sigma": self.residual_sigma.tolist(),
@@ -225,6 +221,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     by_mass = any(one.code == "known_mass" for one in contradicted)
     unit_N = None if by_mass else described_cell.unit_of_force(unconstrained or fit, known, setup, g_m_s2)
     gain = [] if mistakes or changed else _gain_not_modelled(fit, unconstrained)
+    needs_no_misfit = gain or contradicted or quality.largest_share <= NOISY_SHARE
 
     findings = [
         *broken,
@@ -241,11 +238,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
             unit_N=unit_N,
         ),
         *gain,
-        *(
-            []
-            if gain or contradicted or quality.largest_share <= NOISY_SHARE
-            else _misfit_of_known_values(fit, unconstrained)
-        ),
+        *([] if needs_no_misfit else _misfit_of_known_values(fit, unconstrained)),
         *(_noise(fit, quality) if single_poses else []),
         *(_poses(fit, quality, "note" if accidents else "limit", setup) if single_poses else []),
         *_structure(fit, weight_N, in_motion=not single_poses),
@@ -332,8 +325,7 @@ def _unrelated_torques(fit: Judged, quality: Quality) -> list[Finding]:
     """Recognise torques that do not follow the weight while the forces do: another sensor's, or of one without load."""
     torque_Nm, codes = fit.wrench[quality.used, 3:], {one.code: one.severity for one in quality.errors}
     is_near = float(np.linalg.norm(fit.parameters.p_sensor_com_m)) < units.NEAREST_COM_M
-    change_Nm = _rms(torque_Nm - torque_Nm.mean(axis=0))
-    left = _rms(fit.residuals[quality.used, 3:]) / (change_Nm or 1.0)
+    left = _rms(fit.residuals[quality.used, 3:]) / (_rms(torque_Nm - torque_Nm.mean(axis=0)) or 1.0)
     if left < UNRELATED or "force_error" in codes or not (is_near or codes.get("torque_error") == "reject"):
         return []
     return [Finding.of("torques_unrelated", "limit", left_percent=100 * min(left, 1.0))]
@@ -431,8 +423,7 @@ def _weight(fit: Judged, weight_N: float, setup: Setup) -> list[Finding]:
         return []
     if given_in_base := constant_weight(fit.wrench, setup.up):
         return given_in_base
-    values = {"weight_N": weight_N, "sigma_N": sigma_N, "least_sigmas": SIGNIFICANT_SIGMAS}
-    return [Finding.of("weight_insignificant", **values)]
+    return [Finding.of("weight_insignificant", weight_N=weight_N, sigma_N=sigma_N, least_sigmas=SIGNIFICANT_SIGMAS)]
 
 
 def _second_solution(fit: Judged, unconstrained: Judged | None = None) -> list[Finding]:
@@ -455,12 +446,8 @@ def _gain_not_modelled(fit: Judged, unconstrained: Judged | None) -> list[Findin
     reads = unconstrained.response.wrench(unconstrained.parameters, fit.R_base_flange[used])[:, :3]
     if best > COLLAPSE * ours or _rms(reads - reads.mean(axis=0)) < ours / 2:
         return []
-    values = {
-        "gain_percent": 100 * float(np.abs(unconstrained.response.force_gain).max()),
-        "residual_N": ours,
-        "free_N": best,
-    }
-    return [Finding.of("gain_not_modelled", **values)]
+    gain_percent = 100 * float(np.abs(unconstrained.response.force_gain).max())
+    return [Finding.of("gain_not_modelled", gain_percent=gain_percent, residual_N=ours, free_N=best)]
 
 
 def _misfit_of_known_values(fit: Judged, unconstrained: Judged | None) -> list[Finding]:
@@ -483,9 +470,8 @@ def _noise(fit: Judged, quality: Quality) -> list[Finding]:
     minor = quality.noise_factor <= NOISE_FACTOR and quality.largest_share <= NOISY_SHARE
     minor = minor and not (fit.fit is not None and fit.fit.may_bend)
     components = {name: value for name, value in fit.components.items() if value > 0}
-    return [
-        Finding.of("noise_exceeded", "note" if minor else "limit", factor=quality.noise_factor, components=components)
-    ]
+    severity: Severity = "note" if minor else "limit"
+    return [Finding.of("noise_exceeded", severity, factor=quality.noise_factor, components=components)]
 
 
 def _left_out_rms(fit: Judged, poses: NDArray[np.bool_]) -> tuple[float, float]:
@@ -553,10 +539,8 @@ def _poses(fit: Judged, quality: Quality, severity_of_rejected: Severity, setup:
         return findings
     if quality.lag1_p < SURE:
         findings.append(Finding.of("residuals_alike", correlation=quality.lag1))
-    worst, typical = (
-        float(quality.residual_sigma[quality.worst_pose]),
-        float(np.median(quality.residual_sigma[quality.used] ** 2)),
-    )
+    worst = float(quality.residual_sigma[quality.worst_pose])
+    typical = float(np.median(quality.residual_sigma[quality.used] ** 2))
     if n >= RECOMMENDED_POSES and worst**2 > chi2_isf(6, SURE / n) / 6 * max(typical, 1.0):
         findings.append(Finding.of("pose_deviates", pose=quality.worst_pose + 1, sigmas=worst))
     return findings
