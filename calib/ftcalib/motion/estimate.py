@@ -151,8 +151,6 @@ class MotionFit:
 
 
 class _Problem:
-    """Rows with what is known of their load."""
-
     def __init__(
         self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
     ) -> None:
@@ -311,8 +309,7 @@ class _Problem:
         for Q in self.constraints.rotations([one.R.T for one in minima(cost)], cost)[:4]:
             F_b, bias = given_rotation(Q.T, R, force, ones)
             c, torque_bias = com_and_torque_bias(F_b @ R @ Q, rows.wrench[:, 3:])
-            start = self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias))
-            found.append(Load(start, self.g_m_s2))
+            found.append(Load(self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias)), self.g_m_s2))
         return found
 
     def free(self, load: Load) -> Array:

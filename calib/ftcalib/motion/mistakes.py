@@ -55,7 +55,6 @@ _BESIDE, _WITHIN = 5, 1
 _ZERO_SHARE, _STEPS, _AROUND, _LEAST_STEP_N = 0.25, 4.0, 101, 1.0
 # Share of a step that stays: a contact that ends where the sensor was zeroed leaves none.
 _STAYS: Final = 0.6
-_ITERATIONS: Final = 25
 # Places of aside and height in a free fit.
 _POINT: Final = np.r_[SIZE + 1, SIZE + 2, HEIGHT]
 
@@ -102,7 +101,7 @@ def bias_steps(rows: Rows, at_s: Array) -> Array:
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns(), rows.t_s[:, None] > at_s])[apart]
     y, weight, limit = rows.wrench[apart], np.ones(int(apart.sum())), np.inf
     solution = np.zeros((X.shape[1], 6))
-    for _ in range(_ITERATIONS):
+    for _ in range(25):
         root = np.sqrt(weight)[:, None]
         solution = np.linalg.lstsq(root * X, root * y, rcond=1e-9)[0]
         _, weight, limit = robust_weights(y - X @ solution, limit, alike=1)
@@ -184,7 +183,9 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     to_com, com = signs[0] * (np.append(free.error.aside_m, load.height_m) + seen) / turning, signs.prod() * seen
     of_com = np.sqrt(np.diag(Q @ free.covariance[9:12, 9:12] @ Q.T))
     are_signed = abs(moment) > _SIGNED * sigma_moment and found > _SIGNED * sigma_scale
-    behind = are_signed and _is_behind(com, of_com)
+    # Behind the sensor rather than beside it.
+    behind_m = max(INSIDE_M, SIGNIFICANT_SIGMAS * of_com[2], float(np.linalg.norm(com[:2])))
+    behind = are_signed and bool(-com[2] > behind_m)
     other = _other_point(to_com, com, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
     aside_m = (to_com - com)[:2] if other else np.zeros(2)
     findings += other
@@ -264,11 +265,6 @@ def _wrong_units(to_com: Array, com: Array) -> list[tuple[str, str]]:
     return suspects
 
 
-def _is_behind(com: Array, sigma: Array) -> bool:
-    """Whether the centre of mass (3,), in the axes of the poses, lies behind the sensor rather than beside it."""
-    return bool(-com[2] > max(INSIDE_M, SIGNIFICANT_SIGMAS * sigma[2], float(np.linalg.norm(com[:2]))))
-
-
 def _is_height(height_m: float, sigma_m: float) -> bool:
     slack_m = SIGNIFICANT_SIGMAS * sigma_m
     return _LOWEST_M - slack_m < height_m < _HIGHEST_M + slack_m
@@ -288,6 +284,5 @@ def impossible(best: MotionFit) -> list[Finding]:
         principal = np.linalg.eigvalsh(best.load.inertia_kg_m2)
         findings.append(Finding.of("inertia_impossible", principal_gm2=1e3 * principal, sigma_gm2=1e3 * sigma))
     if not _is_height(best.load.height_m, sigma_m):
-        values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma_m}
-        findings.append(Finding.of("height_impossible", **values))
+        findings.append(Finding.of("height_impossible", height_mm=1e3 * best.load.height_m, sigma_mm=1e3 * sigma_m))
     return findings

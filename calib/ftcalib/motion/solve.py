@@ -177,8 +177,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
     findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
     if is_coarse:
-        values = {"off_deg": np.degrees(coarse_rad), "share_percent": 100 * len(used) / len(rows)}
-        causes.append(Finding.of("motion_coarse", **values))
+        share_percent = 100 * len(used) / len(rows)
+        causes.append(Finding.of("motion_coarse", off_deg=np.degrees(coarse_rad), share_percent=share_percent))
     if positions and verdict_of([*findings, *causes]) != "rejected":
         findings += impossible(best)
     findings = [*causes, *(one for one in findings if not _explained(one, causes))]
@@ -349,8 +349,7 @@ def _judge(
         second_basin_chi2=best.second_basin_chi2,
         components={name: size for name, size in best.components.items() if name.startswith(_SMOOTH)},
     )
-    quality = judge(judged, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2, single_poses=False)
-    return quality, places
+    return judge(judged, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2, single_poses=False), places
 
 
 def _means(best: MotionFit, rows: int) -> Array:
@@ -459,8 +458,7 @@ def _mistakes(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Findin
 def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
     """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
-    weight_N = best.load.static.weight_N
-    error = expected_error(best.load.static, best.covariance[:15, :15])[0] / max(weight_N, 1e-9)
+    error = expected_error(best.load.static, best.covariance[:15, :15])[0] / max(best.load.static.weight_N, 1e-9)
     if range_deg >= NARROW_DEG and (explained or error < USABLE_SHARE):
         return []
     severity: Severity = "reject" if error > REJECTED_SHARE else "limit"
