@@ -29,7 +29,6 @@ _CLEARLY = 12.0
 _MOST_MISTAKES = 4
 # Candidates whose sizes are estimated again.
 _TRIED = 4
-_PASSES = 3
 # Of the load, beyond which a sensor is not linear.
 _MOST_REMAINING = 0.03
 # Of the prior of the matrix, in sigmas.
@@ -109,17 +108,13 @@ def solve_loads(
     setup, prior = setup or Setup(), prior or SensorMatrix.usual()
     begun = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
     model, logarithms, at = _fit(copy(begun), np.zeros(len(SIZES)))
-    agrees = False
-    while not agrees and len(model.mistakes) < _MOST_MISTAKES:
-        better = _best_mistake(begun, model, logarithms, at)
-        agrees = better is None
-        model, logarithms, at = better or (model, logarithms, at)
+    while len(model.mistakes) < _MOST_MISTAKES and (better := _best_mistake(begun, model, logarithms, at)):
+        model, logarithms, at = better
     swapped = _swapped(begun, at)
     sizes, remaining = sizes_of(logarithms), _remaining(model)
-    used = slice(0, 39)
     sensor = SensorMatrix(
         model.error,
-        at.covariance[used, used],
+        at.covariance[:39, :39],
         "loads",
         prior.lever_m,
         max(sizes["floor"], max(remaining) / 2 if max(remaining) > _MOST_REMAINING else 0.0),
@@ -169,7 +164,7 @@ def _begin(
 def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
     """Move a model to its best values, with the sizes of the disturbances that explain them best."""
     for _ in range(2):
-        for _ in range(_PASSES):
+        for _ in range(3):
             model.move(model.evaluate(logarithms, model.linear()).step)
         logarithms = _best_sizes(model, logarithms)
     model.move(model.evaluate(logarithms, model.linear()).step)
@@ -177,7 +172,6 @@ def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluat
 
 
 def _best_sizes(model: LoadModel, logarithms: Array) -> Array:
-    """Return the sizes that are most likely about the present values."""
     linear = model.linear()
 
     def cost(y: Array) -> tuple[float, Array]:
@@ -284,11 +278,11 @@ def _loads(model: LoadModel, at: Evaluated, p_flange_sensor_m: Array | None) -> 
 
 
 def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
-    """Name the mistakes that the readings show."""
     findings = []
     touched: dict[int, list[int]] = {}
     for i, mistake in enumerate(model.mistakes):
         values, run = model.x[model.at[f"mistake {i}"]], model.runs[mistake.run]
+        size = float(np.linalg.norm(values))
         sigma = np.sqrt(np.diag(at.covariance)[model.at[f"mistake {i}"]])
         name = "" if run.load is None else run.load.name
         if mistake.kind == "touched":
@@ -300,30 +294,21 @@ def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
             )
         elif mistake.kind == "tool_mass":
             start = model.at["tool"].start
-            found_kg = float(model.x[start] + values[0])
+            found_kg, given_kg = float(model.x[start] + values[0]), float(model.expected[start])
             findings.append(
-                Finding.of(
-                    "load_tool_mass", found_kg=found_kg, sigma_kg=float(sigma[0]), given_kg=float(model.expected[start])
-                )
+                Finding.of("load_tool_mass", found_kg=found_kg, sigma_kg=float(sigma[0]), given_kg=given_kg)
             )
         elif mistake.kind == "mass" and run.load is not None:
             findings.append(_mass_finding(name, _found_load(model, mistake.run)[0], float(sigma[0]), run.load.mass_kg))
         elif mistake.kind == "moved":
-            findings.append(
-                Finding.of("load_moved", name=name, moved_mm=1e3 * float(np.linalg.norm(values)), pose=mistake.pose)
-            )
+            findings.append(Finding.of("load_moved", name=name, moved_mm=1e3 * size, pose=mistake.pose))
         elif mistake.kind == "pulled":
-            findings.append(Finding.of("load_pulled", name=name, force_N=float(np.linalg.norm(values))))
+            findings.append(Finding.of("load_pulled", name=name, force_N=size))
         elif run.load is not None and run.load.p_flange_m is not None:
             given = np.asarray(run.load.p_flange_m)
+            found_mm, given_mm = (1e3 * (given + values)).round(1).tolist(), (1e3 * given).tolist()
             findings.append(
-                Finding.of(
-                    "load_place",
-                    name=name,
-                    found_mm=(1e3 * (given + values)).round(1).tolist(),
-                    given_mm=(1e3 * given).tolist(),
-                    off_mm=1e3 * float(np.linalg.norm(values)),
-                )
+                Finding.of("load_place", name=name, found_mm=found_mm, given_mm=given_mm, off_mm=1e3 * size)
             )
     for run_row, poses in touched.items():
         findings.append(Finding.of("load_touched", run=model.runs[run_row].name, poses=sorted(poses)))
