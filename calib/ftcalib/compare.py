@@ -1,12 +1,11 @@
 """Comparison of all methods on the same data, and of the cases of Yu's Table III."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.display import Displayed, Summary
@@ -55,8 +54,7 @@ class MethodResult(Displayed):
         """Return the JSON object that `ftdrive solve --method all --json` prints for a method."""
         if self.parameters is None:
             return {"method": self.method, "reason": self.reason}
-        cross_validated = (self.cv_force_rms_N, self.cv_torque_rms_Nm)
-        force, torque = map(_or_none, cross_validated)
+        force, torque = map(_or_none, (self.cv_force_rms_N, self.cv_torque_rms_Nm))
         test: dict[str, JSON] = {}
         if self.largest_errors is not None:
             names = ("fx_N", "fy_N", "fz_N", "force_N", "tx_Nm", "ty_Nm", "tz_Nm", "torque_Nm")
@@ -248,20 +246,15 @@ def _cross_validate(
     R_base_flange, wrench = dataset.R_base_flange, dataset.wrench
     prepared = partial(estimator_of, method, known=known, g_m_s2=g_m_s2, setup=setup, as_published=as_published)
     parameters = prepared(R_base_flange)(wrench)
-    left_out = np.empty_like(wrench)
+    left_out, fold_of = np.empty_like(wrench), np.arange(len(wrench)) % _MOST_FOLDS
     try:
-        for out in _folds(len(wrench)):
+        for fold in range(min(len(wrench), _MOST_FOLDS)):
+            out = fold_of == fold
             without = prepared(R_base_flange[~out])(wrench[~out])
             left_out[out] = wrench[out] - predict(without, R_base_flange[out])
     except NotObservable:
         return parameters, np.nan, np.nan
     return parameters, *_rms(left_out)
-
-
-def _folds(n: int) -> Iterator[NDArray[np.bool_]]:
-    folds = min(n, _MOST_FOLDS)
-    for fold in range(folds):
-        yield np.arange(n) % folds == fold
 
 
 def _rms(residuals: Array) -> tuple[float, float]:

@@ -24,7 +24,6 @@ _IN_MOTION: Final[Sequence[tuple[str, float, str, str]]] = (
     ("wrench after pose", 1e3, "ms", "delay_s"),
     ("sensor above flange", 1e3, "mm", "height_m"),
 )
-_INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
 FIXED_BELOW: Final = 1e-9
 """A standard deviation below this share of the largest one is one of rounding: its value was taken as known."""
 
@@ -36,7 +35,7 @@ def quantities_of(document: Mapping[str, Any]) -> Sequence[tuple[str, float, str
 
 def axes_of(count: int) -> Sequence[str]:
     """Return the names of the elements of a number, a vector, or a symmetric tensor."""
-    return {1: ("",), 3: tuple("xyz"), 6: _INERTIA}[count]
+    return {1: ("",), 3: tuple("xyz"), 6: ("xx", "yy", "zz", "xy", "xz", "yz")}[count]
 
 
 def values_of(value: Any, key: str) -> Array:

@@ -139,8 +139,7 @@ def write_object(
 
 def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False) -> str:
     """Return the content of a JSON file: the document and its checksum."""
-    sealed = {**document, "checksum": _checksum(document)}
-    return json.dumps(sealed, indent=indent, allow_nan=allow_nan) + "\n"
+    return json.dumps({**document, "checksum": _checksum(document)}, indent=indent, allow_nan=allow_nan) + "\n"
 
 
 def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, Self
 
 from ftcalib.display import Displayed, Summary
-from ftcalib.rounding import decimals
+from ftcalib.rounding import decimals, to_place_of
 
 # What a finding does to the result: rejected, usable at best, or not worse for it.
 Severity = Literal["reject", "limit", "note"]
@@ -223,9 +223,8 @@ def _scale(unit_N: Sequence[float] | None) -> str:
     """Write what a unit of force is by a known mass, and its sigma, both in N."""
     if not unit_N:
         return ""
-    return ". By the known mass 1 unit = {:.{places}f} N (sigma {:.{places}f} N)".format(
-        *unit_N, places=decimals(unit_N[1])
-    )
+    unit, sigma = (to_place_of(one, unit_N[1]) for one in unit_N)
+    return f". By the known mass 1 unit = {unit} N (sigma {sigma} N)"
 
 
 # Forms of values that files of earlier versions lack.

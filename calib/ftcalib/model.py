@@ -109,11 +109,10 @@ class Parameters(Displayed):
 
     def difference(self, other: Self) -> Array:
         """Return the error vector (15,) with which `moved` gives `other`."""
+        turn = scipy.spatial.transform.Rotation.from_matrix(self.R_flange_sensor @ other.R_flange_sensor.T)
         return np.concatenate(
             [
-                scipy.spatial.transform.Rotation.from_matrix(
-                    self.R_flange_sensor @ other.R_flange_sensor.T
-                ).as_rotvec(),
+                turn.as_rotvec(),
                 other.gravity_force_base_N - self.gravity_force_base_N,
                 other.force_bias_N - self.force_bias_N,
                 other.p_sensor_com_m - self.p_sensor_com_m,

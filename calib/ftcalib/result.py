@@ -372,11 +372,7 @@ class CalibrationResult(Displayed):
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
         weight, alpha, beta = _weight_and_tilt_sigma(self.gravity_force_base_N, covariance[3:6, 3:6])
         return {
-            "R_flange_sensor": std[0:3],
-            "gravity_force_base_N": std[3:6],
-            "force_bias_N": std[6:9],
-            "p_sensor_com_m": std[9:12],
-            "torque_bias_Nm": std[12:15],
+            **{each.name: part for each, part in zip(fields(Parameters), std.reshape(5, 3), strict=True)},
             "weight_N": weight,
             "mass_kg": weight / self.g_m_s2,
             "tilt_alpha_rad": alpha,
@@ -593,14 +589,13 @@ class CalibrationResult(Displayed):
         UsageError
             matplotlib is not installed.
         """
-        rejected = None if self.weights is None else self.weights == 0
         return figure_of(
             np.arange(1.0, len(self.residuals) + 1),
             self.residuals,
             label="pose" if self.motion is None else "row of the recording",
             title=f"Measured minus predicted, {self.verdict.upper()}; band: one sigma",
             sigma=self.measured_sigma,
-            marked=rejected,
+            marked=None if self.weights is None else self.weights == 0,
             points=True,
         )
 
@@ -674,17 +669,14 @@ class CalibrationResult(Displayed):
         if document.get("format") != _EARLIER:
             check_format(document, FORMAT, BadCalibration)
         try:
-            apart = {"parameters", "hidden_covariance", "cable_shift", "sensor", "weighed_kg", "motion", "mean_bias"}
+            later = ("cable_shift", "sensor", "weighed_kg", "mean_bias")
+            apart = {"parameters", "hidden_covariance", "motion", *later}
             plain = [field.name for field in fields(cls) if field.name not in apart]
             result = cls(
                 parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                **{name: document[name] for name in plain},
-                # Files of version 0.1.0 and earlier have none of these.
+                # Files of version 0.1.0 and earlier have none of those that are asked for by `get`.
+                **{name: document[name] for name in plain} | {name: document.get(name) for name in later},
                 hidden_covariance=document.get("hidden_covariance", np.zeros((15, 15))),
-                cable_shift=document.get("cable_shift"),
-                sensor=document.get("sensor"),
-                weighed_kg=document.get("weighed_kg"),
-                mean_bias=document.get("mean_bias"),
                 motion=MotionResult.from_dict(document),
             )
             derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
@@ -710,8 +702,7 @@ class CalibrationResult(Displayed):
     def load(cls, path: str | Path, *, accept_edited: bool = False) -> Self:
         """Read a calibration file, as `from_dict`. Raises `BadCalibration` or `OSError`."""
         try:
-            document = read_object(path, BadCalibration, accept_changed=True)
-            return cls.from_dict(document, accept_edited=accept_edited)
+            return cls.from_dict(read_object(path, BadCalibration, accept_changed=True), accept_edited=accept_edited)
         except BadCalibration as exc:
             raise BadCalibration(f"{Path(path).name}: {exc}") from exc
 

@@ -243,14 +243,13 @@ def _judge(
         require_positive_definite(joint_covariance(judged.covariance, judged.response))
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
-    unconstrained = None if free is None else Judged.of(free)
     return judge(
         judged,
         t_s=dataset.t_s,
         measured_sigma=measured_sigma,
         setup=replace(setup, sensor_has_arbitrary_zero=setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset)),
         known=known,
-        unconstrained=unconstrained,
+        unconstrained=None if free is None else Judged.of(free),
         g_m_s2=g_m_s2,
         written=_written(dataset),
     )

@@ -374,8 +374,8 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
     excess = (sigma / target).max(axis=1)
     best = int(np.argmax(excess <= max(1.0, FLAT * excess.min())))
     reached = bool(excess[best] <= 1)
-    floor = sigma.min(axis=0)
-    words = f"average {times_s[best]:.1f} s at each pose: sigma {_in_words(sigma[best])}"
+    force_N, torque_Nm = sigma[best, :3].max(), sigma[best, 3:].max()
+    words = f"average {times_s[best]:.1f} s at each pose: sigma {force_N:.2g} N and {torque_Nm:.2g} N·m"
     if not reached:
         c = int(np.argmax(sigma[best] / target))
         words += f". {CHANNELS[c]} does not reach the target of {target[c]:.2g} {'N' if c < 3 else 'N·m'}: "
@@ -387,8 +387,4 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
             words += f"that needs {needed_s:.2g} s. Take more poses"
         else:
             words += f"a record of {len(wrench) / rate_Hz:.0f} s is too short for longer averages. Record 30 s or more"
-    return AveragingTime(round(float(times_s[best]), 1), sigma[best], floor, reached, words)
-
-
-def _in_words(sigma: Array) -> str:
-    return f"{sigma[:3].max():.2g} N and {sigma[3:].max():.2g} N·m"
+    return AveragingTime(round(float(times_s[best]), 1), sigma[best], sigma.min(axis=0), reached, words)

@@ -18,8 +18,6 @@ from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, read_only
 # Cross-talk counts relative to a force at this lever.
 LEVER_M = RANGE_LEVER_M
 
-_PAIRS = ((0, 1), (0, 2), (1, 2))
-
 
 def _symmetric(i: int, j: int) -> Array:
     matrix = np.zeros((3, 3))
@@ -27,7 +25,7 @@ def _symmetric(i: int, j: int) -> Array:
     return matrix
 
 
-_MIXED = [_symmetric(i, j) for i, j in _PAIRS]
+_MIXED = [_symmetric(i, j) for i, j in ((0, 1), (0, 2), (1, 2))]
 # (5, 3, 3) basis of the gain: equal and independent coefficients make the entries so.
 GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
 # (6, 3, 3) basis of the cross-talk, m.

@@ -85,8 +85,7 @@ class Session:
         ordered = bool((self.order[1:] > self.order[:-1]).all())
         self.R, self.wrench = (x if ordered else x[self.order] for x in self.given)
         cov = white(*_rounding(self.wrench)) if wrench_cov is None else np.asarray(wrench_cov, dtype=np.float64)
-        common = cov.ndim == 2
-        self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if common else cov if ordered else cov[self.order]
+        self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if cov.ndim == 2 else cov if ordered else cov[self.order]
         self.descent = Descent(self.R, self.wrench, constraints)
         self.everything = np.ones(self.n, bool)
 
@@ -175,9 +174,6 @@ class Session:
         """Whether gain and cross-talk are at least as large as usual, because too few poses show how large."""
         return self.gain_sigma > 0 and self.n < FEW_POSES_FOR_GAIN
 
-    def _groups(self) -> list[range]:
-        return [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
-
     def always(self) -> list[Component]:
         """Components that are part of the model."""
         always = []
@@ -196,7 +192,8 @@ class Session:
         found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not self.assumes_response else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
-            walks = [component("walk", group) for group in self._groups()] if self.drift == "auto" else []
+            groups = [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
+            walks = [component("walk", group) for group in groups] if self.drift == "auto" else []
             walks = walks if self.shown is None else [c for c in walks if c in self.shown]
             found += [*white, ROTATION, *walks]
         if self.n >= FEW_POSES_FOR_HYSTERESIS:

@@ -6,7 +6,7 @@ from those that an arm can reach.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -151,11 +151,7 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     return Prediction(
         n_poses=len(R_base_flange),
         sigma={
-            "R_flange_sensor": read_only(std[0:3]),
-            "gravity_force_base_N": read_only(std[3:6]),
-            "force_bias_N": read_only(std[6:9]),
-            "p_sensor_com_m": read_only(std[9:12]),
-            "torque_bias_Nm": read_only(std[12:15]),
+            **{each.name: read_only(part) for each, part in zip(fields(Parameters), std.reshape(5, 3), strict=True)},
             "weight_N": weight,
             "mass_kg": weight / guess.g_m_s2,
             "tilt_alpha_rad": min(alpha, float(np.pi)),
@@ -236,7 +232,6 @@ def _weight_and_tilt_rows(guess: Guess) -> Array:
 def _condition(M: Array) -> float:
     """Condition number; infinite if a column is not determined."""
     singular = np.linalg.svd(M, compute_uv=False)
-    columns = M.shape[1]
-    if len(singular) < columns or singular[-1] <= OBSERVABLE * singular[0]:
+    if len(singular) < M.shape[1] or singular[-1] <= OBSERVABLE * singular[0]:
         return float("inf")
     return float(singular[0] / singular[-1])
