@@ -277,13 +277,7 @@ class UrArm(RobotArm):
         `StreamBroken` when it cannot be asked.
         """
         q = _joints(q_rad)
-        control = self._in_control()
-        try:
-            return bool(control.call("within_safety_limits", q, look_out=self._look_out))
-        except DeviceError as error:
-            if fault := self._fault():
-                raise fault from error
-            raise
+        return bool(self._ask(self._in_control(), "within_safety_limits", q))
 
     def set_payload(
         self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
@@ -312,16 +306,19 @@ class UrArm(RobotArm):
         control = self._in_control()
         self._look_out()
         self._check_ours(control)
+        if not self._ask(control, f"set_{what}", *values):
+            raise self._fault() or DeviceFault(
+                f"the controller did not confirm the {what} that was sent", "read the pendant's log"
+            )
+
+    def _ask(self, control: Control, name: str, *values: object) -> object:
+        """Call our program; a fault that the controller reports goes before the error of the call."""
         try:
-            taken = control.call(f"set_{what}", *values, look_out=self._look_out)
+            return control.call(name, *values, look_out=self._look_out)
         except DeviceError as error:
             if fault := self._fault():
                 raise fault from error
             raise
-        if not taken:
-            raise self._fault() or DeviceFault(
-                f"the controller did not confirm the {what} that was sent", "read the pendant's log"
-            )
 
     def move_to(
         self,
@@ -372,8 +369,7 @@ class UrArm(RobotArm):
             numbers = (centre, sweep.duration_s, sweep.ramp_s)
             return sent and bool(control.call("sweep", *numbers, look_out=self._look_out))
 
-        timeout_s = sweep.duration_s + _SETTLES_S
-        self._travel(begin, centre, speed, "the sweep", timeout_s=timeout_s, guard=guard)
+        self._travel(begin, centre, speed, "the sweep", timeout_s=sweep.duration_s + _SETTLES_S, guard=guard)
 
     def _travel(
         self,
@@ -386,7 +382,6 @@ class UrArm(RobotArm):
         guard: Guard,
     ) -> None:
         """Begin a motion that ends at `q`, and return when it has."""
-        # A program of another client found before a move is not stopped.
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None

@@ -130,7 +130,6 @@ class Calls:
 
 
 def _main() -> None:
-    """Serve until stdin ends."""
     host = sys.argv[1]
     frequency_Hz, stop_rad_s2, starting_s, leaving_s, unwatched_s = map(float, sys.argv[2:])
     replies = os.fdopen(os.dup(1), "w", encoding="utf-8")

@@ -93,7 +93,6 @@ _LOCAL_X: Final = "set Control mode to Remote in the Safety overview of the pend
 
 def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[ControlPath, str]:
     """Return the control path, and in words why it is taken."""
-    # ur-rtde needs a dashboard server, which PolyScope X has not.
     if setting != "auto":
         return setting, "as configured"
     if version[0] >= POLYSCOPE_X:
@@ -172,12 +171,11 @@ class Opening:
         )
         version = "PolyScope {}.{} can be controlled".format(*self.reader.version)
         free = "the RTDE registers are free: no other client controls the arm"
-        is_open = f"port {self._port}, which takes programs, is open"
         return [
             diagnosis("control", self.require_path, f"control path {path}: {why}{stops}"),
             diagnosis("version", self.require_version, version),
             diagnosis("registers", self.require_registers, free),
-            diagnosis("programs", self.require_port, is_open),
+            diagnosis("programs", self.require_port, f"port {self._port}, which takes programs, is open"),
         ]
 
     def require_path(self) -> None:

@@ -262,7 +262,6 @@ def find_program_port(host: str, port: int, *, timeout_s: float) -> None:
 
 
 def _unreachable(host: str, port: int, error: OSError) -> ConnectError:
-    """Return the error for a port that takes programs."""
     name = "primary" if port == PORT else "real-time"
     return ConnectError(
         f"{host}:{port}, which accepts programs, cannot be reached ({error})",

@@ -211,7 +211,6 @@ class Reader:
                 self._followers.remove(unread)
 
     def _read_on(self, unread: Unread[Received], timeout_s: float) -> ArmStates:
-        """Return what a follower has not read."""
         with self._changed:
             for left_s in self._clock.looks(timeout_s):
                 if received := unread.take():

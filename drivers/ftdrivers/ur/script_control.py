@@ -82,7 +82,6 @@ class _Report:
 
     @property
     def moves(self) -> bool:
-        """Whether the program is carrying out a move."""
         return self.state == _MOVING
 
     @property
@@ -92,7 +91,6 @@ class _Report:
 
     @property
     def missed_heartbeat(self) -> bool:
-        """Whether it has ended because no heartbeat came."""
         return self.state == _NO_HEARTBEAT
 
 
@@ -174,8 +172,7 @@ class ScriptControl(Control):
 
     def wait_until_ready(self, look_out: LookOut) -> None:
         """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
-        timeout_s = self._timing.starting_s
-        wait = partial(self._wait, timeout_s=timeout_s, look_out=look_out, what="start")
+        wait = partial(self._wait, timeout_s=self._timing.starting_s, look_out=look_out, what="start")
         wait(lambda: self._beats >= 2 or self._refusal is not None)  # token and sequence number are in the registers
         if self._refusal is not None:
             raise self._refusal

@@ -41,7 +41,6 @@ class _Dashboard:
             raise
 
     def stop(self) -> None:
-        """Stop the program, and the arm with it."""
         if (reply := self._ask("stop")) != "Stopped":
             raise RuntimeError(reply)
 
@@ -56,12 +55,10 @@ class _Dashboard:
         return reply if reply.isdigit() else None
 
     def polyscope(self) -> str | None:
-        """Return the version, such as 5.15.0.1261331."""
         found = re.search(r"\d+(\.\d+)+", self._ask("PolyscopeVersion"))
         return found and found[0]
 
     def program(self) -> str | None:
-        """Return state and name, such as "PLAYING pick.urp"."""
         return self._ask("programState") or None
 
     def in_remote_control(self) -> bool | None:
@@ -69,7 +66,6 @@ class _Dashboard:
         return {"true": True, "false": False}.get(self._ask("is in remote control").lower())
 
     def close(self) -> None:
-        """Disconnect."""
         self._lines.close()
         self._socket.close()
 
@@ -105,12 +101,10 @@ class _RobotApi:
         return self._value("/system/v1/information", "robotType")
 
     def serial(self) -> str | None:
-        """Return the serial number."""
         # Reported from 10.14 on; the control mode from 10.12 on.
         return self._value("/system/v1/information", "serialNumber")
 
     def polyscope(self) -> str | None:
-        """Return the version."""
         return self._value("/versions/v1", "marketingVersion")
 
     def program(self) -> str | None:
@@ -118,12 +112,10 @@ class _RobotApi:
         return self._value("/program/v1/state", "state")
 
     def in_remote_control(self) -> bool | None:
-        """Return whether programs sent over the network are accepted."""
         mode = self._value("/system/v1/controlmode", "mode")
         return None if mode is None else mode == "REMOTE"
 
     def close(self) -> None:
-        """Disconnect."""
         self._connection.close()
 
     def _value(self, path: str, key: str) -> str | None:
@@ -188,7 +180,6 @@ class Services(Protocol):
         """Disconnect."""
 
 
-# PolyScope X has a Robot API in place of the dashboard, and neither reports everything: what is not known is None.
 @dataclass(frozen=True, slots=True)
 class ServicesOf:
     """Asks the services of one controller."""
