@@ -62,7 +62,6 @@ class Clock(ABC):
 
         The last turn finds what arrived in time, however late this thread is.
         """
-        # After its deadline a wait looks once more, because this process may be late and not the device.
         end_ns = self.now_ns() + round(duration_s * 1e9)
         while (left_ns := end_ns - self.now_ns()) > 0:
             yield left_ns / 1e9
@@ -104,10 +103,7 @@ class Clock(ABC):
 
 
 class _RealClock(Clock):
-    """The computer's monotonic clock."""
-
     def now_ns(self) -> int:
-        """Return `time.monotonic_ns()`."""
         return time.monotonic_ns()
 
     def awake_s(self) -> float:
@@ -117,11 +113,9 @@ class _RealClock(Clock):
         return time.monotonic()
 
     def sleep(self, duration_s: float) -> None:
-        """Sleep."""
         time.sleep(max(0.0, duration_s))
 
     def wait(self, waitable: Waitable, timeout_s: float) -> bool:
-        """Wait."""
         return waitable.wait(max(0.0, timeout_s))
 
 

@@ -57,7 +57,6 @@ class Unread(Generic[Item]):
 
     def put(self, item: Item, samples: int = 1) -> None:
         """Add an item of so many samples."""
-        # Too many unread samples are an error, never a dropped sample.
         self._samples += samples
         if self._samples <= self._most:
             self._items.append(item)

@@ -10,7 +10,7 @@ set.
 
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ftdrivers.ati import codec as ati
 from ftdrivers.ati import modbus
@@ -145,22 +145,16 @@ def _robotous_reply(data: bytes) -> str:
     raise ProtocolError("no reply of a Robotous sensor")
 
 
-_robotous_streams = _frames(robotous.deframer)
-
 _BOTA = _KnownOnLine("bota://{port}?baud=230400", 230_400, False, _frames(bota.deframer))
+_ROBOTOUS = _KnownOnLine(
+    "robotous-serial://{port}", 115_200, False, _frames(robotous.deframer), _ROBOTOUS_REQUEST, _robotous_reply
+)
 _KNOWN = (
-    _KnownOnLine("bota://{port}?baud=460800", 460_800, False, _BOTA.streams),
+    replace(_BOTA, url="bota://{port}?baud=460800", baud=460_800),
     _BOTA,
     _KnownOnLine("robotiq-ft300://{port}", 19_200, False, _frames(robotiq.deframer), _ROBOTIQ_REQUEST, _robotiq_reply),
-    _KnownOnLine("robotous-serial://{port}", 115_200, False, _robotous_streams, _ROBOTOUS_REQUEST, _robotous_reply),
-    _KnownOnLine(
-        "robotous-serial://{port}?baud=921600",
-        921_600,
-        False,
-        _robotous_streams,
-        _ROBOTOUS_REQUEST,
-        _robotous_reply,
-    ),
+    _ROBOTOUS,
+    replace(_ROBOTOUS, url="robotous-serial://{port}?baud=921600", baud=921_600),
     _KnownOnLine("ati-serial://{port}", 1_250_000, True, _ati_streams, _ATI_REQUEST, _ati_reply),
 )
 
@@ -207,16 +201,12 @@ def probe_can(
     try:
         with clock.keeping_up():
             bus.open()
-            heard = _hear_bus(bus, clock)
+            heard = [frame for left_s in clock.looks(_LISTEN_BUS_S) if (frame := bus.look(min(left_s, clock.poll_s)))]
             return [answer for sensor in known if (answer := _look(sensor, heard, bus, clock))]
     except StreamBroken as exc:
         raise ConnectError(exc.found, exc.fix) from exc
     finally:
         bus.close()
-
-
-def _hear_bus(bus: CanBus, clock: Clock) -> list[_Frame]:
-    return [frame for left_s in clock.looks(_LISTEN_BUS_S) if (frame := bus.look(min(left_s, clock.poll_s)))]
 
 
 def _look(known: _KnownOnBus, heard: Sequence[_Frame], bus: CanBus, clock: Clock) -> Answer | None:

@@ -204,8 +204,6 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     own_time = {} if clock is REAL else {"clock": clock}
     try:
         sensor: ForceTorqueSensor = driver.from_url(parts.address, options, sign=sign, **own_time)
-    except BadUrl:
-        raise
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}") from exc
     options.reject_others()

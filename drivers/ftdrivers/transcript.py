@@ -280,8 +280,7 @@ def recording(writer: Writer) -> Iterator[None]:
             if not self._noted:
                 self._noted = True
                 settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
-                marks = marks_asked_for(self)
-                writer.event("open", port=self.port, **settings, parity_marks=marks)
+                writer.event("open", port=self.port, **settings, parity_marks=marks_asked_for(self))
 
         def read(self, size: int = 1, /) -> bytes:
             self._note()

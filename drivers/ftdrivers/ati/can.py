@@ -162,8 +162,7 @@ class AtiCanSensor(StreamingSensor):
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
         counts = reading.gauges[np.newaxis]
-        wrench = self._calibration.wrench(counts)
-        return FtSamples.of(t_host_ns, seq, wrench, counts=counts, status=reading.status)
+        return FtSamples.of(t_host_ns, seq, self._calibration.wrench(counts), counts=counts, status=reading.status)
 
     def _poll(self) -> None:
         self._next_poll_s = max(self._next_poll_s + _PERIOD_S, self._clock.now_s())

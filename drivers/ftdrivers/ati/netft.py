@@ -252,7 +252,6 @@ class NetFtSensor(StreamingSensor):
         counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
         counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
         self._wrench_per_count = undo / np.repeat([counts_per_N, counts_per_Nm], 3)
-        model = "OnRobot HEX (Ethernet)" if self._onrobot else configuration.product_name or "ATI Net F/T"
         facts = scale_facts(counts_per_N, counts_per_Nm, "documented" if self._onrobot else "device")
         rating = numbers_in(page, "cfgmr")
         if len(rating) == 6 and min(rating) > 0:
@@ -264,7 +263,7 @@ class NetFtSensor(StreamingSensor):
             units = f"{text_in(page, 'scfgtdu')}, {text_in(page, 'scfgtau')}"
             facts["tool_transformation"] = Fact(f"{text_in(page, 'cfgtfx')} ({units})", "device")
         return DeviceInfo(
-            model=model,
+            model="OnRobot HEX (Ethernet)" if self._onrobot else configuration.product_name or "ATI Net F/T",
             serial=text_in(page, "cfgcalsn") or NOT_REPORTED,
             firmware=text_in(page, "mfgdigver") or NOT_REPORTED,
             facts=facts,

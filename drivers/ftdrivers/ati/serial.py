@@ -161,8 +161,7 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             self._look_at_status(t_host_ns)
         refuse_saturated(self.name, gauges)
-        wrench = self._calibration.wrench(gauges)
-        return FtSamples.of(t_host_ns, seq, wrench, counts=gauges, status=self._status)
+        return FtSamples.of(t_host_ns, seq, self._calibration.wrench(gauges), counts=gauges, status=self._status)
 
     def _discard_backlog(self) -> None:
         """Treat an overflow of the port as a slip, because the start of a record is unknown."""

@@ -97,8 +97,7 @@ class BotaSensor(StreamingSensor):
 
     def _connect(self) -> DeviceInfo:
         self._seen_status = 0
-        first = self._find()
-        times = [frame.t_us for frame in first]
+        times = [frame.t_us for frame in self._find()]
         self._period_us = median((b - a) % _CLOCK for a, b in pairwise(times))
         if not self._period_us:
             raise ConnectError(f"{self.name}: the sensor's clock stands still at {times[-1]} µs", "power it off and on")

@@ -215,8 +215,7 @@ class RobotiqFt300(StreamingSensor):
         counts = np.array([codec.decode_frame(frame) for _, frame in frames], np.int32)
         if (np.abs(counts + 0.5) > 32767).any():
             raise DeviceFault(f"{self.name}: a value is at the end of its range", "take the load off, check the cable")
-        numbers = [number for number, _ in frames]
-        return FtSamples.of(t_host_ns, numbers, counts / codec.COUNTS_PER_UNIT, counts=counts)
+        return FtSamples.of(t_host_ns, [number for number, _ in frames], counts / codec.COUNTS_PER_UNIT, counts=counts)
 
     def _disconnect(self) -> None:
         if not self._port.is_open:

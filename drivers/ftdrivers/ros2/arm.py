@@ -220,8 +220,7 @@ class Ros2Arm(ReadOnlyArm):
         """Report who publishes, and by how much the stamps differ from the clock of this computer."""
         self._check()
         state, ros = self.state(), self._ros
-        publishers = ", ".join(sorted(set(self._publishers.values())))
-        found = f"{self._host} is published by {publishers}"
+        found = f"{self._host} is published by {', '.join(sorted(set(self._publishers.values())))}"
         return [Diagnosis("topic", True, found), *([clock_diagnosis(ros, state.t_device_s)] if ros else [])]
 
 

@@ -73,7 +73,6 @@ class DeviceClock:
 
         Raises `StreamBroken` when the device's clock jumps back or ahead.
         """
-        # A slow clock falls behind steadily, which is no delay.
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
             return np.zeros(len(t_device_s))

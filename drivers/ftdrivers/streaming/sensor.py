@@ -296,7 +296,6 @@ class StreamingSensor(ForceTorqueSensor):
                 self._taps = [tap for tap in self._taps if tap is not unread]
 
     def _read_on(self, unread: Unread[FtSamples], timeout_s: float) -> FtSamples:
-        """Return what a follower has not read."""
         # What arrived before a failure is read before the failure is raised.
         with self._news:
             for left_s in self._clock.looks(timeout_s):

@@ -78,8 +78,9 @@ class CanBus:
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
         try:
-            if self._interface == "slcan":
-                self._take(tty)
+            if self._interface == "slcan":  # python-can does not lock the port
+                self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._bus = can.Bus(
                 self._channel,
                 interface=self._interface,
@@ -97,11 +98,6 @@ class CanBus:
                 up = f"sudo ip link set {self._channel} up type can bitrate {self._bitrate}"
                 fix = f"plug the adapter in, then run {up}"
             raise refusal(self._owner, tty, exc, f"the bus does not open ({exc})", fix) from exc
-
-    def _take(self, tty: str) -> None:
-        """Lock a serial port before python-can opens it, because python-can itself does not."""
-        self._lock = os.open(tty, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def close(self) -> None:
         """Leave the bus. Idempotent."""
