@@ -240,6 +240,7 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
             weight[9:12, 0] = -p.p_sensor_com_m / weight_N
         columns.append(weight)
     if "centre of mass" in blocks:
+        # The product of weight and centre of mass is estimated: readings are linear in it.
         columns.append(np.eye(15)[:, 9:12] / weight_N)
     if "bias" in blocks:
         columns.append(np.eye(15)[:, BIASES])

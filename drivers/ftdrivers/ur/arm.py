@@ -382,6 +382,7 @@ class UrArm(RobotArm):
         guard: Guard,
     ) -> None:
         """Begin a motion that ends at `q`, and return when it has."""
+        # A program of another client found before a move is not stopped.
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None

@@ -180,6 +180,7 @@ class Services(Protocol):
         """Disconnect."""
 
 
+# PolyScope X has a Robot API in place of the dashboard, and neither reports everything: what is not known is None.
 @dataclass(frozen=True, slots=True)
 class ServicesOf:
     """Asks the services of one controller."""
