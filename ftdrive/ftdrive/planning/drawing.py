@@ -93,7 +93,6 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
 
 
 def _joints(axes: Any, sweep: Sweep) -> None:
-    """Draw the wrist joints against time."""
     t_s = np.linspace(0.0, sweep.duration_s, 400)
     q_deg = np.degrees(sweep.at(t_s))
     for joint in WRISTS:

@@ -74,8 +74,7 @@ class Plan(Displayed):
     """How much nearer to anything the arm can be on the curve than on the moves between the steps."""
 
     def _summary(self) -> Summary:
-        words = _summary(self) if self.sweep is None else _sweep_summary(self)
-        return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=words)
+        return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=_summary(self))
 
     @property
     def certified(self) -> bool:
@@ -171,10 +170,8 @@ class Plan(Displayed):
         """
         still = ", ".join(f"{angle:.0f}" for angle in np.degrees(self.steps[0].q_rad[:3]))
         rest = [f"Base, shoulder and elbow stay at {still} degrees."] if self.arm_rests else []
-        rows, summary = (
-            (_table(self), _summary(self)) if self.sweep is None else (_sweep_table(self.sweep), _sweep_summary(self))
-        )
-        return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *summary])
+        rows = _table(self) if self.sweep is None else _sweep_table(self.sweep)
+        return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *_summary(self)])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
         """Return time and angle of a stop until rest, at the plan's highest speed; empty for other drivers."""
@@ -451,7 +448,7 @@ def _as_json(prediction: Prediction) -> dict[str, Any]:
 def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
     """Return the number of moves of an approach, the range of each joint, and whether the whole arm moves."""
     count = len(np.asarray(way_rad)) - 1
-    words = f"{'1 move' if count == 1 else f'{count} moves'} ({turns_in_words(way_rad)}), "
+    words = f"{counted(count, 'move')} ({turns_in_words(way_rad)}), "
     words += f"proven clear by {1e3 * clearance_m:.0f} mm"
     return words + "; the whole arm moves: keep its space clear" if arm_moves(way_rad) else words
 
@@ -492,26 +489,23 @@ def _sweep_table(sweep: Sweep) -> list[str]:
     return lines
 
 
-def _sweep_summary(plan: Plan) -> list[str]:
-    nearest = min(plan.steps, key=lambda step: step.clearance_m)
-    proven = "proven clear along its whole length" if plan.certified else "NOT PROVEN CLEAR"
-    return [
-        f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included.",
-        f"Least clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
-        plan.room_in_words(),
-    ]
-
-
 def _summary(plan: Plan) -> list[str]:
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
-    count, most = len(plan.steps), np.degrees(max(step.turn_rad for step in plan.steps))
-    proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
+    if plan.sweep is None:
+        count, most = len(plan.steps), np.degrees(max(step.turn_rad for step in plan.steps))
+        proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
+        motion = (
+            f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
+            f"{plan.motion_time_s:.0f} s of motion at the plan's speeds."
+        )
+    else:
+        proven = "proven clear along its whole length" if plan.certified else "NOT PROVEN CLEAR"
+        motion = f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included."
     return [
-        f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
-        f"{sum(step.duration_s for step in plan.steps):.0f} s of motion at the plan's speeds.",
+        motion,
         f"Least clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         plan.room_in_words(),
-        *([] if plan.kind in ("verification", "tool", "hung") else [_accuracy(plan)]),
+        *([] if plan.kind in ("verification", "tool", "hung", "sweep") else [_accuracy(plan)]),
     ]
 
 

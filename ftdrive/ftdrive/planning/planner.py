@@ -4,7 +4,7 @@ All 24 orientations are preferred because they are the most informative. Tours t
 rest come first. If some orientations are out of reach, the most informative reachable poses replace them.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -97,16 +97,17 @@ def plan_tour(
     """
     q_now = checked_joints(q_rad)
     _numbers(poses)
-    refusal = (
+    for kind, why, found in _attempts(certifier, q_now, poses, speeds, guess):
+        if found is not None:
+            return make_plan(kind, why, certifier, *found, speeds, guess)
+    raise PlanRefused(
         f"{_reason(poses)}. Another posture, a box for the flange, and other poses were tried: no tour of them is "
         "proven clear and informative enough to estimate everything. Describe the tool more closely, or clear the "
         "surroundings"
     )
-    return _first_found(_attempts(certifier, q_now, poses, speeds, guess), refusal, certifier, speeds, guess)
 
 
 def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, guess: Guess) -> Iterator[Attempt]:
-    """Try each kind of tour, the preferred ones first."""
     numbers, reason = NUMBERS[poses], _reason(poses)
     if poses == 24:
         why = "The constant tour is proven clear at the present posture; base, shoulder and elbow stay at rest."
@@ -135,13 +136,6 @@ def _reason(poses: int) -> str:
     if poses == 24:
         return "The constant tour cannot be proven clear at the present posture"
     return f"{poses} of the 24 orientations were requested"
-
-
-def _first_found(attempts: Iterable[Attempt], refusal: str, certifier: Certifier, speeds: Speeds, guess: Guess) -> Plan:
-    for kind, why, found in attempts:
-        if found is not None:
-            return make_plan(kind, why, certifier, *found, speeds, guess)
-    raise PlanRefused(refusal)
 
 
 def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
@@ -232,15 +226,14 @@ def plan_cone(
             f"180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
     cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
-    attempts = list[Attempt]()
-    if (chosen := chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)) is not None:
-        why = [f"The tool axis stays {cone}.", *_chosen_words(chosen)]
-        attempts = [("cone", why, (chosen.numbers, chosen.q_rad))]
-    refusal = (
-        f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to estimate "
-        "everything: widen the cone, or jog the arm to another posture"
-    )
-    return _first_found(attempts, refusal, certifier, speeds, guess)
+    found = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
+    if found is None:
+        raise PlanRefused(
+            f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to "
+            "estimate everything: widen the cone, or jog the arm to another posture"
+        )
+    why = [f"The tool axis stays {cone}.", *_chosen_words(found)]
+    return make_plan("cone", why, certifier, found.numbers, found.q_rad, speeds, guess)
 
 
 def plan_box(
@@ -269,11 +262,12 @@ def plan_box(
         raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
     centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
     found = _box(certifier, q_now, _numbers(poses), centre, half_size_m, speeds)
-    refusal = (
-        f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are in "
-        "reach, or no tour of them is proven clear: give a larger box, or another centre"
-    )
-    return _first_found([("box", [_box_words(centre, half_size_m)], found)], refusal, certifier, speeds, guess)
+    if found is None:
+        raise PlanRefused(
+            f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are "
+            "in reach, or no tour of them is proven clear: give a larger box, or another centre"
+        )
+    return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
 
 
 def plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:

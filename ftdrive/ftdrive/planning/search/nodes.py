@@ -242,7 +242,6 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     array
         In the order of travel; all joints within one turn of zero.
     """
-    # Joint 4 takes whole turns for the tour as one, because it turns by 90° only.
     # Wrist 3 turns between -135° and 180°: from outside of -20° to 65° another order is used.
     q = checked_joints(q_rad)
     psi, q5, q6 = np.radians(_TOUR_DEG)[:, 1:].T

@@ -71,7 +71,7 @@ def clear_tour(certifier: Certifier, q_rad: Array, group: Nodes, speeds: Speeds)
         return None
     proof, before = _Proof(certifier, q_rad), 0
     for most in MOST_NODES:
-        nodes = _first_of_each_group(group, most)
+        nodes = np.sort(np.concatenate([np.flatnonzero(group == g)[:most] for g in np.unique(group)]))
         if (
             len(nodes) > before
             and (order := _tour_of(certifier, proof, q_rad[nodes], group[nodes], nodes, speeds)) is not None
@@ -185,13 +185,8 @@ def _to_neighbours(q_rad: Array, count: int, among: Nodes) -> tuple[Nodes, Nodes
 
 def _to_every_group(q_rad: Array, group: Nodes, count: int) -> tuple[Nodes, Nodes]:
     """Moves from every node to its nearest ones of each group."""
-    moves = [_to_neighbours(q_rad, count, np.flatnonzero(group == g)) for g in range(group.max() + 1)]
-    start, end = (np.concatenate(ends) for ends in zip(*moves, strict=True))
+    start, end = np.hstack([_to_neighbours(q_rad, count, np.flatnonzero(group == g)) for g in range(group.max() + 1)])
     return start, end
-
-
-def _first_of_each_group(group: Nodes, most: int) -> Nodes:
-    return np.sort(np.concatenate([np.flatnonzero(group == g)[:most] for g in np.unique(group)]))
 
 
 def _length(tour: Nodes, cost: Array) -> float:
