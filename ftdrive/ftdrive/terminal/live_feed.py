@@ -138,7 +138,12 @@ class Feed:
                 self._press(*self._requests.get_nowait())
             except (ConfigError, DeviceError, OSError) as error:
                 self.note(str(error), BAD)
-        self._read()
+        block = self.reader.read()
+        if block is None:
+            self.status = self.stream.status()
+            self._ended.wait(_RETRY_S)
+        else:
+            self.take(block)
         for event in self.stream.take_events():
             self._record(event)
             if event.kind == "tracked":
@@ -168,17 +173,17 @@ class Feed:
             news.notes.append(note)
 
     def _switch_recording(self) -> None:
-        """Start a recording, or complete the one that runs."""
         if self._sink is not None:
             self._stop_recording()
         elif self._recorder is None:
             self.note("recording is not available here: use `ftdrive record -o FILE`")
         else:
-            utc = datetime.fromtimestamp((self._now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
+            now_ns = self.newest_ns or 0
+            utc = datetime.fromtimestamp((now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
             # a recording has poses and a calibration, a table of readings has not
             kind, ending = ("raw", "csv") if self.stream.info.is_raw else ("live", "mcap")
             path = Path(f"{kind}-{utc:%Y-%m-%dT%H%M%SZ}.{ending}").absolute()
-            self._sink, self.recording_since_ns = self._recorder(path), self._now_ns
+            self._sink, self.recording_since_ns = self._recorder(path), now_ns
             self.recorded.append(path)
             self.note(f"recording to {path}")
 
@@ -188,18 +193,6 @@ class Feed:
                 self.step()
         except BaseException as error:  # the main thread raises it
             self.crash = error
-
-    @property
-    def _now_ns(self) -> int:
-        return self.newest_ns or 0
-
-    def _read(self) -> None:
-        block = self.reader.read()
-        if block is None:
-            self.status = self.stream.status()
-            self._ended.wait(_RETRY_S)
-        else:
-            self.take(block)
 
     def _record(self, item: Block | StreamEvent | None) -> None:
         """Hand something to the recorder, None to complete it; its failure ends the recording, never the screen."""

@@ -64,7 +64,6 @@ def head(view: View, width: int, page: Line | None = None) -> list[Line]:
 
 
 def _title(view: View, width: int) -> Line:
-    """Name the devices, and whether the numbers are live."""
     line = Line(" ftdrive live", STRONG).add("  ")
     line.add(" · ".join(filter(None, [view.info.arm.model, _named(view.info.sensor), view.info.tool])))
     right = Line()
@@ -86,7 +85,6 @@ def _replay(replay: ReplayedStream) -> Line:
 
 
 def _provenance(view: View, width: int) -> Line:
-    """Name the stages, what the numbers are, their axes and their reference point."""
     line = Line(" ")
     if view.reading is None:
         return line.add("waiting for the first sample").fit(width)
@@ -138,7 +136,6 @@ def _point(frame: WrenchFrame) -> str:
 
 
 def _state(view: View, width: int) -> Line:
-    """Name the calibration, the tare and the drift of the bias."""
     calibration, status = view.info.calibration, view.status
     if view.info.is_raw:
         line = Line(" sensor alone: no arm, no calibration", WARNING)
@@ -153,12 +150,10 @@ def _state(view: View, width: int) -> Line:
         line.add(f"  tare {time_of_day(view.info, status.tare_t_host_ns)[:5]} {force_N:.2f} N")
     elif status.tracked is None:
         line.add("  tare ").add("none", FAINT)
-    if view.info.is_raw:
-        return line.fit(width)
-    if status.tracked is not None:
+    if status.tracked is not None and not view.info.is_raw:
         line.add(f"  {status.tracked.in_words()}")
-        return line.fit(width)
-    line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
+    elif not view.info.is_raw:
+        line.add(f"  drift {_rounded(status.drift_N_h)} ± {_rounded(status.drift_sigma_N_h)} N/h")
     return line.fit(width)
 
 
@@ -211,7 +206,8 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
             if bar_cells:
                 line.to(_NUMBERS).join(_bar(view, i, full, bar_cells))
             if trace_cells:
-                line.add("  ").join(_trace(columns, i, full))
+                ink = characters(envelope(columns.low[i], columns.high[i], 1, full))[0]
+                line.add("  ").join(layers(ink, np.zeros_like(ink), columns.contact_cells))
             lines.append(line.fit(width))
         size = _size(view, first, places).to(_NUMBERS)
         lines.append(size.join(_contact(view) if first == 0 else line_of_force(view.reading)).fit(width))
@@ -308,11 +304,6 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
     return Line(rest, FAINT).add(filled[::-1], style).add("│" + "·" * half, FAINT)
 
 
-def _trace(columns: PlotColumns, i: int, full: float) -> Line:
-    ink = characters(envelope(columns.low[i], columns.high[i], 1, full))[0]
-    return layers(ink, np.zeros_like(ink), columns.contact_cells)
-
-
 def layers(ink: Codes, paper: Codes, in_contact: NDArray[np.bool_]) -> Line:
     """Draw packed characters (n,), and the paper where there is no ink; contact has its own colour."""
     line = Line()
@@ -361,7 +352,9 @@ def links(view: View, width: int) -> list[Line]:
     """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
     if view.info.is_raw:
         return [line.fit(width) for line in (_raw(view), _range(view), _link("sensor", view.status.sensor))]
-    dial = _dial(view)
+    dial = [""] * 5
+    if view.reading is not None:
+        dial = _arrow(view.reading.R_base_flange.T @ _unit(view.info.calibration.gravity_force_base_N))
     rows = [_raw(view), _range(view), _link("sensor", view.status.sensor), _link("robot", view.status.arm)]
     if view.replay is None:
         sigma_s = view.status.delay_sigma_s
@@ -371,12 +364,6 @@ def links(view: View, width: int) -> list[Line]:
     payload = next((check for check in view.checks if check.name == "robot.payload"), None)
     rows.append(Line(" payload   ", FAINT).join(_checked(payload) if payload else Line("not checked", FAINT)))
     return [Line(left).to(12).join(right).fit(width) for left, right in zip(dial, rows, strict=True)]
-
-
-def _dial(view: View) -> list[str]:
-    if view.reading is None:
-        return [""] * 5
-    return _arrow(view.reading.R_base_flange.T @ _unit(view.info.calibration.gravity_force_base_N))
 
 
 def _arrow(down_flange: Array) -> list[str]:
@@ -421,7 +408,8 @@ def _link(name: str, link: LinkStatus) -> Line:
     is_usual = check_rate(link.rate_Hz, link.nominal_rate_Hz).state == "ok"
     line.add(f"{link.rate_Hz:.0f}{nominal} Hz", "" if is_usual else WARNING)
     line.add("  ").add(f"lost {link.lost}", WARNING if link.lost else "")
-    return line.add("  ").add(f"age {_short(link.age_s)}", BAD if link.error else "")
+    age = f"{1e3 * link.age_s:.0f} ms" if link.age_s < 1 else f"{link.age_s:.1f} s"
+    return line.add("  ").add(f"age {age}", BAD if link.error else "")
 
 
 def _checked(check: Check) -> Line:
@@ -604,10 +592,6 @@ def _clock(duration_s: float) -> str:
     minutes, seconds = divmod(int(duration_s), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours:02d}:{minutes:02d}:{seconds:02d}"
-
-
-def _short(duration_s: float) -> str:
-    return f"{1e3 * duration_s:.0f} ms" if duration_s < 1 else f"{duration_s:.1f} s"
 
 
 def plain(view: View, width: int) -> list[Line]:

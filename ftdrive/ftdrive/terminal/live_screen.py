@@ -183,18 +183,15 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
     columns = view.columns(2 * cells)
     full = [live_panels.full_scale(columns, view.reading, first) for first in (0, 3)]
     drawn = [_plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
+    below = 6 // across
+    beside = [parts for first in range(below) for parts in zip(*drawn[first::below], strict=True)]
     lines = []
-    for first in range(6 // across):
-        beside = drawn[first::3] if across == 2 else [drawn[first]]
-        for parts in zip(*beside, strict=True):
-            line = Line()
-            for part in parts:
-                line.join(part.fit(width // across))
-            lines.append(line.fit(width))
-    axis = Line()
-    for _ in range(across):
-        axis.join(_time_axis(columns, cells).fit(width // across))
-    return [*lines, axis.fit(width)]
+    for parts in (*beside, [_time_axis(columns, cells) for _ in range(across)]):
+        line = Line()
+        for part in parts:
+            line.join(part.fit(width // across))
+        lines.append(line.fit(width))
+    return lines
 
 
 def _time_axis(columns: PlotColumns, cells: int) -> Line:

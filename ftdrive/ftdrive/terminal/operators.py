@@ -67,11 +67,9 @@ class _Keyless:
     supervisor: Supervisor
 
     def absence(self) -> str | None:
-        """Return why the session is not followed any more; see `Operator`."""
         return self.supervisor.absence()
 
     def pressed(self) -> Key | None:
-        """Return None."""
         return None
 
 

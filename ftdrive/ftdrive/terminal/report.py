@@ -13,7 +13,7 @@ from ftcalib import CalibrationResult
 from ftcalib.compare import MethodResult
 from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.likelihood.response import LEAST_COMMON_GAIN
-from ftcalib.rounding import to_place_of, with_sigma
+from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.pose_hints import find_moved, hints, names_of
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
@@ -401,8 +401,7 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
 
 def print_verification(verified: Verified) -> None:
     """Print measured and predicted wrench of each pose, the verdict with its limits, and what has changed."""
-    found, n = verified.verification, len(verified.records)
-    count = f"{n} poses" if n > 1 else "1 pose"
+    found, count = verified.verification, counted(len(verified.records), "pose")
     answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     for mark in verified.marks:
         answer.print(f" {mark}", style="yellow")

@@ -244,7 +244,6 @@ def _last(view: SessionView) -> list[Text]:
 
 
 def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
-    """Return what the poses show: estimates and their coverage, or in a verification the poses compared."""
     if view.command == "calibrate":
         return [*_estimates(view, with_cube=with_cube), *_coverage(view, width)]
     lines = [Text("measured minus predicted, ± one sigma expected", "dim")]

@@ -123,7 +123,6 @@ class SessionText:
 
 
 def _plan_in_brief(plan: Plan) -> tuple[str, str]:
-    """Describe a plan in two lines: its motion and clearance, and the room to keep clear."""
     nearest = min(plan.steps, key=lambda step: step.clearance_m)
     count = len(plan.steps)
     clear = f"{1e3 * nearest.clearance_m:.0f} mm"
@@ -241,7 +240,6 @@ def proposal_in_lines(push: Push) -> list[str]:
 
 
 def _table(push: Push) -> list[str]:
-    """Return a row for each value that is to be set, as wide as a narrow terminal."""
     values = {
         "mass, kg": (push.old.mass_kg, push.new.mass_kg, 1.0, 3),
         "centre, mm": (push.old.p_flange_com_m, push.new.p_flange_com_m, 1e3, 1),

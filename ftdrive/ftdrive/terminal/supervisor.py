@@ -116,7 +116,6 @@ class Supervisor:
 
 
 def _descriptor(stream: IO[str]) -> int | None:
-    """Return the file descriptor of a stream; None for one that is not of the system."""
     try:
         return stream.fileno()
     except (OSError, ValueError):
