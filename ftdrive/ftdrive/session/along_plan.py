@@ -17,7 +17,6 @@ from ftcalib.data.dwell_mean import LEAST_SAMPLES, averaging_time, mean_and_cova
 from ftcalib.files import read_file
 from ftcalib.model import Array
 from ftcalib.rounding import to_place_of
-from ftcalib.routine import PoseRecord
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import Approach, plan_approach
@@ -109,7 +108,6 @@ class _SafetyQuestions:
 
 
 def _load_questions(load: Load | None) -> list[str]:
-    """Return what is asked about a load on the tool."""
     if load is None:
         return []
     if load.gripped:
@@ -146,8 +144,6 @@ def take_along_plan(session: Session) -> Run | None:
 
 
 class _AlongPlan:
-    """A session in which the arm goes along a plan."""
-
     def __init__(self, session: Session) -> None:
         self._session, self.cell, self.task, self.options = session, session.cell, session.task, session.options
         self._onlookers: tuple[guards.Guard, ...] = ()
@@ -157,11 +153,13 @@ class _AlongPlan:
         cell, dry_run, plan = self.cell, self.options.dry_run, self._session.plan
         certifier = self._certifier()
         if plan is None:
-            plan = self._plan(certifier)
+            q = np.round(cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
+            plan = self.task.plan(certifier, q, self.options.poses)
         elif plan is not (own := plan.of_arm(certifier)):
             cell.note("the plan was made with other kinematics: its moves are proven again with those of this arm")
             plan = own
-        kept = self._kept()
+        records = [] if self._session.resumed is None else self._session.resumed.records()
+        kept = [record for record in records if record.stop not in self.options.redo]
         taken = {record.stop for record in kept}
         todo = [stop for stop in plan.stops if stop not in taken]
         judge = self.task.judge(by_hand=False)
@@ -188,10 +186,6 @@ class _AlongPlan:
     def _serial(self) -> str:
         return self.cell.arm.identify().serial
 
-    def _is_slow(self, before: Before) -> bool:
-        """Whether the arm moves at the speed of a first run."""
-        return self.options.real and not (self.options.fast and before.known)
-
     def _certifier(self) -> Certifier:
         arm = self.cell.arm
         if not self.options.dry_run and arm.status().tcp_offset is None:
@@ -201,15 +195,6 @@ class _AlongPlan:
         load = self.options.load
         hook_m = None if load is None else load.p_flange_m
         return certifier_for(self.task.cell, info.model, kinematics_of(info), hook_m)
-
-    def _plan(self, certifier: Certifier) -> Plan:
-        q = np.round(self.cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD
-        return self.task.plan(certifier, q, self.options.poses)
-
-    def _kept(self) -> list[PoseRecord]:
-        """Return the poses of the resumed run that are not taken again."""
-        records = [] if self._session.resumed is None else self._session.resumed.records()
-        return [record for record in records if record.stop not in self.options.redo]
 
     def _look(self, certifier: Certifier, plan: Plan, todo: Sequence[int]) -> Before:
         """Plan the approach to the first pose that is left, listen to the resting sensor, and show every motion."""
@@ -241,14 +226,13 @@ class _AlongPlan:
         force_N, torque_Nm = rms_sigma(sigma)
         noise = f"sigma of {sampling.average_s:g} s averages: {force_N:.2g} N, {to_place_of(torque_Nm, torque_Nm)} N·m"
         cell.note("; ".join(filter(None, (noise, self.task.forecast(plan, before.certifier, sigma)))))
-        slow = self._is_slow(before)
+        slow = self.options.real and not (self.options.fast and before.known)
         if self.options.fast and slow:
             why = f": {_NO_SERIAL}" if self._serial == NOT_REPORTED else ""
             cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
         speeds = speeds_of(self.task.cell)
         driven = plan.limited(before.certifier, speeds.limited(SLOW) if slow else speeds)
-        total_s = moves_s(driven, todo, before.approach)
-        total_s += len(todo) * (sampling.average_s + 0.6)
+        total_s = moves_s(driven, todo, before.approach) + len(todo) * (sampling.average_s + 0.6)
         cell.note(
             f"{len(todo)} stops left, at most {np.degrees(driven.top_speed_rad_s):.0f} °/s: "
             f"about {total_s / 60:.1f} min{f'; {taken} poses taken before' if taken else ''}"
@@ -358,7 +342,6 @@ def _quiet_std(driven: Before) -> Array:
 
 
 def _show_plan(before: Before, options: SessionOptions) -> None:
-    """Show every motion to come: in words, and as the options ask in files."""
     cell, plan, way = before.cell, before.plan, before.approach.way_rad
     words = "The arm stands at the first pose."
     if len(way):

@@ -68,15 +68,11 @@ class State(StrEnum):
     HOLD = "hold"
 
 
-def _now() -> str:
-    return datetime.now(UTC).isoformat()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Event:
     """Base of all events."""
 
-    t_utc: str = field(default_factory=_now)
+    t_utc: str = field(default_factory=lambda: datetime.now(UTC).isoformat())
 
     def to_dict(self) -> dict[str, Any]:
         """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""

@@ -264,7 +264,6 @@ class HandGuided:
         return False
 
     def _take(self, state: ArmState) -> None:
-        """Take the pose where the arm stands, or show why not."""
         others = {stop: turned_rad(record.before, state) for stop, record in self._taken.items() if stop != self._redo}
         nearest = min(others, key=others.__getitem__, default=0)
         first = min(self._taken, default=0)
@@ -348,7 +347,6 @@ class HandGuided:
         return self._light == "green" and not (self._listen or self._ends_by_itself)
 
     def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
-        """Show what the poses show with one more, which is on disk."""
         self._taken[record.stop] = record
         # The quietest pose gives the scatter of the untouched sensor.
         if record.steady:
@@ -362,7 +360,6 @@ class HandGuided:
         self._light = judged.light
 
     def _note_if_touched(self, record: PoseRecord, estimated: Estimated) -> bool:
-        """Show a pose that differs from the fit of the others."""
         sigmas, force_N = estimated.residual_sigma or 0.0, estimated.residual_force_N or 0.0
         touched = estimated.poses >= LEAST_TO_COMPARE and sigmas > SURPRISE_SIGMA and force_N > SURPRISE_N
         if touched:

@@ -77,8 +77,6 @@ def record_passively(
 
 
 class _Recorder:
-    """Writes both streams of a cell into a run, part by part."""
-
     def __init__(self, cell: OpenCell, run: Run) -> None:
         self._cell, self._run = cell, run
         self._unsaved: tuple[list[FtSamples], list[ArmStates]] = [], []
@@ -86,7 +84,6 @@ class _Recorder:
         self.duration_s = 0.0
 
     def record(self, seconds: float, fit: Callable[[float], "Future[tuple[str, bool]]"]) -> None:
-        """Record, and show a fit from time to time, until it is over."""
         cell, clock = self._cell, self._cell.clock
         (self._run.folder / "motion").mkdir()
         begin_s = heard_s = saved_s = clock.now_s()
@@ -126,7 +123,6 @@ class _Recorder:
                 self._save()
 
     def _save(self) -> None:
-        """Write what is not on disk yet as one more part."""
         samples, states = self._unsaved
         if samples and states:
             joined = FtSamples.concatenate(samples), ArmStates.concatenate(states)
@@ -149,7 +145,6 @@ def _fitted(run: Run, at_s: float, setup: Setup, g_m_s2: float) -> tuple[str, bo
 
 
 def _describe_fit(result: CalibrationResult) -> str:
-    """Return what is determined so far, with sigmas, and why it is not good yet."""
     mass = with_sigma(result.mass_kg, float(result.sigma["mass_kg"]))
     force_N, torque_Nm = result.predicted_error()
     used = 0.0 if result.motion is None else 100 * result.motion.used_share

@@ -164,7 +164,6 @@ def _check_plan(before: Before) -> Check:
 
 
 def _check_approach(before: Before) -> Check:
-    """Check that the moves to the first pose are proven clear."""
     approach = before.approach
     if not approach.certified:
         return Check("approach", "failed", "the approach to the first pose is not proven clear", "jog the arm near it")

@@ -5,7 +5,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.emulated import Station
+from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.errors import Declined, NotAccepted
 from ftdrive.runs.source import Outcome
 from ftdrive.session.events import Event, Key, Operator, Question
@@ -107,5 +107,4 @@ def short_calibration(operator: Operator, sensor: str | None = None) -> Calibrat
 def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Station:
     """Return the emulated cell of a calibration for a stream, not started; `sensor` replaces its sensor."""
     # A stream pairs by the controller's clock.
-    pace = ("--time-scale", "1")
-    return Station.of(calibration.provenance.get("station"), sensor, pace)
+    return Station.of(calibration.provenance.get("station"), sensor, REAL_PACE)

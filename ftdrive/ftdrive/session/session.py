@@ -48,12 +48,7 @@ def _require_devices(
 ) -> tuple[str, ...]:
     """Return what is uncertain about the connected devices, where a calibration or a resumed run must have the same.
 
-    Raises
-    ------
-    ConfigError
-        Arm, sensor or mounting is not that of the calibration.
-    PlanRefused
-        As `_require_same_devices`.
+    Raises `ConfigError` if arm, sensor or mounting is not that of the calibration, and as `_require_same_devices`.
     """
     belongs = None if calibration is None else compare_devices(calibration, connected, config.mount)
     if belongs is not None and belongs.others:

@@ -123,7 +123,8 @@ class SweepTour(Tour):
         curve = sweep.at(np.arange(0.0, sweep.duration_s + CURVE_S, CURVE_S))
         with self._sensor.follow() as wrench, self._arm.follow() as poses:
             self._rest(centre)
-            self._confirm_first()
+            if not self._now.confirmed:
+                self._confirm(self._begin_words)
             self._require_at(centre)
             self._show_state(State.SWEEP, stop, f"{sweep.duration_s:.0f} s along the curve of the plan")
             self._now.standing = False
@@ -150,10 +151,6 @@ class SweepTour(Tour):
             ),
             sync=True,
         )
-
-    def _confirm_first(self) -> None:
-        if not self._now.confirmed:
-            self._confirm(self._begin_words)
 
     def _rest(self, centre: np.ndarray) -> None:
         clock = self._watcher.clock

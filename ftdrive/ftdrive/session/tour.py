@@ -361,8 +361,7 @@ class Tour:
                 most_swing_N=None if self._options.load is None else self._options.load.most_swing_N,
             )
         self._guarded.load.judge(record.samples.wrench)
-        average_s = sampling.average_s
-        judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=average_s)
+        judged = self._book.keep(record, stops=self._now.stops, settle_s=settled_s, average_s=sampling.average_s)
         self._guarded.show_new()
         self._journal.show(judged)
         self._now.taken_last = stop
