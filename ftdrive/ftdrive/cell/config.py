@@ -16,6 +16,7 @@ from dataclasses import MISSING, asdict, dataclass, field, fields
 from difflib import get_close_matches
 from inspect import getdoc
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from textwrap import wrap
 from typing import Any
@@ -338,7 +339,8 @@ def settings(
     """
     found: dict[str, Setting] = {}
     if cell is not None:
-        found = _from_cell(cell)
+        values = {key: attrgetter(key)(cell) for key in _KEYS}
+        found = {key: Setting(value, "emulated cell") for key, value in values.items() if value is not None}
     else:
         for path in (user_file(), config or Path(FILE)):
             if path == config or path.is_file():
@@ -397,11 +399,6 @@ def user_file() -> Path:
     home = os.environ.get("XDG_CONFIG_HOME", "")
     folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
     return folder / "ftdrive" / FILE
-
-
-def _from_cell(cell: CellConfig) -> dict[str, Setting]:
-    values = {key: getattr(getattr(cell, section), name) for key in _KEYS for section, name in [key.split(".")]}
-    return {key: Setting(value, "emulated cell") for key, value in values.items() if value is not None}
 
 
 def _from_file(path: Path) -> dict[str, Setting]:
@@ -466,7 +463,6 @@ def _names(section: str) -> list[str]:
 
 
 def _known(unknown: str, kind: str, names: Iterable[str]) -> str:
-    """Return what may have been meant, and all names."""
     near = get_close_matches(unknown, names, 1)
     return f"{f'did you mean {near[0]}? ' if near else ''}the {kind} are {', '.join(names)}"
 

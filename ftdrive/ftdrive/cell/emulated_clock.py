@@ -74,7 +74,10 @@ class EmulatedClock(Clock):
 
     def sleep(self, duration_s: float) -> None:
         """Sleep; a thread that keeps up is not waited for meanwhile."""
-        self._sleep_until(self.now_ns() + round(duration_s * 1e9))
+        deadline_ns = self.now_ns() + round(duration_s * 1e9)
+        self._follow(deadline_ns)
+        while (left_ns := deadline_ns - self._read_ns()) > 0:
+            time.sleep(min(max(left_ns / 1e9, 5e-4), _SUSPECT_S))
         self.now_ns()
 
     def wait(self, waitable: Waitable, timeout_s: float) -> bool:
@@ -128,11 +131,6 @@ class EmulatedClock(Clock):
         slot = self._slot
         if slot is not None:
             self._page[slot + 1] = up_to_ns
-
-    def _sleep_until(self, deadline_ns: int) -> None:
-        self._follow(deadline_ns)
-        while (left_ns := deadline_ns - self._read_ns()) > 0:
-            time.sleep(min(max(left_ns / 1e9, 5e-4), _SUSPECT_S))
 
     def _claim(self) -> int:
         with _claiming:

@@ -6,6 +6,7 @@ from math import isfinite
 from typing import Any
 
 from ftdrive.errors import ConfigError
+from ftdrivers.ur.control import CONTROL_SETTINGS
 
 Rows = tuple[tuple[float, ...], ...]
 # Returns what to do about a value that cannot be used; None for one that can.
@@ -130,8 +131,6 @@ def reject_model(value: str) -> str | None:
 
 def reject_control(value: str) -> str | None:
     """Reject an unknown control path."""
-    from ftdrivers.ur.control import CONTROL_SETTINGS
-
     return None if value in CONTROL_SETTINGS else f"give one of {', '.join(CONTROL_SETTINGS)}"
 
 
