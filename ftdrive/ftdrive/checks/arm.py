@@ -19,11 +19,14 @@ from ftdrivers.errors import DeviceError, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Diagnosis, RobotArm
 from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
+# The centre of the payload may be this far outside the described tool.
 _PAYLOAD_MM: Final = 100.0
 _LINK_S: Final = 0.5
 _LINK_TRIES: Final = 3
+# Random ones, in which an arm is compared with its model.
 _POSTURES: Final = 200
 SLOWEST_SLIDER = 0.05
+"""The time-outs of moves allow for this one."""
 # Rated payloads by Universal Robots' data sheets. Later arms of one model may carry more: see the label of the arm.
 # The curve of payload against the offset of its centre is published only as a picture, in the user manual.
 RATED_KG: Final = (

@@ -17,6 +17,7 @@ from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
+from ftcalib.rounding import counted
 from ftdrive.checks.check import Check, State
 from ftdrive.errors import ConfigError
 from ftdrivers.registry import in_url, split_url
@@ -119,13 +120,9 @@ def check_workcell(cell: "CellConfig", model: str | None) -> Check:
     if not cell.workcell.measured:
         fix = "measure tool, planes and boxes, then set measured = true in [workcell] of ftdrive.toml"
         return Check(name, "failed", "tool and surroundings are placeholders", fix)
-    rows = (cell.tool.cylinders_mm, "cylinder"), (cell.workcell.planes_mm, "plane"), (cell.workcell.boxes_mm, "box")
-    cylinders, planes, boxes = (_counted(len(row), one) for row, one in rows)
+    cylinders, planes = counted(len(cell.tool.cylinders_mm), "cylinder"), counted(len(cell.workcell.planes_mm), "plane")
+    boxes = "1 box" if len(cell.workcell.boxes_mm) == 1 else f"{len(cell.workcell.boxes_mm)} boxes"
     return Check(name, "ok", f"tool of {cylinders}, {planes}, {boxes}, measured")
-
-
-def _counted(count: int, one: str) -> str:
-    return f"{count} {one if count == 1 else 'boxes' if one == 'box' else one + 's'}"
 
 
 def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:

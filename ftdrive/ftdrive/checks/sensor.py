@@ -41,10 +41,7 @@ _LOAD: Final = 0.8
 SATURATION: Final = 0.9
 _MUCH_AT_REST: Final = 0.5
 # A smaller share of the weight at rest is likely to be compensated or zeroed.
-# The centre of the payload may be this far outside the described tool.
-# Random ones, in which an arm is compared with its model.
 _COMPENSATED: Final = 0.1
-"""The time-outs of moves allow for this one."""
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 
@@ -188,7 +185,6 @@ def _usual_fix(error: BaseException, address: SensorAddress) -> str:
 
 
 def _who_answers(address: SensorAddress) -> str:
-    """Return the command that shows which device answers at an address."""
     if address.host is not None:
         return f"ping {address.host}"
     return "ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
