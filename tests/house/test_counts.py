@@ -20,7 +20,7 @@ CEILINGS = {
     "files": 314,
     "dataclasses": 239,
     "public functions and classes": 1443,
-    "import statements inside functions": 417,
+    "import statements inside functions": 334,
     "test lines": 83014,
 }
 ROOMS = {

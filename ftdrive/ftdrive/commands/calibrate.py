@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 from click.core import ParameterSource
 
+from ftcalib.rounding import to_place_of
 from ftdrive.commands.common import (
     CELL,
     CONTROL,
@@ -28,6 +29,7 @@ from ftdrive.commands.common import (
     require_viz,
     runs,
     simulate,
+    start_mover,
     stop_unless_accepted,
     view_options,
     write_json,
@@ -138,7 +140,6 @@ def calibrate(
     continues.
     """
     from ftdrive.cell.emulated import REAL_PACE, Station
-    from ftdrive.commands.common import start_mover
     from ftdrive.runs.load import Load
     from ftdrive.runs.run import Run
     from ftdrive.session.options import SessionOptions, method_of_poses
@@ -207,7 +208,6 @@ def calibrate(
 
 
 def _report(outcome: "Outcome", page: "Page | None", *, simulate: bool, as_json: bool) -> None:
-    """Print the result and what to do next, and show both on the page."""
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.report import print_result
 
@@ -223,11 +223,9 @@ def _report(outcome: "Outcome", page: "Page | None", *, simulate: bool, as_json:
 
 
 def _conclude(page: "Page", result: "CalibrationResult", commands: Sequence[str]) -> None:
-    """Show verdict and estimates of a result."""
     import numpy as np
 
     from ftcalib.estimates import FIXED_BELOW, quantities_of, values_of
-    from ftcalib.rounding import to_place_of
     from ftdrive.terminal.report import error_in_words
     from ftdrive.view.parts import BAD, GOOD, WARN, number
     from ftdrive.view.session_page import conclude

@@ -1,16 +1,22 @@
 """What several commands share: options, JSON on stdout."""
 
+import importlib.util
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import wraps
+from math import isfinite
 from os import fsdecode
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
 
 import click
 
+from ftcalib.files import require_new
+from ftdrive.cli import in_a_sentence
+from ftdrive.errors import BadStore, ConfigError, Declined, NotAccepted
 from ftdrive.terminal.text import echo, in_one_line
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
@@ -49,12 +55,10 @@ def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
 
-def _known_sets(context: click.Context, parameter: click.Parameter, sets: str | None) -> str | None:
+def _known_sets(_context: click.Context, _parameter: click.Parameter, sets: str | None) -> str | None:
     """Refuse unknown sets before a device is opened."""
-    del context, parameter
     if sets is not None:
         from ftcalib.poses.selection import names_of
-        from ftdrive.errors import ConfigError
 
         try:
             names_of(sets)
@@ -174,8 +178,6 @@ class Number(click.FloatRange):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Return the number."""
-        from math import isfinite
-
         number: float = super().convert(value, param, ctx)
         if not isfinite(number):
             self.fail(f"'{value}' is not a number.", param, ctx)
@@ -193,12 +195,9 @@ def require_extra(extra: str, what: str, *modules: str) -> None:
     modules : str
         That it brings.
     """
-    from importlib.util import find_spec
-
-    from ftdrive.errors import ConfigError
     from ftdrivers.installation import missing_extra
 
-    if missing := [name for name in modules if find_spec(name) is None]:
+    if missing := [name for name in modules if importlib.util.find_spec(name) is None]:
         raise ConfigError(missing_extra(what, missing[0], extra))
 
 
@@ -263,9 +262,6 @@ def on_page(
 
 def _last_line(error: BaseException) -> str:
     """Return the line that the terminal prints when an error ends a session."""
-    from ftdrive.cli import in_a_sentence
-    from ftdrive.errors import Declined
-
     if isinstance(error, Declined):
         return str(error)
     return "interrupted" if isinstance(error, KeyboardInterrupt) else f"error: {in_one_line(in_a_sentence(error))}"
@@ -301,9 +297,6 @@ class NewFile(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path; raises `ConfigError`."""
-        from ftcalib.files import require_new
-        from ftdrive.errors import ConfigError
-
         path = Path(fsdecode(super().convert(value, param, ctx)))
         try:
             require_new(path)
@@ -328,8 +321,6 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
     real, emulated : mapping
         Values by option that require a real cell, and that require --simulate. None, False and empty mean not given.
     """
-    from ftdrive.errors import ConfigError
-
     if given := [option for option, value in (real if simulate else emulated).items() if value]:
         fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
         raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
@@ -346,8 +337,6 @@ class Source(NamedTuple):
 
     def check(self) -> None:
         """Raise `ConfigError` for options that exclude one another."""
-        from ftdrive.errors import ConfigError
-
         real = {"--tool": self.tool, "--config": self.described.config, "--robot": self.described.robot}
         check_simulate(self.simulate, real=real)
         if self.path is not None and self.tool is not None:
@@ -382,10 +371,6 @@ TRACK = click.option(
 
 def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
     """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
-    from math import isfinite
-
-    from ftdrive.errors import ConfigError
-
     try:
         values = [float(part) for part in text.split(separator)]
     except ValueError:
@@ -426,7 +411,6 @@ def read_frame(axes: "Axes", about: str) -> "WrenchFrame":
 @contextmanager
 def declined_aborts() -> Iterator[None]:
     """Print why the operator ended a session, and abort the command."""
-    from ftdrive.errors import Declined
     from ftdrive.terminal.console import messages
 
     try:
@@ -447,7 +431,6 @@ def index_run(folder: Path, cell: "CellConfig | None" = None) -> None:
     The run folder is complete without the store, and the next call adds it. Without a real cell the store is that of
     environment and files.
     """
-    from ftdrive.errors import BadStore, ConfigError
     from ftdrive.store.store import Store
     from ftdrive.terminal.console import messages
 
@@ -477,8 +460,6 @@ def store_url(config: Path | None = None) -> str | None:
 
 def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
     """Raise `NotAccepted` for a rejected result that was shown; it mentions the missing file if one was requested."""
-    from ftdrive.errors import NotAccepted
-
     if result.verdict == "rejected":
         unsaved = " and was not saved" if to_be_saved else ""
         codes = ", ".join(one.code for one in result.findings if one.severity != "note")
@@ -487,8 +468,6 @@ def stop_unless_accepted(result: "CalibrationResult", *, to_be_saved: bool = Fal
 
 def stop_unless(passed: bool, words: str) -> None:
     """Raise `NotAccepted` with these words unless a check has passed."""
-    from ftdrive.errors import NotAccepted
-
     if not passed:
         raise NotAccepted(words)
 
@@ -524,8 +503,6 @@ def rehearsed_run(sensor: str | None, **options: Any) -> Iterator[Path]:
     options
         As of `SessionOptions`.
     """
-    from tempfile import TemporaryDirectory
-
     from ftdrive.cell.emulated import Station
 
     with TemporaryDirectory(prefix="ftdrive-") as runs:

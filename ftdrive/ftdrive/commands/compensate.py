@@ -6,8 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.errors import BadDataset
+from ftcalib.rounding import with_sigma
 from ftdrive.commands.common import BAG_TOPICS, FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
 from ftdrive.commands.tables import TABLE
+from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -65,7 +68,6 @@ def compensate(
     table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), each at its own rate, or
     a bag of ROS 1 or ROS 2. --columns and the options beside it say what a table does not.
     """
-    from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import compensate_recording
     from ftdrive.recording.files import format_of, is_bag
     from ftdrive.runs.source import SolveOptions, read_calibration
@@ -132,8 +134,6 @@ def _open(
     everything: bool,
 ) -> tuple["Source", dict[str, float] | None]:
     """Return the recording with the calibration, and the delay of one of another program with one sigma."""
-    from ftcalib.errors import BadDataset
-    from ftdrive.errors import ConfigError
     from ftdrive.recording.compensation import NEEDED, read_with_calibration
     from ftdrive.recording.foreign import table_words, tables_of
     from ftdrive.recording.recording import ROW
@@ -159,7 +159,6 @@ def _open(
 
 
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
-    from ftcalib.rounding import with_sigma
     from ftdrive.runs.verification import MARKS
 
     yield from (f" {MARKS[mark]}" for mark in result["marks"])

@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from ftdrive.commands.common import JSON, NewFile, write_json
+from ftdrive.errors import BadRecording, ConfigError
 
 
 @click.command()
@@ -17,7 +18,6 @@ def convert(source: Path | None, target: Path | None, output: Path | None, as_js
 
     IN may also be the .partial of a recording that was interrupted; OUT is complete then.
     """
-    from ftdrive.errors import BadRecording, ConfigError
     from ftdrive.recording.files import RecordingReader, format_of, is_recording
     from ftdrive.recording.recorder import converted
     from ftdrive.terminal.console import beside, messages, working

@@ -186,7 +186,6 @@ def _show_loads(outcome: "Outcome", solution: "LoadSolution", truth: Mapping[str
 
 
 def _draw(cell: CellConfig, run: Run) -> None:
-    """Draw the sweep into its run, where matplotlib is installed."""
     from ftdrive.planning.drawing import draw
     from ftdrive.planning.plan import Plan
     from ftdrive.planning.planner import certifier_for

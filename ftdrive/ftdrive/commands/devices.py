@@ -1,7 +1,7 @@
 """`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from rich.text import Text
@@ -12,10 +12,8 @@ from ftcalib.errors import UsageError
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
 from ftdrive.terminal.console import answer, hanging
+from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
-
-if TYPE_CHECKING:
-    from ftdrivers.clock import Clock
 
 _PLACES = """\b
 A PLACE is
@@ -74,7 +72,7 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
     }
 
 
-def _answers(place: str, clock: "Clock", failures: list[Exception]) -> list[dict[str, Any]]:
+def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
     """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
     from ftdrive.checks.discovery import ask
 

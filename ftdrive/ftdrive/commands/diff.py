@@ -1,13 +1,15 @@
 """`ftdrive diff`: the difference of two calibrations, in sigmas."""
 
 from dataclasses import dataclass
-from math import degrees
+from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.rounding import to_place_of
 from ftdrive.commands.common import JSON, store_url, write_json
+from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -25,8 +27,6 @@ _ROWS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Side:
-    """One of the two calibrations."""
-
     calibrated: "Estimated"
     id: str
     path: str
@@ -90,7 +90,6 @@ def diff(first: str, second: str, as_json: bool) -> None:
 
 def _side(text: str) -> _Side:
     """Find a calibration by path or id; raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
     from ftdrive.runs.source import read_calibration
     from ftdrive.runs.verification import EMULATED, marks_of
     from ftdrive.store.records import mass_sigma_kg
@@ -131,8 +130,6 @@ def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
 
 
 def _line(label: str, change: float, sigma: float) -> str:
-    from ftcalib.rounding import to_place_of
-
     if change == 0:
         return f"{label:22}{'same':>12}"
     spread, ratio = (to_place_of(sigma, sigma), f"{change / sigma:+11.1f}") if sigma > 0 else ("known", "")
@@ -152,8 +149,6 @@ def _describe_difference(found: "Difference", sensors: tuple[str, str] | None) -
 
 
 def _parameter(found: "Difference", i: int) -> dict[str, Any]:
-    from math import isfinite
-
     from ftcalib.model import PARAMETER_NAMES
 
     ratio = float(found.in_sigmas[i])
@@ -166,7 +161,5 @@ def _parameter(found: "Difference", i: int) -> dict[str, Any]:
 
 
 def _as_json(test: "ChiSquare") -> dict[str, Any]:
-    from math import isfinite
-
     chi2 = test.chi2 if isfinite(test.chi2) else None
     return {"chi2": chi2, "dof": test.dof, "p_value": test.p_value}

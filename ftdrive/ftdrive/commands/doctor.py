@@ -163,7 +163,6 @@ def doctor(
 
 
 def _examine_robot(cell: CellConfig, stack: ExitStack) -> tuple[list[Check], RobotArm | None]:
-    """Return the checks of the arm, and the arm where it could be opened."""
     if not cell.robot.host:
         found = "the sensor is checked alone, because [robot] host and --robot are not set"
         return [Check("robot.reachable", "skipped", found)], None

@@ -19,6 +19,7 @@ from ftdrive.commands.common import (
     simulate,
     write_json,
 )
+from ftdrive.errors import ConfigError
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N
 from ftdrive.terminal.text import Group, echo
 
@@ -52,7 +53,6 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
     The program asks before it moves, and stops unless the arm is near the first pose, because the approach is not
     planned. Unlike `ftdrive calibrate`, it has no guards.
     """
-    from ftdrive.errors import ConfigError
     from ftdrive.exports import urscript
     from ftdrive.planning.plan import Plan
 
@@ -243,8 +243,6 @@ def _deliver(
 @contextmanager
 def _calibrated(source: Path | None, sensor: str | None, *, simulate: bool) -> Iterator[Path]:
     """Give the calibration file or run folder to export; that of an emulated cell is temporary."""
-    from ftdrive.errors import ConfigError
-
     if simulate:
         from ftdrive.commands.common import rehearsed_run
 

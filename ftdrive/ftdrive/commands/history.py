@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
-from ftdrive.terminal.text import echo
-
-if TYPE_CHECKING:
-    from ftdrive.runs.verification import VerificationRecord
-    from ftdrive.store.records import StoredResult, StoredWeighings
+from ftdrive.errors import ConfigError
+from ftdrive.runs.verification import VerificationRecord
+from ftdrive.store.history import age_days, drifts, warnings
+from ftdrive.store.records import StoredResult, StoredWeighings, read_records, record_paths
+from ftdrive.terminal.text import GLUE, echo, print_table
 
 
 @click.command()
@@ -41,11 +41,6 @@ def history(
     Where a sensor reports its temperature, its bias is fitted against that too. Runs within hours show how far the bias
     moves in an hour.
     """
-    from ftdrive.errors import ConfigError
-    from ftdrive.runs.verification import VerificationRecord
-    from ftdrive.store.history import drifts, warnings
-    from ftdrive.store.records import StoredResult, read_records, record_paths
-
     left_out: tuple[str, ...] = ()
     weighed: Sequence[StoredWeighings] = ()
     name = None
@@ -112,7 +107,7 @@ def history(
             answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-def _hour_changes(results: Sequence["StoredResult"], checks: Sequence["VerificationRecord"]) -> list[dict[str, Any]]:
+def _hour_changes(results: Sequence[StoredResult], checks: Sequence[VerificationRecord]) -> list[dict[str, Any]]:
     """Give how far the bias of each sensor moves in an hour, one standard deviation of an axis, where runs show it."""
     if len(results) + len(checks) < _FEWEST_RUNS:
         return []
@@ -152,9 +147,7 @@ _MOST_DAYS = 20
 _RECENT = timedelta(days=90)
 
 
-def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequence[str], as_json: bool) -> None:
-    from ftdrive.terminal.text import print_table
-
+def _show_weighings(days: Sequence[StoredWeighings], name: str, left_out: Sequence[str], as_json: bool) -> None:
     _print_left_out(left_out)
     if as_json:
         write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})
@@ -167,7 +160,7 @@ def _show_weighings(days: "Sequence[StoredWeighings]", name: str, left_out: Sequ
 _DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 
 
-def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
+def _day_row(one: StoredWeighings) -> tuple[str, ...]:
     return (
         one.day,
         one.arm_serial or one.robot_host or "-",
@@ -180,14 +173,14 @@ def _day_row(one: "StoredWeighings") -> tuple[str, ...]:
     )
 
 
-def _weighing_in_words(one: "StoredWeighings") -> str:
+def _weighing_in_words(one: StoredWeighings) -> str:
     refused = sum(one.refusals.values())
     counts = f"{counted(one.weighings, 'part')}, {refused} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
 
 
-def _mass_in_words(one: "StoredWeighings") -> str:
+def _mass_in_words(one: StoredWeighings) -> str:
     if one.mass_kg is None or one.mass_sigma_kg is None:
         return "-"
     return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"
@@ -198,10 +191,7 @@ _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias
 _OPTIONAL = {"°C", "parent"}
 
 
-def _row(one: "StoredResult", check: "VerificationRecord | None", now: datetime) -> tuple[str, ...]:
-    from ftdrive.store.history import age_days
-    from ftdrive.terminal.text import GLUE
-
+def _row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> tuple[str, ...]:
     verified = "-"
     if check is not None:
         since = age_days(check.created_utc, now)
@@ -224,8 +214,6 @@ def _row(one: "StoredResult", check: "VerificationRecord | None", now: datetime)
 
 
 def _print_table(rows: Sequence[Sequence[str]]) -> None:
-    from ftdrive.terminal.text import print_table
-
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     print_table(
         [_TITLES[n] for n in shown],
@@ -234,11 +222,10 @@ def _print_table(rows: Sequence[Sequence[str]]) -> None:
     )
 
 
-def _as_json(one: "StoredResult", check: "VerificationRecord | None", now: datetime) -> dict[str, Any]:
+def _as_json(one: StoredResult, check: VerificationRecord | None, now: datetime) -> dict[str, Any]:
     import numpy as np
 
     from ftcalib.model import BIASES
-    from ftdrive.store.history import age_days
 
     kept = {name: value for name, value in asdict(one).items() if name != "numbers"}
     bias = {name: one.numbers[name] for name in ("force_bias_N", "torque_bias_Nm", "p_sensor_com_m")}

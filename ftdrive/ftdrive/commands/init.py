@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.errors import UsageError
 from ftdrive.commands.common import (
     JSON,
     MODEL,
@@ -19,7 +20,9 @@ from ftdrive.commands.common import (
     view_options,
     write_json,
 )
-from ftdrive.terminal.text import echo, visible
+from ftdrive.errors import ConfigError
+from ftdrive.terminal.text import echo, in_whole_words, visible
+from ftdrivers.errors import DeviceError
 
 if TYPE_CHECKING:
     from ftdrive.checks.description import Description, Question
@@ -84,7 +87,6 @@ def init(
     from ftdrive.cell.config import clock_in_force, settings
     from ftdrive.cell.emulated import EMULATED, Station, sensor_name
     from ftdrive.checks.description import ROBOT, SENSOR, Description, draft_of
-    from ftdrive.errors import ConfigError
     from ftdrive.terminal.console import beside, messages
 
     if yes and view.wanted:
@@ -215,7 +217,6 @@ class _Interview:
             _say(described.without_shape, "  ! ")
 
     def _former(self, question: "Question") -> str | None:
-        """Return the answer of Enter: the former one, else the usual one."""
         texts = self._described.texts.get(question.key)
         return texts[0] if texts else self._described.usual(question)
 
@@ -254,10 +255,8 @@ class _Interview:
 
     def _find(self, question: "Question") -> None:
         """Ask for the address of a device until one answers; the operator may keep one that does not."""
-        from ftcalib.errors import UsageError
         from ftdrive.checks.description import SENSOR
         from ftdrive.checks.discovery import is_place, places
-        from ftdrivers.errors import DeviceError
 
         described, key = self._described, question.key
         text = self._addresses.pop(key, None)
@@ -292,13 +291,9 @@ class _Interview:
     def _confirmed(self) -> bool:
         """Show all answers; return whether they are to be written, False after a number, whose question is open again.
 
-        Raises
-        ------
-        _Back
-            The last question is to be asked again.
+        Raises `_Back` if the last question is to be asked again.
         """
         from ftdrive.checks.description import ROBOT, SENSOR
-        from ftdrive.errors import ConfigError
 
         described = self._described
         questions = described.questions
@@ -323,8 +318,6 @@ class _Interview:
 
     def _ask(self, question: "Question", words: str, usual: str | None, accept: Callable[[str], None]) -> str:
         """Return the answer to a question, asked again until it is accepted; Enter and --yes take `usual`."""
-        from ftdrive.errors import ConfigError
-
         if self._draft is None:
             if usual is None:
                 raise ConfigError(f"{question.option} is missing and has no default: {words[0].lower()}{words[1:]}")
@@ -348,9 +341,6 @@ class _Interview:
 
     def _prompt(self, words: str, usual: str | None, what: str) -> str:
         """Ask once; raises `_Back`, `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
-        from ftdrive.errors import ConfigError
-        from ftdrive.terminal.text import in_whole_words
-
         shown = in_whole_words(words, sys.stderr)
         try:
             answer: str = click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 import numpy as np
@@ -36,6 +36,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.live.replay import ReplayedStream, replay_run
 from ftdrive.live.samples import Axes, Paired, Sink, StreamInfo, Tracking, WrenchFrame
 from ftdrive.live.stream import RECOVER_S, CompensatedStream
+from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.planning.planner import certifier_for
 from ftdrive.recording import Recorder, RecordingReader, read_recording
 from ftdrive.recording.foreign import tables_of
 from ftdrive.recording.raw_table import RawTable
@@ -51,9 +53,6 @@ from ftdrive.terminal.live_panels import plain as plain_lines
 from ftdrive.terminal.live_view import Summary, View
 from ftdrive.terminal.text import echo
 from ftdrivers.interfaces import Array
-
-if TYPE_CHECKING:
-    from ftdrive.planning.geometry.certify import Certifier
 
 # N and N·m, sensor axes, on the tool of an emulated cell.
 _PUSH = [0.0, 0.0, -8.0, 0.0, 0.0, 0.0]
@@ -177,7 +176,6 @@ def _is_run(path: Path) -> bool:
 
 
 def _recorded_cell(path: Path) -> CellConfig | None:
-    """Return the cell of a run or a recording, where its files describe it."""
     try:
         if _is_run(path):
             return recorded_cell(Run(path).header()["config"])
@@ -186,10 +184,8 @@ def _recorded_cell(path: Path) -> CellConfig | None:
         return None
 
 
-def _certifier(cell: CellConfig, model: str) -> "Certifier | None":
+def _certifier(cell: CellConfig, model: str) -> Certifier | None:
     """Describe arm and tool of a cell; None where it does not describe them."""
-    from ftdrive.planning.planner import certifier_for
-
     try:
         return certifier_for(cell, model)
     except ConfigError as error:

@@ -3,11 +3,13 @@
 from contextlib import ExitStack
 from datetime import UTC, datetime
 from itertools import repeat
+from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.rounding import with_sigma
 from ftdrive.commands.common import JSON, SOURCE, Number, Source, stop_unless, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.text import Group, echo, visible
@@ -53,8 +55,6 @@ def check(
     rests. The answer has scale and line of action with one sigma of each, and whether the error is within what the
     sensor promises. The exit code is 7 if it is not.
     """
-    from math import isfinite
-
     from ftcalib.after.weighing import drift_since
     from ftcalib.loads.check import check_load
     from ftdrive.cell.emulated import TOOL_MM
@@ -156,10 +156,6 @@ def _weighed(stream: Any, mass_kg: float, poses: int, wait_s: float, *, replayed
 
 
 def _print_check(found: "LoadCheck", load: "KnownLoad") -> None:
-    from math import degrees
-
-    from ftcalib.rounding import with_sigma
-
     off = with_sigma(100 * found.scale_error, 100 * found.scale_sigma, "+")
     echo(f"reads {found.read_N:.3f} N, expected {found.expected_N:.3f} N: {off} %")
     line = ""
@@ -281,8 +277,6 @@ def _solution_json(solution: "LoadSolution", saved: Path | None) -> dict[str, An
 
 
 def _print_solution(solution: "LoadSolution", prior: "SensorMatrix", saved: Path | None) -> None:
-    from ftcalib.rounding import with_sigma
-
     echo(f"{'load':14}{'mass, kg':>22}{'place from the flange, mm':>44}")
     for one in solution.loads:
         place = ", ".join(
@@ -302,7 +296,6 @@ def _print_solution(solution: "LoadSolution", prior: "SensorMatrix", saved: Path
 
 def _print_matrix(sensor: "SensorMatrix") -> None:
     from ftcalib.loads.solve import AXES
-    from ftcalib.rounding import with_sigma
 
     diagonal = zip(AXES, sensor.error.diagonal(), sensor.sigma.diagonal(), strict=True)
     echo("diagonal, %: " + ", ".join(f"{axis} {with_sigma(100 * e, 100 * s, '+')}" for axis, e, s in diagonal))

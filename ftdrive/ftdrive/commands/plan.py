@@ -24,6 +24,7 @@ from ftdrive.commands.common import (
     view_options,
     write_json,
 )
+from ftdrive.errors import ConfigError
 
 if TYPE_CHECKING:
     from ftdrive.planning.geometry.certify import Certifier
@@ -117,7 +118,6 @@ def plan(
 
     from ftdrive.cell.config import cell_of, settings
     from ftdrive.cell.emulated import Station
-    from ftdrive.errors import ConfigError
     from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
     from ftdrive.terminal.console import answer, messages, working
 
@@ -194,7 +194,6 @@ def plan(
 
 
 def _next_command(tour: Mapping[str, object], output: Path | None, *, simulate: bool) -> str:
-    """Return the command that drives the plan: from its file, else by the same options."""
     same = {"--simulate": simulate, **(tour if output is None else {f"--plan {quote(str(output))}": True})}
     command = " ".join(["ftdrive calibrate", *(option for option, given in same.items() if given)])
     return f"{command}   (asks before anything moves)"
@@ -210,8 +209,6 @@ def _show(page: "Page", plan: "Plan", certifier: "Certifier") -> None:
 
 
 def _tip_speed(text: str | None) -> float | None:
-    from ftdrive.errors import ConfigError
-
     if text is None or _unlimited(text):
         return None
     try:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.rounding import with_sigma
 from ftdrive.commands.common import (
     FRAME,
     JSON,
@@ -109,13 +110,9 @@ def _record_stream(
     count: int | None = None,
     show: Callable[[str], object] = lambda _: None,
 ) -> None:
-    """Record until the end or an exception, and complete the files; `show` gets in words how far it is.
-
-    Raises what the stream or a file raises.
-    """
+    """Record until the end or an exception, and complete the files; `show` gets in words how far it is."""
     import numpy as np
 
-    from ftcalib.rounding import with_sigma
     from ftdrive.live.samples import StreamEvent
 
     try:
@@ -129,7 +126,7 @@ def _record_stream(
                 if left >= len(block) or event.t_host_ns < block.t_host_ns[left]:
                     recorder.event(event)
             recorder.write(block.rows(slice(left)))
-            show(_so_far(recorder))
+            show(f"{recorder.duration_s:.1f} s, {recorder.samples} samples, gaps: {recorder.gaps}")
             if left < len(block) or recorder.samples == count:
                 return
     finally:
@@ -142,10 +139,6 @@ def _record_stream(
         values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
         recorder.event(StreamEvent(recorder.last_ns, "delay", text, values))
         recorder.close(show)
-
-
-def _so_far(recorder: "Recorder") -> str:
-    return f"{recorder.duration_s:.1f} s, {recorder.samples} samples, gaps: {recorder.gaps}"
 
 
 def _report(recorder: "Recorder", frame: "WrenchFrame", name: str, *, as_json: bool) -> None:

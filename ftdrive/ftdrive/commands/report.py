@@ -155,7 +155,6 @@ def _format_of(output: Path | None) -> Format:
 
 
 def _folder_of(source: Path | None) -> Path:
-    """Return where a report is kept: in its run, or beside its source."""
     if source is None:
         return Path()
     return source if is_run(source) else source.parent

@@ -1,5 +1,6 @@
 """The options that describe a table of another program, for the commands that read one."""
 
+import tomllib
 from collections.abc import Callable, Mapping
 from functools import wraps
 from pathlib import Path
@@ -8,7 +9,10 @@ from urllib.parse import parse_qsl
 
 import click
 
+from ftcalib.files import read_file
 from ftdrive.commands.common import Number, numbers
+from ftdrive.errors import ConfigError
+from ftdrivers.errors import BadUrl
 
 if TYPE_CHECKING:
     from ftdrivers.interfaces import Array
@@ -94,11 +98,6 @@ def _columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
 
     Raises `ConfigError` or `OSError`.
     """
-    import tomllib
-
-    from ftcalib.files import read_file
-    from ftdrive.errors import ConfigError
-
     if text.endswith(".toml"):
         try:
             found = tomllib.loads(read_file(text).decode())
@@ -116,8 +115,6 @@ def _columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
 
 def _forward(model: str | None, urdf: str | None) -> "Callable[[Array], tuple[Array, Array]] | None":
     """Return what makes poses of joint angles (n, 6). Raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
-
     if model is not None and urdf is not None:
         raise ConfigError("--model and --urdf both describe the arm: leave one out")
     if urdf is not None:
@@ -138,8 +135,6 @@ def _forward(model: str | None, urdf: str | None) -> "Callable[[Array], tuple[Ar
 
 
 def _chain(urdf: str) -> "Callable[[Array], tuple[Array, Array]]":
-    from ftdrive.errors import ConfigError
-    from ftdrivers.errors import BadUrl
     from ftdrivers.ros2.poses import Chain
 
     file, _, query = urdf.partition("?")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
+from ftcalib.rounding import to_place_of
 from ftdrive.commands.common import (
     CALIBRATION,
     CELL,
@@ -20,19 +21,21 @@ from ftdrive.commands.common import (
     declined_aborts,
     index_run,
     on_page,
+    rehearse,
     runs,
     simulate,
+    start_mover,
     stop_unless_accepted,
     view_options,
     write_json,
 )
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, Declined, NotAccepted
+from ftdrive.runs.verification import AcceptanceLimits, Verified, save_update, verify_run
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
     from ftdrive.cell.emulated import Station
     from ftdrive.runs.run import Mode
-    from ftdrive.runs.verification import AcceptanceLimits, Verified
     from ftdrive.session.options import SessionOptions
     from ftdrive.view.page import Page
 
@@ -96,8 +99,6 @@ def verify(
     --max-torque, 1 of 100 verifications near the poses of the fit is a false alarm, more far from them. A
     verification that fails names what has changed, offers the smallest sufficient update, and ends with exit code 7.
     """
-    from ftdrive.errors import NotAccepted
-    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.options import SessionOptions
 
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
@@ -121,23 +122,21 @@ def verify(
 def verify_cell(
     cell: "CellConfig",
     path: Path,
-    limits: "AcceptanceLimits",
+    limits: AcceptanceLimits,
     options: "SessionOptions",
     station: "Station | None" = None,
     page: "Page | None" = None,
     *,
     update: Answer = "ask",
     as_json: bool = False,
-) -> "Verified":
+) -> Verified:
     """Guide the operator through the poses, compare them with a calibration, report, and add the run to the store.
 
     `path` is the calibration file or its run folder, `station` the emulated cell that `cell` describes, `page` shows
     the session. A verification is quick if `options` are fast. Raises as `ftdrive.session.session.take_poses`.
     """
-    from ftdrive.commands.common import start_mover
     from ftdrive.runs.run import Run
     from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification import verify_run
     from ftdrive.session.session import take_poses
     from ftdrive.session.verifying import Verifying
     from ftdrive.terminal.screen import open_operator
@@ -168,17 +167,16 @@ def verify_cell(
     return verified
 
 
-def failure_in_words(verified: "Verified") -> str:
+def failure_in_words(verified: Verified) -> str:
     """Return why a verification failed."""
     return "; ".join(verified.exceeded if verified.limits.given else (verified.verification.reason,))
 
 
 def _with_poses(
-    options: "SessionOptions", path: Path | None, poses: int | None, limits: "AcceptanceLimits"
-) -> tuple[Path | None, "AcceptanceLimits", "SessionOptions"]:
+    options: "SessionOptions", path: Path | None, poses: int | None, limits: AcceptanceLimits
+) -> tuple[Path | None, AcceptanceLimits, "SessionOptions"]:
     """Return what is verified and how: as given, or as the run that is resumed was begun."""
     from ftdrive.runs.run import Run
-    from ftdrive.runs.verification import AcceptanceLimits
     from ftdrive.session.verifying import POSES, QUICK_POSES
 
     quick, resume = options.fast, options.resume
@@ -197,9 +195,8 @@ def _with_poses(
     return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
 
 
-def _report(verified: "Verified", update: Answer, page: "Page | None", *, simulated: bool, as_json: bool) -> None:
+def _report(verified: Verified, update: Answer, page: "Page | None", *, simulated: bool, as_json: bool) -> None:
     """Print the outcome and what to do next, and show both on the page; save the update if it is wanted."""
-    from ftdrive.runs.verification import save_update
     from ftdrive.terminal.console import answer, messages
     from ftdrive.terminal.report import print_verification
 
@@ -225,11 +222,9 @@ def _report(verified: "Verified", update: Answer, page: "Page | None", *, simula
     messages.print_next(following)
 
 
-def _conclude(page: "Page", verified: "Verified", *following: str) -> None:
-    """Show the verdict and the largest differences."""
+def _conclude(page: "Page", verified: Verified, *following: str) -> None:
     import numpy as np
 
-    from ftcalib.rounding import to_place_of
     from ftdrive.terminal.report import verdict_in_words
     from ftdrive.view.parts import BAD, GOOD, number
     from ftdrive.view.session_page import conclude
@@ -250,7 +245,6 @@ def _conclude(page: "Page", verified: "Verified", *following: str) -> None:
 def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Path) -> tuple["Station", Path]:
     """Start the cell of a calibration, or calibrate a new one; return it with the path of its calibration."""
     from ftdrive.cell.emulated import Station
-    from ftdrive.commands.common import rehearse
     from ftdrive.runs.source import read_calibration
 
     made_by = None if path is None else read_calibration(path).provenance.get("station")
@@ -262,8 +256,7 @@ def _emulated(stack: ExitStack, path: Path | None, sensor: str | None, runs: Pat
     return station, path
 
 
-def _wants_update(verified: "Verified", update: Answer, page: "Page | None" = None, *, as_json: bool) -> bool:
-    from ftdrive.errors import Declined
+def _wants_update(verified: Verified, update: Answer, page: "Page | None" = None, *, as_json: bool) -> bool:
     from ftdrive.session.events import Question
     from ftdrive.terminal.console import messages
     from ftdrive.terminal.operators import JsonOperator, PlainOperator
@@ -286,5 +279,5 @@ def _wants_update(verified: "Verified", update: Answer, page: "Page | None" = No
             page.put({"question": None})
 
 
-def _updated(verified: "Verified") -> str:
+def _updated(verified: Verified) -> str:
     return "all values" if verified.update_name == "all" else f"the {verified.update_name}"

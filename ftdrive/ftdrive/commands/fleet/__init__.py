@@ -14,10 +14,5 @@ def fleet() -> None:
     """Watch many cells: which are due, which sensor drifts, what is wrong in several of them."""
 
 
-fleet.add_command(add)
-fleet.add_command(remove)
-fleet.add_command(index)
-fleet.add_command(status)
-fleet.add_command(solve)
-fleet.add_command(verify)
-fleet.add_command(serve)
+for _command in (add, remove, index, status, solve, verify, serve):
+    fleet.add_command(_command)

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import click
 
+from ftcalib.rounding import counted
 from ftdrive.commands.common import FILE, FOLDER, STORE, open_store
+from ftdrive.errors import ConfigError
 
 
 @click.command()
@@ -36,7 +38,6 @@ def add(file: Path, url: str | None) -> None:
 @STORE
 def remove(names: Sequence[str], url: str | None) -> None:
     """Remove cells from the store. Their runs and results stay."""
-    from ftdrive.errors import ConfigError
     from ftdrive.fleet.state import list_names
     from ftdrive.terminal.console import answer
 
@@ -57,7 +58,6 @@ def index(folders: Sequence[Path], url: str | None) -> None:
 
     If cells were added, arms that belong to none of them are listed.
     """
-    from ftcalib.rounding import counted
     from ftdrive.fleet.cells import Owners
     from ftdrive.fleet.state import list_names
     from ftdrive.store.records import record_paths

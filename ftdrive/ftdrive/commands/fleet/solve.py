@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from ftcalib.errors import DataError
 from ftcalib.rounding import counted
 from ftdrive import __version__
 from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
+from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -25,7 +27,6 @@ def _runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | N
 
     Those without a dataset or a recording in motion are left out, and counted on stderr.
     """
-    from ftdrive.errors import ConfigError
     from ftdrive.fleet.resolve import is_calibration, run_folders
     from ftdrive.runs.run import Run, in_motion
     from ftdrive.terminal.console import messages
@@ -48,7 +49,6 @@ def _runs_to_solve(folders: Sequence[Path], url: str | None, since: datetime | N
 
 
 def _how_to_finish(folder: Path) -> str:
-    from ftcalib.errors import DataError
     from ftdrive.runs.run import Run
 
     try:
@@ -91,7 +91,6 @@ def solve(
     """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from ftdrive.errors import ConfigError, NotAccepted
     from ftdrive.fleet.resolve import solve_again, solved_path
     from ftdrive.fleet.workers import cluster_workers, local_workers
     from ftdrive.terminal.console import messages
@@ -115,8 +114,6 @@ def solve(
 
 def _time(since: str) -> datetime:
     """Return the time, UTC, of an age such as 90d or of a date; raises `ConfigError`."""
-    from ftdrive.errors import ConfigError
-
     try:
         if age := re.fullmatch(r"(\d+)([dh])", since):
             return datetime.now(UTC) - int(age[1]) * _UNITS[age[2]]
@@ -138,7 +135,6 @@ class _Solved:
     failed: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, run: Path, found: "Comparison | str") -> None:
-        """Add a run."""
         here = {"run": str(run)}
         if isinstance(found, str):
             self.failed.append({**here, "reason": found})
@@ -153,11 +149,9 @@ class _Solved:
         self.unchanged += not (found.has_changed or found.has_other_verdict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
         return {"schema_version": 1, "version": __version__, **asdict(self)}
 
     def print(self) -> None:
-        """Print the numbers, then one line for each run that changed or failed."""
         now = self.runs - self.solved_before - len(self.failed)
         echo(
             f"{counted(self.runs, 'run')} with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftdrive.commands.common import JSON, STORE, NewFile, open_store, require_extra, write_json
+from ftdrive.terminal.text import print_table
 
 if TYPE_CHECKING:
     from ftdrive.fleet.state import CellState, Fleet
@@ -55,7 +56,6 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         messages.print("No cells. `ftdrive fleet add cells.toml` adds them.")
     elif page_path is None:
         from ftdrive.fleet.state import attention, summary
-        from ftdrive.terminal.text import print_table
 
         shown = len(_TITLES) if any(one.weighings for one in fleet.cells) else -1
         rows = [_row(one, now)[:shown] for one in fleet.cells]
@@ -137,8 +137,6 @@ def serve(address: str, url: str | None) -> None:
 
 
 def _page(store: "Store") -> str:
-    from datetime import UTC, datetime
-
     from ftdrive.fleet.cells import Observed
     from ftdrive.fleet.page import page
     from ftdrive.fleet.status import fleet_of

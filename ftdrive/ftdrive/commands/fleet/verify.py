@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ftdrive.cli import in_a_sentence
 from ftdrive.commands.common import STORE, CellOptions, store_url
 from ftdrive.commands.verify import failure_in_words, verify_cell
-from ftdrive.errors import ConfigError
+from ftdrive.errors import ConfigError, Declined, NotAccepted, exit_code
 from ftdrive.terminal.text import echo
 
 if TYPE_CHECKING:
@@ -32,12 +33,12 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
     skips the cell. No option answers these questions, and a terminal is required.
     """
-    from ftdrive.errors import Declined, NotAccepted, exit_code
     from ftdrive.fleet.cells import refuse_variables
     from ftdrive.fleet.status import fleet_state
     from ftdrive.store.store import Store
 
-    _require_terminal()
+    if not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
     refuse_variables()
     if names and due:
         raise ConfigError("CELL and --due exclude one another: leave one of them out")
@@ -66,17 +67,12 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
                 failed.append(one.name)
             lines.append(f"{one.name}: {outcome}{f', {words}' if words else ''}")
     finally:
-        _print(lines)
+        for line in lines:
+            echo(line)
     if failed:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
     if errors:
         raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its line is printed
-
-
-def _require_terminal() -> None:
-    """Raise `ConfigError` if no operator can read and answer."""
-    if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
 
 
 def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredCell]":
@@ -134,7 +130,6 @@ def _calibration(one: "StoredCell", tool: str, store: "Store", fleet: "Fleet") -
 
 def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
     """Ask whether an operator stands at the cell; only yes counts, and the end of the input does not."""
-    from ftdrive.errors import Declined
     from ftdrive.session.events import Question
     from ftdrive.terminal.operators import PlainOperator
 
@@ -150,15 +145,6 @@ def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
 
 def _sentence(error: Exception) -> str:
     """Return the message of an error that a user can fix; raises any other."""
-    from ftdrive.cli import in_a_sentence
-    from ftdrive.errors import exit_code
-
     if exit_code(error) is None:
         raise error
     return in_a_sentence(error)
-
-
-def _print(lines: Sequence[str]) -> None:
-
-    for line in lines:
-        echo(line)
