@@ -20,14 +20,7 @@ from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE, expected_error
-from ftcalib.likelihood.response import (
-    LEVER_M,
-    SIZE,
-    SQUARES,
-    Response,
-    joint_covariance,
-    predicted_covariance,
-)
+from ftcalib.likelihood.response import LEVER_M, SIZE, SQUARES, Response, joint_covariance, predicted_covariance
 from ftcalib.model import (
     PARAMETER_NAMES,
     Array,

@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.data.dataset import CalibrationDataset
-from ftcalib.data.dwell_mean import (
-    LEAST_SAMPLES,
-    PoseMean,
-    is_quiet,
-    is_stationary,
-    mean_and_covariance,
-    without_swing,
-)
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_quiet, is_stationary, mean_and_covariance, without_swing
 from ftcalib.errors import NotObservable, TooFewSamples
 from ftcalib.model import Array
 from ftcalib.sampling import Sampling

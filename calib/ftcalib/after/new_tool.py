@@ -20,23 +20,8 @@ from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import (
-    LEVER_M,
-    SIZE,
-    Response,
-    joint_covariance,
-    joint_jacobian,
-    response_columns,
-)
-from ftcalib.model import (
-    BIASES,
-    Array,
-    Parameters,
-    angle_between,
-    angle_between_vectors,
-    predict,
-    skew,
-)
+from ftcalib.likelihood.response import LEVER_M, SIZE, Response, joint_covariance, joint_jacobian, response_columns
+from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
 
 # Share of good runs that the test of what was kept rejects.

@@ -26,13 +26,7 @@ from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
-from ftcalib.likelihood.response import (
-    joint_covariance,
-    joint_jacobian,
-    ranges,
-    response_columns,
-    with_covariance,
-)
+from ftcalib.likelihood.response import joint_covariance, joint_jacobian, ranges, response_columns, with_covariance
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
 from ftcalib.rounding import to_place_of, with_sigma

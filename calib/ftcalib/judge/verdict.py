@@ -15,15 +15,7 @@ from ftcalib.findings import Finding, Severity, Verdict, folded, ordered, verdic
 from ftcalib.judge import described_cell, units
 from ftcalib.judge.cross_validation import DriftAhead, Judged, drift_ahead, standardize
 from ftcalib.judge.described_cell import contradictions
-from ftcalib.judge.faults import (
-    COLLAPSE,
-    ROUNDING,
-    broken_channels,
-    constant_weight,
-    faults,
-    other_poses,
-    written_step,
-)
+from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses, written_step
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup

@@ -35,15 +35,7 @@ from ftcalib.motion.mistakes import (
     without_steps,
 )
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import (
-    NARROW_S,
-    WIDE_S,
-    Means,
-    Rows,
-    interpolation_error_rad,
-    require_seconds,
-    rows_of,
-)
+from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, interpolation_error_rad, require_seconds, rows_of
 from ftcalib.result import CalibrationResult, MotionResult
 
 LEAST_S = 5.0

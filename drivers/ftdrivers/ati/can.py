@@ -14,15 +14,7 @@ from typing import Literal, Self
 import numpy as np
 
 from ftdrivers.ati import codec
-from ftdrivers.ati.codec import (
-    NEWTON,
-    NEWTON_METRE,
-    Calibration,
-    Op,
-    parse_units,
-    refuse_saturated,
-    unit_names,
-)
+from ftdrivers.ati.codec import NEWTON, NEWTON_METRE, Calibration, Op, parse_units, refuse_saturated, unit_names
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Array, DeviceInfo, FtSamples

@@ -5,13 +5,7 @@ from pathlib import Path
 from serial.tools import list_ports
 
 from ftdrive.checks.check import Check
-from ftdrive.checks.computer import (
-    can_details,
-    can_interfaces,
-    check_can_interface,
-    check_serial_port,
-    name_by_id,
-)
+from ftdrive.checks.computer import can_details, can_interfaces, check_can_interface, check_serial_port, name_by_id
 from ftdrive.errors import ConfigError
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError

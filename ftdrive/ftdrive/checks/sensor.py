@@ -24,13 +24,7 @@ from ftdrivers.errors import (
     ProtocolError,
     StreamBroken,
 )
-from ftdrivers.interfaces import (
-    Array,
-    DeviceInfo,
-    Fact,
-    FtSamples,
-    Health,
-)
+from ftdrivers.interfaces import Array, DeviceInfo, Fact, FtSamples, Health
 
 _PUSH_N = 2.0
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"

@@ -43,17 +43,7 @@ from ftdrive.checks.sensor import (
     check_sensor_error,
     check_stream,
 )
-from ftdrive.commands.common import (
-    CELL,
-    JSON,
-    MODEL,
-    CellOptions,
-    Number,
-    check_simulate,
-    runs,
-    simulate,
-    write_json,
-)
+from ftdrive.commands.common import CELL, JSON, MODEL, CellOptions, Number, check_simulate, runs, simulate, write_json
 from ftdrive.errors import NotAccepted
 from ftdrive.planning.planner import guess_of_devices
 from ftdrive.runs.source import read_calibration

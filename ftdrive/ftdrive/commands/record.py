@@ -9,16 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ftcalib.rounding import with_sigma
-from ftdrive.commands.common import (
-    FRAME,
-    JSON,
-    SOURCE,
-    TRACK,
-    NewFile,
-    Source,
-    read_frame,
-    write_json,
-)
+from ftdrive.commands.common import FRAME, JSON, SOURCE, TRACK, NewFile, Source, read_frame, write_json
 from ftdrive.errors import RecordingHasGaps
 
 if TYPE_CHECKING:

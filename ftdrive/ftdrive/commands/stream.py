@@ -7,13 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import (
-    FRAME,
-    SOURCE,
-    TRACK,
-    Source,
-    read_frame,
-)
+from ftdrive.commands.common import FRAME, SOURCE, TRACK, Source, read_frame
 
 if TYPE_CHECKING:
     from ftdrive.live.samples import Axes, Sink, Tracking

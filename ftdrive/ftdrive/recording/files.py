@@ -16,17 +16,7 @@ from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
 from ftdrive.recording.parquet_file import ParquetFile, read_parquet
-from ftdrive.recording.recording import (
-    FORMAT,
-    ROW,
-    Header,
-    Measured,
-    Piece,
-    Recording,
-    Rows,
-    measured,
-    read_ahead,
-)
+from ftdrive.recording.recording import FORMAT, ROW, Header, Measured, Piece, Recording, Rows, measured, read_ahead
 from ftdrivers.installation import missing_extra
 
 _MAGIC: Final = b"\x89MCAP0\r\n"

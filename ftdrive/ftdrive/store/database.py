@@ -36,12 +36,7 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import (
-    Record,
-    StoredResult,
-    StoredWeighings,
-    user_folder,
-)
+from ftdrive.store.records import Record, StoredResult, StoredWeighings, user_folder
 from ftdrivers.installation import missing_extra
 
 # Version of the index, kept in the database.

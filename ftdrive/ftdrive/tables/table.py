@@ -12,14 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset
-from ftcalib.data.dataset import (
-    LARGEST,
-    MATRIX_COLUMNS,
-    QUATERNION_COLUMNS,
-    VECTOR_COLUMNS,
-    Orientation,
-    rotations_of,
-)
+from ftcalib.data.dataset import LARGEST, MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS, Orientation, rotations_of
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, QUIET, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
