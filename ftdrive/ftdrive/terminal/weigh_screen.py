@@ -11,7 +11,7 @@ from ftdrive.live.weighing import UNZEROED_KG, Weighing, line_of, worth_of
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.lines import STRONG, Line
 
-_FIGURES = "0123456789- "
+_FIGURES = "0123456789-"
 # Three rows of each figure, three characters wide.
 _ROWS = (
     "█▀█ ▀█  ▀▀█ ▀▀█ █ █ █▀▀ █▀▀ ▀▀█ █▀█ █▀█",

@@ -84,7 +84,7 @@ def test_figures_are_three_rows_high_and_letters_one() -> None:
     assert [row.rstrip() for row in large("-4.06 kg")] == [
         "    █ █   █▀█ █▀▀",
         "▀▀▀ ▀▀█   █ █ █▀█",
-        "      ▀ ▀ ▀▀▀ ▀▀▀     kg",
+        "      ▀ ▀ ▀▀▀ ▀▀▀  kg",
     ]
 
 
