@@ -174,7 +174,7 @@ def table_iii(
 
     Returns
     -------
-    list of (int, str, str, Compared)
+    list of (int, str, str, MethodResult)
         Number of the case, sets of the estimate, set of the test, and the result with the columns of the table.
 
     Raises
