@@ -16,12 +16,12 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 73518,
+    "product lines": 72793,
     "files": 314,
     "dataclasses": 239,
     "public functions and classes": 1443,
     "import statements inside functions": 334,
-    "test lines": 83014,
+    "test lines": 81737,
 }
 ROOMS = {
     "a: calibrate, to the first move": 72,
@@ -33,8 +33,8 @@ ROOMS = {
 
 LINES_OF_A_MODULE = 700
 LONGER = {
-    "calib/ftcalib/motion/estimate.py": 793,
-    "calib/ftcalib/result.py": 760,
+    "calib/ftcalib/motion/estimate.py": 790,
+    "calib/ftcalib/result.py": 744,
 }
 """Modules that are longer, until the core has one model of a result and one of an estimate (issue 67)."""
 
