@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from ftdrive.cell.config import CellConfig, ToolConfig, WorkcellConfig
+from ftdrive.cell.config import CellConfig, ToolConfig
 from ftdrive.cell.emulated import Station
 
 Json = dict[str, Any]
@@ -270,7 +270,7 @@ def _of_workcell(**different: Any) -> Callable[[CellConfig], CellConfig]:
 def _caged(cell: CellConfig) -> CellConfig:
     """Four walls and a ceiling around an arm with a tool that is longer than its cage."""
     walls = ((-1, 0, 0, -600), (1, 0, 0, -600), (0, 1, 0, -600), (0, -1, 0, -600), (0, 0, -1, -1000))
-    return replace(_of_tool(0.0, 1200.0, 100.0)(cell), workcell=WorkcellConfig(planes_mm=walls, measured=True))
+    return _of_workcell(planes_mm=walls, measured=True)(_of_tool(0.0, 1200.0, 100.0)(cell))
 
 
 BOX_MM: Final = (-400.0, -600.0, 300.0, 100.0, 0.0, 600.0)
@@ -290,7 +290,7 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("10", "protective stop", 7, "protective", do={"do": "protective-stop"}),
     Beforehand("11", "emergency stop", 5, "emergency", do={"do": "emergency-stop"}),
     Beforehand("13", "a tool of 14 kg, 300 mm", 7, "of the sensor's range", HEAVY_SET, None, HEAVY, MINIMAL, "serial"),
-    Beforehand("15", "sensor silent", 3, "no answer", do={"do": "sensor-faults", "stall": True}),
+    Beforehand("15", "sensor silent", 3, "no reply", do={"do": "sensor-faults", "stall": True}),
     Beforehand("15", "sensor stuck", 5, "frozen", do={"do": "freeze-sensor"}),
     Beforehand("16", "controller silent", 3, "did not answer", do={"do": "silence-arm"}),
     Beforehand("21", "program of another client", 7, "stop it at the", do={"do": "foreign-program", "seconds": 60}),

@@ -103,7 +103,7 @@ def conduct(scene: Scene, fault: Fault | None = None, seen: Observed | None = No
 
 def _here(event: Json, fault: Fault) -> bool:
     if fault.at == "approach":  # the session says it after the answer
-        return event["event"] == "asked" and str(event["question"]).startswith("The arm goes")
+        return event["event"] == "asked" and str(event["question"]).startswith("Approach ")
     return (event["event"], event.get("state"), event.get("stop")) == ("state-changed", fault.at, fault.stop)
 
 
