@@ -174,8 +174,8 @@ def outcome(root: Path, mutant: Mutant, reach: CoverageData, limit_s: float, fir
             except subprocess.TimeoutExpired:
                 os.killpg(run.pid, signal.SIGKILL)
                 return "too slow"
-        # Pytest ends alike where a file cannot be imported and where a test is not there.
-        if failed := re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?: - |$)", said, re.MULTILINE):
+        # Pytest ends alike where a file cannot be imported and where a test is not there. Names of parameters change.
+        if failed := re.search(r"^(?:FAILED|ERROR) (tests/.+?)(?:\[| - |$)", said, re.MULTILINE):
             return failed[1]
         if run.returncode not in NO_TESTS:
             return "its import"
