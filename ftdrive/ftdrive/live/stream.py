@@ -301,9 +301,9 @@ class CompensatedStream(ProcessedStream):
             self.info = self._described(arm, sensor, sensor_rate_Hz, arm_rate_Hz, status)
             # only now are the rates known that the processing needs
             super().__init__(self.info, *self._begin, temperature=self._temperature)
-            delay_ms = self.cell.sensor.delay_ms
-            estimator = DelayEstimator(self._calibration, self.info.p_flange_sensor_m)
-            self._pairing = Pairing(nominal_Hz, estimator if delay_ms is None else delay_ms / 1e3)
+            delay_ms, p_flange_sensor_m = self.cell.sensor.delay_ms, self.info.p_flange_sensor_m
+            delay = DelayEstimator(self._calibration, p_flange_sensor_m) if delay_ms is None else delay_ms / 1e3
+            self._pairing = Pairing(nominal_Hz, delay)
             self._pairing.add_states(states)
             self._pairing.add_samples(samples)
             self._stack = stack.pop_all()
