@@ -27,7 +27,7 @@ from ftdrive.errors import BadRecording
 from ftdrive.live import ros2
 from ftdrive.live.samples import StreamEvent, frames_in_flange, matrices
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import ROW, Header, Piece, Rows, changed
+from ftdrive.recording.recording import ROW, ZSTD_LEVEL, Header, Piece, Rows, changed
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -74,8 +74,6 @@ _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
-LEVEL: Final = -5
-"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 _NONE: Final = np.zeros(0, np.int64)
 
 
@@ -126,7 +124,7 @@ class McapFile(GrowingFile):
             return
         first_ns = min(int(table[:, 0].min()) for table in tables.values())
         last_ns = max(int(table[:, 0].max()) for table in tables.values())
-        packed = compress(content, LEVEL)
+        packed = compress(content, ZSTD_LEVEL)
         chunk = _bytes(Chunk("zstd", packed, last_ns, first_ns, zlib.crc32(content), len(content)))
         indexes, places = b"", {}
         for number, table in tables.items():

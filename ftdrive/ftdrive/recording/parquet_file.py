@@ -16,11 +16,11 @@ from ftcalib.files import open_file, parsed_json
 from ftdrive.errors import BadRecording
 from ftdrive.live.samples import StreamEvent
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.mcap_file import LEVEL
 from ftdrive.recording.recording import (
     COLUMNS,
     NUMBERS,
     ROW,
+    ZSTD_LEVEL,
     Header,
     Piece,
     Rows,
@@ -53,7 +53,7 @@ class ParquetFile(GrowingFile):
             PythonFile(self, "w"),
             _schema(),
             compression="zstd",
-            compression_level=LEVEL,
+            compression_level=ZSTD_LEVEL,
             use_dictionary=False,
             write_statistics=False,
             write_page_checksum=True,

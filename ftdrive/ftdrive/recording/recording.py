@@ -40,6 +40,8 @@ Rows = NDArray[np.void]
 """(n,) records of the type `ROW`."""
 PIECE_ROWS: Final = 1 << 13
 """Samples of a piece, which stay in the cache."""
+ZSTD_LEVEL: Final = -5
+"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
