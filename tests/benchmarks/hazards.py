@@ -1,6 +1,6 @@
 """Every row of the hazard table that software can see, injected into a tour on the emulated cell, at real speed.
 
-uv run python -m tests.benchmarks.hazards                # every row; about 30 minutes
+uv run python -m tests.benchmarks.hazards                # every row; about 40 minutes
 uv run python -m tests.benchmarks.hazards --only 14 15   # some rows
 uv run python -m tests.benchmarks.hazards --repeat 3     # each fault so often
 
