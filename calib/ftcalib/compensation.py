@@ -16,8 +16,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from ftcalib.likelihood.response import Response
 from ftcalib.model import Array, Parameters, Rotations, matrices_of, read_only, skew
+from ftcalib.sensor_matrix import Response
 
 Reals = NDArray[np.floating[Any]]
 

@@ -9,7 +9,7 @@ import os
 import stat
 from collections.abc import Iterator, Mapping
 from io import BufferedReader
-from itertools import count
+from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -79,6 +79,21 @@ def _give_name(written: Path, path: Path) -> None:
 def _refuse_existing(path: Path) -> None:
     if path.exists():
         raise FileExistsError(f"{path} exists already and is never overwritten: choose another name")
+
+
+def unused_path(path: Path) -> Path:
+    """Return the first of name, name-2 and so on that does not exist."""
+    return next(one for one in _numbered(path) if not one.exists())
+
+
+def newest_path(path: Path) -> Path:
+    """Return the last of name, name-2 and so on that exists; the name itself if it does not."""
+    return [path, *takewhile(Path.exists, _numbered(path))][-1]
+
+
+def _numbered(path: Path) -> Iterator[Path]:
+    yield path
+    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 
 
 def open_file(path: str | Path) -> BufferedReader:

@@ -44,7 +44,8 @@ class Code:
     @property
     def values(self) -> set[str]:
         """Names of the values that the templates need."""
-        return {place[1] for place in _PLACE.finditer(self.found + self.fix) if place[2] not in _OPTIONAL}
+        places = [place for place in _PLACE.finditer(self.found + self.fix) if place[2] not in _OPTIONAL]
+        return {place[1] for place in places} | {place[2][1:] for place in places if (place[2] or "")[:1] == "~"}
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -199,7 +200,7 @@ def _units(pairs: Sequence[Sequence[str]]) -> str:
         " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
         for force, torque in pairs
     )
-    return f", as with {', or '.join(each)}" if pairs else ""
+    return f" (perhaps {', or '.join(each)})" if pairs else ""
 
 
 def _axes(corrections: Sequence[Sequence[Any]]) -> str:
@@ -216,7 +217,7 @@ def _order(channels: Sequence[str]) -> str:
 def _orders(orders: Sequence[str]) -> str:
     """Write the orders of quaternions that would make gravity point down."""
     each = " or ".join(f"({order})" for order in orders)
-    return f", or for quaternions {each} that were read inverted and in another order" if orders else ""
+    return f", such as quaternions {each} read inverted and in another order" if orders else ""
 
 
 def _scale(unit_N: Sequence[float] | None) -> str:
@@ -257,9 +258,9 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 # fmt: off
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
-    "other_recording": Code(_REJECT, "the wrench does not follow the poses: {left_percent:.0f} of its change remain "
-        "unexplained", "keep the tool free of contact, and check that wrench and poses are of one recording on one "
-        "clock, and the form of the rotations"),
+    "other_recording": Code(_REJECT, "{left_percent:.0f} of the change of the wrench do not follow the poses",
+        "keep the tool free of contact, and check that wrench and poses are of one recording on one clock, and the "
+        "form of the rotations"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
     "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
@@ -271,54 +272,51 @@ CODES: Final[Mapping[str, Code]] = {
         "repeat these poses"),
     "constant_force": Code(_REJECT, "the force is {force_N:.2g} in all poses, as if the wrench were given in base axes",
         "add --wrench-frame base, or record it in the axes of the sensor"),
-    "wrench_in_base": Code(_REJECT, "the wrench looks given in base axes (force residual {residual_N:.2g}, corrected "
-        "{corrected_N:.2g})", "add --wrench-frame base, with --tcp if it is about the TCP, or record it in "
-        "the axes of the sensor"),
-    "orientations_inverted": Code(_REJECT, "the orientations look inverted (force residual {residual_N:.2g}, "
-        "corrected {corrected_N:.2g}){also:?, or |}{also}",
-        "state that they map base to flange (--orientation R_flange_base)"),
-    "quaternion_order": Code(_REJECT, "the quaternions look like ({order}), but were read as ({read_as}) (force "
-        "residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}",
-        'exchange their columns (--columns "qx=NAME,...")'),
-    "euler_angles": Code(_REJECT, "the orientations look made of Euler angles in the order {order}, but were read "
-        "in the order {read_as} (force residual {residual_N:.2g}, corrected {corrected_N:.2g}){also:?, or |}{also}",
-        "add --euler {order} for a file of angles, or compute the rotations in this order"),
-    "columns_swapped": Code(_REJECT, "forces and torques look exchanged (force residual {residual_N:.2g}, corrected "
-        "{corrected_N:.2g})", 'exchange the columns of force and torque (--columns "fx=NAME,...")'),
-    "pairing_shifted": Code(_REJECT, "each wrench looks like that of the pose {neighbour} it (force residual "
-        "{residual_N:.2g}, corrected {corrected_N:.2g})", "pair each wrench with the pose at which it was measured"),
-    "zeroed_each_pose": Code(_REJECT, "each wrench looks zeroed at the pose before (force residual {residual_N:.2g}, "
-        "corrected {corrected_N:.2g})", "zero the sensor at most once, before the first pose, and record again"),
-    "pairing_or_rotations": Code(_REJECT, "the forces are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but "
-        "in these orientations only to {residual_N:.2g}, so wrenches are paired with other poses, or the "
-        "orientations have another form",
-        "check the pairing, and look for Euler angles (--euler), degrees or another order"),
-    "orientations_off": Code(_REJECT_OR_LIMIT, "the orientations are off by about {turn_deg:.1f}, because the forces "
-        "are those of a weight of {weight_N:.3g} to {radial_N:.2g}, but in these orientations only to {residual_N:.2g}",
+    "wrench_in_base": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with the wrench in base "
+        "axes", "add --wrench-frame base, with --tcp if it is about the TCP, or record it in the axes of the sensor"),
+    "orientations_inverted": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with the "
+        "orientations inverted", "state that they map base to flange (--orientation R_flange_base)"
+        "{also:?, or read them as |}{also}"),
+    "quaternion_order": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with quaternions "
+        "({order}) instead of ({read_as})", 'exchange their columns (--columns "qx=NAME,...")'
+        "{also:?, or read them as |}{also}"),
+    "euler_angles": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with Euler angles {order} "
+        "instead of {read_as}", "add --euler {order} for a file of angles, or compute the rotations in this "
+        "order{also:?, or read them as |}{also}"),
+    "columns_swapped": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with forces and torques "
+        "exchanged", 'exchange the columns of force and torque (--columns "fx=NAME,...")'),
+    "pairing_shifted": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if each wrench is that "
+        "of the pose {neighbour} it", "pair each wrench with the pose at which it was measured"),
+    "zeroed_each_pose": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if the sensor was "
+        "zeroed at each pose", "zero the sensor at most once, before the first pose, and record again"),
+    "pairing_or_rotations": Code(_REJECT, "forces fit a weight of {weight_N:.3g} to {radial_N:.2g} in size, but to "
+        "{residual_N:.2g} in direction", "check the pairing, and look for Euler angles (--euler), degrees or another "
+        "order"),
+    "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by about {turn_deg:.1f}, as forces fit to "
+        "{radial_N:.2g} in size, to {residual_N:.2g} in direction",
         "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
         "model"),
-    "torques_unrelated": Code(_REJECT_OR_LIMIT, "the torques do not follow the weight, as the forces do: "
-        "{left_percent:.0f} of their change remain unexplained", "check that forces and torques are of one sensor and "
-        "one recording, then cables and contact"),
-    "axes_disagree": Code(_REJECT, "force and torque axes disagree, because with {corrections:axes} the torque "
-        "residual is {corrected_Nm:.2g} instead of {residual_Nm:.2g}",
-        "check the columns (--columns), the wiring of the axes, or the sensor's matrix"),
+    "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the change of the torques do not follow the "
+        "weight, as the forces do", "check that forces and torques are of one sensor and one recording, then cables "
+        "and contact"),
+    "axes_disagree": Code(_REJECT, "torque residual {residual_Nm:.2g}, but {corrected_Nm:.2g} with other axes of "
+        "force or torque", "try {corrections:axes} (--columns), or check the wiring of the axes and the sensor's "
+        "matrix"),
     # Known values that the data contradict
-    "known_mass": Code(_LIMIT_OR_NOTE, "the known mass of {known_kg:g} contradicts the data, which give "
-        "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}){units:units}{unit_N:scale}",
-        "scale the forces so (--columns \"fx=NAME [.82 N],...\" for .82 N), or correct the known value (--mass-kg)"),
-    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "the known direction of gravity contradicts the data, which give "
-        "one {off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg})",
-        "correct the data or the known value (--level-deg, --up)"),
-    "known_mounting": Code(_LIMIT_OR_NOTE, "the known mounting of the sensor contradicts the data, which give one "
-        "{off_deg:~sigma_deg} away (sigma {sigma_deg:~sigma_deg}){corrections:?, as with |}{corrections:axes}",
-        "correct the data or the known value (--mounting-deg)"),
+    "known_mass": Code(_LIMIT_OR_NOTE, "{mass_kg:~sigma_kg} (sigma {sigma_kg:~sigma_kg}) by the data, but "
+        "{known_kg:g} by the known mass", 'scale the forces so (--columns "fx=NAME [.82 N],..." for .82 N), or '
+        "correct the known value (--mass-kg){units:units}{unit_N:scale}"),
+    "known_gravity_direction": Code(_LIMIT_OR_NOTE, "{off_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) between "
+        "gravity by the data and its known direction", "correct the data or the known value (--level-deg, --up)"),
+    "known_mounting": Code(_LIMIT_OR_NOTE, "{off_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) between the mounting "
+        "by the data and the known one", "correct the known value (--mounting-deg), or the data{corrections:?, such "
+        "as |}{corrections:axes}"),
     # Units, drift and changes of one session
     "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
-        "{weight_N:.3g}, as with raw counts or other units{unit_N:scale}", "convert the counts to N and N·m by the "
-        "factors of the sensor. A known mass shows that of the force (--mass-kg)"),
-    "payload_units": Code(_LIMIT, "the load is {load_kg:.2f}, but {expected_kg:.2f} by the payload in the "
-        "controller{units:units}", "check the units of the sensor before you correct the payload"),
+        "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m by the factors of the sensor. A known "
+        "mass shows that of the force (--mass-kg){unit_N:scale}"),
+    "payload_units": Code(_LIMIT, "{load_kg:.2f} hang on the sensor, but {expected_kg:.2f} by the payload in the "
+        "controller", "check the units of the sensor{units:units} before you correct the payload"),
     "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
         "load had shifted", "fix the load and calibrate again"),
     "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
@@ -329,103 +327,94 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings are those of another sensor, turned by "
-        "{turn_deg:.2g}, whose bias differs by {force_N:.2g} and {torque_Nm:.2g}", "calibrate each sensor by itself"),
-    "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned by {turn_deg:.2g}, whose "
-        "bias differs by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it reads like another sensor, turned "
+        "{turn_deg:.2g}, bias {force_N:.2g} and {torque_Nm:.2g} off",
+        "calibrate each sensor by itself"),
+    "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned {turn_deg:.2g}, bias "
+        "{force_N:.2g} and {torque_Nm:.2g} off", "separate the readings of the sensors"),
     "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
         "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
         "of {sigma_N:.2g}", "record the raw wrench if it is compensated already or zeroed "
         "at each pose, keep the tool free of contact, or hang something heavier on the sensor"),
-    "second_solution": Code(_REJECT, "a very different mounting of the sensor explains the data almost as well "
-        "(probability {probability_percent:.2g})", "add poses with another angle between the tool and the vertical"),
-    "torques_about_point": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, "
-        "as if the torques were about a point more than {inside_mm:.0f} in front of it, such as the TCP",
-        "add --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ, or record the torques about the sensor"),
-    "torques_reversed": Code(_LIMIT, "the centre of mass lies {inside_mm:.0f} on the robot's side of the sensor, as if "
-        "the torques were about a point more than {inside_mm:.0f} in front of it, such as the TCP, or reversed, or the "
-        "orientations mirrored", "push the tip aside. If that gives almost no torque, add --wrench-frame tcp "
+    "second_solution": Code(_REJECT, "{probability_percent:.2g} probability of a very different mounting, which "
+        "explains the data almost as well", "add poses with another angle between the tool and the vertical"),
+    "torques_about_point": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
+        "about a point in front of it", "add --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ, or record the torques about the "
+        "sensor"),
+    "torques_reversed": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
+        "reversed or about the TCP", "push the tip aside. If that gives almost no torque, add --wrench-frame tcp "
         "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the torques, or give the orientations in right-handed axes, unless "
         "the tool reaches back that far"),
-    "weight_compensated": Code(_LIMIT, "the weight is only {weight_N:.2g}, as if it were compensated already, "
-        "or the sensor were zeroed at each pose", "record the raw wrench, without compensation, and zero at most once, "
-        "before the first pose"),
-    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}{units:units}{unit_N:scale}",
-        "check the units of force and torque, and whether they are raw counts"),
+    "weight_compensated": Code(_LIMIT, "the weight is only {weight_N:.2g}, as if it were compensated, or zeroed at "
+        "each pose", "record the raw wrench, without compensation, and zero at most once, before the first pose"),
+    "weight_implausible": Code(_REJECT_OR_LIMIT, "the weight is {weight_N:.5g}",
+        "check the units of force and torque{units:units}, and whether they are raw counts{unit_N:scale}"),
     "com_too_far": Code(_REJECT_OR_LIMIT, "the centre of mass is {distance_m:.2f} from the sensor, farther than "
-        "{most_m:g}{units:units}", "check the units of force and torque, and their reference point "
-        "(--wrench-frame, --tcp), or describe the tool if it reaches so far ([tool] cylinders_mm, [workcell] "
-        "measured = true)"),
-    "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as if torques were "
-        "1000 times too small or forces were in mN", "check the units of force and torque"),
+        "{most_m:g}", "check the units of force and torque{units:units}, and their reference point (--wrench-frame, "
+        "--tcp), or describe the tool if it reaches so far ([tool] cylinders_mm, [workcell] measured = true)"),
+    "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as with forces in mN "
+        "or torques in kN·m", "check the units of force and torque"),
     # Directions and signs
-    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting"
-        "{orders:orders}",
+    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting",
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
-        "direction of the rotations"),
-    "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot "
-        "on a wall{orders:orders}, but no mounting is declared",
-        "declare the mounting ([workcell] mounting, --up), or check the order and the direction of the rotations"),
+        "direction of the rotations{orders:orders}"),
+    "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, but no mounting "
+        "is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order and the "
+        "direction of the rotations{orders:orders}"),
     "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
         "add --sign -1 ([sensor] sign = -1) if the sensor reports the reaction, or correct axes that are reversed or "
         "swapped in forces and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). "
         "Otherwise check the order and the direction of the rotations"),
-    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down) and the centre of mass lies "
-        "on the robot's side of the sensor, as if the wrench were the reaction about a point in front of it, such as "
-        "the TCP, or the forces alone were reversed, or the orientations mirrored",
-        "push the tip aside. If that gives almost no torque, add --sign -1 --wrench-frame tcp --tcp X,Y,Z,RX,RY,RZ. "
-        "Otherwise reverse the forces, or give the orientations in right-handed axes"),
+    "forces_reversed": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down), and the centre of mass is "
+        "behind the sensor", "push the tip aside. If that gives almost no torque, add --sign -1 --wrench-frame tcp "
+        "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in right-handed axes"),
     # The described cell
-    "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has "
-        "{tool_kg:.3g}{units:units}{unit_N:scale}",
-        "check the sensor's units, what is mounted, and whether the controller compensates a part, or correct [tool] "
-        "mass_kg"),
+    "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has {tool_kg:.3g}",
+        "check the sensor's units{units:units}, what is mounted, and whether the controller compensates a part, or "
+        "correct [tool] mass_kg{unit_N:scale}"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
         "sensor{sensor_kg:?|, whose own mass is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
         "sensor and adapter ([sensor] mass_kg)}"),
-    "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, at {com_mm:.0f} from the {origin} in flange axes, "
-        "lies {outside_mm:.0f} outside the described tool{units:units}",
-        "check signs, units and reference point of the wrench (--sign, --columns, --wrench-frame), then [tool] "
-        "cylinders_mm"),
+    "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, {com_mm:.0f} from the {origin} in flange axes, "
+        "is {outside_mm:.0f} outside the tool", "check units{units:units}, signs and reference point of the "
+        "wrench (--sign, --columns, --wrench-frame), then [tool] cylinders_mm"),
     # Recordings in motion
     "zeroed": Code(_LIMIT, "the sensor was zeroed within the recording, at {at_s:.2f} from its start",
         "zero it before the recording only"),
-    "positions_unit": Code(_REJECT, "the positions look given in {unit}, because they spread over {spread_m:.3g} and "
-        "accelerate as much too fast for the weight", "give them in m"),
+    "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g}, too far for the weight, as if they "
+        "were in {unit}", "give them in m"),
     "wrench_compensated": Code(_REJECT_OR_LIMIT, "the load weighs {weight_N:.2g}, but has the inertia of "
-        "{mass_kg:.2g}, as if a controller had compensated the weight, or a part of it", "record the wrench as the "
-        "sensor measures it, or set the controller's payload to 0 before"),
+        "{mass_kg:.2g}, as if it were partly compensated", "record the wrench as the sensor measures it, or set the "
+        "controller's payload to 0 before"),
     "clocks_differ": Code(_REJECT, "the wrench follows the poses if its times are divided by {ratio:.4g}",
         "give the true rate of wrench and poses"),
-    "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and the acceleration of the poses agree if all times are "
-        "{factor:~sigma} times as long (sigma {sigma:~sigma})", "give the true rate, which is "
-        "{rate:.4g} times the stated one, the unit of the times, or the wrench as the sensor measures it"),
-    "reversed_in_motion": Code(_REJECT, "the {channels} look reversed, because weight, acceleration and inertia "
-        "disagree in sign", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
-    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the poses look like those of a TCP, because the sensor lies at "
-        "{point_mm:.0f} in their axes, not on z of the flange{units:units}", "give the poses of the flange{units:?, or "
-        "correct the units|}"),
-    "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques look taken about a TCP, because their point lies at "
-        "{point_mm:.0f} in the axes of the poses, beyond the centre of mass", "give the torques about the sensor "
-        "origin, and the poses of the flange"),
+    "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and acceleration of the poses agree with times {factor:~sigma} "
+        "times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the stated one, the "
+        "unit of the times, or the wrench as the sensor measures it"),
+    "reversed_in_motion": Code(_REJECT, "the {channels} look reversed: the signs of weight, acceleration and inertia "
+        "disagree", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
+    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, not on z, as if "
+        "they were of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
+    "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques are about {point_mm:.0f} in the axes of the poses, "
+        "beyond the centre of mass", "give the torques about the sensor origin, and the poses of the "
+        "flange"),
     "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
         "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
         "poses, then the clock"),
     "height_impossible": Code(_REJECT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
         "{sigma_mm:~sigma_mm}), where none is", "check that the poses are those of the flange, then the axes and units "
         "of wrench and poses, then the clock"),
-    "motion_coarse": Code(_LIMIT, "the poses are too few for their motion, or their times are not those of the "
-        "samples: from the poses beside it each one is {off_deg:.2g} off, so only the parts at rest count "
+    "motion_coarse": Code(_LIMIT, "each pose is {off_deg:.2g} off those beside it, so only the parts at rest count "
         "({share_percent:.0f})", "record poses and wrench at 50 Hz or more, each with its own time"),
-    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned through {range_deg:.0f} only, which leaves the mounting "
-        "{mounting_deg:.2g} and the weight {weight_N:.2g} uncertain (1 sigma)",
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned only {range_deg:.0f}, which leaves mounting ± "
+        "{mounting_deg:.2g}, weight ± {weight_N:.2g} (1 sigma)",
         "turn wrist 2 and wrist 3 by 60° or more"),
     "clock_offset": Code(_LIMIT, "the wrench follows the poses by {delay_s:.3f}", "correct the clock of one of the "
         "two, or check that the times of both files mean the same"),
-    "positions_missing": Code(_LIMIT, "the poses have no positions, so only slow parts count ({share_percent:.0f}), "
-        "where the unknown acceleration adds up to {force_N:.2g}", "give the position of the flange too"),
+    "positions_missing": Code(_LIMIT, "positions are missing, so only slow parts count ({share_percent:.0f}), with "
+        "errors up to {force_N:.2g}", "give the position of the flange too"),
     "height_differs": Code(_LIMIT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
         "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
     "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
@@ -435,33 +424,31 @@ CODES: Final[Mapping[str, Code]] = {
     "motion_slow": Code(_NOTE, "the motion does not determine {names}", "turn the three wrist joints together, at "
         "60 °/s or more"),
     # How well the data fit
-    "gain_not_modelled": Code(_LIMIT, "this method does not model the gain of the sensor, which is off by up to "
-        "{gain_percent:.1f}: the residual is {residual_N:.2g}, with the gain {free_N:.2g}", "solve with method ml"),
-    "force_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the force error is {share_percent:.1f} of the "
-        "weight ({error_N:.2g}), more than {limit_percent:g}",
-        "check cables, contact and orientations, and take more poses"),
-    "torque_error": Code(_REJECT_OR_LIMIT, "judged by the {source}, the torque error is {share_percent:.1f} of the "
-        "weight at {lever_m:.2g} ({error_Nm:.2g}), more than {limit_percent:g}",
+    "gain_not_modelled": Code(_LIMIT, "the gain is off by {gain_percent:.1f}, which this method ignores (residual "
+        "{residual_N:.2g}, with it {free_N:.2g})", "solve with method ml"),
+    "force_error": Code(_REJECT_OR_LIMIT, "the force error is {share_percent:.1f} of the weight ({error_N:.2g}, "
+        "{source}), limit {limit_percent:g}", "check cables, contact and orientations, and take more poses"),
+    "torque_error": Code(_REJECT_OR_LIMIT, "the torque error is {share_percent:.1f} of the weight at {lever_m:.2g} "
+        "({error_Nm:.2g}, {source}), limit {limit_percent:g}",
         "check cables, contact and orientations, and take more poses"),
     "known_values_misfit_force": Code(_LIMIT, "method ml without known values fits the forces to {free_N:.2g} instead "
         "of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
     "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to {free_Nm:.2g} "
         "instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take more poses"),
-    "response_not_linear": Code(_LIMIT_OR_NOTE, "the response of the sensor is not linear, by {share_percent:.2g} of "
-        "the weight, which compensation does not know", "stay within the range of the sensor, or have it calibrated"),
-    "cable_acts": Code(_LIMIT_OR_NOTE, "something pulls as the tool turns, as a cable does, by {force_N:.2g} and "
-        "{torque_Nm:.2g}, which compensation does not know", "give cables and hoses more slack"),
-    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have an error of {turn_deg:.2g} that is smooth "
-        "over the poses", "fasten base, sensor and tool, take the factory calibration of the arm, or stiffen the "
-        "mount"),
+    "response_not_linear": Code(_LIMIT_OR_NOTE, "{share_percent:.2g} of the weight is not linear in the sensor, which "
+        "is not compensated", "stay within the range of the sensor, or have it calibrated"),
+    "cable_acts": Code(_LIMIT_OR_NOTE, "something pulls by {force_N:.2g} and {torque_Nm:.2g} as the tool turns, like "
+        "a cable, not compensated", "give cables and hoses more slack"),
+    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "{turn_deg:.2g} is the error of the orientations, smooth over "
+        "the poses", "fasten base, sensor and tool, take the factory calibration of the arm, or stiffen the mount"),
     "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
-        "({components:?found: |the stated uncertainties do not include this}{components:.2g})",
+        "({components:?found: |not in the sigmas}{components:.2g})",
         "look for drift, cables, contact and inexact orientations"),
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
-    "gain_unknown": Code(_LIMIT, "{n_poses} poses do not show gain and cross-talk of the sensor: {gain_percent:.2g} is "
-        "assumed, and part of all uncertainties", "take {recommended} or more, or declare its accuracy_percent"),
+    "gain_unknown": Code(_LIMIT, "{n_poses} poses do not show gain and cross-talk: {gain_percent:.2g} is assumed, and "
+        "part of all sigmas", "take {recommended} or more, or declare its accuracy_percent"),
     "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
         "parameters", "add similar poses"),
     # Known loads
@@ -494,22 +481,20 @@ CODES: Final[Mapping[str, Code]] = {
     "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected"),
     "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected"),
     "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected"),
-    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g} turns with the orientation, as of a cable that acts as a "
-        "spring; it may have moved the centre of mass by {shift_mm:.2g}, which sigma allows for",
-        "give the cable more slack"),
-    "residuals_alike": Code(_NOTE, "successive poses have similar residuals (correlation {correlation:.2f}), most "
-        "likely from drift", "let the sensor warm up and mix the order of the poses"),
+    "cable_spring": Code(_NOTE, "{torque_Nm:.2g} turn with the orientation, as of a cable; the centre of mass may be "
+        "{shift_mm:.2g} off", "give the cable more slack"),
+    "residuals_alike": Code(_NOTE, "the residuals of successive poses correlate by {correlation:.2f}, most likely "
+        "from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
     "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
         "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
-    "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side}, "
-        "compared with the declared mounting", "level the base, or set its mounting in the controller"),
-    "noise_unknown": Code(_NOTE, "the noise was estimated from the residuals, so chi2 does not test the fit",
+    "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side} "
+        "from the declared mounting", "level the base, or set its mounting in the controller"),
+    "noise_unknown": Code(_NOTE, "chi2 does not test the fit, because the noise was estimated from the residuals",
         "state the noise of each pose to test it (columns sigma_fx to sigma_tz)"),
-    "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations of the "
-        "method, which puts an error of {force_N:.2g} into the gravity force",
-        "use --method lrom or ml, which take the orientations as they are"),
+    "orientations_deviate": Code(_NOTE, "the poses are up to {off_deg:.2f} off the method's 24 orientations, a force "
+        "error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
     "earlier_cell": Code(_NOTE, "mounting, base and gain of {parent} count as known, within their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs as one fit, each with a bias of its own; the bias is that of the last"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),

@@ -38,6 +38,16 @@ PARAMETER_NAMES = tuple(f"{name}.{axis}" for name in _QUANTITIES for axis in "xy
 BIASES = np.r_[6:9, 12:15]
 """Where force and torque bias stand in `PARAMETER_NAMES`."""
 
+_CUBE = (
+    "+x +y +z", "+x -y -z", "+x -z +y", "+x +z -y", "-x +y -z", "-x -y +z",
+    "-x +z +y", "-x -z -y", "+y +x -z", "-y +x +z", "+z +x +y", "-z +x -y",
+    "+y -x +z", "-y -x -z", "-z -x +y", "+z -x -y", "+y +z +x", "-y -z +x",
+    "-z +y +x", "+z -y +x", "+y -z -x", "-y +z -x", "+z +y -x", "-z -y -x",
+)  # fmt: skip
+_AXES = dict(zip("xyz", np.eye(3), strict=True))
+# (24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube.
+SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row in rows.split()] for rows in _CUBE])
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Parameters(Displayed):
@@ -236,6 +246,18 @@ def rotation_of(vector: Array) -> Array:
     return np.asarray(_IDENTITY + math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K))
 
 
+def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
+    """Weight (N) and the tilt angles alpha, beta (rad) of the base for a gravity force (3,): Yu eqs 46-48.
+
+    Two misprints of eq 48 are corrected: the weight is the norm of F_b, not its square, and the angles are those that
+    reproduce F_b = -weight [cos(alpha) sin(beta), -sin(alpha), cos(alpha) cos(beta)], with alpha in [-pi/2, pi/2]. An
+    upright base has (0, 0), one under the ceiling (0, pi). Where gravity runs along base y, beta is free and set to 0.
+    """
+    x, y, z = F_b.tolist()
+    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
+    return float(np.linalg.norm(F_b)), float(np.arctan2(y, np.hypot(x, z))), float(beta)
+
+
 def angle_between(R1: Array, R2: Array) -> Array:
     """Angle in rad, shape (...), between rotations of shape (..., 3, 3) each; accurate for small angles too."""
     # The chord keeps the digits of small angles, of which the trace loses half.
@@ -267,6 +289,16 @@ def read_only(value: ArrayLike) -> Array:
     return array
 
 
+def keep_finite(record: object, whose: str, **shapes: tuple[int, ...]) -> None:
+    """Make arrays of a frozen record read-only copies; raise `ValueError` unless they are finite, in these shapes."""
+    for name, shape in shapes.items():
+        value = read_only(getattr(record, name))
+        if value.shape != shape or not np.isfinite(value).all():
+            size = shape if len(shape) > 1 else shape[0]
+            raise ValueError(f"{whose}{name} must be {size} finite numbers, got shape {value.shape}")
+        object.__setattr__(record, name, value)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftResult:
     """Change of the bias during the tour; arrays are read-only."""
@@ -280,8 +312,4 @@ class DriftResult:
     change alone."""
 
     def __post_init__(self) -> None:
-        for name in ("change", "sigma"):
-            value = read_only(getattr(self, name))
-            if value.shape != (6,) or not np.isfinite(value).all():
-                raise ValueError(f"the drift's {name} must be six finite numbers, got shape {value.shape}")
-            object.__setattr__(self, name, value)
+        keep_finite(self, "the drift's ", change=(6,), sigma=(6,))

@@ -19,8 +19,8 @@ from ftcalib.errors import BadCalibration
 from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
-from ftcalib.judge.verdict import SURE, expected_error
-from ftcalib.likelihood.response import LEVER_M, SIZE, SQUARES, Response, joint_covariance, predicted_covariance
+from ftcalib.judge.verdict import SURE
+from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import (
     PARAMETER_NAMES,
     Array,
@@ -28,13 +28,22 @@ from ftcalib.model import (
     Parameters,
     Rotations,
     is_rotation,
+    keep_finite,
     matrices_of,
-    read_only,
+    weight_and_tilt,
 )
 from ftcalib.notebook import figure_of, frame_of
-from ftcalib.published.yu import weight_and_tilt
 from ftcalib.rounding import counted, to_place_of, with_sigma
-from ftcalib.sensor_matrix import ContactResponse, SensorMatrix
+from ftcalib.sensor_matrix import (
+    SIZE,
+    SQUARES,
+    ContactResponse,
+    Response,
+    SensorMatrix,
+    expected_error,
+    joint_covariance,
+    predicted_covariance,
+)
 
 FORMAT = "ftdrive.calibration/2"
 # The bias of a session with drift is its mean there.
@@ -89,11 +98,7 @@ class MotionResult(Displayed):
     """Each with `t_s` after the first sample, `duration_s`, and the peaks `force_N` and `torque_Nm`, all filtered."""
 
     def __post_init__(self) -> None:
-        for name, shape in (("inertia_kg_m2", (3, 3)), ("covariance", (23, 23))):
-            value = read_only(getattr(self, name))
-            if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"the motion's {name} must be {shape} finite numbers, got shape {value.shape}")
-            object.__setattr__(self, name, value)
+        keep_finite(self, "the motion's ", inertia_kg_m2=(3, 3), covariance=(23, 23))
         object.__setattr__(self, "contacts", tuple(MappingProxyType(dict(one)) for one in self.contacts))
 
     @property
@@ -202,19 +207,13 @@ class CalibrationResult(Displayed):
                 raise ValueError(f"{each.name} must be finite, not {value.tolist()}")
         if not is_rotation(self.R_flange_sensor):
             raise ValueError(f"R_flange_sensor must be a rotation matrix, not {self.R_flange_sensor.tolist()}")
-        _require_known_words(self)
+        for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} is {getattr(self, name)!r}, not one of {', '.join(choices)}")
         n = len(self.residuals)
-        for name, shape in (("covariance", (15, 15)), ("hidden_covariance", (15, 15)), ("residuals", (n, 6))):
-            value = read_only(getattr(self, name))
-            if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"{name} must be {shape} finite numbers, got shape {value.shape}")
-            object.__setattr__(self, name, value)
-        for name, length in (("measured_sigma", 6), ("weights", n), ("cable_shift", 15), ("mean_bias", 6)):
-            if getattr(self, name) is not None:
-                value = read_only(getattr(self, name))
-                if value.shape != (length,) or not np.isfinite(value).all():
-                    raise ValueError(f"{name} must be {length} finite numbers, got shape {value.shape}")
-                object.__setattr__(self, name, value)
+        keep_finite(self, "", covariance=(15, 15), hidden_covariance=(15, 15), residuals=(n, 6))
+        optional = {"measured_sigma": (6,), "weights": (n,), "cable_shift": (15,), "mean_bias": (6,)}
+        keep_finite(self, "", **{name: shape for name, shape in optional.items() if getattr(self, name) is not None})
         read: dict[str, Callable[[Mapping[str, Any]], object]] = {
             "drift": lambda given: DriftResult(given["change"], given["sigma"]),
             "response": lambda given: Response(given["coefficients"], given["covariance"]),
@@ -317,7 +316,7 @@ class CalibrationResult(Displayed):
     @property
     def weight_N(self) -> float:
         """Weight of the load on the sensor."""
-        return weight_and_tilt(self.gravity_force_base_N)[0]
+        return self.parameters.weight_N
 
     @property
     def mass_kg(self) -> float:
@@ -326,7 +325,7 @@ class CalibrationResult(Displayed):
 
     @property
     def tilt_alpha_rad(self) -> float:
-        """First tilt angle of the base, see `ftcalib.published.yu.weight_and_tilt`."""
+        """First tilt angle of the base, see `ftcalib.model.weight_and_tilt`."""
         return weight_and_tilt(self.gravity_force_base_N)[1]
 
     @property
@@ -407,6 +406,11 @@ class CalibrationResult(Displayed):
         rotation = None if is_of_loads else self.covariance[:3, :3]
         return sensor.after(self.parameters, self.shown_response, rotation, self._excess(sensor))
 
+    @property
+    def known_contact(self) -> ContactResponse | None:
+        """How the sensor reads a contact if known loads have shown it; None else."""
+        return self.contact if self.sensor is not None and self.sensor.source == "loads" else None
+
     def _excess(self, sensor: SensorMatrix) -> tuple[float, float] | None:
         """Return by how much more the tool weighs as read than by a scale, relative, and one sigma."""
         if self.weighed_kg is None:
@@ -428,7 +432,7 @@ class CalibrationResult(Displayed):
             return self.response
         n = self.n_poses - len(self.rejected_poses)
         left_out: list[float] = [self.quality.get(name, np.inf) for name in ("loo_force_rms_N", "loo_torque_rms_Nm")]
-        error = np.maximum(np.repeat(left_out, [5, 6]) / np.repeat([1.0, LEVER_M], [5, 6]), 1e-12)
+        error = np.maximum(np.repeat(left_out, [5, 6]) / np.repeat([1.0, RANGE_LEVER_M], [5, 6]), 1e-12)
         shown = max(self.dof, 0) / (6 * n) / 2 * n * SQUARES * (self.weight_N / error) ** 2
         covariance = np.zeros((15 + SIZE, 15 + SIZE))
         covariance[:15, :15] = self.covariance
@@ -472,8 +476,7 @@ class CalibrationResult(Displayed):
         -------
         array, shape (..., 6, 6)
         """
-        R = np.asarray(R_base_flange, dtype=np.float64)
-        return predicted_covariance(self.parameters, self.covariance, self.response, R)
+        return predicted_covariance(self.parameters, self.covariance, self.response, np.asarray(R_base_flange, float))
 
     def predicted_error(self) -> tuple[float, float]:
         """Expected root mean square error of `compensate` over all orientations, N and N·m, from noise alone."""
@@ -708,12 +711,6 @@ def require_positive_definite(covariance: Array) -> None:
     least = float(np.linalg.eigvalsh(correlations)[0]) if free.any() else 0.0
     if least < INDEFINITE:
         raise ValueError(f"the covariance is not positive definite: its smallest normalised eigenvalue is {least:.2g}")
-
-
-def _require_known_words(result: CalibrationResult) -> None:
-    for name, choices in (("method", (*get_args(Method), "motion")), ("noise_source", get_args(NoiseSource))):
-        if getattr(result, name) not in choices:
-            raise ValueError(f"{name} is {getattr(result, name)!r}, not one of {', '.join(choices)}")
 
 
 def _mass_and_sigma(given: Sequence[float] | None) -> tuple[float, float] | None:

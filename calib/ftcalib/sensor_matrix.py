@@ -1,11 +1,17 @@
-"""What the errors of a sensor's own matrix do to a contact: without known loads as a sigma, with them corrected.
+"""The matrix of a sensor: what of its errors a tool shows, and what they do to a contact.
 
     reading = (I + E) wrench + bias        in the sensor frame, about its origin
 
-A tool shows in all orientations what E does to forces at its centre of mass: the gain and cross-talk of
-`ftcalib.likelihood.response`, eleven of the 36 numbers. Of the others three are a rotation d of the sensor and three a
-shift of the centre of mass, which the calibration of the tool has in its estimates. A contact in the axes of that
-calibration is read as M times the contact, with
+A tool shows in all orientations what E does to forces at its centre of mass: a gain of the force, and cross-talk from
+force to torque,
+
+    force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
+
+with u the weight in the sensor frame. Both matrices are symmetric, and the gain has no trace: together with mounting,
+weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
+separated from the weight. These are eleven of the 36 numbers (`Response`). Of the others three are a rotation d of the
+sensor and three a shift of the centre of mass, which the calibration of the tool has in its estimates. A contact in the
+axes of that calibration is read as M times the contact, with
 
     M = I + E - blk([d]x, [d]x)        d: half the antisymmetric part of E_FF + E_FT [p]x, p the centre of mass
 
@@ -28,20 +34,17 @@ from scipy.linalg import block_diag
 from ftcalib.display import Displayed
 from ftcalib.errors import BadCalibration
 from ftcalib.files import JSON, check_format, read_object, write_object
-from ftcalib.known import COMMON_SHARE, USUAL_GAIN, Setup
-from ftcalib.likelihood.response import (
-    ENTRIES,
-    LEAST_COMMON_GAIN,
-    LEVER_M,
-    Response,
-    gain_at,
-    mounting_turn,
-    own_variances,
-    ranges,
-    shown_by,
-    vector_of,
+from ftcalib.known import COMMON_SHARE, CROSS_TALK_SHARE, RANGE_LEVER_M, USUAL_GAIN, Setup
+from ftcalib.model import (
+    Array,
+    Parameters,
+    SPECIAL_R_flange_base,
+    gravity_wrench,
+    jacobian,
+    keep_finite,
+    read_only,
+    skew,
 )
-from ftcalib.model import Array, Parameters, read_only, skew
 
 FORMAT = "ftdrive.sensor/1"
 
@@ -56,6 +59,178 @@ _LARGEST_ERROR, _LARGEST_SIGMA, _LEVERS_M, _LARGEST_FLOOR = 0.5, 0.5, (1e-3, 10.
 _DIAGONAL = np.arange(0, 36, 7)
 
 Source = Literal["assumed", "data sheet", "loads"]
+
+
+def _symmetric(i: int, j: int) -> Array:
+    matrix = np.zeros((3, 3))
+    matrix[i, j] = matrix[j, i] = 1.0
+    return matrix
+
+
+_MIXED = [_symmetric(i, j) for i, j in ((0, 1), (0, 2), (1, 2))]
+# (5, 3, 3) basis of the gain: equal and independent coefficients make the entries so.
+GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
+# (6, 3, 3) basis of the cross-talk, m: it counts relative to a force at this lever.
+CROSS_TALK_M = RANGE_LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
+SIZE = len(GAIN) + len(CROSS_TALK_M)
+# One sigma of each coefficient of a mounted or aged sensor before its fit.
+USUAL = USUAL_GAIN * np.array([1.0, 1.0, *[CROSS_TALK_SHARE] * 9])
+# Sum of the squares of the entries of each basis; of the cross-talk relative to the lever.
+SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
+
+# Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the symmetric
+# part of two entries has half their variance.
+_WEIGHTS = np.array([1, 1, 2, 2, 2]) / 5
+# Least sigma of the gain common to all axes: no orientation shows it, and no sensor is better.
+LEAST_COMMON_GAIN = 0.002
+
+
+def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
+    u = gravity_wrench(parameters, R_base_flange)[..., :3]
+    T = np.zeros((*u.shape[:-1], 6, SIZE))
+    T[..., :3, :5] = np.einsum("kij,...j->...ik", GAIN, u)
+    T[..., 3:, 5:] = np.einsum("kij,...j->...ik", CROSS_TALK_M, u)
+    return T
+
+
+def sensor_columns(parameters: Parameters, R_base_flange: Array) -> dict[str, Array]:
+    """Give these derivatives by what they are of."""
+    columns = response_columns(parameters, R_base_flange)
+    return {"gain": columns[..., : len(GAIN)], "cross_talk": columns[..., len(GAIN) :]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Response:
+    """Gain and cross-talk as estimated; what was not looked for, or not found, is zero. Arrays are read-only."""
+
+    coefficients: Array
+    """(11,) of the bases `GAIN` and `CROSS_TALK_M`."""
+    covariance: Array
+    """(26, 26) of the 15 error coordinates of the parameters and of the coefficients."""
+
+    def __post_init__(self) -> None:
+        keep_finite(self, "the response's ", coefficients=(SIZE,), covariance=(15 + SIZE, 15 + SIZE))
+
+    @property
+    def force_gain(self) -> Array:
+        """(3, 3) symmetric, without trace: read minus true force, over the true force."""
+        return np.asarray(np.tensordot(self.coefficients[:5], GAIN, 1))
+
+    @property
+    def cross_talk_m(self) -> Array:
+        """(3, 3) symmetric: torque read for a force, N·m/N."""
+        return np.asarray(np.tensordot(self.coefficients[5:], CROSS_TALK_M, 1))
+
+    @property
+    def sigma(self) -> dict[str, Array]:
+        """One standard deviation (3, 3) of each entry of both matrices, by their names."""
+        C = self.covariance[15:, 15:]
+        return {
+            name: np.sqrt(np.maximum(np.einsum("kij,kl,lij->ij", basis, C[own, own], basis), 0.0))
+            for name, basis, own in (("force_gain", GAIN, slice(5)), ("cross_talk_m", CROSS_TALK_M, slice(5, None)))
+        }
+
+    @property
+    def gain_sigma(self) -> float:
+        """Standard deviation of the entries of the whole gain, of which the symmetric part without trace shows."""
+        return float(np.sqrt(_WEIGHTS @ (self.coefficients**2 + np.diag(self.covariance)[15:])[:5]))
+
+    def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
+        """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
+        return np.asarray(response_columns(parameters, R_base_flange) @ self.coefficients)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Give what a calibration file holds of it; reading takes `coefficients` and `covariance`."""
+        return {
+            "force_gain": self.force_gain.tolist(),
+            "cross_talk_m": self.cross_talk_m.tolist(),
+            "sigma": {name: value.tolist() for name, value in self.sigma.items()},
+            "coefficients": self.coefficients.tolist(),
+            "covariance": self.covariance.tolist(),
+        }
+
+
+def joint_covariance(covariance: Array, response: Response | None) -> Array:
+    """(15, 15) of the parameters, or (26, 26) with gain and cross-talk where they were found."""
+    return covariance if response is None else response.covariance
+
+
+def joint_jacobian(parameters: Parameters, response: Response | None, R_base_flange: Array) -> Array:
+    """Derivative (..., 6, 15 or 26) of the wrench by what `joint_covariance` has."""
+    J = jacobian(parameters, R_base_flange)
+    return J if response is None else np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1)
+
+
+def with_covariance(response: Response | None, joint: Array) -> Response | None:
+    """Keep gain and cross-talk, if there are any, with another joint covariance."""
+    return None if response is None else Response(response.coefficients, joint)
+
+
+def predicted_covariance(
+    parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array
+) -> Array:
+    """Covariance (..., 6, 6) of the predicted wrench that the uncertainty of all estimates, (15, 15), causes."""
+    J = joint_jacobian(parameters, response, R_base_flange)
+    return np.asarray(J @ joint_covariance(covariance, response) @ np.swapaxes(J, -1, -2))
+
+
+def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
+    """Root mean square error of the predicted wrench over all orientations, N and N·m.
+
+    It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+    """
+    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
+    return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+
+
+ENTRIES = np.eye(36).reshape(36, 6, 6)
+"""Derivative of an error (6, 6) of the matrix by its entries, row by row."""
+
+
+def ranges(lever_m: float) -> Array:
+    """Return the ranges (6,) of the axes relative to that of a force, for a range of torque of `lever_m` times it."""
+    return np.repeat([1.0, lever_m], 3)
+
+
+def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
+    """Return the variances (36,) of the entries of a usual sensor's error, without what all axes have in common.
+
+    `gain_sigma` is one standard deviation of the entries of the diagonal, the common part included, and `lever_m` the
+    range of torque over that of force.
+    """
+    F = ranges(lever_m)
+    share = np.where(np.eye(6) > 0, np.sqrt(1 - COMMON_SHARE), CROSS_TALK_SHARE)
+    return np.asarray((gain_sigma * share * F[:, None] / F).ravel() ** 2)
+
+
+def gain_at(E: Array, p: Array) -> tuple[Array, Array]:
+    """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
+    P = skew(p)
+    return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
+
+
+def vector_of(M: Array) -> Array:
+    """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3)."""
+    A = (M - np.swapaxes(M, -1, -2)) / 2
+    return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
+
+
+def mounting_turn(E: Array, p: Array) -> Array:
+    """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
+    return vector_of(gain_at(E, p)[0])
+
+
+def shown_by(p: Array) -> Array:
+    """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
+    force, torque = gain_at(ENTRIES, p)
+    torque = torque - skew(p) @ skew(mounting_turn(ENTRIES, p))
+    parts = [
+        np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
+        for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
+    ]
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,7 +250,7 @@ class SensorMatrix(Displayed):
     covariance: Array
     """(39, 39) of a rotation of the sensor (3, rad, flange axes) and of the entries of E, row by row."""
     source: Source = "assumed"
-    lever_m: float = LEVER_M
+    lever_m: float = RANGE_LEVER_M
     """Range of torque over range of force."""
     floor: float = FLOOR
     """Errors that are not linear, relative to the load in units of the ranges, one sigma."""
@@ -83,18 +258,16 @@ class SensorMatrix(Displayed):
     """Serial number, sets of loads, date."""
 
     def __post_init__(self) -> None:
-        for name, shape in (("error", (6, 6)), ("covariance", (39, 39))):
-            value = read_only(getattr(self, name))
-            if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"the sensor's {name} must be {shape} finite numbers, got shape {value.shape}")
-            object.__setattr__(self, name, value)
+        keep_finite(self, "the sensor's ", error=(6, 6), covariance=(39, 39))
         if self.source not in ("assumed", "data sheet", "loads"):
             raise ValueError(f"the source is {self.source!r}, not assumed, data sheet or loads")
         if not (0 < self.lever_m < np.inf and 0 <= self.floor < 1):
             raise ValueError(f"lever_m is {self.lever_m} and floor {self.floor}, expected positive numbers")
 
     @classmethod
-    def usual(cls, gain_sigma: float = USUAL_GAIN, *, lever_m: float = LEVER_M, source: Source = "assumed") -> Self:
+    def usual(
+        cls, gain_sigma: float = USUAL_GAIN, *, lever_m: float = RANGE_LEVER_M, source: Source = "assumed"
+    ) -> Self:
         """Return what is known of a sensor without loads: the size of its errors.
 
         Parameters
@@ -129,13 +302,7 @@ class SensorMatrix(Displayed):
         return shared
 
     def shown_variance(self, p_sensor_com_m: Array) -> Array:
-        """Return the variance (11,) of the gain and cross-talk that a tool shows, before it is measured.
-
-        Parameters
-        ----------
-        p_sensor_com_m : array, shape (3,)
-            Its centre of mass.
-        """
+        """Return the variance (11,) of gain and cross-talk that a tool of this centre of mass shows, beforehand."""
         H = shown_by(p_sensor_com_m)
         return np.asarray(np.einsum("ai,ij,aj->a", H, self.covariance[3:, 3:] - self.common, H))
 

@@ -18,13 +18,12 @@ from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, Quality, judge
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.response import joint_covariance
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, Method, require_positive_definite
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SensorMatrix, joint_covariance
 
 SIMULATIONS = 400
 # No sensor resolves smaller differences of force.
@@ -124,6 +123,7 @@ def solve(
     quality = _judge(judged, free, dataset, measured_sigma, known, g_m_s2, setup)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
+    declares_sensor = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
     return CalibrationResult(
         parameters=judged.parameters,
         mean_bias=None if judged.drift is None else best.on_average.bias,
@@ -147,15 +147,9 @@ def solve(
         cable_shift=quality.cable_shift,
         second_basin_chi2=best.second_basin_chi2,
         quality=quality.to_dict(),
-        sensor=declared_sensor(setup),
+        sensor=SensorMatrix.declared(setup) if declares_sensor else None,
         weighed_kg=setup.weighed_kg,
     )
-
-
-def declared_sensor(setup: Setup) -> SensorMatrix | None:
-    """Return what the described cell declares of its sensor; None if nothing."""
-    declares = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
-    return SensorMatrix.declared(setup) if declares else None
 
 
 def _choose(

@@ -19,17 +19,7 @@ from ftmocks.disturbances import Contact, SensorDrift
 from ftmocks.hung_load import HungLoad
 from ftmocks.imperfections import IDEAL, Imperfections, Ripple
 from ftmocks.inertia import Body, drawn_gyration, moved_load
-from ftmocks.kinematics import (
-    Dh,
-    FlangeMotion,
-    JointState,
-    Vector6,
-    cross,
-    flange_motion,
-    forward,
-    jacobian,
-    rotation,
-)
+from ftmocks.kinematics import Dh, FlangeMotion, JointState, Vector6, cross, flange_motion, forward, jacobian, rotation
 from ftmocks.sensor_errors import PERFECT, SensorErrors
 
 MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}

@@ -4,7 +4,8 @@ What is estimated by a fit of few poses is uncertain, and so is what acts on its
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise, by a factor that only the residuals of the fit show, and what sensor, arm and cable usually do
-  (`ftcalib.after.cell_errors`). The residuals show its size, but not what other joint angles do in one orientation.
+  (`sensor_error_columns`, `_smooth_errors`). The residuals show its size, but not what other joint angles do in one
+  orientation.
 
 Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
 over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
@@ -21,23 +22,24 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
-from ftcalib.after.cell_errors import smooth_errors
 from ftcalib.after.state import Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.files import JSON
+from ftcalib.known import CROSS_TALK_SHARE, RANGE_LEVER_M, USUAL_GAIN
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.response import (
+from ftcalib.likelihood.structure import alike, hysteresis_columns
+from ftcalib.model import BIASES, Array, Parameters, gravity_wrench, jacobian, predict, read_only, skew
+from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import (
     SIZE,
     USUAL,
-    hysteresis_columns,
+    Response,
     joint_covariance,
     joint_jacobian,
     response_columns,
     with_covariance,
 )
-from ftcalib.model import BIASES, Array, jacobian, predict, read_only
-from ftcalib.result import CalibrationResult
 
 # Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
 USUAL_GAINS = np.array([0.1, 1.0])
@@ -50,6 +52,13 @@ BEYOND, LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
 FEW_TO_SMOOTH = 100
 # Least share of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
 LEAST_FACTOR = 0.1
+
+# A mounted or aged sensor before its fit, one sigma: its diagonal, and the rest of its range (levers of 50 mm).
+GAIN, CROSS = USUAL_GAIN, CROSS_TALK_SHARE * USUAL_GAIN
+# What of the gain depends on the load.
+LOAD = 0.005
+# Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
+TURN_RAD, CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
 
 _AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
 _CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
@@ -169,7 +178,7 @@ def expected_with_smooth_errors(
     e = (fitted.wrench[rows] - predict(p, R)).ravel()
     J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
     T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
-    smooth, between, new = (smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
+    smooth, between, new = (_smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
     alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
     coefficients = np.zeros(SIZE) if response is None else response.coefficients
@@ -277,3 +286,51 @@ def bias_change(expected: Expected, R_base_flange: Array, wrench: Array) -> Bias
         np.sqrt(expected.factor * np.diag(G @ part @ G.T).clip(0.0)) for part in (expected.noise, common)
     )
     return BiasChange(G @ residual.ravel(), noise, calibration)
+
+
+def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_base_flange: Array) -> Array:
+    """Give what errors of the sensor do to the reading of a load, for one sigma of each, beyond those of the tool.
+
+    The response to the tool is that to any load at its centre of mass. A load at another has a torque beside, to which
+    the sensor responds by errors of its own, as large as those that the tool shows.
+
+    Parameters
+    ----------
+    tool : Parameters
+        Of the calibration.
+    known : Response
+        To the tool, as of `known_response`.
+    p : Parameters
+        Of the load.
+    R_base_flange : array, shape (n, 3, 3)
+
+    Returns
+    -------
+    array, shape (n, 6, 38)
+        Independent columns, the errors of `known` not among them.
+    """
+    square = known.coefficients**2 + np.diag(known.covariance)[15:]
+    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / USUAL**2, [5]))
+    u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - tool.p_sensor_com_m)
+    entries = np.where(np.eye(3) > 0, GAIN, CROSS)
+    columns = np.zeros((len(u), 6, 27))
+    columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * CROSS / RANGE_LEVER_M))
+    columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
+    columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
+    # A gain of one load is that of another but for what depends on the load.
+    other = min(abs(p.weight_N / tool.weight_N - 1), 1.0) if tool.weight_N else 1.0
+    loads = response_columns(p, R_base_flange) * np.minimum(np.sqrt(square), LOAD) * other
+    return np.concatenate([columns, loads], axis=2)
+
+
+def _products(A: Array, v: Array, sigma: Array) -> Array:
+    """Derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
+    return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
+
+
+def _smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
+    """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
+    correlated = alike(R_base_flange, others)
+    turn, turn_other = (jacobian(p, R)[..., :3] * TURN_RAD for R in (R_base_flange, others))
+    of_arm = np.einsum("nm,nik,mjk->nimj", correlated, turn, turn_other)
+    return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(correlated, np.diag(CABLE**2))])

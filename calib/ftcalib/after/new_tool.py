@@ -15,14 +15,15 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.cell_errors import LOAD, sensor_error_columns
+from ftcalib.after.expected_readings import LOAD, sensor_error_columns
 from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import LEVER_M, SIZE, Response, joint_covariance, joint_jacobian, response_columns
+from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import SIZE, Response, joint_covariance, joint_jacobian, response_columns
 
 # Share of good runs that the test of what was kept rejects.
 FALSE_ALARMS = 1e-4
@@ -258,7 +259,7 @@ def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> 
     level = np.sqrt(variance)
     before_m, now_m = (float(np.linalg.norm(p.p_sensor_com_m)) for p in (earlier.parameters, new))
     forces = earlier.weight_N, new.weight_N
-    torques = forces[0] * before_m, forces[1] * max(now_m, LEVER_M)
+    torques = forces[0] * before_m, forces[1] * max(now_m, RANGE_LEVER_M)
     for channels, (before, now) in ((slice(3), forces), (slice(3, 6), torques)):
         ratio = max(1.0, now / before) if before else 1.0
         level[channels] = np.maximum(level[channels], np.minimum(level[channels] * ratio**3, most * now))

@@ -13,22 +13,15 @@ from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 
-from ftcalib.after.cell_errors import known_response
 from ftcalib.after.series import Estimated
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.data.dwell_mean import is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding
-from ftcalib.likelihood.response import (
-    Response,
-    joint_covariance,
-    joint_jacobian,
-    predicted_covariance,
-    with_covariance,
-)
 from ftcalib.model import BIASES, Array, Parameters, read_only, skew
 from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import Response, joint_covariance, joint_jacobian, predicted_covariance, with_covariance
 
 SIGNIFICANT_SIGMAS = 5.0
 # Squared step in standard deviations at which the iteration ends.
@@ -57,6 +50,14 @@ class Calibrated(Estimated, Protocol):
     @property
     def response(self) -> Response | None:
         """Gain and cross-talk of the sensor."""
+
+
+def known_response(calibration: Estimated, found: Response | None) -> Response | None:
+    """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
+
+    None for an update of a calibration that has none.
+    """
+    return calibration.shown_response if found is None and isinstance(calibration, CalibrationResult) else found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,29 +110,14 @@ def with_bias_change(calibration: Calibrated, change: Array, sigma: Array, *, me
 
 
 def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:
-    """Estimated some of the parameters again by generalised least squares; keep the others.
+    """Estimate some of the parameters again by generalised least squares; keep the others.
 
-    With x the parameters of `kind` and e the errors of the old calibration, a reading is h(x) + K e + noise. The
-    weights are the inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the
-    matrix of the estimate.
+    With x the parameters of `kind`, one of `BLOCKS`, and e the errors of the old calibration, a reading is h(x) + K e
+    + noise, with the covariance `noise` (6n, 6n) of all mean readings, pose by pose. The weights are the inverse of
+    noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the matrix of the estimate.
 
-    Parameters
-    ----------
-    calibration : CalibrationResult or Update
-    R_base_flange : array, shape (n, 3, 3)
-    wrench : array, shape (n, 6)
-        Mean readings as measured, N and N·m, in the sensor frame.
-    noise : array, shape (6n, 6n)
-        Covariance of all readings, pose by pose.
-    kind : str
-        One of `BLOCKS`.
-
-    Raises
-    ------
-    BadDataset
-        Shapes that do not fit each other.
-    NotObservable
-        The poses do not determine these parameters, or the weight is not significant.
+    Raises `BadDataset` for shapes that do not fit each other, and `NotObservable` where the poses do not determine
+    these parameters, or the weight is not significant.
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
     R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
@@ -308,25 +294,11 @@ USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03
 def compare_with_prediction(
     calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, drift_N: float, drift_Nm: float
 ) -> tuple[Array, Array]:
-    """Compare readings of a free tool with the prediction.
+    """Compare mean readings (n, 6) of a free tool, as measured, with the prediction; `wrench_cov` (n, 6, 6) is theirs.
 
-    Parameters
-    ----------
-    calibration : CalibrationResult or Update
-    R_base_flange : array, shape (n, 3, 3)
-    wrench : array, shape (n, 6)
-        Means, N and N·m, in the sensor frame.
-    wrench_cov : array, shape (n, 6, 6)
-        Covariance of those means.
-    drift_N, drift_Nm : float
-        Expected drift of the biases, one standard deviation an axis.
-
-    Returns
-    -------
-    change : array, shape (n, 6)
-        Measured minus predicted.
-    sigmas : array, shape (n,)
-        Mahalanobis distance, with noise, drift and the uncertainty of the calibration.
+    `drift_N` and `drift_Nm` are the expected drift of the biases, one standard deviation an axis. Returns measured
+    minus predicted (n, 6), and the Mahalanobis distances (n,) with noise, drift and the uncertainty of the
+    calibration.
     """
     p, response = calibration.parameters, calibration.response
     change = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)

@@ -20,17 +20,23 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.cell_errors import LOAD, known_response, sensor_error_columns
-from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update
+from ftcalib.after.expected_readings import LOAD, sensor_error_columns
+from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update, known_response
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
-from ftcalib.likelihood.response import joint_covariance, joint_jacobian, ranges, response_columns, with_covariance
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
 from ftcalib.rounding import to_place_of, with_sigma
-from ftcalib.sensor_matrix import ContactResponse
+from ftcalib.sensor_matrix import (
+    ContactResponse,
+    joint_covariance,
+    joint_jacobian,
+    ranges,
+    response_columns,
+    with_covariance,
+)
 
 # A part is held so near to the given point, one standard deviation an axis.
 REACH_M = 0.1
@@ -93,8 +99,7 @@ class Weight(Displayed):
         mass = with_sigma(self.mass_kg, self.mass_sigma_kg)
         rows = [Row("least mass that differs from 0", [to_place_of(self.least_kg, self.mass_sigma_kg)], "kg")]
         if self.is_something:
-            pairs = zip(1e3 * self.p_sensor_com_m, 1e3 * self.com_sigma_m, strict=True)
-            rows.append(Row("centre of mass x, y, z", [with_sigma(*pair) for pair in pairs], "mm in sensor axes"))
+            rows.append(Row("centre of mass x, y, z", self.com_in_words, "mm in sensor axes"))
         return Summary(
             f"Weight {mass} kg (1 sigma)", rows, [] if self.fault is None else [f"not one weight: {self.fault}"]
         )
@@ -108,6 +113,11 @@ class Weight(Displayed):
     def com_sigma_m(self) -> Array:
         """(3,) one standard deviation along the axes of the sensor."""
         return np.asarray(np.sqrt(np.diag(self.com_covariance)))
+
+    @property
+    def com_in_words(self) -> list[str]:
+        """x, y and z of the centre of mass with their standard deviations, mm in sensor axes."""
+        return [with_sigma(1e3 * x, 1e3 * s) for x, s in zip(self.p_sensor_com_m, self.com_sigma_m, strict=True)]
 
 
 def drift_since(seconds: float, per_h: Array = DRIFT_PER_H) -> Array:
@@ -271,19 +281,8 @@ def _by_sensor(by_reading: Array, mass_kg: float, contact: ContactResponse, held
 def moment_as_read(moment: tuple[Array, Array], contact: ContactResponse) -> tuple[tuple[Array, Array], Array]:
     """Return what the sensor reads as mass and moment of a part that it carries in all directions.
 
-    Parameters
-    ----------
-    moment : array, shape (4,), and array, shape (4, 4)
-        True mass (kg) and mass times centre of mass (kg m) of the part, and their covariance.
-    contact : ContactResponse
-        How the sensor reads a contact.
-
-    Returns
-    -------
-    as_read : array, shape (4,), and array, shape (4, 4)
-        With their covariance.
-    of_sensor : array, shape (4, 4)
-        Covariance of the true ones by errors of the sensor.
+    `moment` holds the true mass (kg) and mass times centre of mass (kg m) of the part (4,), and their covariance
+    (4, 4). Returns the same as read, and the covariance (4, 4) of the true ones by errors of the sensor.
     """
     (x, covariance), A = moment, _unit_readings(np.eye(3))
     by_reading = np.asarray(np.linalg.pinv(A.reshape(18, 4)), dtype=np.float64)
@@ -293,16 +292,10 @@ def moment_as_read(moment: tuple[Array, Array], contact: ContactResponse) -> tup
 
 def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:
     """Return mass (kg) and centre of mass (3,) of the tool, without errors that known loads have shown."""
-    if (contact := known_contact(calibration)) is None:
+    if (contact := calibration.known_contact) is None:
         return calibration.mass_kg, calibration.p_sensor_com_m
     weight_N, p_sensor_com_m = contact.true_load(calibration.shown_response)
     return weight_N / calibration.g_m_s2, p_sensor_com_m
-
-
-def known_contact(calibration: CalibrationResult) -> ContactResponse | None:
-    """Return how the sensor reads a contact if known loads have shown it; None else."""
-    sensor = calibration.sensor
-    return calibration.contact if sensor is not None and sensor.source == "loads" else None
 
 
 def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:

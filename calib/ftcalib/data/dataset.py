@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any, Literal, Self
 
 import numpy as np
-import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.data.dwell_mean import CHANNELS
@@ -31,11 +30,6 @@ LARGEST = 1e9
 # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits.
 LEAST_VARIANCE = 1e-18
 MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
-QUATERNION_COLUMNS = ("qx", "qy", "qz", "qw")
-VECTOR_COLUMNS = ("rx", "ry", "rz")
-_LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
-# A quaternion rounded to two decimals differs from length 1 by no more.
-_ROUNDED_LENGTH = 0.01
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +71,7 @@ class CalibrationDataset(Displayed):
         if n == 0:
             raise BadDataset("the dataset has no pose: record at least four.")
         wrench = _require_measured("wrench", self.wrench, (n, 6))
-        R_base_flange = _rotations(_require_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
+        R_base_flange = proper_rotations(_require_measured("R_base_flange", self.R_base_flange, (n, 3, 3)))
         t_s = _require_shape("t_s", self.t_s, (n,))
         for i in np.flatnonzero(np.isinf(t_s)):
             raise BadDataset(f"row {i + 1}: t_s is {t_s[i]}, expected seconds or NaN for unknown.")
@@ -243,25 +237,6 @@ def list_names(names: Sequence[str], most: int = 20) -> str:
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
-def rotations_of(columns: Sequence[str], table: Array) -> Array:
-    """Return the rotations (n, 3, 3) in these columns (n, k); raises `BadDataset` naming the row."""
-    if columns == MATRIX_COLUMNS:
-        return _rotations(table.reshape(-1, 3, 3))
-    length = np.linalg.norm(table, axis=1)
-    if columns == QUATERNION_COLUMNS:
-        for i in np.flatnonzero(np.abs(length - 1) > _ROUNDED_LENGTH):
-            raise BadDataset(
-                f"row {i + 1}: the quaternion has length {length[i]:.3g}, not 1: check {', '.join(columns)}."
-            )
-        return scipy.spatial.transform.Rotation.from_quat(table).as_matrix()
-    if length.max() > _LONGEST_VECTOR_RAD:
-        raise BadDataset(
-            f"row {length.argmax() + 1}: the rotation vector is {length.max():.0f} rad long, more than 2π: rx, ry, rz "
-            "look like degrees, convert them to rad."
-        )
-    return scipy.spatial.transform.Rotation.from_rotvec(table).as_matrix()
-
-
 def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
     """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
     array = _require_shape(name, value, shape)
@@ -292,7 +267,8 @@ def _reject(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None
         raise BadDataset(f"row {row + 1}: {name}{entry} is {array[(row, *rest)]:.3g}, {why}")
 
 
-def _rotations(R: Array) -> Array:
+def proper_rotations(R: Array) -> Array:
+    """Return rotations (n, 3, 3) without their rounding. Raises `BadDataset` naming the row that is none."""
     error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     for i in np.flatnonzero(error > ROUNDING):
         raise BadDataset(

@@ -87,26 +87,11 @@ def without_swing(wrench: Array, duration_s: float) -> tuple[Array, Array]:
     """Take the swing of a weight on a string out of a dwell: two harmonics of one frequency, if significant.
 
     The mean of what is left is the constant of the fit. A plain mean would keep a part of the swing, because a dwell
-    hardly ever holds whole periods.
+    hardly ever holds whole periods. `wrench` (N, 6) has 20 evenly spaced samples or more, in N and N·m, over
+    `duration_s`; three periods of the longest string, of 1.4 s, are best.
 
-    Parameters
-    ----------
-    wrench : array, shape (N, 6)
-        Consecutive samples, evenly spaced, N and N·m; N >= 20.
-    duration_s : float
-        From the first to the last; at least three periods of the longest string, of 1.4 s, are best.
-
-    Returns
-    -------
-    left : array, shape (N, 6)
-        The samples without the swing; the samples themselves if none is significant.
-    amplitude : array, shape (6,)
-        Of the first harmonic; zero if none is significant.
-
-    Raises
-    ------
-    BadDataset
-        Too few samples, or a value that is not finite.
+    Returns the samples without the swing, and the amplitude (6,) of the first harmonic, zero if none is significant.
+    Raises `BadDataset` for too few samples, or a value that is not finite.
     """
     wrench = _require_samples(wrench)
     N = len(wrench)
@@ -164,17 +149,8 @@ def is_stationary(wrench: Array) -> bool:
 def noise_level(wrench: Array, window: int) -> Array:
     """Standard deviation (6,) of an untouched sensor: the median over windows, little affected by contact or drift.
 
-    Parameters
-    ----------
-    wrench : array, shape (N, 6)
-        Consecutive samples of the arm at rest, N and N·m.
-    window : int
-        Samples in a window, 20 to N; as many as in the dwells to compare with it.
-
-    Raises
-    ------
-    BadDataset
-        Too few samples, or a value that is not finite.
+    `wrench` (N, 6) are samples of the arm at rest, N and N·m. A window has 20 to N samples, as many as the dwells to
+    compare with it. Raises `BadDataset` for too few samples, or a value that is not finite.
     """
     wrench = _require_samples(wrench)
     if not LEAST_SAMPLES <= window <= len(wrench):
@@ -190,17 +166,8 @@ def is_quiet(wrench: Array, level: Array) -> bool:
     so quiet dwells fail as rarely as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a
     low-pass of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, because 2 s contain few independent samples.
 
-    Parameters
-    ----------
-    wrench : array, shape (N, 6)
-        Consecutive samples, N and N·m; N >= 20.
-    level : array, shape (6,)
-        From `noise_level`.
-
-    Raises
-    ------
-    BadDataset
-        Too few samples, or a value that is not finite.
+    `level` (6,) is that of `noise_level`. Raises `BadDataset` for fewer than 20 samples, or a value that is not
+    finite.
     """
     return is_stationary(wrench) and not restless_channels(wrench, level).any()
 

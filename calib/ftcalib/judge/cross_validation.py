@@ -11,10 +11,10 @@ import numpy as np
 
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Fit
-from ftcalib.likelihood.response import Response
 from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.variance_components import FORCE, TORQUE, component, left_out
 from ftcalib.model import Array, DriftResult, Parameters, jacobian, predict
+from ftcalib.sensor_matrix import Response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,14 +155,7 @@ class DriftAhead:
 
 
 def drift_ahead(fit: Judged, t_s: Array | None = None) -> DriftAhead:
-    """Extrapolate the drift of a fit.
-
-    Parameters
-    ----------
-    fit : Judged
-    t_s : array, shape (n,), optional
-        When each pose was measured; without it, or with times that are not finite, one pose every 10 s in their order.
-    """
+    """Extrapolate the drift of a fit; without finite times `t_s` (n,) one pose every 10 s in their order."""
     if fit.drift is None or fit.drift.course is None:
         return DriftAhead(*np.zeros((3, 6)))
     n = len(fit.weights)

@@ -14,9 +14,8 @@ from scipy.special import stdtrit
 from ftcalib.findings import Finding
 from ftcalib.judge import units
 from ftcalib.judge.observability import RECOMMENDED_POSES
-from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
-from ftcalib.model import UP_IN_BASE, Array, Parameters, gravity_wrench, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+from ftcalib.likelihood.rotation_minima import com_and_torque_bias, force_cost, given_rotation, minima
+from ftcalib.model import UP_IN_BASE, Array, Parameters, SPECIAL_R_flange_base, gravity_wrench, predict
 
 # Rounding of readings, relative to the largest: no fit leaves less.
 ROUNDING = 1e-9
@@ -211,7 +210,7 @@ _Reading = tuple[str, Mapping[str, Any], Array, Array]
 
 def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
     """Yield each mistake as code and values, with the data as they are without it, the simplest first."""
-    if is_euler(written):
+    if written.lower() in EULER_ORDERS:
         yield from _other_orders(R, wrench, written)
     if written != "joints":
         yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
@@ -230,11 +229,6 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
         yield "pairing_shifted", {"neighbour": side}, R[own], wrench[other]
     # The model is linear in the orientation, so a difference of two serves as one.
     yield "zeroed_each_pose", {}, np.diff(R, axis=0), wrench[1:]
-
-
-def is_euler(written: str) -> bool:
-    """Whether orientations were written as three angles about x, y and z in any order."""
-    return written.lower() in EULER_ORDERS
 
 
 def _other_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:

@@ -124,19 +124,9 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
 
 
 def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None) -> None:
-    """Raise `NotObservable` for poses that do not determine the parameters.
+    """Raise `NotObservable`, with the reason and the poses to add, for poses that do not determine the parameters.
 
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-    parameters : Parameters
-        Estimated, because observability depends on the direction of gravity.
-    wrench_cov : array, shape (n, 6, 6), optional
-
-    Raises
-    ------
-    NotObservable
-        The message names the reason and the poses to add.
+    The parameters are the estimated ones, because observability depends on the direction of gravity.
     """
     require_orientations(R_base_flange)
     observability = assess(R_base_flange, parameters, wrench_cov, advise=False)

@@ -22,7 +22,6 @@ from ftcalib.findings import CODES, Finding, Severity
 from ftcalib.judge.faults import CORRECTED, ROUNDING, rough_fit
 from ftcalib.likelihood.descent import FARTHEST, column_scale
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.response import response_columns
 from ftcalib.likelihood.session_noise import summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.variance_components import EFFECTS, GAIN, GAIN_OF_RESPONSE, squared_length
@@ -38,6 +37,7 @@ from ftcalib.model import (
     rotation_of,
     skew,
 )
+from ftcalib.sensor_matrix import response_columns
 
 # Fewer do not show a change beside 15 parameters.
 FEWEST_POSES = 10
@@ -183,15 +183,8 @@ def minus_two_log_likelihood(found: Fit) -> float:
 def likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
     """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
 
-    Parameters
-    ----------
-    parameters : Parameters
-        Estimated from all poses.
-    R : array, shape (n, 3, 3)
-        In the order of time, as the wrench.
-    wrench : array, shape (n, 6)
-    scale : array, shape (6,)
-        How much each channel is off without a change, in any common unit.
+    The poses are in the order of time. `scale` (6,) is how much each channel is off without a change, in any common
+    unit.
     """
     n = len(wrench)
     ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
@@ -440,12 +433,8 @@ _AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
 def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     """Look for the torque of a spring in what a fit leaves; None if chance explains it.
 
-    Returns
-    -------
-    finding : Finding
-        With the torque, root mean square over the poses, and what it may have done to the centre of mass.
-    shift : array, shape (15,)
-        By which it may have moved the estimates; zero for the biases, which belong to the cell.
+    The finding holds the torque, root mean square over the poses, and what it may have done to the centre of mass. The
+    second value (15,) is by what it may have moved the estimates; zero for the biases, which belong to the cell.
     """
     n = len(fit.order)
     dof = fit.dof - STIFFNESS - SLACK

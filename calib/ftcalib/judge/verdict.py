@@ -19,11 +19,10 @@ from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_w
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
 from ftcalib.judge.session_change import cable_of, session_change
 from ftcalib.known import NOTHING, Known, Setup
-from ftcalib.likelihood.response import Response, predicted_covariance
 from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
 from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
-from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, DriftResult
+from ftcalib.sensor_matrix import Response, expected_error
 
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
@@ -108,7 +107,7 @@ class Quality:
 
     @property
     def _is_noise(self) -> bool:
-        return self.fits_measured_noise and few_rejected(self.used)
+        return self.fits_measured_noise and _few_rejected(self.used)
 
     @property
     def next_use_rms(self) -> Array:
@@ -189,7 +188,7 @@ def judge(  # noqa: PLR0913 - one for each thing that may be known
     quality = _statistics(fit, t_s, setup)
     parameters, weight_N = fit.parameters, fit.parameters.weight_N
     # Uneven rounding alone also rejects poses.
-    accidents = few_rejected(quality.used) or bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
+    accidents = _few_rejected(quality.used) or bool((np.abs(fit.residuals) <= _finest(fit.wrench)).all())
     suspect = quality.errors or not accidents or "cross_talk" in fit.components  # which hides axes that almost agree
     mistakes = _mistakes(fit, quality.used, t_s, setup, written) if suspect else []
     mistakes = mistakes or _unrelated_torques(fit, quality)
@@ -272,7 +271,7 @@ def _statistics(fit: Judged, t_s: Array | None, setup: Setup) -> Quality:
         largest_share,
         errors,
         *left_out_rms,
-        np.array(left_out_rms if few_rejected(used) else _left_out_rms(fit, np.ones_like(used))),
+        np.array(left_out_rms if _few_rejected(used) else _left_out_rms(fit, np.ones_like(used))),
         fit.elsewhere.reshape(2, 3).sum(axis=1),
         error_with_other_joints(fit.parameters, setup.orientation_rad) ** 2,
         np.array(expected_error(fit.parameters, fit.covariance, fit.response)),
@@ -283,7 +282,7 @@ def _statistics(fit: Judged, t_s: Array | None, setup: Setup) -> Quality:
     )
 
 
-def few_rejected(used: NDArray[np.bool_]) -> bool:
+def _few_rejected(used: NDArray[np.bool_]) -> bool:
     """Whether so few poses were rejected that something happened to them alone."""
     return bool(used.sum() >= (1 - FEW_LEFT_OUT) * len(used))
 
@@ -328,7 +327,7 @@ def _other_poses(fit: Judged, used: NDArray[np.bool_], t_s: Array | None) -> lis
     kept = order[used[order]]
     named = other_poses(fit.R_base_flange[kept], fit.wrench[kept])
     # Those that fit by chance do not show how far off the poses are.
-    if named and not few_rejected(used):
+    if named and not _few_rejected(used):
         named = other_poses(fit.R_base_flange[order], fit.wrench[order]) or named
     return named
 
@@ -340,14 +339,9 @@ def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
 
 
 def successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
-    """Correlation of the residuals of successive poses, and the probability of a larger one by chance.
+    """Correlation of standardized residuals (n, 6) of successive poses, and the probability of a larger one by chance.
 
-    Parameters
-    ----------
-    standardized : array, shape (n, 6)
-        Residuals with unit variance.
-    t_s : array, shape (n,), optional
-        Order of the poses; rows in order if missing or not finite.
+    The times `t_s` order the poses; rows are in order if they are missing or not finite.
     """
     if t_s is not None and np.isfinite(t_s).all():
         standardized = standardized[np.argsort(t_s, kind="stable")]
@@ -364,16 +358,6 @@ def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[t
     pairs = [(float(correlation[i, j]), i, j) for i, j in combinations(range(len(sigma)), 2)]
     strong = sorted((pair for pair in pairs if abs(pair[0]) > least), key=lambda pair: -abs(pair[0]))
     return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
-
-
-def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
-    """Root mean square error of the predicted wrench over all orientations, N and N·m.
-
-    It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
-    """
-    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
-    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
-    return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
 def _errors(

@@ -131,19 +131,10 @@ def _sixty(A: Array) -> Array:
 
 
 def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
-    """Sum up all that the model needs to know of poses with common noise.
+    """Sum up all that the model needs to know of poses with common noise; sums of disjoint data add up.
 
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-    wrench : array, shape (n, 6)
-    reference : array, shape (6, 10)
-        Only its last column may differ from zero: an offset.
-
-    Returns
-    -------
-    array, shape (16, 16)
-        Sum of row.T @ row with row = (wrench - offset, features). Sums of disjoint data add up.
+    Of `reference` (6, 10) only the last column may differ from zero: an offset. Returns the sum (16, 16) of row.T @
+    row with row = (wrench - offset, features).
     """
     n = len(wrench)
     gram = np.zeros((16, 16))
@@ -336,21 +327,10 @@ def fewest_kept(n: int) -> int:
 
 
 def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters]) -> tuple[Parameters, Kept] | None:
-    """Find the largest set of poses that one calibration explains.
+    """Find the largest set of poses that one calibration explains, from several starts.
 
-    Parameters
-    ----------
-    descent : Descent
-        Descent for these poses.
-    weights : array, shape (n, 6, 6)
-        Inverse noise covariances.
-    starts : sequence of Parameters
-
-    Returns
-    -------
-    parameters : Parameters
-    kept : bool array, shape (n,)
-        Or None when fewer than `fewest_kept` agree, from every start.
+    `weights` (n, 6, 6) are inverse noise covariances. Returns the parameters and which poses are kept (n,), or None
+    for these when fewer than `fewest_kept` agree, from every start.
     """
     phi, wrench = features(descent.R), descent.wrench
 

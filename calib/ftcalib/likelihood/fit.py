@@ -13,7 +13,6 @@ from ftcalib.errors import NotObservable
 from ftcalib.known import USUAL_GAIN, Constraints, Known
 from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
-from ftcalib.likelihood.response import SIZE, Response, sensor_columns
 from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
@@ -31,6 +30,7 @@ from ftcalib.likelihood.variance_components import (
     point,
 )
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
+from ftcalib.sensor_matrix import SIZE, Response, sensor_columns
 
 # From this difference of the criterion on the data show a structure: real ones have 250 and more in 24 poses.
 _SURE = 40.0

@@ -4,14 +4,14 @@ For a known mount the rest of the force model is linear. With gravity and bias e
 `min r.T @ Q @ r` over the rotations, where `r = R.ravel()` and `R = R_flange_sensor.T` maps flange to sensor
 coordinates (`s_eR` in Yu et al.). Written in unit quaternions this is a quartic on the sphere, which makes it small
 enough to solve completely: Newton descents from a fixed set of starts find all minima, and a sum of squares proves
-that no rotation costs less.
+that no rotation costs less. `given_rotation` and `com_and_torque_bias` then solve the linear rest.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from ftcalib.model import Array
+from ftcalib.model import Array, skew
 
 # Rows per matrix product: 0.4 MB, so that a chunk stays in the cache.
 _CHUNK = 4096
@@ -96,6 +96,20 @@ def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array,
     gravity_N = _inverse(gravity_square, gram[12, 12]) @ gravity_force @ R_sensor_flange.ravel()
     mean = gram[12, :12] / gram[12, 12] + offset[:12]
     return gravity_N, mean[:3] - R_sensor_flange @ mean[3:].reshape(3, 3).T @ gravity_N
+
+
+def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array]:
+    """Centre of mass and torque bias by linear least squares: Yu eqs 43-45.
+
+    The paper's regressor is the measured force without bias, whose noise makes P too short by
+    sigma^2 / (sigma^2 + mg^2 / 3).
+
+    `weight_N` (n, 3) is the measured force minus the force bias, in the sensor frame; both results are (3,).
+    """
+    P_x_F = -skew(weight_N)
+    C = np.concatenate([P_x_F, np.broadcast_to(np.eye(3), P_x_F.shape)], axis=2)
+    solution = np.asarray(np.linalg.lstsq(C.reshape(-1, 6), torque_Nm.ravel())[0], dtype=np.float64)
+    return solution[:3], solution[3:]
 
 
 def minima(Q: Array) -> list[RotationMinimum]:

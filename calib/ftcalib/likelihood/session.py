@@ -6,13 +6,11 @@ from typing import Literal
 import numpy as np
 
 from ftcalib.data.dwell_mean import RESOLUTION
-from ftcalib.known import USUAL_GAIN, Constraints
+from ftcalib.known import RANGE_LEVER_M, USUAL_GAIN, Constraints
 from ftcalib.likelihood.descent import Descent, Kept, Minimum, Statistics, coefficients, column_scale, features
-from ftcalib.likelihood.response import GAIN, hysteresis_columns, own_variances, sensor_columns, shown_by
-from ftcalib.likelihood.response import LEVER_M as CROSS_TALK_LEVER_M
 from ftcalib.likelihood.session_noise import Noise, pose_times
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
-from ftcalib.likelihood.structure import structure_columns
+from ftcalib.likelihood.structure import hysteresis_columns, structure_columns
 from ftcalib.likelihood.variance_components import (
     FORCE,
     HYSTERESIS,
@@ -25,6 +23,7 @@ from ftcalib.likelihood.variance_components import (
     component,
 )
 from ftcalib.model import Array, Parameters, jacobian, predict
+from ftcalib.sensor_matrix import GAIN, own_variances, sensor_columns, shown_by
 
 Drift = Literal["auto", "none", "linear", "random-walk"]
 
@@ -157,7 +156,7 @@ class Session:
             A, residual = self.constraints.measurements(p)
             Z = self.constraints.free(p)
             J, H, g = J @ Z, Z.T @ A.T @ A @ Z, Z.T @ A.T @ residual
-        lever = float(np.linalg.norm(p.p_sensor_com_m)) / CROSS_TALK_LEVER_M
+        lever = float(np.linalg.norm(p.p_sensor_com_m)) / RANGE_LEVER_M
         effects = sensor_columns(p, self.R) | {"hysteresis": hysteresis_columns(p, self.R)}
         if kinds := {c.kind for c in (STRUCTURE if self.n <= STRUCTURED_POSES else self.structure())}:
             structure = structure_columns(p, self.R, self.R.mean(axis=0))

@@ -8,12 +8,12 @@ The coefficients of a kind are unknowns of mean zero with one variance. Each bas
 orientation, so that the standard deviation is that of the error itself: a share of the weight, N and N·m, rad.
 
 Errors of arm and mounts that resemble the parameters do not show in the data. Their sizes are assumed, and they belong
-to the sigmas of the parameters (`hidden_columns`).
+to the sigmas of the parameters (`hidden_columns`). Hysteresis is no smooth error: see `hysteresis_columns`.
 """
 
 import numpy as np
 
-from ftcalib.likelihood.response import LEVER_M
+from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
 # Of more poses only the kinds that some of them show, because so many unknowns take memory and time.
@@ -132,7 +132,7 @@ def _load_columns(parameters: Parameters, R_base_flange: Array) -> Array:
     """
     u = gravity_wrench(parameters, R_base_flange)[:, :3] / max(parameters.weight_N, 1e-12)
     squares = np.column_stack([u**2, np.sqrt(2) * u * u[:, [1, 2, 0]]])
-    lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), LEVER_M)
+    lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), RANGE_LEVER_M)
     scale = parameters.weight_N * np.repeat([1.0, lever_m], 3)
     return _of_each_channel(np.column_stack([squares, u**3]) / np.sqrt(2)) * scale[:, None]
 
@@ -140,3 +140,28 @@ def _load_columns(parameters: Parameters, R_base_flange: Array) -> Array:
 def _of_each_channel(basis: Array) -> Array:
     """Give columns (n, 6, 6 k) that have the basis (n, k) in one channel each."""
     return np.asarray(np.einsum("cd,nk->ncdk", np.eye(6), basis).reshape(len(basis), 6, -1))
+
+
+# How a sensor with hysteresis reads: each axis lags behind by a share of its last swing.
+# Reading i is wrench i less a share of its step, wrench i minus wrench i - 1.
+#
+# Six shares, one for each axis, have one variance. Where the arm came from before the first pose is unknown, so that
+# pose is off by a share of a usual swing. Compensation knows no swing: hysteresis is part of the noise of a reading.
+
+# More poses need no allowance for the first.
+FEW = 1000
+
+
+def hysteresis_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+    """Give the derivative (n, 6, 12) of the wrench by the shares, and by those of the swing to the first pose.
+
+    The poses are in the order of measuring. More than 1000 have only the first 6 columns.
+    """
+    wrench = gravity_wrench(parameters, R_base_flange)
+    n, axis = len(wrench), range(6)
+    columns = np.zeros((n, 6, 12 if n <= FEW else 6))
+    swing = np.diff(wrench, axis=0)
+    columns[1:, axis, axis] = -swing
+    if n <= FEW:
+        columns[0, axis, range(6, 12)] = np.sqrt(np.mean(swing**2, axis=0))
+    return columns

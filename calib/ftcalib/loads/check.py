@@ -1,15 +1,17 @@
 """Whether a sensor reads a known weight right: one weight on a string, in one pose or several."""
 
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
 
 from ftcalib.after.state import Calibrated
 from ftcalib.compensation import Compensator
-from ftcalib.likelihood.response import predicted_covariance
+from ftcalib.files import JSON
 from ftcalib.loads.model import KnownLoad
 from ftcalib.model import Array, cross
 from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import predicted_covariance
 
 # So many sigmas of what the sensor promises are within it.
 _WITHIN = 2.0
@@ -42,6 +44,11 @@ class LoadCheck(NamedTuple):
     def is_significant(self) -> bool:
         """Whether the check shows an error at all."""
         return abs(self.scale_error) > _WITHIN * self.scale_sigma
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return it as JSON, without a number that is not known."""
+        values: dict[str, JSON] = {key: value if isfinite(value) else None for key, value in self._asdict().items()}
+        return values | {"is_within": self.is_within}
 
 
 def check_load(

@@ -16,9 +16,8 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ftcalib.data.dataset import CalibrationDataset
 from ftcalib.display import Displayed
-from ftcalib.likelihood.response import ranges
 from ftcalib.model import Array, cross, rotation_of, skew
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 
 # All places share an error of the sensor origin, one sigma.
 ORIGIN_M = 0.0005
@@ -148,20 +147,9 @@ class Evaluated:
 class LoadModel:
     """All unknowns of runs with known loads, at their present values.
 
-    Parameters
-    ----------
-    runs : sequence of LoadRun
-    prior : SensorMatrix
-    R_flange_sensor : array, shape (3, 3)
-        To begin with.
-    tool : float and array, shape (3,)
-        Mass and centre of mass from the sensor origin in flange axes, to begin with.
-    p_flange_sensor_m : array, shape (3,)
-        Sensor origin.
-    gravity_base_m_s2 : array, shape (3,)
-        As declared; its direction is an unknown.
-    tool_mass_kg : float and float, optional
-        Mass of the tool as weighed, and its sigma.
+    It begins with a mounting and with `tool`, mass (kg) and centre of mass from the sensor origin in flange axes. The
+    direction of `gravity_base_m_s2` is as declared, and an unknown. `tool_mass_kg` are the mass as weighed, and its
+    sigma.
     """
 
     mistakes: tuple[Mistake, ...] = ()

@@ -18,10 +18,9 @@ from ftcalib.errors import NotObservable
 from ftcalib.files import JSON
 from ftcalib.findings import Finding, Verdict, ordered, verdict_of
 from ftcalib.known import Setup
-from ftcalib.likelihood.response import ranges
 from ftcalib.loads.model import SIZES, Evaluated, LoadModel, LoadRun, Mistake, sizes_of
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftcalib.solver import solve
 
 # By which minus twice the logarithm of the likelihood falls, for a mistake to count; per pose it could be in many.
@@ -56,6 +55,19 @@ class LoadSolution(Displayed):
     def verdict(self) -> Verdict:
         """Verdict of the worst finding: a rejected matrix is not saved."""
         return verdict_of(self.findings)
+
+    def to_dict(self) -> dict[str, JSON]:
+        """Return it as JSON."""
+        return {
+            "verdict": self.verdict,
+            "findings": [one.to_dict() for one in self.findings],
+            "loads": [dict(one) for one in self.loads],
+            "sizes": dict(self.sizes),
+            "remaining": list(self.remaining),
+            "tool_mass_kg": self.tool_mass_kg,
+            "tool_mass_sigma_kg": self.tool_mass_sigma_kg,
+            "sensor": self.sensor.to_dict(),
+        }
 
 
 def solve_loads(

@@ -11,9 +11,8 @@ from scipy.special import chdtri as chi2_isf
 from scipy.special import ndtri
 
 from ftcalib.after.new_tool import WHOLE, CellPrior
-from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.response import LEVER_M
-from ftcalib.likelihood.rotation_minima import force_cost, given_rotation, minima
+from ftcalib.known import RANGE_LEVER_M, Constraints, Known
+from ftcalib.likelihood.rotation_minima import com_and_torque_bias, force_cost, given_rotation, minima
 from ftcalib.model import Array, DriftResult, Parameters, angle_between, cross, nearest_rotation
 from ftcalib.motion.model import (
     CROSS_TALK,
@@ -35,7 +34,6 @@ from ftcalib.motion.model import (
     wrench_of,
 )
 from ftcalib.motion.samples import Motion, Rows
-from ftcalib.published.yu import com_and_torque_bias
 
 # What is expected of a tool before any data, one sigma: radius of gyration, sensor height, delay beyond the rows.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
@@ -197,7 +195,7 @@ class _Problem:
         groups["yielding_rad"] = of_turns[-12:-3], np.eye(9)
         groups["rotation_rad"] = np.append(of_turns[:-12], of_turns[-3:]), np.eye(turns - 9)
         # An antisymmetric entry has half the variance of an entry.
-        precision = np.diag(np.append(np.ones(CROSS_TALK.stop - CROSS_TALK.start), np.full(3, 2 / LEVER_M**2)))
+        precision = np.diag(np.append(np.ones(CROSS_TALK.stop - CROSS_TALK.start), np.full(3, 2 / RANGE_LEVER_M**2)))
         groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
         return groups, at + 3 - start
 
@@ -627,20 +625,9 @@ def _join(
 def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[Array, Array, float]:
     """Weigh rows for the next step of a robust fit, which begins with a limit of infinity and ends at `LIMIT`.
 
-    Parameters
-    ----------
-    residuals : array, shape (n, 6)
-    limit : float
-        Squared distance of a row that counted a quarter in the step before.
-    alike : {3, 1}
-        Successive channels that have one scale: forces and torques, or each by itself.
-
-    Returns
-    -------
-    scale : array, shape (6,)
-        Standard deviations by the median.
-    weight : array, shape (n,)
-    limit : float
+    `limit` is the squared distance of a row that counted a quarter in the step before. `alike` successive channels
+    have one scale: 3 for forces and torques, 1 for each by itself. Returns the standard deviations (6,) by the median,
+    the weights (n,), and the next limit.
     """
     size = np.median(np.abs(residuals).reshape(len(residuals), -1, alike), axis=(0, 2))
     scale = np.repeat(1.4826 * size + 1e-12, alike)

@@ -229,16 +229,9 @@ def _unit(scale: float, spread_m: float) -> str | None:
 def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
     """Find poses or torques of another point than they should be.
 
-    Parameters
-    ----------
-    to_com, com : array, shape (3,)
-        To the centre of mass from the point of the poses and from that of the torques, in the axes of the poses.
-    sigma : array, shape (3,)
-        Of their difference.
-    behind : bool
-        Whether the centre of mass lies on the robot's side of the sensor, though no channel is reversed.
-    upright : bool
-        Whether z of the sensor points along that of the poses.
+    `to_com` and `com` lead to the centre of mass from the point of the poses and from that of the torques, in the axes
+    of the poses; `sigma` is that of their difference. `behind` says that the centre of mass lies on the robot's side
+    of the sensor, though no channel is reversed, and `upright` that z of the sensor points along that of the poses.
     """
     point = to_com - com
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])

@@ -18,10 +18,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.likelihood.structure import alike
 from ftcalib.model import Array, Parameters, cross, skew
 from ftcalib.motion.samples import Motion, Rows
+from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
 # Names of what motion adds to the 15 static coordinates.

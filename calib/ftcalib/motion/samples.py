@@ -1,14 +1,20 @@
-"""Samples of sensor and arm in motion, reduced while they are read to what the estimator needs.
+"""Samples of sensor and arm in motion: their times of measurement, and what the estimator needs of them.
 
-Two steps. `Means` averages each stream over 10 ms, in constant memory a second of recording. `rows_of` puts both on one
-clock, differentiates the poses, and passes wrench and motion through the same zero-phase filter to 8 rows a second.
+A sample is received some time after it was measured, and never before. `Timeline` and `measured_s` therefore lay a
+straight line under the times of receipt over the device's own count; the device's clock may drift slowly.
+
+Two steps reduce a recording while it is read. `Means` averages each stream over 10 ms, in constant memory a second of
+recording. `rows_of` puts both on one clock, differentiates the poses, and passes wrench and motion through the same
+zero-phase filter to 8 rows a second.
 
 The wrench is linear in the orientation R, the acceleration a of the flange origin and `Omega` = [alpha]x + [omega]x²
 (all in flange axes). Products of poses are taken before the filter, so what it cuts, it cuts on both sides alike.
 """
 
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import pairwise, permutations
 from typing import Self
 
 import numpy as np
@@ -41,12 +47,146 @@ _CHUNK = 600
 # Translation counts as a rotation about a point this far away.
 _LEVER_M = 0.5
 
+_BUCKET_S, _BUCKETS = 0.25, 40
+_LEAST_SCATTER_NS = 1e4
+CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
+"""Relative error of a device's clock, and of the nominal rate of a sensor without one, one sigma."""
+_IMPLAUSIBLE = 4.0
+# Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing.
+_SLEW = 0.05
+# They approach one that is farther away faster.
+_FAR_NS, _FASTEST_SLEW = 2e8, 0.9
+# If so many buckets in a row are later than this, and alike, the line before them is no longer true.
+_STEP_BUCKETS, _STEP_NS = 8, 5e6
+# A device whose count is so far from the line has restarted.
+_LOST_S = 1.0
+# Parts of a recording, of each of which the one sample counts that is received the soonest.
+_PARTS = 200
 
 # Seconds from row to row, multiples of `MEAN_S`. To 4.7 Hz: below the ripple of gears and the vibration of an arm,
 # above its motion. A contact is short in such rows.
 WIDE_S = 0.12
 # To 2 Hz: gears of joints that turn slowly shake the tool at 2 to 5 Hz.
 NARROW_S = 0.28
+
+
+class Timeline:
+    """Time of measurement of every sample of one device: the supporting line below its times of receipt.
+
+    Each quarter of a second contributes its least delayed sample; the line is below those of the last ten seconds.
+    `measured_s` takes a whole recording at once.
+
+    Parameters
+    ----------
+    period_s : float
+        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
+    tolerance : float
+        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
+        much to show the rate, as on a computer that is too busy.
+    """
+
+    def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
+        self.shift_s = 0.0
+        """Subtracted from every time; a change is followed slowly."""
+        self._nominal_ns = period_s * 1e9
+        self._tolerance = tolerance
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the line, after an interruption: a device may not have counted meanwhile."""
+        self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
+        self._origin: tuple[float, int] | None = None
+        self._slope, self._offset = self._nominal_ns, 0.0
+        self._last: tuple[float, float] | None = None
+
+    def stamp(self, count: Array, t_host_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the times of measurement (n,) of samples with these counts (n,) and times of receipt (n,)."""
+        if self._origin is None:
+            self._origin = float(count[0]), int(t_host_ns[0])
+        x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
+        behind_ns = y - self._slope * x
+        k = int(np.argmin(behind_ns))
+        if self._last is not None and (
+            # the device has restarted
+            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9
+        ):
+            self.restart()
+            return self.stamp(count, t_host_ns)
+        self._note(float(x[k]), float(y[k]))
+        end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
+        if self._last is None:
+            times = self._slope * (x - x[-1]) + end
+        else:
+            x_0, y_0 = self._last
+            # the device's clock has coarse steps
+            if x[-1] <= x_0:
+                return np.full(len(x), self._origin[1] + round(y_0), np.int64)
+            due = self._slope * (x[-1] - x_0)
+            slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
+            end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
+            times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
+        self._last = float(x[-1]), float(end)
+        return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
+
+    def _note(self, x: float, y: float) -> None:
+        """Keep the least delayed sample of each bucket, and fit the line."""
+        width = _BUCKET_S * 1e9 / self._slope
+        if not self._points or x // width > self._points[-1][0] // width:
+            self._points.append((x, y))
+            late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
+            by_ns = [b - self._slope * a - self._offset for a, b in late]
+            if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
+                # samples were lost that nothing has counted
+                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)
+        elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
+            self._points[-1] = x, y
+        elif len(self._points) > 1:
+            return
+        if len(self._points) > 1:
+            x_0, y_0, slope = _line_below(self._points)
+            above_ns = sum(b - y_0 - slope * (a - x_0) for a, b in self._points) / len(self._points)
+            error = (above_ns + _LEAST_SCATTER_NS) / ((self._points[-1][0] - self._points[0][0]) * self._nominal_ns)
+            weight = 1 / (1 + (error / self._tolerance) ** 2)
+            if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
+                # no drift of a clock, but a growing delay
+                weight = 0.0
+            self._slope = weight * slope + (1 - weight) * self._nominal_ns
+        self._offset = min(b - self._slope * a for a, b in self._points)
+
+
+def measured_s(count: Array, t_host_ns: NDArray[np.int64], start_ns: int) -> Array:
+    """Return the times of measurement (n,) of a recording, in s from `start_ns`: one line below all times of receipt.
+
+    A computer that starves receives samples late, for seconds on end, but none early.
+    """
+    x, y = count - float(count[0]), (t_host_ns - start_ns) * 1e-9
+    rough = (y[-1] - y[0]) / max(x[-1], 1.0)
+    late_s = y - rough * x
+    parts = [part for part in np.array_split(np.arange(len(x)), _PARTS) if len(part)]
+    soonest = [part[np.argmin(late_s[part])] for part in parts]
+    x_0, y_0, slope = _line_below(list(zip(x[soonest].tolist(), late_s[soonest].tolist(), strict=True)))
+    return np.asarray(rough * x + y_0 + slope * (x - x_0))
+
+
+def _line_below(points: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
+    """Return a point (x, y) and the slope of the line below all points with the least mean distance from them.
+
+    It is the edge of their lower convex hull at their middle, which is the clock skew estimator of Moon, Skelly,
+    Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
+    """
+    hull: list[tuple[float, float]] = []
+    for point in sorted(points):
+        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+            hull.pop()
+        hull.append(point)
+    middle = sum(x for x, _ in points) / len(points)
+    edges = (edge for edge in pairwise(hull) if edge[1][0] >= middle and edge[1][0] > edge[0][0])
+    (x_0, y_0), (x_1, y_1) = next(edges, (hull[0], hull[0]))
+    return x_0, y_0, (y_1 - y_0) / (x_1 - x_0) if x_1 > x_0 else 0.0
+
+
+def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
 def row_filter(row_s: float) -> Array:

@@ -14,9 +14,8 @@ from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding, Severity, ordered, verdict_of
 from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.observability import assess
-from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, expected_error, judge
+from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, judge
 from ftcalib.known import NOTHING, Known, Setup
-from ftcalib.likelihood.response import Response
 from ftcalib.likelihood.structure import hidden_in_any_poses, yielding_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
@@ -37,6 +36,7 @@ from ftcalib.motion.mistakes import (
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, interpolation_error_rad, require_seconds, rows_of
 from ftcalib.result import CalibrationResult, MotionResult
+from ftcalib.sensor_matrix import Response, expected_error
 
 LEAST_S = 5.0
 # Largest delay that is found.

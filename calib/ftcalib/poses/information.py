@@ -13,10 +13,18 @@ from numpy.typing import ArrayLike
 
 from ftcalib.judge.observability import second_minimum
 from ftcalib.known import NOTHING
-from ftcalib.likelihood.rotation_minima import given_rotation
+from ftcalib.likelihood.rotation_minima import com_and_torque_bias, given_rotation
 from ftcalib.likelihood.structure import hidden_columns
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, Parameters, jacobian, predict, read_only, skew
-from ftcalib.published.yu import SPECIAL_R_flange_base, com_and_torque_bias
+from ftcalib.model import (
+    STANDARD_GRAVITY_M_S2,
+    Array,
+    Parameters,
+    SPECIAL_R_flange_base,
+    jacobian,
+    predict,
+    read_only,
+    skew,
+)
 from ftcalib.sensor_matrix import SensorMatrix
 
 # Smaller eigenvalues of the scaled information, as a share of the largest, count as zero.

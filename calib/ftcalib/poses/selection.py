@@ -73,22 +73,10 @@ def cone_candidates(
 def tilted_candidates(
     tilts_rad: ArrayLike, azimuths: int, spin_rad: float, down_base: ArrayLike = (0.0, 0.0, -1.0)
 ) -> Array:
-    """Orientations with the tool axis (flange z) at these angles from straight down, without turns about that axis.
+    """R_base_flange (k * azimuths, 3, 3) with the tool axis (flange z) at these k angles from straight down.
 
-    Parameters
-    ----------
-    tilts_rad : array_like, shape (k,)
-    azimuths : int
-        Directions of each tilt, evenly spaced.
-    spin_rad : float
-        Turn about the tool axis that all of them have.
-    down_base : array_like, shape (3,)
-        Direction of gravity in base, a unit vector.
-
-    Returns
-    -------
-    array, shape (k * azimuths, 3, 3)
-        R_base_flange.
+    Each tilt has so many evenly spaced directions, and all have one turn about the tool axis, `spin_rad`. `down_base`
+    is the direction of gravity in base, a unit vector.
     """
     tilt = np.repeat(np.asarray(tilts_rad, dtype=np.float64), azimuths)
     azimuth = np.resize(2 * np.pi * np.arange(azimuths) / azimuths, len(tilt))
@@ -190,20 +178,9 @@ def next_pose(R_done: Array, R_candidates: Array, guess: Guess) -> Indices:
 
 
 def greedy_and_exchange(gains: Callable[[list[int]], Array], n: int, pinned: Sequence[int] = ()) -> Indices:
-    """Choose n candidates greedily, then exchange one at a time as long as it helps.
+    """Choose n candidates greedily, then exchange one at a time as long as it helps; return them, pinned ones first.
 
-    Parameters
-    ----------
-    gains : callable
-        Returns what each candidate (m,) improves, added to chosen ones.
-    n : int
-    pinned : sequence of int
-        Candidates that stay chosen.
-
-    Returns
-    -------
-    int array, shape (n,)
-        Indices of candidates, the pinned ones first.
+    `gains` returns what each candidate (m,) improves, added to chosen ones. The pinned candidates stay chosen.
     """
     chosen = list(pinned)
 

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.likelihood import rotation_minima
-from ftcalib.model import Array, nearest_rotation, skew
+from ftcalib.model import Array, angle_between, nearest_rotation, skew
 
 MOST_ITERATIONS = 20_000
 
@@ -74,28 +74,10 @@ class ForceEquations:
 
 
 def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
-    """Check the input of a method and form its equations.
+    """Check the input of a method and form its equations; `bias` estimates a force bias too, which needs one more pose.
 
-    Parameters
-    ----------
-    R_base_flange : array, shape (n, 3, 3)
-    force_N : array, shape (n, 3)
-        Sensor axes.
-    bias : bool
-        Whether to estimate the force bias, which needs one more pose.
-    method : str
-        Name for the error message.
-    min_poses : int
-        Poses the method needs without bias.
-
-    Raises
-    ------
-    NotObservable
-        Too few poses.
-    BadDataset
-        A pose or force is not finite.
-    ValueError
-        The shapes do not fit.
+    Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a pose or force that is not finite, and
+    `ValueError` for other shapes than (n, 3, 3) and (n, 3).
     """
     n = len(force_N)
     if R_base_flange.shape != (n, 3, 3) or force_N.shape != (n, 3):
@@ -241,7 +223,7 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     degrees_of_freedom = 3 * len(force_N) - (9 if bias else 6)
     indistinguishable = max(12 * best.cost / degrees_of_freedom, 1e-12 * float(np.sum(eq.f**2)))
     if others and others[0].cost - best.cost <= indistinguishable:
-        apart = np.degrees(np.arccos(np.clip((np.trace(best.R.T @ others[0].R) - 1) / 2, -1, 1)))
+        apart = np.degrees(angle_between(best.R, others[0].R))
         raise NotObservable(
             f"two sensor orientations {apart:.0f} deg apart explain the forces about equally well: add poses, at least "
             "one with another angle between tool axis and gravity"
@@ -298,23 +280,13 @@ def spanned_dimensions(rows: Array, size: float) -> int:
 
 
 def require_weight(eq: ForceEquations) -> None:
-    """Reject forces that are zero or, with a bias, constant.
-
-    Raises
-    ------
-    NotObservable
-    """
+    """Raise `NotObservable` for forces that are zero or, with a bias, constant."""
     if not spanned_dimensions(eq.f, float(np.linalg.norm(eq.f + eq.f_mean))):
         raise NotObservable("the forces show no weight: attach a tool or a mass to the sensor")
 
 
 def require_turns_and_weight(eq: ForceEquations) -> None:
-    """Reject poses that leave the gravity force of a known rotation open, and forces as in `require_weight`.
-
-    Raises
-    ------
-    NotObservable
-    """
+    """Raise `NotObservable` for poses that leave the force of a known rotation open, and as `require_weight`."""
     if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
         raise NotObservable(
             "all poses turn about one base axis, and a weight along it resembles a bias: add poses turned about "

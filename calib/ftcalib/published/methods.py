@@ -7,6 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
+from ftcalib.likelihood.rotation_minima import com_and_torque_bias
 from ftcalib.model import Array, Parameters, skew
 from ftcalib.published import carlson
 from ftcalib.published.carlson import (
@@ -17,7 +18,7 @@ from ftcalib.published.carlson import (
     require_weight,
     spanned_dimensions,
 )
-from ftcalib.published.yu import com_and_torque_bias, lrom, mixed, special_numbers, srom
+from ftcalib.published.yu import lrom, mixed, special_numbers, srom
 
 # Earlier methods that assume more: the mounting of the sensor, or all of it but a yaw, and the direction of gravity.
 #

@@ -14,21 +14,10 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
-from ftcalib.model import Array, Parameters, nearest_rotation, skew
+from ftcalib.likelihood.rotation_minima import com_and_torque_bias
+from ftcalib.model import Array, Parameters, SPECIAL_R_flange_base, nearest_rotation
 
 Indices = NDArray[np.intp]
-
-_ROWS = (
-    "+x +y +z", "+x -y -z", "+x -z +y", "+x +z -y", "-x +y -z", "-x -y +z",
-    "-x +z +y", "-x -z -y", "+y +x -z", "-y +x +z", "+z +x +y", "-z +x -y",
-    "+y -x +z", "-y -x -z", "-z -x +y", "+z -x -y", "+y +z +x", "-y -z +x",
-    "-z +y +x", "+z -y +x", "+y -z -x", "-y +z -x", "+z +y -x", "-z -y -x",
-)  # fmt: skip
-
-
-_AXES = dict(zip("xyz", np.eye(3), strict=True))
-# (24, 3, 3) the paper's e_bR_1 … e_bR_24 (Fig. 3, Table of special orientations): the rotation group of the cube.
-SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row in rows.split()] for rows in _ROWS])
 
 # Deviation from one of the 24 that is always accepted: more than an arm with calibrated kinematics misses by.
 TOLERANCE_RAD = np.deg2rad(1.0)
@@ -104,8 +93,8 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
     """Calibrate from at least five orientations: eqs 24-34.
 
     Eq 34 chooses the sign by the mounting of the robot. Lines 1 and 2 of the rule are right for the alpha of eq 48 as
-    printed. With eq 48 corrected (`weight_and_tilt`) alpha is another angle, by which an upright robot would get the
-    wrong sign. det R > 0 replaces the rule and needs no knowledge of the mounting.
+    printed. With eq 48 corrected (`ftcalib.model.weight_and_tilt`) alpha is another angle, by which an upright robot
+    would get the wrong sign. det R > 0 replaces the rule and needs no knowledge of the mounting.
 
     Parameters
     ----------
@@ -292,17 +281,7 @@ def _list(indices: Indices, most: int = 6) -> str:
 
 
 def srom_gravity_force(force_N: Array) -> Array:
-    """Gravity force in base from the 24 forces, in the paper's order: eqs 14-23.
-
-    Parameters
-    ----------
-    force_N : array, shape (24, 3)
-        In the sensor frame.
-
-    Returns
-    -------
-    array, shape (3,)
-    """
+    """Gravity force (3,) in base from the 24 forces (24, 3) in the sensor frame, in the paper's order: eqs 14-23."""
     F_b = np.empty(3)
     for k, sums in enumerate(_SUMS):
         p = [
@@ -311,41 +290,3 @@ def srom_gravity_force(force_N: Array) -> Array:
         ]
         F_b[k] = np.cbrt(np.linalg.det(np.column_stack(p)))  # [p_k1 p_k2 p_k3] = f_bk R and det R = 1
     return F_b
-
-
-def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array]:
-    """Centre of mass and torque bias by linear least squares: eqs 43-45.
-
-    The paper's regressor is the measured force without bias, whose noise makes P too short by
-    sigma^2 / (sigma^2 + mg^2 / 3).
-
-    Parameters
-    ----------
-    weight_N : array, shape (n, 3)
-        Measured force minus force bias, in the sensor frame.
-    torque_Nm : array, shape (n, 3)
-
-    Returns
-    -------
-    p_sensor_com_m, torque_bias_Nm : array, shape (3,)
-    """
-    P_x_F = -skew(weight_N)
-    C = np.concatenate([P_x_F, np.broadcast_to(np.eye(3), P_x_F.shape)], axis=2)
-    solution = np.asarray(np.linalg.lstsq(C.reshape(-1, 6), torque_Nm.ravel())[0], dtype=np.float64)
-    return solution[:3], solution[3:]
-
-
-def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
-    """Weight (N) and the tilt angles alpha, beta (rad) of the base: eqs 46-48.
-
-    Two misprints of eq 48 are corrected: the weight is the norm of F_b, not its square, and the angles are those that
-    reproduce F_b = -weight [cos(alpha) sin(beta), -sin(alpha), cos(alpha) cos(beta)], with alpha in [-pi/2, pi/2]. An
-    upright base has (0, 0), one under the ceiling (0, pi). Where gravity runs along base y, beta is free and set to 0.
-
-    Parameters
-    ----------
-    F_b : array, shape (3,)
-    """
-    x, y, z = F_b.tolist()
-    beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
-    return float(np.linalg.norm(F_b)), float(np.arctan2(y, np.hypot(x, z))), float(beta)

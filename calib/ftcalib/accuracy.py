@@ -1,0 +1,127 @@
+"""How large the errors of a calibration are: over orientations, at the tip, against a known truth."""
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib.estimates import quantities_of, values_of
+from ftcalib.model import Array
+from ftcalib.result import CalibrationResult
+
+# Where the tip is if no tool is described, from the flange.
+_USUAL_TIP_MM: Final = 200.0
+CONTACT_N: Final = 100.0
+"""A contact whose sigma is named."""
+# Orientations over which the error of a calibration is averaged if the truth is known.
+_RANDOM = Rotation.random(1000, rng=0).as_matrix()
+# Grid of elevation and azimuth.
+STEP_DEG = 10
+# Turns of the tool about its axis at each direction, over a whole turn.
+TURNS = 12
+
+
+def error_map(result: CalibrationResult) -> dict[str, Any]:
+    """Return the error of the compensation of a free tool over the directions of the tool axis, one standard deviation.
+
+    `elevation_deg` (n,) and `azimuth_deg` (m,) are of flange z in base axes. `force_N` and `torque_Nm` have `map`
+    (n, m), the largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations, and
+    `worst_direction` (3,) of flange z in base.
+    """
+    elevation = np.radians(np.arange(-90, 91, STEP_DEG))
+    azimuth = np.radians(np.arange(-180, 181, STEP_DEG))
+    R = orientations(elevation, azimuth)
+    variance = np.diagonal(result.wrench_covariance(R), axis1=-2, axis2=-1)
+    document: dict[str, Any] = {
+        "elevation_deg": np.degrees(elevation).round().tolist(),
+        "azimuth_deg": np.degrees(azimuth).round().tolist(),
+    }
+    for k, name in enumerate(("force_N", "torque_Nm")):
+        error = np.sqrt(variance[..., 3 * k : 3 * k + 3].sum(axis=-1))
+        worst = np.unravel_index(int(np.argmax(error)), error.shape)
+        document[name] = {
+            "map": error.max(axis=-1).tolist(),
+            "largest": float(error.max()),
+            "rms": result.predicted_error()[k],
+            "worst_direction": R[worst][:, 2].tolist(),
+        }
+    return document
+
+
+def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
+    """Return R_base_flange (n, m, TURNS, 3, 3): flange z in these directions, turned about itself.
+
+    Elevation (n,) is from the base xy-plane, azimuth (m,) about base z from base x.
+    """
+    tip, turn = np.meshgrid(np.pi / 2 - elevation_rad, azimuth_rad, indexing="ij")
+    point = Rotation.from_euler("ZY", np.stack([turn, tip], axis=-1).reshape(-1, 2)).as_matrix()
+    spin = Rotation.from_rotvec(np.outer(np.linspace(0, 2 * np.pi, TURNS, endpoint=False), [0, 0, 1])).as_matrix()
+    return np.asarray(point[:, None] @ spin).reshape(*tip.shape, TURNS, 3, 3)
+
+
+def tip_of(result: CalibrationResult) -> Array:
+    """Return the far end of the tool (3,) from the sensor origin, sensor axes: of its cylinders, else 200 mm out."""
+    setup = result.provenance.get("setup")
+    given: Mapping[str, Any] = setup if isinstance(setup, dict) else {}
+    rows = given.get("cylinders_mm") or [[0.0, _USUAL_TIP_MM, 0.0]]
+    far = max(rows, key=lambda row: row[1])
+    # From, to, diameter, and perhaps where the axis is.
+    x, y = far[3:] if len(far) > 3 else (0.0, 0.0)
+    tip_mm = np.array([x, y, far[1] - (given.get("height_mm") or 0.0)])
+    return np.asarray(result.R_flange_sensor.T @ tip_mm / 1e3)
+
+
+def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTACT_N) -> Array:
+    """Return one standard deviation of a force at the tip, as the length of its error, over all directions."""
+    share, _ = result.contact.sigma_at(tip_of(result))
+    return np.asarray(np.hypot(result.likely_error()[0], share * np.asarray(force_N)))
+
+
+def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
+    """Errors of the estimates, each divided by its standard deviation.
+
+    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
+    an angle is at most half a turn.
+    """
+    data = result.to_dict()
+    errors = {}
+    for _, _, _, key in quantities_of(data):
+        if key not in truth:
+            continue
+        if key == "R_flange_sensor":
+            error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
+        else:
+            error = values_of(data[key], key) - values_of(truth[key], key)
+            if key.endswith("_rad"):
+                # a ceiling is at both +180 and -180 degrees
+                error = np.remainder(error + np.pi, 2 * np.pi) - np.pi
+        errors[key] = error / values_of(data["sigma"][key], key)
+    return errors
+
+
+def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
+    """Return what the sensor of a free tool reads, (n, 6): computed from the truth, not with the solver's model."""
+    weight = np.einsum(
+        "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
+    )
+    load = np.hstack([weight, np.cross(truth["p_sensor_com_m"], weight)])
+    # Cells of version 0.1.0 and earlier have a perfect sensor.
+    load = load + load @ np.array(truth.get("sensor_error", np.zeros((6, 6)))).T
+    return np.asarray(load + np.hstack([truth["force_bias_N"], truth["torque_bias_Nm"]]))
+
+
+def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
+    """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
+    left = result.compensate(_free_tool_wrench(truth, _RANDOM), _RANDOM)
+    return {"force_rms_N": _rms(left[:, :3]), "torque_rms_Nm": _rms(left[:, 3:])}
+
+
+def uncompensated(truth: Mapping[str, Any]) -> tuple[float, float]:
+    """Rms of what the sensor of a free tool reads, N and N·m, over the same orientations."""
+    raw = _free_tool_wrench(truth, _RANDOM)
+    return _rms(raw[:, :3]), _rms(raw[:, 3:])
+
+
+def _rms(vectors: Array) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
