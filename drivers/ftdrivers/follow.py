@@ -10,13 +10,7 @@ Item = TypeVar("Item")
 
 
 class Follow(Generic[Samples]):
-    """Reads every sample of a device, as long as `with device.follow() as follow:` lasts.
-
-    Parameters
-    ----------
-    read
-        Does what `read` describes.
-    """
+    """Reads every sample of a device, as long as `with device.follow() as follow:` lasts."""
 
     def __init__(self, read: Callable[[float], Samples]) -> None:
         self._read = read

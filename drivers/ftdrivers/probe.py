@@ -65,13 +65,7 @@ class _KnownOnLine:
 
 
 def probe_serial(port: str, clock: Clock = REAL) -> Answer | None:
-    """Return the known sensor on this port, or None.
-
-    Raises
-    ------
-    ConnectError
-        The port does not open.
-    """
+    """Return the known sensor on this port, or None. Raises `ConnectError` if the port does not open."""
     with clock.keeping_up():
         for known in _KNOWN:
             if known.streams(_hear_line(port, known, None, _LISTEN_LINE_S, clock)):

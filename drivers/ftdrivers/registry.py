@@ -140,7 +140,7 @@ class Options:
 
 
 @dataclass(frozen=True, slots=True)
-class UrlParts:
+class _UrlParts:
     """The parts of an address, not yet checked."""
 
     scheme: str
@@ -151,13 +151,13 @@ class UrlParts:
     fragment: str
 
 
-def split_url(url: str) -> UrlParts:
+def split_url(url: str) -> _UrlParts:
     """Split an address into its parts. Raises `BadUrl`."""
     try:
         parts = urlsplit(url)
     except ValueError as exc:
         raise BadUrl(f"{url}: {exc}; write it like {', '.join(_EXAMPLES)}") from exc
-    return UrlParts(parts.scheme, unquote(parts.netloc + parts.path), parts.query, parts.fragment)
+    return _UrlParts(parts.scheme, unquote(parts.netloc + parts.path), parts.query, parts.fragment)
 
 
 def in_url(address: str) -> str:

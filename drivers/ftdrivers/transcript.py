@@ -23,23 +23,29 @@ import select
 import threading
 import tty
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import IO, Any, Final, Self
 from urllib.parse import parse_qsl, urlencode
 
 import can
+import numpy as np
 import serial
 
 from ftdrivers.clock import REAL, Clock, Follower
-from ftdrivers.errors import BadTranscript, BadUrl
-from ftdrivers.registry import split_url
+from ftdrivers.errors import BadTranscript, BadUrl, ConnectError, DeviceTimeout, ProtocolError
+from ftdrivers.interfaces import ForceTorqueSensor
+from ftdrivers.registry import sensor_from_url, split_url
 from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 
 FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
+# A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
+_PIECE_S: Final = 60.0
+# Recorded beyond the duration, so that a replay which begins a little later still has enough.
+_TAIL_S: Final = 0.3
 # More than a serial port buffers, in hexadecimal.
 _LONGEST_LINE: Final = 16_000_000
 INTERRUPTED: Final = "interrupted"
@@ -51,24 +57,14 @@ _EARLY_S: Final = 0.05
 class Writer:
     """Writes a transcript to `path` with the suffix ``.partial``; `end` renames it.
 
-    Parameters
-    ----------
-    path : Path
-        Must not exist.
-    header : mapping
-        Content of the first line.
-    clock : Clock
-        The driver's.
-
-    Raises
-    ------
-    OSError
-        The file or its ``.partial`` exists already, or cannot be written.
+    `header` is the content of the first line. Raises `OSError` if the file or its ``.partial`` exists already, or
+    cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], clock: Clock = REAL) -> None:
         self.has_port = False
         """Whether any port was opened; without one there is nothing to play."""
+        self.is_saved = False
         self.clock = clock
         self._path = path
         self._partial = path.parent / (path.name + ".partial")
@@ -106,6 +102,29 @@ class Writer:
                 self._received_ns = now_ns
             self._received += data
 
+    def record(self, device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
+        """Record a sensor from opening to closing, and return what its driver measures.
+
+        The file is kept if a port was opened or the driver has failed, whose error is then its end. Raises
+        `DeviceError`.
+        """
+        seen: dict[str, Any] = {"error": INTERRUPTED}
+        try:
+            with recording(self), device:
+                whole = _watch(device, duration_s)
+                device.collect(_TAIL_S)
+            seen = whole
+        except Exception as error:
+            seen = {"error": f"{type(error).__name__}: {error}"}
+            raise
+        finally:
+            # A port that does not open is worth a report.
+            if not self.has_port and seen["error"] in {None, INTERRUPTED}:
+                self.discard()
+            else:
+                self.end(**seen)
+        return seen
+
     def end(self, **content: Any) -> None:
         """Write the last line and rename the file."""
         self.event("end", **content)
@@ -119,6 +138,7 @@ class Writer:
         if self._path.exists():
             raise FileExistsError(f"{self._path} was created meanwhile; find the transcript in {self._partial}")
         self._partial.rename(self._path)
+        self.is_saved = True
 
     def discard(self) -> None:
         """Delete the file."""
@@ -211,6 +231,52 @@ class Transcript:
         parts = split_url(str(self.header["url"]))
         options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
         return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
+
+    def play(self, clock: Clock = REAL) -> dict[str, Any]:
+        """Play it to its driver, and return what that measures; what was interrupted is played to its end.
+
+        Raises `ProtocolError` for a driver that sends what is not in it, `BadTranscript` if it was interrupted before
+        there was anything to measure, and what the driver raises.
+        """
+        player = Player(self, clock)
+        with player as port:
+            device = sensor_from_url(self.url_at(port), clock=clock)
+            duration_s = float(self.header["duration_s"])
+            try:
+                with device:
+                    if self.is_broken_off:
+                        duration_s = min(duration_s, player.left_s - _TAIL_S)
+                    return _watch(device, duration_s)
+            except Exception as error:
+                if player.divergence:
+                    raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
+                silent = isinstance(error, ConnectError | DeviceTimeout)
+                if silent and self.is_broken_off and player.left_s < _TAIL_S:
+                    raise BadTranscript(
+                        f"the recording was interrupted before there was anything to measure ({error}): record it again"
+                    ) from error
+                raise
+
+
+def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
+    """Collect from an open sensor, in pieces because a `collect` is bounded; with the sensor's own sign."""
+    pieces = math.ceil(duration_s / _PIECE_S)
+    samples, total = 0, np.zeros(6)
+    for _ in range(pieces):
+        wrench = device.collect(duration_s / pieces).wrench
+        samples, total = samples + len(wrench), total + wrench.sum(axis=0)
+    if not samples:
+        raise DeviceTimeout(f"no sample came in {duration_s:g} s: record for longer, with --duration")
+    force_N, torque_Nm = np.split(total / samples, 2)
+    return {
+        "error": None,
+        "identity": asdict(device.identify()),
+        "duration_s": duration_s,
+        "samples": samples,
+        "lost": device.health().lost,
+        "mean_force_N": force_N.tolist(),
+        "mean_torque_Nm": torque_Nm.tolist(),
+    }
 
 
 def _parsed(line: bytes) -> Any:

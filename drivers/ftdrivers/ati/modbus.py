@@ -87,7 +87,7 @@ def calibration_reads(index: int) -> list[tuple[int, int]]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CalibrationBlock:
+class _CalibrationBlock:
     """One calibration as the sensor stores it."""
 
     serial: str
@@ -102,7 +102,7 @@ class CalibrationBlock:
     offsets: tuple[int, ...]
 
 
-def decode_calibration_block(data: bytes) -> CalibrationBlock:
+def decode_calibration_block(data: bytes) -> _CalibrationBlock:
     """Decode the 338 bytes of a calibration; an empty slot is a `ProtocolError`."""
     if len(data) != 338:
         raise ProtocolError(f"a calibration has 338 bytes, got {len(data)}")
@@ -110,7 +110,7 @@ def decode_calibration_block(data: bytes) -> CalibrationBlock:
     force, torque = struct.unpack_from(">ii", data, 2 * 117)
     if not np.isfinite(matrix).all() or force <= 0 or torque <= 0:
         raise ProtocolError(f"the slot is empty, with counts per unit {force} and {torque}")
-    return CalibrationBlock(
+    return _CalibrationBlock(
         serial=decode_text(data[0:8]),
         part_number=decode_text(data[8:40]),
         matrix=matrix.astype(np.float64),
@@ -163,17 +163,10 @@ def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
     """Judge n records by their checksums: which to keep, how many are settled, and whether the stream has slipped.
 
-    The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row mean
-    a slip. An intact record between two damaged ones, or directly before a slip, is dropped. Therefore the last record
-    waits for its successor, and so does the damage next to it.
-
-    Returns
-    -------
-    keep : array of bool, shape (settled,)
-    settled : int
-        Judge the other n - settled records again, together with their successors.
-    slipped : bool
-        All bytes behind `settled` are misaligned.
+    The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row
+    mean a slip. An intact record between two damaged ones, or directly before a slip, is dropped. Therefore the last
+    record waits for its successor, and so does the damage next to it: judge the records that are not settled again,
+    together with their successors. After a slip all bytes behind the settled ones are misaligned.
     """
     bad = ~intact
     n = len(bad)

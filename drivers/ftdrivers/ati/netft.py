@@ -129,20 +129,12 @@ def numbers_in(page: bytes, element: str) -> list[float]:
 
 
 def transformation_in(page: bytes) -> Array:
-    """Find the tool transformation of the box in ``netftapi2.xml``, and return what undoes it.
+    """Find the tool transformation of the box in ``netftapi2.xml``, and return the matrix (6, 6) that undoes it.
 
     The box sends the wrench in the axes of its tool frame, about the origin of that frame. The frame is displaced from
-    that of the transducer, then turned about x, y and z.
+    that of the transducer, then turned about x, y and z. The identity stands for a page without a frame.
 
-    Returns
-    -------
-    array, shape (6, 6)
-        Maps such a wrench to the axes and the origin of the transducer; the identity where the page has no frame.
-
-    Raises
-    ------
-    ProtocolError
-        The page has another number of values, or an unknown unit.
+    Raises `ProtocolError` for a page with another number of values, or an unknown unit.
     """
     undo = np.eye(6)
     values, distance, angle = numbers_in(page, "cfgtfx"), text_in(page, "scfgtdu"), text_in(page, "scfgtau")

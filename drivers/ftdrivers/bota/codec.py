@@ -87,14 +87,12 @@ def find_baud(text: bytes) -> int | None:
     return None if match is None else BAUDS[int(match[1])]
 
 
-def configuration_command(baud: int) -> bytes:
-    """Build the command that selects calibrated binary frames, without temperature compensation (vendor's advice)."""
-    return f"c,0,1,0,{BAUDS.index(baud)}".encode("ascii")
+def setup_commands(baud: int, sinc: int) -> tuple[bytes, bytes]:
+    """Build the commands that select calibrated binary frames, and set the length of the sinc filter.
 
-
-def filter_command(sinc: int) -> bytes:
-    """Build the command that sets the sinc length: no chopping, no fast mode, FIR off (the vendor's example)."""
-    return f"f,{sinc},0,0,1".encode("ascii")
+    Without temperature compensation (vendor's advice); no chopping, no fast mode, FIR off (the vendor's example).
+    """
+    return f"c,0,1,0,{BAUDS.index(baud)}".encode("ascii"), f"f,{sinc},0,0,1".encode("ascii")
 
 
 def success(command: bytes) -> bytes:

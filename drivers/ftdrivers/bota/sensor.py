@@ -164,7 +164,7 @@ class BotaSensor(StreamingSensor):
         if not codec.find_identity(self._text).serial:  # it has not just booted
             with contextlib.suppress(DeviceTimeout):
                 self._command(codec.ASK_SERIAL, attempts=1)
-        for command in (codec.configuration_command(baud), codec.filter_command(sinc), codec.ENTER_RUN):
+        for command in (*codec.setup_commands(baud, sinc), codec.ENTER_RUN):
             self._command(command)
 
     def _command(self, command: bytes, attempts: int = _ATTEMPTS) -> None:

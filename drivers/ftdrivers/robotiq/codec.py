@@ -19,8 +19,8 @@ from ftdrivers.wires.framing import Deframer, crc16_modbus
 
 ADDRESS = 9
 
-STREAM, FIRMWARE, SERIAL = 410, 500, 510
-START_STREAM = 0x0200
+FIRMWARE, SERIAL = 500, 510
+START_STREAM = _modbus.write_registers(ADDRESS, 410, [0x0200])
 
 STOP = b"\xff" * 50
 """Stops a running stream, which may take 0.5 s."""
@@ -37,11 +37,6 @@ RANGE = (300.0, 300.0, 300.0, 30.0, 30.0, 30.0)
 Refused = _modbus.Refused
 read_registers = partial(_modbus.read_registers, ADDRESS)
 reply_size = _modbus.reply_size
-
-
-def write_register(register: int, value: int) -> bytes:
-    """Request to write one holding register."""
-    return _modbus.write_registers(ADDRESS, register, [value])
 
 
 def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:

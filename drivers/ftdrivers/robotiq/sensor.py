@@ -196,7 +196,7 @@ class RobotiqFt300(StreamingSensor):
             firmware = codec.decode_firmware(self._ask(codec.read_registers(codec.FIRMWARE, 3)))
         except codec.Refused:
             firmware = NOT_REPORTED
-        self._ask(codec.write_register(codec.STREAM, codec.START_STREAM))
+        self._ask(codec.START_STREAM)
         self._frames = codec.deframer()
         self._nominal_Hz = codec.NOMINAL_RATE_Hz
         return DeviceInfo(

@@ -267,8 +267,3 @@ def stamp_ns(header: Any, topic: str) -> int:
             "set header.stamp to the time of measurement in its driver",
         )
     return t_ns
-
-
-def is_finite(*values: float) -> bool:
-    """Return whether all are numbers."""
-    return all(map(math.isfinite, values))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ftdrivers.errors import BadUrl, ProtocolError
 from ftdrivers.interfaces import Array
-from ftdrivers.ros2.middleware import is_finite, stamp_ns
+from ftdrivers.ros2.middleware import stamp_ns
 
 # Bytes of a URDF; its meshes are files of their own.
 _LARGEST: Final = 16_000_000
@@ -147,7 +147,7 @@ def _pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
     """Return orientation and origin of a message's parts. Raises `ProtocolError`."""
     p = position.x, position.y, position.z
     q = quaternion.x, quaternion.y, quaternion.z, quaternion.w
-    if not is_finite(*p, *q):
+    if not np.isfinite((*p, *q)).all():
         raise ProtocolError(f"{what} is not finite", "check its driver")
     if abs(float(np.linalg.norm(q)) - 1) > UNIT_TOLERANCE:
         raise ProtocolError(f"{what} has a quaternion of length {np.linalg.norm(q):.3g}", "normalize it in its driver")
@@ -189,7 +189,7 @@ class Joints:
         found = dict(zip(message.name, map(float, message.position), strict=True))
         if not all(name in found for name in self.chain.names):
             return None
-        if not is_finite(*(found[name] for name in self.chain.names)):
+        if not np.isfinite([found[name] for name in self.chain.names]).all():
             raise ProtocolError(f"a joint of {topic} is not finite", "check its driver")
         return {name: found[name] for name in self.chain.names}
 

@@ -178,15 +178,7 @@ def _text(data: bytes) -> str:
 
 
 class Primary:
-    """One connection. Raises `ConnectError` when the controller cannot be reached.
-
-    Parameters
-    ----------
-    host
-        Address of the controller.
-    timeout_s
-        To connect, and for each sending.
-    """
+    """One connection, with a time-out to connect and for each sending. Raises `ConnectError` when it cannot be made."""
 
     def __init__(self, host: str, *, timeout_s: float) -> None:
         self.closed = False
