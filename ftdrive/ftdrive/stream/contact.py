@@ -11,25 +11,17 @@ from scipy.special import chdtri, fdtri
 
 from ftcalib.after.state import Calibrated
 from ftcalib.files import JSON
-from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array
-from ftdrive.live.motion import READING_S, REST, samples_in_reading, wrench_by_acceleration
-from ftdrive.live.noise import NoiseEstimator, SensorNoise
-from ftdrive.live.samples import Ns
-from ftdrive.live.stages import TARE_DRIFT_N, TARE_DRIFT_NM
+from ftcalib.sensor_matrix import predicted_covariance
+from ftdrive.stream.free_tool import Following
+from ftdrive.stream.motion import GYRATION_M, READING_S, REST, samples_in_reading, wrench_by_acceleration
+from ftdrive.stream.noise import NoiseEstimator, SensorNoise
+from ftdrive.stream.samples import Ns, Paired
 
 # The covariance of a calibration is evaluated again after so much turning.
 _TURN_RAD = 0.02
-# The offset of a free tool at rest follows after so many readings.
-_STEP = 10
-# Share of the difference that one step takes away: the offset follows within 2 s.
-_GAIN = 0.1
-# The offset follows no farther than this beyond three sigmas of the prediction.
-_DRIFT = np.repeat([TARE_DRIFT_N, TARE_DRIFT_NM], 3)
 # Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
-GYRATION_M = 0.08
-"""Radius of gyration of a tool, where its inertia is not known."""
 # Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long.
 _INEXACT_S = 0.005
 # Friction of wrist 3, which the arm's own sensor feels.
@@ -59,20 +51,9 @@ class ContactTest:
     Noise is that of the present state of motion. In motion, the error of the delay and, where inertia is not
     subtracted, an unknown acceleration are in the covariance too.
 
-    At rest the test follows the offset of the free tool, so that neither drift nor the error of the calibration in this
-    orientation is a contact. A load that grows by less than the limit within 2 s counts as drift, up to 0.5 N and
-    15 mN·m beyond three sigmas of the calibration.
-
-    Parameters
-    ----------
-    rate_Hz : float
-        Of the sensor.
-    false_alarm_rate : float
-        Share of independent readings of a free tool that exceed `limit`.
-    beyond : array, shape (6,)
-        Variance beyond what the calibration predicts, N² and (N·m)².
-    friction_axis : array, shape (3,), optional
-        Axis of wrist 3 in sensor axes, if the sensor feels its friction.
+    The offset of the free tool, which drift and the error of the calibration in this orientation make, is that of its
+    filter. `beyond` (6,) is the variance beyond what the calibration predicts, N² and (N·m)², and `friction_axis` (3,)
+    the axis of wrist 3 in sensor axes, if the sensor feels its friction.
     """
 
     def __init__(
@@ -94,17 +75,12 @@ class ContactTest:
         self.restart()
 
     def restart(self) -> None:
-        """Forget earlier samples and the offset."""
+        """Forget earlier samples."""
         self._earlier = np.zeros((self._size - 1, 6))
         # The predictions of the last `READING_S` seconds.
         self._predicted: Array | None = None
         self._R: Array | None = None
-        self._offset = np.zeros(6)
-        # Share of the variance of the prediction that the offset still has.
-        self._share = 1.0
-        # Sum and number of the samples since the last step of the offset, and whether all were of a free tool.
-        self._sum, self._count, self._is_free = np.zeros(6), 0, True
-        self._whitening: tuple[tuple[SensorNoise, float, Inertia | None], Array] | None = None
+        self._whitening: tuple[tuple[SensorNoise, int, Inertia | None], Array, Array] | None = None
 
     def expect(self, calibration: Calibrated, mass_kg: float, *, tensor_known: bool) -> None:
         """Set the calibration of a free tool, its mass, and whether its inertia tensor is known."""
@@ -123,55 +99,38 @@ class ContactTest:
         self,
         residual: Array,
         predicted: Array,
-        R_base_flange: Array,
+        rows: Paired,
         motion: tuple[NDArray[np.int8], Array],
         noise: NoiseEstimator,
+        free: Following,
         *,
         delay_sigma_s: float,
         inertia: Inertia,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Judge n samples.
+        """Return readings (n, 6), their chi2 (n,), NaN until the noise is known, and which are beyond the limit (n,).
 
-        Parameters
-        ----------
-        residual, predicted : array, shape (n, 6)
-            Measured minus predicted wrench, and the prediction.
-        R_base_flange : array, shape (n, 3, 3)
-        motion : tuple of array, shapes (n,) and (n, 6)
-            As `MotionTracker.follow` returns it.
-        noise : NoiseEstimator
-        delay_sigma_s : float
-            Of the wrench after the pose.
-        inertia : Inertia
-            How well the prediction has it.
-
-        Returns
-        -------
-        readings : array, shape (n, 6)
-        chi2 : array, shape (n,)
-            NaN until the noise is known.
-        beyond : array, shape (n,)
-            Whether each is beyond the limit.
+        `residual` is the measured minus the predicted wrench (n, 6), `motion` is that of `MotionTracker.follow`, and
+        `inertia` is how well the prediction has it. The samples are added to what is known of the free tool.
         """
         states, felt = motion
         n = len(residual)
-        rows = np.concatenate([self._earlier, residual])
-        self._earlier = rows[n:]
-        sums = np.cumsum(np.concatenate([np.zeros((1, 6)), rows]), axis=0)
+        residuals = np.concatenate([self._earlier, residual])
+        self._earlier = residuals[n:]
+        sums = np.cumsum(np.concatenate([np.zeros((1, 6)), residuals]), axis=0)
         readings = (sums[self._size :] - sums[: -self._size]) / self._size
         inexact = np.where((states == REST)[:, None], felt, self._change(predicted, delay_sigma_s))
         chi2, beyond = np.full(n, np.nan), np.zeros(n, np.bool_)
-        for part in self._parts(R_base_flange, states):
-            self._turn(R_base_flange[part.start])
+        for part in self._parts(rows.R_base_flange, states, free.windows.steps(n)):
+            self._turn(rows.R_base_flange[part.start])
             state = int(states[part.start])
             if (known := noise.of(state)) is not None:
-                W = self._whiten(known, state, inertia)
-                distance = (readings[part] - self._offset) @ W.T
+                W, offset = self._whiten(known, state, inertia, free)
+                distance = (readings[part] - offset) @ W.T
                 direction = inexact[part] @ W.T
                 along, length = (distance * direction).sum(axis=1), np.square(direction).sum(axis=1)
                 chi2[part] = np.square(distance).sum(axis=1) - along**2 / (1 + length)
                 beyond[part] = chi2[part] > self.limit
-                self._follow_offset(residual[part], state, is_free=not beyond[part].any())
+            free.add(rows if part.stop - part.start == n else rows.rows(part), states[part], noise, self.uncertainty)
         return readings, chi2, beyond
 
     def _change(self, predicted: Array, delay_sigma_s: float) -> Array:
@@ -185,10 +144,10 @@ class ContactTest:
         share = np.hypot(delay_sigma_s, _INEXACT_S) / READING_S
         return np.asarray(share * (rows[self._size :] - rows[: -self._size]))
 
-    def _parts(self, R_base_flange: Array, states: NDArray[np.int8]) -> Iterator[slice]:
+    @staticmethod
+    def _parts(R_base_flange: Array, states: NDArray[np.int8], step: NDArray[np.int64]) -> Iterator[slice]:
         turned = np.sqrt(np.square(R_base_flange[1:] - R_base_flange[:-1]).sum(axis=(1, 2)) / 2)
         cell = np.concatenate([[0.0], np.floor(np.cumsum(turned) / _TURN_RAD)])
-        step = (self._count + np.arange(len(states))) // (_STEP * self._size)
         is_edge = [column[1:] != column[:-1] for column in (cell, step, states)]
         edges = np.flatnonzero(np.logical_or.reduce(is_edge)) + 1
         for start, stop in pairwise([0, *edges.tolist(), len(states)] if len(states) else []):
@@ -202,31 +161,19 @@ class ContactTest:
         self._R = R_base_flange
         predicted = predicted_covariance(known.parameters, known.covariance, known.response, R_base_flange)
         self.uncertainty = predicted + self._beyond
-        self._share = 2.0 if self._offset.any() else 1.0
         self._whitening = None
 
-    def _whiten(self, noise: SensorNoise, state: int, inertia: Inertia) -> Array:
-        """Return the matrix that makes the readings of a free tool white."""
-        key = noise, self._share, None if state == REST else inertia
+    def _whiten(self, noise: SensorNoise, state: int, inertia: Inertia, free: Following) -> tuple[Array, Array]:
+        """Return the matrix that makes the readings of a free tool white, and their mean."""
+        key = noise, free.filter.changes, None if state == REST else inertia
         if self._whitening is None or self._whitening[0] != key:
-            covariance = self._share * self.uncertainty + noise.reading + noise.wander
+            offset, covariance = free.filter.offset(self.uncertainty, np.eye(3) if self._R is None else self._R)
+            covariance = covariance + noise.reading + noise.wander
             if state != REST:
                 covariance = covariance + self._friction + self._unknown[inertia]
-            self._whitening = key, np.linalg.inv(np.linalg.cholesky(covariance))
+            self._whitening = key, np.linalg.inv(np.linalg.cholesky(covariance)), offset
             self.limit = _hotelling(self.false_alarm_rate, noise.dof)
-        return self._whitening[1]
-
-    def _follow_offset(self, residual: Array, state: int, *, is_free: bool) -> None:
-        self._sum = self._sum + residual.sum(axis=0)
-        self._count += len(residual)
-        self._is_free &= is_free and state == REST
-        if self._count < _STEP * self._size:
-            return
-        if self._is_free:
-            most = _DRIFT + 3 * np.sqrt(np.diag(self.uncertainty))
-            self._offset = np.clip(self._offset + _GAIN * (self._sum / self._count - self._offset), -most, most)
-            self._share *= (1 - _GAIN) ** 2
-        self._sum, self._count, self._is_free = np.zeros(6), 0, True
+        return self._whitening[1:]
 
 
 def _hotelling(rate: float, dof: float) -> float:
@@ -293,13 +240,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings beyond the limit to contacts: three in a row begin one, and three that are not end it.
-
-    Parameters
-    ----------
-    rate_Hz : float
-        Of the sensor.
-    """
+    """Joins readings beyond the limit to contacts: three in a row begin one, and three that are not end it."""
 
     def __init__(self, rate_Hz: float) -> None:
         self._lag, self._short_lag = (max(1, round(lag_s * rate_Hz)) for lag_s in (_LAG_S, _SHORT_LAG_S))
@@ -313,23 +254,10 @@ class ContactTracker:
     def follow(
         self, t_ns: Ns, beyond: NDArray[np.bool_], readings: Array, soon: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], list[Contact]]:
-        """Add readings, each of which ends at a sample.
+        """Return in which samples (n,) there is a contact, and each contact that has begun or is over.
 
-        Parameters
-        ----------
-        t_ns : array, shape (n,)
-        beyond : array, shape (n,)
-            Whether they are beyond the limit.
-        readings : array, shape (n, 6)
-            In the frame of the stream.
-        soon : array, shape (n,)
-            Whether a contact may begin sooner, because the poses that follow show rest.
-
-        Returns
-        -------
-        in_contact : array, shape (n,)
-        changes : list of Contact
-            Each that has begun, and each that is over.
+        A reading (n, 6), in the frame of the stream, ends at each sample, and `beyond` is whether it is beyond the
+        limit. `soon` is whether a contact may begin sooner, because the poses that follow show rest.
         """
         n, before = len(t_ns), len(self._earlier[0])
         t_ns = np.concatenate([self._earlier[0], t_ns])

@@ -1,41 +1,36 @@
 """Weigh what the gripper holds, from half a second of a stream at rest, or while the arm carries it.
 
-`Scale` weighs once, `Weighing` reads a stream and weighs ten times a second.
+`Scale` weighs once, `Weighing` is a sink that weighs ten times a second.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, get_args
+from typing import Final, TypeVar, get_args
 
 import numpy as np
 
 from ftcalib.after import weighing
 from ftcalib.after.weighing import Fault, Weight, drift_since
-from ftcalib.data.dwell_mean import LEAST_SAMPLES, PoseMean, is_stationary, mean_and_covariance, restless_channels
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance, restless_channels
 from ftcalib.errors import AcceptanceError
 from ftcalib.files import JSON
 from ftcalib.model import angle_between
-from ftcalib.rounding import counted, to_place_of, with_sigma
+from ftcalib.rounding import counted, with_sigma
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.live.noise import unexplained_variance
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Block, Paired, Sink, StreamEvent, StreamInfo, gripping_point
-from ftdrive.live.stages import TARE_S, is_still, try_tare
-from ftdrive.live.stream import RECOVER_S, BlockReader, CompensatedStream, ProcessedStream
-from ftdrive.live.tracking import weight_of
-from ftdrivers.clock import Clock
+from ftdrive.stream.free_tool import weight_of
+from ftdrive.stream.noise import unexplained_variance
+from ftdrive.stream.samples import Block, Paired, StreamEvent, StreamInfo, gripping_point
+from ftdrive.stream.stages import TARE_S, is_still, try_tare
+from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
-if TYPE_CHECKING:
-    from ftdrive.store.weighing_log import WeighingLog
+T = TypeVar("T")
 
 WEIGH_S: Final = TARE_S
 """A weighing averages so long."""
 PATIENCE_S = 10.0
 """So long a zero, or the only weight, may take."""
-UNZEROED_KG: Final = 0.1
-"""With a larger smallest mass the drift since the calibration decides, and a zero helps."""
 # Between two weighings, each of the last half second.
 _STEP_S = 0.1
 # The variance of a mean comes from its own samples. With n of them it is raised by this over n.
@@ -60,18 +55,13 @@ WORDS: Final[Mapping[str, str]] = {
     "count": "no whole number of parts: check the mass of one part, and the gripper",
 }
 """Why nothing was weighed, and what to do, by `CannotWeigh.code`."""
-FAULTS: Final[tuple[Fault, ...]] = get_args(Fault)
+_FAULTS: Final = *get_args(Fault), "count"
 
 
 class CannotWeigh(AcceptanceError):
     """The reading is not that of one weight at rest.
 
-    Parameters
-    ----------
-    code : str
-        One of `WORDS`.
-    weight : Weight, optional
-        What was found all the same, of a reading at rest.
+    `code` is one of `WORDS`, and `weight` is what was found all the same, of a reading at rest.
 
     Examples
     --------
@@ -89,45 +79,32 @@ class Scale:
     """Weighs what the gripper of a stream holds beyond its calibrated tool.
 
     The reference is the calibration, or the last tare of the stream, which is the better the younger it is.
-
-    Parameters
-    ----------
-    stream : CompensatedStream or ReplayedStream
     """
 
-    def __init__(self, stream: ProcessedStream) -> None:
+    def __init__(self, stream: Stream) -> None:
         self._stream = stream
-        self._readings: list[tuple[Array, PoseMean]] = []
+        self._readings: list[tuple[Array, Array, Array]] = []
         # Noise of a sample at rest: steps of the load make it look louder for a while.
         self._quietest = np.full(6, np.inf)
 
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
-        """Weigh the last half second.
+        """Weigh the last half second from `since_ns` on, clock of the cell; `more` joins the poses before of one load.
 
-        Parameters
-        ----------
-        since_ns : int
-            Earlier samples do not count, clock of the cell.
-        more : bool
-            Join this pose to those before, of the same load.
-
-        Raises
-        ------
-        CannotWeigh
-            The arm or the reading is not at rest, or the reading is not that of one weight.
+        Raises `CannotWeigh` if arm or reading is not at rest, or the reading is not that of one weight.
         """
         stream = self._stream
-        R, mean = self._rest(since_ns)
-        kept = [one for one in self._readings if angle_between(one[0], R) > _NEW_POSE_RAD] if more else []
-        self._readings = [*kept, (R, mean)]
-        reference, since_s = stream.reference()
+        reading = self._rest(since_ns)
+        kept = [one for one in self._readings if angle_between(one[0], reading[0]) > _NEW_POSE_RAD] if more else []
+        self._readings = [*kept, reading]
+        reference, since_s = stream.processor.monitor.reference()
         calibration = stream.info.calibration
-        contact = weighing.known_contact(calibration)
+        contact = calibration.known_contact
+        R_base_flange, wrench, noise = self.poses
         weight = weighing.weigh(
             reference,
-            np.array([one[0] for one in self._readings]),
-            np.array([one[1].mean for one in self._readings]),
-            np.array([one[1].covariance for one in self._readings]) + np.diag(unexplained_variance(calibration)),
+            R_base_flange,
+            wrench,
+            noise + np.diag(unexplained_variance(calibration)),
             drift=drift_since(since_s),
             g_m_s2=calibration.g_m_s2,
             p_sensor_near_m=gripping_point(stream.info),
@@ -143,17 +120,13 @@ class Scale:
     @property
     def poses(self) -> tuple[Array, Array, Array]:
         """R_base_flange (n, 3, 3), means (n, 6) and covariances (n, 6, 6) of the poses that were joined last."""
-        means = [mean for _, mean in self._readings]
-        R_base_flange = np.array([R for R, _ in self._readings])
-        return R_base_flange, np.array([one.mean for one in means]), np.array([one.covariance for one in means])
+        R_base_flange, means, covariances = map(np.array, zip(*self._readings, strict=True))
+        return R_base_flange, means, covariances
 
     def zero(self, since_ns: int = 0) -> StreamEvent:
         """Tare the empty gripper by the last half second: the drift of the bias up to now is no error any more.
 
-        Raises
-        ------
-        CannotWeigh
-            The arm or the reading is not at rest, or too far from that of the empty tool.
+        Raises `CannotWeigh` if arm or reading is not at rest, or the reading is too far from that of the empty tool.
         """
         self._rest(since_ns)
         # A zero is a tare, so it is refused where a tare is: else the contact wrench would keep the old bias.
@@ -165,23 +138,24 @@ class Scale:
 
     def warm_up(self) -> None:
         """Compute once what a weighing and a zero compute: the first time takes ten times as long as later ones."""
-        rows = self._stream.recent()
+        rows = self._stream.processor.recent()
         if rows is not None and len(rows) >= LEAST_SAMPLES:
-            try_tare(rows, self._stream.reference()[0])
+            try_tare(rows, self._stream.processor.monitor.reference()[0])
             with suppress(CannotWeigh):
                 self.weigh()
 
-    def _rest(self, since_ns: int) -> tuple[Array, PoseMean]:
-        rows = self._stream.recent()
-        if rows is None:
+    def _rest(self, since_ns: int) -> tuple[Array, Array, Array]:
+        processor = self._stream.processor
+        if (rows := processor.recent()) is None:
             raise CannotWeigh("samples")
         rows = rows.rows(rows.t_host_ns >= max(since_ns, int(rows.t_host_ns[-1]) - round(WEIGH_S * 1e9)))
-        if self._stream.rest_sigma is not None:
-            self._quietest = np.minimum(self._quietest, self._stream.rest_sigma)
+        if processor.rest_sigma is not None:
+            self._quietest = np.minimum(self._quietest, processor.rest_sigma)
         return _reading(rows, self._quietest)
 
 
-def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, PoseMean]:
+def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
+    """Return R_base_flange (3, 3), mean (6,) and covariance (6, 6) of a rest; raises `CannotWeigh`."""
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
         raise CannotWeigh("samples")
     if not is_still(rows):
@@ -189,50 +163,36 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, PoseMean]:
     if not is_stationary(rows.raw) or restless_channels(rows.raw, rest_sigma).any():
         raise CannotWeigh("unsteady")
     dwell = mean_and_covariance(rows.raw)
-    return rows.R_base_flange[-1], PoseMean(dwell.mean, dwell.covariance * (1 + _FEW / len(rows)))
+    return rows.R_base_flange[-1], dwell.mean, dwell.covariance * (1 + _FEW / len(rows))
 
 
-def weigh_in_motion(stream: ProcessedStream, since_ns: int = 0) -> Weight:
-    """Weigh what the arm carries, by the load that the stream follows.
+def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
+    """Weigh what the arm carries, by the load that the stream follows from `since_ns` on, clock of the cell.
 
-    Parameters
-    ----------
-    stream : CompensatedStream or ReplayedStream
-        Its `track` is not "off".
-    since_ns : int
-        Earlier samples do not count, clock of the cell.
-
-    Raises
-    ------
-    CannotWeigh
-        A contact, a load that is not decided yet, or no samples.
-    ConfigError
-        The stream does not follow the load.
+    Raises `CannotWeigh` if there is a contact, a load that is not decided yet, or no sample, and `ConfigError` if the
+    stream does not follow the load.
     """
     if stream.track == "off":
         raise ConfigError('the stream does not follow the load: open it with track="show" to weigh in motion')
-    rows, tracked = stream.recent(), stream.tracked
+    rows, tracked = stream.processor.recent(), stream.processor.monitor.tracked
     if rows is None or tracked is None or not np.isfinite(tracked.last_seen_s):
         # the first windows are no answer: an empty gripper is assumed
         raise CannotWeigh("samples")
-    t_ns = round(1e9 * tracked.t_s)
-    if t_ns < max(since_ns, int(rows.t_host_ns[-1]) - round(1e9 * _LATE_S)):
+    if round(1e9 * tracked.t_s) < max(since_ns, int(rows.t_host_ns[-1]) - round(1e9 * _LATE_S)):
         raise CannotWeigh("samples")
     if not tracked.part_known:
         raise CannotWeigh("undecided")
     return weight_of(tracked, stream.info.calibration)
 
 
-def weigh(
-    stream: CompensatedStream | ReplayedStream, *, poses: int = 1, moving: bool = False, timeout_s: float = 10.0
-) -> Weight:
+def weigh(stream: Stream, *, poses: int = 1, moving: bool = False, timeout_s: float = 10.0) -> Weight:
     """Wait until arm and reading rest, and weigh what the gripper holds beyond its calibrated tool.
 
     Call `stream.tare()` at the empty gripper just before it grasps: that cancels the drift of the bias.
 
     Parameters
     ----------
-    stream : CompensatedStream
+    stream : Stream
         Open; it is read here.
     poses : int
         One gives the mass, and the centre of mass but for its place along gravity. From two on, another program turns
@@ -265,28 +225,35 @@ def weigh(
     >>> weight.mass_kg < weight.least_kg  # the gripper is empty
     True
     """
-    clock: Clock = stream.clock
-    scale, since_ns = Scale(stream), 0
-    weight: Weight | None = None
-    while weight is None or weight.poses < poses:
-        refusal = CannotWeigh("samples")
-        before = 0 if weight is None else weight.poses
-        for _ in clock.looks(timeout_s):
-            rows = stream.read()
-            since_ns = since_ns or int(rows.t_host_ns[-1])
-            try:
-                if moving:
-                    return weigh_in_motion(stream, since_ns)
-                weight = scale.weigh(since_ns, more=True)
-            except CannotWeigh as error:
-                refusal = error
-            else:
-                if weight.poses > before:
-                    break
-                refusal = CannotWeigh("moving")
-        else:
-            raise refusal
+    scale, weight = Scale(stream), None
+
+    def attempt(since_ns: int) -> Weight:
+        if moving:
+            return weigh_in_motion(stream, since_ns)
+        found = scale.weigh(since_ns, more=True)
+        if weight is not None and found.poses <= weight.poses:
+            raise CannotWeigh("moving")
+        return found
+
+    while weight is None or (weight.poses < poses and not moving):
+        weight = first_success(stream, attempt, timeout_s)
     return weight
+
+
+def first_success(stream: Stream, attempt: Callable[[int], T], timeout_s: float) -> T:
+    """Read a stream until `attempt` succeeds with the samples from now on; it gets their first time.
+
+    After the time-out raise its last `CannotWeigh`.
+    """
+    end_s, refusal, since_ns = stream.clock.now_s() + timeout_s, CannotWeigh("samples"), 0
+    for block in pump(stream, until=lambda: stream.clock.now_s() > end_s, patience_s=0.0):
+        try:
+            if block:
+                since_ns = since_ns or int(block.t_host_ns[-1])
+                return attempt(since_ns)
+        except CannotWeigh as error:
+            refusal = error
+    raise refusal
 
 
 def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
@@ -339,130 +306,80 @@ class ScaleState:
         return self.weight if self.refusal in {None, "count"} else None
 
 
-class Weighing:
-    """Reads a stream, records it, and weighs ten times a second.
+class Weighing(Sink):
+    """Weighs ten times a second what the gripper of a stream holds, and zeroes on request.
 
-    Parameters
-    ----------
-    stream : CompensatedStream
-    recorder : Sink, optional
-    joins : bool
-        Join the poses of one load.
-    moving : bool
-        Weigh what the arm carries, in motion too.
-    part_kg : float, optional
-        Mass of one part.
-    log : WeighingLog, optional
-        Keeps each new weight or fault.
-
-    Attributes
-    ----------
-    shown : ScaleState
-        The present state.
-    note : str
-        What has become of the last requested zero.
+    It `joins` the poses of one load, weighs what is `moving` too, and counts parts of `part_kg`. `keep` takes each new
+    weight or fault, see `WeighingLog.keep`.
     """
 
+    label, keeps_all = "scale", True
     shown = ScaleState(None, "samples")
+    is_new = False
+    """Whether the last block has brought a new weight, or a fault that lasts."""
     note = ""
-    _zero_requested = False
+    """Outcome of the last requested zero."""
+    refusal: NotAccepted | None = None
+    """The error if it was refused."""
 
     def __init__(
         self,
-        stream: CompensatedStream,
-        recorder: Sink | None,
+        stream: Stream,
         *,
         joins: bool,
         part_kg: float | None,
         moving: bool = False,
-        log: "WeighingLog | None" = None,
+        keep: Callable[[Mapping[str, JSON]], object] = lambda _: None,
     ) -> None:
-        self.stream, self.part_kg = stream, part_kg
-        self._log = log
-        self.joins, self.moving = joins, moving
-        self._recorder = recorder
-        self._scale = Scale(stream)
+        self.stream, self.part_kg, self.joins, self.moving = stream, part_kg, joins, moving
+        self._scale, self._keep = Scale(stream), keep
         # Weight of the load that is held; None since the reading was not at rest.
         self._last: Weight | None = None
+        self._due_s = stream.clock.now_s() + _STEP_S
+        # When a zero was requested, on the clock of the cell; set by another thread.
+        self._zero_ns: int | None = None
+        self._fault: str | None = None
+        self._fault_since_s = 0.0
 
-    def zero(self) -> None:
-        """Tare the empty gripper, within some seconds. Raises `NotAccepted`."""
-        end_s = self.stream.clock.now_s() + PATIENCE_S
-        while True:
-            self._read_for(WEIGH_S)
-            try:
-                self._scale.zero()
-            except CannotWeigh as refusal:
-                if refusal.code == "not-empty" or self.stream.clock.now_s() > end_s:
-                    raise NotAccepted(f"no zero: {WORDS[refusal.code]}") from None
-            else:
-                self._last = None
-                return
+    @property
+    def is_zeroing(self) -> bool:
+        """Whether a zero is requested, and neither done nor refused."""
+        return self._zero_ns is not None
 
     def request_zero(self) -> None:
-        """Let the thread that takes the states tare the empty gripper."""
-        self.note = "zero: waits for half a second at rest …"
-        self._zero_requested = True
+        """Let the thread that reads tare the empty gripper, when it has rested for half a second."""
+        self.note, self.refusal = "zero: waits for half a second at rest …", None
+        self._zero_ns = self.stream.clock.now_ns()
 
-    def _zero_as_requested(self) -> None:
-        self._zero_requested = False
-        # the number of before would look live
-        self.shown = ScaleState(None, "samples")
-        try:
-            self.zero()
-        except NotAccepted as error:
-            self.note = str(error)
+    def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
+        """Weigh or zero if it is time to."""
+        now_s, zero_ns, self.is_new = self.stream.clock.now_s(), self._zero_ns, False
+        if block is None:
+            self._last = None
+            self.shown = ScaleState(None, None, stale=self.stream.status().failure)
+        elif now_s < self._due_s:
+            return
+        elif zero_ns is not None:
+            # the number of before would look live
+            self.shown = ScaleState(None, "samples")
+            self._zero(zero_ns)
         else:
-            self.note = "zero: the empty gripper was tared"
+            self.shown = self._weighed()
+            self.is_new = self._is_new(self.shown, now_s)
+        self._due_s = self.stream.clock.now_s() + _STEP_S
 
-    def _read_for(self, seconds: float) -> None:
-        end_s = self.stream.clock.now_s() + seconds
-        while self.stream.clock.now_s() < end_s:
-            self._record(self.stream.read())
-
-    def _record(self, block: Block) -> None:
-        if self._recorder is not None:
-            self._recorder.write(block)
-            for event in self.stream.take_events():
-                self._recorder.event(event)
-
-    def states(self, *, raises: bool = False) -> Iterator[tuple[ScaleState, bool]]:
-        """Yield the state ten times a second, and whether it is a new weight or fault.
-
-        Between two of them a requested zero is done. Raises `DeviceError` if a device has failed for some seconds, or
-        at once with `raises`.
-        """
-        for shown, is_new in self._states(raises=raises):
-            self.shown = shown
-            yield shown, is_new
-            if self._zero_requested:
-                self._zero_as_requested()
-
-    def _states(self, *, raises: bool) -> Iterator[tuple[ScaleState, bool]]:
-        clock, reader = self.stream.clock, BlockReader(self.stream, 0.0 if raises else RECOVER_S)
-        fault_since_s = 0.0
-        fault: str | None = None
-        due_s = clock.now_s() + _STEP_S
-        for block in reader:
-            if block is None:
-                self._last = None
-                yield ScaleState(None, None, stale=str(reader.failure)), False
-                due_s = clock.now_s() + _STEP_S
-                continue
-            self._record(block)
-            if clock.now_s() < due_s:
-                continue
-            shown = self._weighed()
-            now_s = clock.now_s()
-            if shown.refusal != fault:
-                fault, fault_since_s = shown.refusal, now_s
-            lasts = shown.refusal in (*FAULTS, "count") and now_s - fault_since_s > WEIGH_S
-            if lasts:
-                fault_since_s = float("inf")  # reported once
-                if self._log is not None and shown.refusal is not None:
-                    self._log.refused(shown.refusal)
-            yield shown, lasts or (shown.refusal is None and self._is_new(shown))
-            due_s = clock.now_s() + _STEP_S
+    def _zero(self, since_ns: int) -> None:
+        try:
+            self._scale.zero(since_ns)
+        except CannotWeigh as refusal:
+            if refusal.code != "not-empty" and self.stream.clock.now_ns() <= since_ns + 1e9 * PATIENCE_S:
+                return
+            self.refusal = NotAccepted(f"no zero: {WORDS[refusal.code]}")
+        else:
+            self._last = None
+        # first, because the operator may request another one now
+        self._zero_ns = None
+        self.note = "zero: the empty gripper was tared" if self.refusal is None else str(self.refusal)
 
     def _weighed(self) -> ScaleState:
         try:
@@ -474,36 +391,36 @@ class Weighing:
                 self._last = None
             return ScaleState(refusal.weight, refusal.code)
 
-    def _is_new(self, shown: ScaleState) -> bool:
-        """Note a weight as an event if it is another one than the last; the same one is followed."""
+    def _is_new(self, shown: ScaleState, now_s: float) -> bool:
+        """Keep another weight than the last, or once a fault that lasts; return whether there is one."""
+        if shown.refusal != self._fault:
+            self._fault, self._fault_since_s = shown.refusal, now_s
+        if shown.refusal in _FAULTS and now_s - self._fault_since_s > WEIGH_S:
+            self._fault_since_s = float("inf")
+            self._keep({"refused": shown.refusal})
+            return True
         weight, last = shown.weight, self._last
-        if weight is None:
+        if weight is None or shown.refusal is not None:
             return False
         if last is not None:
-            if abs(weight.mass_kg - last.mass_kg) < weight.least_kg and weight.poses == last.poses:
+            is_same = abs(weight.mass_kg - last.mass_kg) < weight.least_kg
+            if is_same and weight.poses == last.poses:
                 return False
-            if abs(weight.mass_kg - last.mass_kg) >= weight.least_kg:
-                self._scale = Scale(self.stream)  # another load
+            if not is_same:
+                self._scale = Scale(self.stream)
         self._last = weight
         values = load_values(weight, self.stream.info) | {"count": shown.count}
-        self.stream.note("load", line_of(shown), values)
-        if self._log is not None:
-            self._log.weighed(values)
+        self.stream.processor.note("load", line_of(shown), values)
+        self._keep(values)
         return True
 
     def given_up(self, shown: ScaleState) -> CannotWeigh:
         """Return the error of the only weight that was wanted, after `PATIENCE_S`."""
         code = shown.refusal or "samples"
         # these are kept already
-        if self._log is not None and code not in (*FAULTS, "count"):
-            self._log.refused(code)
+        if code not in _FAULTS:
+            self._keep({"refused": code})
         return CannotWeigh(code, shown.weight)
-
-
-def worth_of(weight: Weight) -> str:
-    """Return the sigma and the smallest mass of a weight as words."""
-    sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
-    return f"sigma {sigma_g} g, smallest mass {least_g} g"
 
 
 def line_of(shown: ScaleState) -> str:
@@ -517,7 +434,5 @@ def line_of(shown: ScaleState) -> str:
     if not weight.is_something:
         return f"nothing: {with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg, less than {weight.least_kg:.2g} kg"
     parts = "" if shown.count is None else f"{counted(shown.count, 'part')}, "
-    com = ", ".join(
-        with_sigma(1e3 * x, 1e3 * s) for x, s in zip(weight.p_sensor_com_m, weight.com_sigma_m, strict=True)
-    )
-    return f"{parts}{with_sigma(weight.mass_kg, weight.mass_sigma_kg)} kg at ({com}) mm from the sensor origin"
+    com, mass = ", ".join(weight.com_in_words), with_sigma(weight.mass_kg, weight.mass_sigma_kg)
+    return f"{parts}{mass} kg at ({com}) mm from the sensor origin"

@@ -1,14 +1,12 @@
 """Wrench and pose on one time axis: times of measurement, the delay between the two links, the pose at each wrench.
 
-A sample is received some time after it was measured, and never before. `Timeline` therefore lays a straight line under
-the times of receipt over the device's own count; the device's clock may drift slowly. What the line cannot show is the
-shortest delay of each link. Only the difference between the two links matters, and `DelayEstimator` finds it from
-motion.
+`Timeline` finds when each sample was measured, but for the shortest delay of each link. Only the difference between
+the two links matters, and `DelayEstimator` finds it from motion.
 """
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -17,33 +15,22 @@ from numpy.lib.stride_tricks import sliding_window_view
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftcalib.model import jacobian, skew
-from ftdrive.live.motion import MovedLoad
-from ftdrive.live.samples import Ns, Paired, matrices, quaternions
+from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
+from ftdrive.stream.motion import MovedLoad
+from ftdrive.stream.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
-_BUCKET_S, _BUCKETS = 0.25, 40
-_LEAST_SCATTER_NS = 1e4
-CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
-"""Relative error of a device's clock, and of the nominal rate of a sensor without one, one sigma."""
-_IMPLAUSIBLE = 4.0
-# Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing.
-_SLEW = 0.05
-# They approach one that is farther away faster.
-_FAR_NS, _FASTEST_SLEW = 2e8, 0.9
 # A clock is no clock of seconds if it differs by so much over this time.
 _SCALED_S, _SCALED = 0.2, 0.05
 _PASSES = 4
+_ROUNDS = 10
 # A recording is paired so often until its delay changes by less.
 _CONVERGED_S = 1e-8
-# If so many buckets in a row are later than this, and alike, the line before them is no longer true.
-_STEP_BUCKETS, _STEP_NS = 8, 5e6
 # A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay.
 # A wrench does not wait for the next pose: waiting delayed a block by one interval and split it.
 _MOST_AHEAD_NS = 10_000_000
 # Poses are kept so long, for samples that are late.
 _KEEP_NS = 2_000_000_000
-# A device whose count is so far from the line has restarted.
-_LOST_S = 1.0
 MOST_DELAY_S = 0.1
 
 PERIOD_S = 0.024
@@ -53,7 +40,7 @@ _BATCH_S = 1.0
 _REACH = 2
 # What means of an acceleration keep of it when it comes from means of the poses: a parabola through five of them.
 _SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
-# The estimate is applied from this sigma on.
+# The estimate is applied from this sigma on, which it must have without its best second.
 _USABLE_S = 3e-3
 # Slower, a tool does not show the delay.
 _SLOWEST_RAD_S = 0.02
@@ -71,101 +58,6 @@ _FLOOR_N = 1e-3
 _NOTICED_S = 2e-4
 
 
-class Timeline:
-    """Time of measurement of every sample of one device: the supporting line below its times of receipt.
-
-    Each quarter of a second contributes its least delayed sample. Of the last ten seconds' samples, the edge of the
-    lower convex hull at their middle is the line: the clock skew estimator of Moon, Skelly, Towsley, INFOCOM 1999.
-
-    Parameters
-    ----------
-    period_s : float
-        Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
-    tolerance : float
-        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
-        much to show the rate, as on a computer that is too busy.
-    """
-
-    def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
-        self.shift_s = 0.0
-        """Subtracted from every time; a change is followed slowly."""
-        self._nominal_ns = period_s * 1e9
-        self._tolerance = tolerance
-        self.restart()
-
-    def restart(self) -> None:
-        """Forget the line, after an interruption: a device may not have counted meanwhile."""
-        self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
-        self._origin: tuple[float, int] | None = None
-        self._slope, self._offset = self._nominal_ns, 0.0
-        self._last: tuple[float, float] | None = None
-
-    def stamp(self, count: Array, t_host_ns: Ns) -> Ns:
-        """Return the times of measurement (n,) of samples with these counts (n,) and times of receipt (n,)."""
-        if self._origin is None:
-            self._origin = float(count[0]), int(t_host_ns[0])
-        x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
-        behind_ns = y - self._slope * x
-        k = int(np.argmin(behind_ns))
-        if self._last is not None and (
-            # the device has restarted
-            x[0] < self._last[0] or abs(behind_ns[k] - self._offset) > _LOST_S * 1e9
-        ):
-            self.restart()
-            return self.stamp(count, t_host_ns)
-        self._note(float(x[k]), float(y[k]))
-        end = self._slope * x[-1] + self._offset - self.shift_s * 1e9
-        if self._last is None:
-            times = self._slope * (x - x[-1]) + end
-        else:
-            x_0, y_0 = self._last
-            # the device's clock has coarse steps
-            if x[-1] <= x_0:
-                return np.full(len(x), self._origin[1] + round(y_0), np.int64)
-            due = self._slope * (x[-1] - x_0)
-            slew = min(max(_SLEW, abs(end - y_0 - due) / _FAR_NS), _FASTEST_SLEW)
-            end = min(max(end, y_0 + (1 - slew) * due), y_0 + (1 + slew) * due)
-            times = y_0 + (x - x_0) * ((end - y_0) / (x[-1] - x_0))
-        self._last = float(x[-1]), float(end)
-        return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
-
-    def _note(self, x: float, y: float) -> None:
-        """Keep the least delayed sample of each bucket, and fit the line."""
-        width = _BUCKET_S * 1e9 / self._slope
-        if not self._points or x // width > self._points[-1][0] // width:
-            self._points.append((x, y))
-            late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
-            by_ns = [b - self._slope * a - self._offset for a, b in late]
-            if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
-                # samples were lost that nothing has counted
-                self._points = deque([*late, (x, y)], maxlen=_BUCKETS)
-        elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
-            self._points[-1] = x, y
-        elif len(self._points) > 1:
-            return
-        hull: list[tuple[float, float]] = []
-        for point in self._points:
-            while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
-                hull.pop()
-            hull.append(point)
-        if len(hull) > 1:
-            middle = sum(a for a, _ in self._points) / len(self._points)
-            (x_0, y_0), (x_1, y_1) = next(edge for edge in pairwise(hull) if edge[1][0] >= middle)
-            slope = (y_1 - y_0) / (x_1 - x_0)
-            above_ns = sum(b - y_0 - slope * (a - x_0) for a, b in self._points) / len(self._points)
-            error = (above_ns + _LEAST_SCATTER_NS) / ((hull[-1][0] - hull[0][0]) * self._nominal_ns)
-            weight = 1 / (1 + (error / self._tolerance) ** 2)
-            if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
-                # no drift of a clock, but a growing delay
-                weight = 0.0
-            self._slope = weight * slope + (1 - weight) * self._nominal_ns
-        self._offset = min(b - self._slope * a for a, b in self._points)
-
-
-def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
-    return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
-
-
 class PoseTrack:
     """Poses of the flange over time, interpolated to any time between the first and the last.
 
@@ -174,8 +66,6 @@ class PoseTrack:
 
     def __init__(self) -> None:
         self._t_ns = np.empty(0, np.int64)
-        # Both, with room for more.
-        self._room = np.empty(0, np.int64), np.empty((0, 14))
         # unit quaternion x y z w, position, joint angles, half the angle to the next
         self._columns = np.empty((0, 14))
 
@@ -198,29 +88,20 @@ class PoseTrack:
         new = np.zeros((int(later.sum()), 14))
         new[:, :4] = quaternions(R_base_flange[later])
         new[:, 4:7], new[:, 7:13] = p_base_flange_m[later], q_rad[later]
-        start, end = max(0, len(self._t_ns) - 1), len(self._t_ns) + len(new)
-        if end > len(self._room[0]):
-            self._make_room(end)
-        t_ns, columns = self._room[0][:end], self._room[1][:end]
-        t_ns[end - len(new) :], columns[end - len(new) :] = t_host_ns[later], new
-        quat = columns[start:, :4]
+        start = max(0, len(self._t_ns) - 1)
+        self._t_ns = np.concatenate([self._t_ns, t_host_ns[later]])
+        self._columns = np.concatenate([self._columns, new])
+        quat = self._columns[start:, :4]
         # q and -q are one orientation: take the one on the side of its predecessor
         side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         quat[1:] *= np.cumprod(side)[:, None]
         chord = np.sqrt(np.square(quat[1:] - quat[:-1]).sum(axis=1))
-        columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
-        self._t_ns, self._columns = t_ns, columns
+        self._columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
 
     def forget(self, t_ns: int) -> None:
         """Drop the poses that no time from `t_ns` on needs."""
         keep = max(int(np.searchsorted(self._t_ns, t_ns, "right")) - 1, 0)
-        self._room = self._room[0][keep:], self._room[1][keep:]
         self._t_ns, self._columns = self._t_ns[keep:], self._columns[keep:]
-
-    def _make_room(self, rows: int) -> None:
-        t_ns, columns = np.empty(2 * rows, np.int64), np.empty((2 * rows, 14))
-        t_ns[: len(self._t_ns)], columns[: len(self._t_ns)] = self._t_ns, self._columns
-        self._room = t_ns, columns
 
     def at(self, t_ns: Ns) -> tuple[Array, Array, Array]:
         """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times (n,).
@@ -249,16 +130,11 @@ class DelayEstimator:
         force = prediction - d * derivative of the prediction + errors of calibration, bias and lever + noise
 
     and the prediction holds weight, bias and inertia. The errors are estimated beside d, with the covariance of the
-    calibration as prior, so that they are not taken for a delay. Every second has the weight of its own residual,
-    reduced where residuals are correlated in time, so that a touched tool counts little.
+    calibration as prior, so that they are not taken for a delay. Every second has the weight of its residual from what
+    all seconds have in common, reduced where residuals are correlated in time: a second with a contact counts little,
+    even if a delay or a bias of its own would explain the contact.
 
-    Parameters
-    ----------
-    calibration : CalibrationResult
-    p_flange_sensor_m : array, shape (3,)
-        NaN where unknown.
-    window : int
-        The last so many seconds of motion count.
+    `p_flange_sensor_m` (3,) is NaN where unknown. The last `window` seconds of motion count.
     """
 
     def __init__(self, calibration: CalibrationResult, p_flange_sensor_m: Array, window: int = 30) -> None:
@@ -274,7 +150,8 @@ class DelayEstimator:
         eigenvalues, V = np.linalg.eigh(errors)
         self._scale[1:10, 1:10] = V * np.sqrt(np.maximum(eigenvalues, 0.0))
         self._scale[10:, 10:] = (_LEVER_M if known else _ANY_LEVER_M) * np.eye(3)
-        self._seconds: deque[tuple[Array, Array]] = deque(maxlen=window)
+        # of each second: products of derivatives and residual, their number, reduction, least variance
+        self._seconds: deque[tuple[Array, int, float, float]] = deque(maxlen=window)
         self._pending: list[Paired] = []
         self._settling = False
         motion = calibration.motion
@@ -292,12 +169,19 @@ class DelayEstimator:
         elif sum(map(self._learn, pieces)):
             self._apply()
 
-    def learn(self, recording: Iterable[Paired]) -> None:
-        """Forget what was learnt; improve the delay once, from blocks of a recording that were paired with it."""
-        self._seconds.clear()
-        self._pending = []
-        if sum(self._learn(piece) for paired in recording for piece in self._whole_seconds(paired)):
-            self._apply()
+    def learn(self, samples: Iterable[FtSamples], states: Callable[[], Iterable[ArmStates]]) -> None:
+        """Estimate the delay of a recording as `pair_blocks` takes it, with a window as long as the recording.
+
+        Both are read several times; a call of `states` begins again. Raises `BadDataset`.
+        """
+        for _ in range(_PASSES):
+            before_s = self.delay_s
+            self._seconds.clear()
+            self._pending, self._settling = [], False
+            # in seconds of the whole, whatever the blocks, which keep few poses in memory
+            self.add(Paired.concatenate(list(pair_blocks(samples, states(), before_s))))
+            if abs(self.delay_s - before_s) < _CONVERGED_S:
+                break
 
     def _whole_seconds(self, paired: Paired) -> list[Paired]:
         """Add samples; return the seconds that are complete."""
@@ -323,20 +207,18 @@ class DelayEstimator:
             column[: groups * size].reshape(groups, size, *column.shape[1:]).mean(axis=1)
             for column in (seconds, paired.raw[:, :3], paired.R_base_flange, paired.p_base_flange_m)
         )
-        if not (np.diff(t_s) > 0).all():
-            return False
-        if (found := self._linearised(t_s, force, R, p)) is None:
+        if not (np.diff(t_s) > 0).all() or (found := self._linearised(t_s, force, R, p)) is None:
             return False
         H, y = found
-        A, b = H.T @ H, H.T @ y
-        variance = float(y @ y) / len(y)
+        columns = np.column_stack([H, y])
+        products, variance = columns.T @ columns, float(y @ y) / len(y)
         for _ in range(3):
-            residual = y - H @ np.linalg.solve(A / variance + np.eye(13), b / variance)
+            A, b = products[:13, :13] / variance, products[:13, 13] / variance
+            residual = y - H @ np.linalg.solve(A + np.eye(13), b)
             variance = max(float(residual @ residual) / len(y), _FLOOR_N**2)
         rows = residual.reshape(-1, 3)
         correlation = min(max(float((rows[1:] * rows[:-1]).sum() / (rows**2).sum()), 0.0), 0.95)
-        weight = (1 - correlation) / (1 + correlation) / variance
-        self._seconds.append((weight * A, weight * b))
+        self._seconds.append((products, len(y), (1 - correlation) / (1 + correlation), variance))
         return True
 
     def _linearised(self, t_s: Array, force: Array, R: Array, p: Array) -> tuple[Array, Array] | None:
@@ -356,32 +238,40 @@ class DelayEstimator:
         return H.reshape(-1, 13) @ self._scale, (force - prediction).ravel()
 
     def _apply(self) -> None:
-        A = sum((a for a, _ in self._seconds), np.eye(13))
-        b = sum((b for _, b in self._seconds), np.zeros(13))
-        covariance = np.linalg.inv(A)
-        left_s = _PRIOR_S * float(covariance[0] @ b)
-        self.sigma_s = _PRIOR_S * float(np.sqrt(covariance[0, 0]))
-        if self.sigma_s > _USABLE_S:
+        products, count, reduction, least = (np.array(column) for column in zip(*self._seconds, strict=True))
+        variance = least
+        for _ in range(_ROUNDS):
+            weighted = (reduction / variance)[:, None, None] * products
+            total = weighted.sum(axis=0)
+            found = np.linalg.solve(total[:13, :13] + np.eye(13), total[:13, 13])
+            left = np.append(-found, 1.0)
+            variance = np.maximum(left @ products @ left / count, least)
+        # a single second may be a contact that looks like a delay
+        both = np.array([total, total - weighted[np.argmax(weighted[:, 0, 0])]])[:, :13, :13] + np.eye(13)
+        sigma_s, sigma_without_one_s = (_PRIOR_S * np.sqrt(np.linalg.inv(both)[:, 0, 0])).tolist()
+        if sigma_without_one_s > _USABLE_S:
             return
+        self.sigma_s = sigma_s
         before_s = self.delay_s
-        self.delay_s = min(max(before_s + left_s, -MOST_DELAY_S), MOST_DELAY_S)
-        step = (self.delay_s - before_s) / _PRIOR_S
-        self._seconds = deque(((a, c - step * a[0]) for a, c in self._seconds), maxlen=self._seconds.maxlen)
+        self.delay_s = min(max(before_s + _PRIOR_S * float(found[0]), -MOST_DELAY_S), MOST_DELAY_S)
+        change = np.eye(14)
+        change[0, 13] = -(self.delay_s - before_s) / _PRIOR_S
+        moved = change.T @ products @ change
+        seconds = ((one, *rest) for one, (_, *rest) in zip(moved, self._seconds, strict=True))
+        self._seconds = deque(seconds, maxlen=self._seconds.maxlen)
         self._settling = abs(self.delay_s - before_s) > _NOTICED_S
 
 
 class Pairing:
     """Puts the samples of both links on one time axis and finds the pose of each wrench.
 
-    Parameters
-    ----------
-    sensor_rate_Hz : float
-        Nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a fixed rate.
-    delay : DelayEstimator or float
-        Finds the delay of the wrench after the pose, or is that delay in s.
+    `sensor_rate_Hz` is nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a
+    fixed rate. `delay` finds the delay of the wrench after the pose, or is that delay in s. Without an arm, position
+    and joint angles are unknown, and the flange never turns.
     """
 
-    def __init__(self, sensor_rate_Hz: float, delay: DelayEstimator | float) -> None:
+    def __init__(self, sensor_rate_Hz: float, delay: DelayEstimator | float, *, has_arm: bool = True) -> None:
+        self._has_arm = has_arm
         self._estimator = delay if isinstance(delay, DelayEstimator) else None
         self._rate_Hz = sensor_rate_Hz
         self._sensor: Timeline | None = None
@@ -409,7 +299,7 @@ class Pairing:
     @property
     def waits_for_pose(self) -> bool:
         """Whether there are samples without a pose, which are too new to extrapolate it."""
-        return bool(self._waiting)
+        return bool(self._waiting) and self._has_arm
 
     def add_states(self, states: ArmStates) -> None:
         """Add what the arm has sent."""
@@ -444,10 +334,16 @@ class Pairing:
 
         Samples before the first pose are dropped.
         """
-        if not self._waiting or (span_ns := self._poses.span_ns) is None:
+        span_ns = self._poses.span_ns
+        if not self._waiting or (span_ns is None and self._has_arm):
             return None
         samples = FtSamples.concatenate([block for block, _ in self._waiting])
         t_ns = np.concatenate([times for _, times in self._waiting])
+        if span_ns is None:
+            self._waiting, unknown = [], np.full((len(t_ns), 6), np.nan)
+            R_base_flange = np.tile(np.eye(3), (len(t_ns), 1, 1))
+            columns = samples.t_device_s, samples.seq, samples.status, samples.wrench
+            return Paired(t_ns, *columns, unknown, R_base_flange, unknown[:, :3])
         first, end = np.searchsorted(t_ns, [span_ns[0], span_ns[1] + self._poses.ahead_ns + 1]).tolist()
         self._waiting = [(samples.rows(slice(end, None)), t_ns[end:])] if end < len(t_ns) else []
         if first >= end:
@@ -483,17 +379,8 @@ def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
 def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay_s: float) -> Iterator[Paired]:
     """Pair a recording whose times are those of measurement, in blocks; both are sorted by time.
 
-    Parameters
-    ----------
-    samples, states
-        Samples before the first and after the last state are dropped.
-    delay_s : float
-        Of the wrench after the pose.
-
-    Raises
-    ------
-    BadDataset
-        The two do not overlap.
+    Samples before the first and after the last state are dropped. `delay_s` is that of the wrench after the pose.
+    Raises `BadDataset` if the two do not overlap.
     """
     poses, coming, found = PoseTrack(), iter(states), False
     for block in samples:
@@ -510,16 +397,3 @@ def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay
             yield _paired_with(poses, t_ns[inside], block.rows(inside))
     if not found:
         raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
-
-
-def estimate_delay(samples: Iterable[FtSamples], states: Iterable[ArmStates], estimator: DelayEstimator) -> None:
-    """Estimate the delay of a recording as `paired_blocks` takes it, with a window as long as the recording.
-
-    Both are read several times. Raises `BadDataset`.
-    """
-    for _ in range(_PASSES):
-        before_s = estimator.delay_s
-        # in seconds of the whole, whatever the blocks, which keep few poses in memory
-        estimator.learn([Paired.concatenate(list(pair_blocks(samples, states, before_s)))])
-        if abs(estimator.delay_s - before_s) < _CONVERGED_S:
-            break

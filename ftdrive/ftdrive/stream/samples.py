@@ -5,10 +5,11 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar, Final, Literal, Protocol
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.display import Displayed
@@ -17,7 +18,8 @@ from ftcalib.model import skew
 from ftcalib.motion.model import HEIGHT
 from ftcalib.rounding import with_sigma
 from ftdrive.errors import ConfigError
-from ftdrive.runs.verification import VerificationRecord, marks_of
+from ftdrive.runs.calibration import EMULATED, marks_of
+from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.interfaces import Array, Columns, DeviceInfo
 
 Axes = Literal["sensor", "flange", "base", "tcp"]
@@ -67,6 +69,9 @@ class WrenchFrame:
 class Stages:
     """What is done to the raw wrench, in this order. Raw samples are always kept beside the result.
 
+    All interfaces and files take the settings from these fields; a default is a bool, None for a frequency, a number
+    or a count, and False, None or 0 is off.
+
     Examples
     --------
     >>> import ftdrive
@@ -75,14 +80,16 @@ class Stages:
     (True, True, False)
     """
 
-    bias: bool = True
-    gravity: bool = True
-    inertia: bool = False
-    """Subtract the inertial wrench of the load; on by default where the calibration is one in motion."""
-    notch_Hz: float | None = None
-    lowpass_Hz: float | None = None
-    deadband_N: float = 0.0
-    deadband_Nm: float = 0.0
+    bias: bool = field(default=True, metadata={"text": "Subtract the bias."})
+    gravity: bool = field(default=True, metadata={"text": "Subtract the weight of the load."})
+    inertia: bool = field(
+        default=False, metadata={"text": "Subtract the inertial wrench of the load; needs [sensor] height_mm."}
+    )
+    """On by default where the calibration is one in motion."""
+    notch_Hz: float | None = field(default=None, metadata={"text": "Frequency of the notch filter; 0 is off."})
+    lowpass_Hz: float | None = field(default=None, metadata={"text": "Frequency of the low-pass filter; 0 is off."})
+    deadband_N: float = field(default=0.0, metadata={"text": "Forces below it are 0."})
+    deadband_Nm: float = field(default=0.0, metadata={"text": "Torques below it are 0."})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,8 +164,8 @@ class Sample(Displayed):
 
     A reading is the mean over 20 ms, so a contact begins after 40 to 60 ms. One reading of a free tool in a million
     exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also behind a
-    filter of the sensor. At rest, a force that grows by less than the limit in 2 s counts as drift, up to 0.5 N and
-    15 mN·m. In motion, inertia that is not subtracted counts as unknown, so a smaller contact is not found.
+    filter of the sensor. A force that grows by less than 20 N in an hour counts as drift of the bias. In motion,
+    inertia that is not subtracted counts as unknown, so a smaller contact is not found.
     """
     frame: WrenchFrame
 
@@ -269,18 +276,16 @@ class Tracked(Displayed):
         return f"bias {with_sigma(force_N, sigma_N)} N{seen}, part {part}"
 
 
-NO_ARM: Final = DeviceInfo("", "", "")
-"""The arm of a stream that reads a sensor alone."""
-
-
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StreamInfo(Displayed):
     """What does not change while a stream runs with one calibration; every file and every client gets it."""
 
-    calibration: CalibrationResult
+    result: CalibrationResult | None
+    """The calibration; None of a sensor alone."""
     calibration_name: str
     """The file it was read from."""
     arm: DeviceInfo
+    """Without a model of a sensor alone."""
     sensor: DeviceInfo
     tool: str
     utc_offset_ns: int
@@ -307,13 +312,22 @@ class StreamInfo(Displayed):
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """What every output says of the cell and the calibration, see `ftdrive.runs.verification.MARKS`."""
-        return marks_of(self.calibration, emulated=self.emulated, foreign=self.foreign)
+        """What every output says of the cell and the calibration, see `ftdrive.runs.calibration.MARKS`."""
+        if self.result is None:
+            return (EMULATED,) if self.emulated else ()
+        return marks_of(self.result, emulated=self.emulated, foreign=self.foreign)
 
     @property
     def is_raw(self) -> bool:
-        """Whether these are readings of a sensor alone; `calibration` then has no meaning."""
-        return self.arm is NO_ARM
+        """Whether these are readings of a sensor alone, without arm and calibration."""
+        return self.result is None
+
+    @property
+    def calibration(self) -> CalibrationResult:
+        """The calibration; only a sensor alone has none, see `is_raw`. Raises `ConfigError` then."""
+        if self.result is None:
+            raise ConfigError("a sensor alone has no calibration: give --calibration PATH or --tool NAME")
+        return self.result
 
 
 @dataclass(frozen=True, slots=True)
@@ -330,9 +344,8 @@ class LinkStatus:
     """Why it is silent or has failed; empty while it delivers."""
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class StreamStatus(Displayed):
-    """The state of a stream beside its samples."""
+class Links(NamedTuple):
+    """The devices of a stream, or of the recording that replaces them."""
 
     sensor: LinkStatus
     arm: LinkStatus
@@ -340,6 +353,16 @@ class StreamStatus(Displayed):
     """Delay of the wrench after the pose."""
     delay_sigma_s: float
     """0 if the delay is configured."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class StreamStatus(Displayed):
+    """The state of a stream beside its samples; the devices and the delay are those of `Links`."""
+
+    sensor: LinkStatus
+    arm: LinkStatus
+    delay_s: float
+    delay_sigma_s: float
     tare: Array | None
     """(6,) what was subtracted from the bias, N and N·m, sensor axes; None without a tare."""
     tare_t_host_ns: int | None
@@ -351,6 +374,11 @@ class StreamStatus(Displayed):
     false_alarm_rate: float
     tracked: Tracked | None = None
     """Bias and held part beside the calibration; None unless the stream follows them."""
+
+    @property
+    def failure(self) -> str:
+        """Why a device is silent or has failed; empty while both deliver."""
+        return self.sensor.error or self.arm.error
 
 
 def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
@@ -370,22 +398,14 @@ def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
 class FrameTransform:
     """Maps wrenches from sensor axes, about the sensor origin, to a frame.
 
-    f' = R f and t' = R (t + p x f), with R the axes and p the sensor origin seen from the new point.
-
-    Parameters
-    ----------
-    frame : WrenchFrame
-    info : StreamInfo
-        Its points of the flange.
-
-    Raises
-    ------
-    ConfigError
-        The frame needs a point that is not configured.
+    f' = R f and t' = R (t + p x f), with R the axes and p the sensor origin seen from the new point. Raises
+    `ConfigError` if the frame needs a point that is not configured.
     """
 
     def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
-        R_flange_sensor = info.calibration.R_flange_sensor
+        # of a sensor alone only its own frame is known
+        is_alone = info.is_raw and frame == WrenchFrame()
+        R_flange_sensor = np.eye(3) if is_alone else info.calibration.R_flange_sensor
         lever_m = R_flange_sensor.T @ _sensor_from(frame, info)
         if frame.axes == "tcp":
             _require_tcp(info)
@@ -415,13 +435,8 @@ class FrameTransform:
 def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:
     """Return orientation and origin in the flange frame of sensor, tcp and the frame of a wrench, by their `frame_id`.
 
-    Parameters
-    ----------
-    frame : WrenchFrame
-    info : StreamInfo
-        Its sensor is drawn at the flange if its height is unknown.
-    R_base_flange : array, shape (..., 3, 3)
-        With base axes the orientation of the wrench's frame has this shape too.
+    The sensor is at the flange if its height is unknown. With base axes the orientation of the wrench's frame has the
+    shape of `R_base_flange` (..., 3, 3).
     """
     sensor = info.calibration.R_flange_sensor, np.nan_to_num(info.p_flange_sensor_m)
     tcp = info.R_flange_tcp, info.p_flange_tcp_m
@@ -463,20 +478,10 @@ def _require_tcp(info: StreamInfo) -> None:
         raise ConfigError("the controller does not report its active TCP: choose another frame than tcp")
 
 
-_I, _J, _K = np.arange(4), np.array([2, 0, 1]), np.array([1, 2, 0])
-
-
 def quaternions(R: Array) -> Array:
-    """Return unit quaternions x y z w (n, 4) of rotations (n, 3, 3), by the largest component (Shepperd 1978)."""
-    x, y, z = R[:, 0, 0], R[:, 1, 1], R[:, 2, 2]
-    squares = np.stack([1 + x - y - z, 1 - x + y - z, 1 - x - y + z, 1 + x + y + z], axis=1)  # 4 times
-    largest = squares.argmax(axis=1)
-    outer = np.empty((len(R), 4, 4))  # 4 q q^T
-    outer[:, :3, :3] = R + np.swapaxes(R, 1, 2)
-    outer[:, :3, 3] = outer[:, 3, :3] = R[:, _J, _K] - R[:, _K, _J]
-    outer[:, _I, _I] = squares
-    row = outer[np.arange(len(R)), largest]
-    return np.asarray(row / np.sqrt(np.square(row).sum(axis=1, keepdims=True)))
+    """Return unit quaternions x y z w (n, 4) of rotations (n, 3, 3)."""
+    # to check them takes ten times as long
+    return Rotation.from_matrix(R, assume_valid=True).as_quat()
 
 
 def matrices(quat: Array) -> Array:
@@ -487,19 +492,6 @@ def matrices(quat: Array) -> Array:
     xy, xz, yz, wx, wy, wz = x * y2, x * z2, y * z2, w * x2, w * y2, w * z2
     columns = (1 - yy - zz, xy - wz, xz + wy, xy + wz, 1 - xx - zz, yz - wx, xz - wy, yz + wx, 1 - xx - yy)
     return np.stack(columns, axis=1).reshape(-1, 3, 3)
-
-
-class Sink(Protocol):
-    """A consumer of blocks, such as a recorder."""
-
-    def write(self, block: Block) -> None:
-        """Take samples."""
-
-    def event(self, event: StreamEvent) -> None:
-        """Take an event."""
-
-    def close(self) -> None:
-        """Complete the output."""
 
 
 class Picked:

@@ -4,12 +4,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
+from ftcalib.after.state import Calibrated
 from ftcalib.compensation import SensorMotion, inertial_wrench, motion_of_poses
 from ftcalib.model import Parameters, skew
+from ftdrive.stream.samples import Paired, StreamInfo
 from ftdrivers.interfaces import Array
 
 READING_S = 0.02
 """A reading is the mean of the samples of this time: contact is judged by readings."""
+GYRATION_M = 0.08
+"""Radius of gyration of a tool or a part, where its inertia is not known."""
 REST = 0
 SPEEDS_RAD_S = (0.15, 0.4, 0.7)
 """Limits of the classes of speed: angular speed, plus that of the flange at 0.5 m."""
@@ -27,6 +31,8 @@ _FELT_M = 4e-5
 # Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it.
 _HOLD_S, _RINGS_S = 0.5, 0.4
 _LEVER_M = 0.5
+# Poses of this spacing give the acceleration, over twice so long: longer ones lose the edges of a move, and are later.
+_KNOT_S, _REACH_S = 0.002, 0.015
 _SPEEDS = np.array(SPEEDS_RAD_S)
 
 
@@ -38,15 +44,7 @@ def samples_in_reading(rate_Hz: float) -> int:
 class MotionTracker:
     """State of motion at each sample, by the mean poses of successive readings; rest begins when it has lasted 0.5 s.
 
-    Parameters
-    ----------
-    rate_Hz : float
-        Of the sensor.
-    mass_kg : float
-    parameters : Parameters
-        Of the calibration.
-    p_flange_sensor_m : array, shape (3,)
-        NaN where unknown: then the centre of mass counts from the flange.
+    Where the position of the sensor is unknown (NaN), the centre of mass counts from the flange.
     """
 
     def __init__(self, rate_Hz: float, mass_kg: float, parameters: Parameters, p_flange_sensor_m: Array) -> None:
@@ -63,20 +61,16 @@ class MotionTracker:
         self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
-        """Add samples with these poses; an unknown position does not move.
+        """Return the states (n,) at these poses, `REST` or a class of motion, and what rest does not exclude.
 
-        Returns
-        -------
-        states : array, shape (n,)
-            `REST` or a class of motion.
-        felt : array, shape (n, 6)
-            Wrench of inertia, N and N·m, sensor axes, that rest does not exclude; zero where nothing shows.
+        That is the wrench of inertia (n, 6), N and N·m, sensor axes, zero where nothing shows. An unknown position does
+        not move.
         """
         n, k = len(R_base_flange), self._size
         if not n:
             return np.zeros(0, np.int8), np.zeros((0, 6))
         turned_m = (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(n, 3)
-        p_base_com_m = np.nan_to_num(p_base_flange_m) + turned_m
+        p_base_com_m = np.where(np.isfinite(p_base_flange_m), p_base_flange_m, 0.0) + turned_m
         # (12, n), for sums along long rows
         poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])
         if self._earlier is None:
@@ -123,16 +117,7 @@ class MotionTracker:
 
 
 class MovedLoad:
-    """A load that the arm moves: motion and inertial wrench of it, from poses.
-
-    Parameters
-    ----------
-    parameters : Parameters
-    g_m_s2 : float
-    p_flange_sensor_m : array, shape (3,)
-    reach : int
-        Poses on each side that give the acceleration.
-    """
+    """A load that the arm moves: its motion and inertial wrench, from poses, `reach` of them on each side."""
 
     def __init__(self, parameters: Parameters, g_m_s2: float, p_flange_sensor_m: Array, reach: int) -> None:
         self._mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
@@ -152,6 +137,79 @@ class MovedLoad:
     def wrench(self, motion: SensorMotion, inertia_kg_m2: Array | None = None) -> Array:
         """Return the wrench (m, 6) of a motion; without the inertia the mass counts as a point."""
         return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)
+
+
+class Neighbours:
+    """Samples with the poses on both sides of them, which show the inertial wrench of the load.
+
+    While that is subtracted, the newest samples wait for the poses after them.
+    """
+
+    def __init__(self, info: StreamInfo) -> None:
+        motion = info.calibration.motion
+        self._tensor = None if motion is None else motion.inertia_kg_m2
+        self._g_m_s2, self._p_flange_sensor_m = info.calibration.g_m_s2, info.p_flange_sensor_m
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        knot_s = self._stride / info.sensor_rate_Hz
+        self._reach = max(2, round(max(_REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._buffer: Paired | None = None
+        self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
+        # Rows of the buffer that are processed.
+        self._done = 0
+
+    @property
+    def knows_tensor(self) -> bool:
+        """Whether the inertia of the tool was calibrated."""
+        return self._tensor is not None
+
+    def arrange(
+        self, rows: Paired, states: NDArray[np.int8], felt: Array, load: Calibrated, *, on: bool, last: bool
+    ) -> tuple[Paired, NDArray[np.int8], Array, Array | None]:
+        """Add samples with their motion; return those that are due, and the inertial wrench (n, 6) if it is wanted.
+
+        `last` is whether no more poses come, so that none waits for them.
+        """
+        if self._buffer is None and not (on and len(rows)):
+            return rows, states, felt, None
+        buffer = rows if self._buffer is None else Paired.concatenate([self._buffer, rows])
+        self._states, self._felt = np.concatenate([self._states, states]), np.concatenate([self._felt, felt])
+        end, inertial = len(buffer), None
+        neighbours = self._reach * self._stride
+        if on and np.isfinite(buffer.p_base_flange_m[-1]).all():
+            inertial, ready = self.wrench(buffer, load)
+            end = end if last else max(ready, self._done)
+            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # the poses after them
+            state = self._states[ahead]
+            # at rest nothing is subtracted, because that would amplify the noise of the joints
+            inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])
+        else:
+            state = self._states[self._done : end]
+        rows, felt = buffer.rows(slice(self._done, end)), self._felt[self._done : end]
+        # knots stay where they are
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride
+        self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
+        self._states, self._felt = self._states[keep:], self._felt[keep:]
+        if not on:
+            self.restart()
+        return rows, state, felt, inertial
+
+    def wrench(self, rows: Paired, load: Calibrated) -> tuple[Array, int]:
+        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        knots = np.arange(0, len(rows), self._stride)
+        t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
+        # a coarse clock repeats times
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
+        if len(knots) < 2 * self._reach + 2:
+            return np.zeros((len(rows), 6)), 0
+        moved = MovedLoad(load.parameters, self._g_m_s2, self._p_flange_sensor_m, self._reach)
+        motion = moved.motion(t_s[knots], rows.R_base_flange[knots], rows.p_base_flange_m[knots])
+        at_knots = moved.wrench(motion, self._tensor)
+        wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
+        return wrench, int(knots[-1 - self._reach]) + 1
 
 
 def wrench_by_acceleration(mass_kg: float, p_sensor_com_m: Array) -> Array:

@@ -1,0 +1,326 @@
+"""Noise of a sensor in each state of motion of the arm, and means of short windows, from its stream."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib import CalibrationResult
+from ftcalib.compensation import Compensator
+from ftcalib.data.dwell_mean import RESOLUTION
+from ftcalib.model import skew
+from ftdrive.stream.motion import (
+    GYRATION_M,
+    READING_S,
+    REST,
+    STATES,
+    MovedLoad,
+    samples_in_reading,
+    wrench_by_acceleration,
+)
+from ftdrive.stream.samples import Paired, StreamInfo, gripping_point
+from ftdrivers.interfaces import Array
+
+# Successive readings of a window at rest, and of one in motion or of a short rest.
+_WINDOW, _SHORT = 25, 8
+# Readings before a motion is seen: they do not count for the rest before it.
+_UNSEEN = 4
+_WINDOWS = 60
+# A window this many times louder than the median holds a touch or a jolt, and does not count.
+_LOUD = {True: 1.5, False: 4.0}
+# A larger step between the means of two windows is the begin or the end of a contact.
+_STEP_SIGMAS = 5.0
+# Until the noise of a state of motion is known, it counts as so many times that at rest, and as an acceleration.
+_FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
+_ENOUGH_DOF = 25.0
+# Degrees of freedom per reading: low-pass filters of sensors make neighbours alike.
+_INDEPENDENT = 0.25
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorNoise:
+    """Covariances of white and coloured noise alike, N and N·m, sensor axes."""
+
+    sample: Array
+    """(6, 6) of one sample."""
+    reading: Array
+    """(6, 6) of the mean over `READING_S`, about its course over half a second."""
+    wander: Array
+    """(6, 6) of what changes more slowly, from one half second to the next."""
+    dof: float
+    """Independent readings behind it."""
+
+
+class NoiseEstimator:
+    """Covariances over the last windows of each state of motion; older ones are forgotten.
+
+    Readings are taken about a straight line through a window, and at rest the means of these windows from one to the
+    next, so that bias, drift, a constant contact and slow errors of a calibration do not count. A window counts for the
+    fastest state that it holds, and not for rest just before motion, which is felt before it is seen. `accelerated`
+    (6, 3) is the wrench of the load by its acceleration: what vibrates before the noise in motion is known.
+    """
+
+    def __init__(self, rate_Hz: float, accelerated: Array) -> None:
+        self._size = samples_in_reading(rate_Hz)
+        self._unread = np.empty((0, 7))
+        self._at_rest = True
+        # Mean (6), scatter (6, 6) and state of the readings since the last window or change of rest and motion.
+        self._open = np.empty((0, 43))
+        self._mean_before: Array | None = None
+        # Scatter of its readings, scatter of their samples, and step from the window before.
+        self._windows: list[deque[tuple[Array, Array, Array]]] = [deque(maxlen=_WINDOWS) for _ in range(STATES)]
+        self._known: dict[int, SensorNoise] = {}
+        self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
+
+    def of(self, state: int) -> SensorNoise | None:
+        """Return the noise in a state, or what is assumed until a second of it; None before the first half second."""
+        known, rest = self._known.get(state), self._known.get(REST)
+        other = rest or next(iter(self._known.values()), None)
+        if state == REST or other is None:
+            return other
+        # A new class of motion counts as a loud one, for about 2 s of its motion.
+        if known is None or known.dof < _ENOUGH_DOF:
+            learnt = (one for k, one in sorted(self._known.items()) if k > state and one.dof >= _ENOUGH_DOF)
+            if (faster := next(learnt, None)) is not None:
+                return faster
+            reading = _FIRST_MOTION**2 * other.reading if rest else other.reading
+            return replace(other, sample=other.sample + self._first, reading=reading + self._first)
+        return known if rest is None else replace(known, wander=rest.wander)
+
+    def add(self, residual: Array, states: NDArray[np.int8]) -> None:
+        """Add samples (n, 6) of which the wrench of a free tool is subtracted, and the states of motion (n,)."""
+        rows = np.concatenate([self._unread, np.column_stack([residual, states])])
+        n = len(rows) // self._size
+        self._unread = rows[n * self._size :]
+        if not n:
+            return
+        groups = rows[: n * self._size].reshape(n, self._size, 7)
+        means = groups[:, :, :6].mean(axis=1)
+        inside = groups[:, :, :6] - means[:, None]
+        within = np.einsum("nsi,nsj->nij", inside, inside).reshape(n, 36) / self._size
+        readings = np.column_stack([means, within, groups[:, :, 6].max(axis=1)])
+        at_rest = readings[:, 42] == REST
+        edges = np.flatnonzero(np.diff(at_rest)) + 1
+        for run, rest in zip(np.split(readings, edges), np.split(at_rest, edges), strict=True):
+            self._collect(run, at_rest=bool(rest[0]))
+
+    def _collect(self, readings: Array, *, at_rest: bool) -> None:
+        if at_rest is not self._at_rest:
+            short = self._open[: max(len(self._open) - _UNSEEN, 0)]
+            if self._at_rest and len(short) >= _SHORT:
+                self._add_windows([short])
+            self._at_rest, self._open, self._mean_before = at_rest, self._open[:0], None
+        self._open = np.concatenate([self._open, readings])
+        size, later = (_WINDOW, _UNSEEN) if at_rest else (_SHORT, 0)
+        full = max(len(self._open) - later, 0) // size
+        self._add_windows(list(self._open[: full * size].reshape(full, size, 43)[-_WINDOWS - 1 :]))
+        self._open = self._open[full * size :]
+
+    def _add_windows(self, windows: Sequence[Array]) -> None:
+        changed = set()
+        for window in windows:
+            size = len(window)
+            left = _about_line(size) @ window[:, :6]
+            mean = window[:, :6].mean(axis=0)
+            step = np.full(6, np.nan) if self._mean_before is None else mean - self._mean_before
+            self._mean_before = mean
+            state = int(window[:, 42].max())
+            within = window[:, 6:42].mean(axis=0).reshape(6, 6)
+            self._windows[state].append((left.T @ left / (size - 2), within, step))
+            changed.add(state)
+        for state in changed:
+            self._known[state] = self._estimated(state)
+
+    def _estimated(self, state: int) -> SensorNoise:
+        at_rest = state == REST
+        reading, within, steps = (np.array([window[i] for window in self._windows[state]]) for i in range(3))
+        floor = RESOLUTION**2 / self._size
+        variances = np.diagonal(reading, axis1=1, axis2=2)
+        loudness = (variances / (np.median(variances, axis=0) + floor)).mean(axis=1)
+        quiet = loudness <= _LOUD[at_rest] * np.median(loudness)
+        mean = reading[quiet].mean(axis=0) + np.diag(floor)
+        steps = steps[np.isfinite(steps[:, 0])]
+        if len(steps):
+            # the same quantile of chi²
+            smallest = np.quantile(np.square(steps), 0.25, axis=0) / 0.1015
+            usual = np.sqrt(smallest + np.diag(mean) / _WINDOW)
+            steps = steps[(np.abs(steps) < _STEP_SIGMAS * usual).all(axis=1)]
+        wander = steps.T @ steps / max(len(steps), 1)
+        dof = _INDEPENDENT * (_WINDOW if at_rest else _SHORT) * float(quiet.sum())
+        return SensorNoise(mean + within[quiet].mean(axis=0), mean, wander, dof)
+
+
+@lru_cache
+def _about_line(n: int) -> Array:
+    """Return the matrix (n, n) that subtracts the straight line through n values."""
+    basis = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)
+    return np.asarray(np.eye(n) - basis @ np.linalg.pinv(basis))
+
+
+def variance_at_next_use(calibration: CalibrationResult) -> Array:
+    """Return the variance (6,) of an axis in any orientation beyond the prediction: what residuals leave, and drift."""
+    excess = np.square(calibration.likely_error("workspace")) - np.square(calibration.predicted_error())
+    return np.repeat(excess.clip(0.0) / 3, 3)
+
+
+def unexplained_variance(calibration: CalibrationResult) -> Array:
+    """Return the same (6,) without drift, where that counts on its own: zero where the noise explains the residuals."""
+    return np.zeros(6) if calibration.noise_explains else variance_at_next_use(calibration)
+
+
+# ------------------------------------------------------------------------------------------------------------ windows
+
+# Ringing at 8 to 20 Hz leaves 0.06 N in plain means at the end of a move, and 0.01 N with Hann weights.
+WINDOW_S = 0.3
+"""Each begins in the middle of the one before. The weights, a Hann window, suppress the ringing of the links."""
+# Poses of this spacing give the acceleration, with so many neighbours on each side.
+_KNOT_S, _REACH = 0.004, 5
+# Error of a tool's inertia that was calibrated, of what it is without.
+_TENSOR = 0.5
+# A window that took so many times as long has lost samples.
+_LATE = 1.2
+# Of the noise: that of the first half second may have a push in it, which the next one shows.
+_LEAST_DOF = 10.0
+_ROW = np.dtype(
+    [
+        ("state", "i1"),
+        ("t_host_ns", "i8"),
+        ("raw", "f8", 6),
+        ("R_base_flange", "f8", (3, 3)),
+        ("p_base_flange_m", "f8", 3),
+    ],
+    align=True,
+)
+# No arm turns so far from one pose to the next, as where samples are lost.
+_JUMP = 0.1
+# Acceleration in motion of an arm that reports no positions, one sigma.
+_UNKNOWN_M_S2 = 1.0
+# Variance of such a mean over that of a reading, if the noise is white: vibration leaves less.
+_LIKE_WHITE = 1.5 * READING_S / WINDOW_S
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """The weighted mean of a short time."""
+
+    t_s: float
+    residual: Array
+    """(6,) measured minus predicted wrench of the tool alone, N and N·m, sensor axes."""
+    felt_m_s2: Array
+    """(3,) gravity minus the acceleration of the sensor's origin, sensor axes."""
+    lever_s2: Array
+    """(3, 3) acceleration of a point by its place from there, as the sensor turns."""
+    p_sensor_near_m: Array
+    """(3,) where the gripper holds parts."""
+    noise: Array
+    """(6, 6) covariance that is expected before the windows show it."""
+    state: int
+    """Fastest state of motion, as `MotionTracker.follow` returns it."""
+    systematic: Array
+    """(6, 6) covariance of the prediction in this orientation."""
+    turning_rad_s2: float
+    """Mean angular acceleration."""
+    tensor_Nm: float
+    """One sigma of the torque that an unknown inertia of the tool exerts."""
+    R_base_flange: Array
+    p_base_flange_m: Array
+    as_read: Array
+    """(6, 6) what the sensor reads of the wrench of a part."""
+
+
+class Windows:
+    """Collects samples of a stream to windows."""
+
+    def __init__(self, info: StreamInfo) -> None:
+        calibration = info.calibration
+        self._calibration, self._tool = calibration, calibration.parameters
+        self._compensator = Compensator(self._tool, response=calibration.response)
+        self._inertia = None if calibration.motion is None else calibration.motion.inertia_kg_m2
+        self._near_m = gripping_point(info)
+        self._load = MovedLoad(self._tool, calibration.g_m_s2, np.nan_to_num(info.p_flange_sensor_m), _REACH)
+        contact = calibration.known_contact
+        # a bias is added to the reading, which is not decoded, and the weight of a part is true
+        self._as_read = np.eye(6) if contact is None else np.asarray(np.linalg.inv(contact.decode(np.eye(6)).T))
+        self._size = round(WINDOW_S * info.sensor_rate_Hz)
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
+        self._unknown = wrench_by_acceleration(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
+        # Of one window and its margins: to join the blocks at its end would take too long at once.
+        self._rows = np.empty(self._size + 2 * self._stride * _REACH, _ROW)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._filled = 0
+
+    def steps(self, n: int) -> NDArray[np.int64]:
+        """Return in which window each of the next n samples is the newest."""
+        return (np.arange(n) + self._filled - len(self._rows)) // (self._size // 2)
+
+    def add(self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator, systematic: Array) -> Iterator[Window]:
+        """Add samples with their states of motion; yield the windows that are complete."""
+        n, start, step = len(rows), 0, self._size // 2
+        while start < n:
+            stop = min(n, start + len(self._rows) - self._filled)
+            into, part = self._rows[self._filled : self._filled + stop - start], slice(start, stop)
+            into["state"] = states[part]
+            for name in (_ROW.names or ())[1:]:
+                into[name] = getattr(rows, name)[part]
+            self._filled, start = self._filled + stop - start, stop
+            if self._filled == len(self._rows):
+                window = self._window(self._rows, noise, systematic)
+                self._rows[:-step] = self._rows[step:]
+                self._filled -= step
+                if window is not None:
+                    yield window
+
+    def _window(self, rows: NDArray[np.void], noise: NoiseEstimator, systematic: Array) -> Window | None:
+        margin = self._stride * _REACH
+        inner = rows[margin : margin + self._size]
+        state = int(inner["state"].max())
+        known = noise.of(state)
+        t_s = (rows["t_host_ns"] - rows["t_host_ns"][0]) * 1e-9
+        knots = np.arange(0, len(rows), self._stride)
+        R_base_flange, p_base_flange_m = rows["R_base_flange"][knots], rows["p_base_flange_m"][knots]
+        jump = np.abs(np.diff(R_base_flange, axis=0)).max()
+        if known is None or known.dof < _LEAST_DOF or jump > _JUMP:
+            return None
+        if t_s[-1] > _LATE * WINDOW_S * len(rows) / self._size or (np.diff(t_s[knots]) <= 0).any():
+            return None
+        tool, mass_kg = self._tool, self._calibration.mass_kg
+        # the wrench of a free tool is linear in R, so that the mean of R is as good as a rotation
+        R_mean = np.einsum("n,nij->ij", self._weights, inner["R_base_flange"])
+        residual = np.asarray(self._compensator.sample(self._weights @ inner["raw"], R_mean), float)
+        felt = tool.gravity_force_base_N / mass_kg @ R_mean @ tool.R_flange_sensor
+        covariance, lever, turning = _LIKE_WHITE * known.reading, np.zeros((3, 3)), 0.0
+        # at rest the noise of the joints would only look like motion
+        if state != REST:
+            motion = self._load.motion(t_s[knots], R_base_flange, p_base_flange_m)
+            weights = np.interp(motion.t_s, t_s[margin : margin + self._size], self._weights)
+            weights /= weights.sum()
+            residual -= weights @ self._load.wrench(motion, self._inertia)
+            omega, alpha = motion.angular_velocity_rad_s, motion.angular_acceleration_rad_s2
+            lever = np.einsum("n,nij->ij", weights, skew(alpha) + skew(omega) @ skew(omega))
+            felt = felt - weights @ motion.linear_acceleration_m_s2
+            turning = float(weights @ np.linalg.norm(alpha, axis=1))
+            if not np.isfinite(p_base_flange_m).all():
+                covariance = covariance + self._unknown @ self._unknown.T
+        middle = inner[self._size // 2].copy()
+        return Window(
+            t_s=float(middle["t_host_ns"]) * 1e-9,
+            residual=residual,
+            felt_m_s2=felt,
+            lever_s2=lever,
+            p_sensor_near_m=self._near_m,
+            noise=covariance,
+            state=state,
+            systematic=systematic,
+            turning_rad_s2=turning,
+            tensor_Nm=(1.0 if self._inertia is None else _TENSOR) * mass_kg * GYRATION_M**2 * turning,
+            R_base_flange=middle["R_base_flange"],
+            p_base_flange_m=middle["p_base_flange_m"],
+            as_read=self._as_read,
+        )

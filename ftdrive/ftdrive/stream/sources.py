@@ -1,0 +1,501 @@
+"""What gives a stream its paired samples: a cell, the sensor of a cell alone, or a recording that replaces it."""
+
+import math
+import time
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal, NamedTuple, NoReturn
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult
+from ftcalib.after.series import BiasTemperature
+from ftcalib.errors import BadDataset
+from ftdrive.cell.config import CellConfig
+from ftdrive.cell.devices import build_arm, build_sensor
+from ftdrive.cell.emulated import Station
+from ftdrive.checks.check import compare_devices
+from ftdrive.errors import ConfigError
+from ftdrive.runs.calibration import marks_of, versions
+from ftdrive.runs.verification import VerificationRecord, calibration_in_words, verification_near
+from ftdrive.stream.pairing import DelayEstimator, Pairing
+from ftdrive.stream.samples import Links, LinkStatus, Paired, StreamEvent, StreamInfo, mean_rate_Hz, sensor_origin_m
+from ftdrivers.clock import REAL, Clock
+from ftdrivers.errors import DeviceError, DeviceTimeout
+from ftdrivers.follow import Follow
+from ftdrivers.interfaces import ArmStates, Array, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
+
+STALE_S = 0.3
+"""Without a new sample of either device for so long, `CellSource.read` raises."""
+
+# Between two attempts to reconnect.
+_RETRY_S = 0.2
+# At the beginning both rates are measured.
+_RATE_S = 0.5
+_RATE_WINDOW_NS = 1_000_000_000
+_ALONE = DeviceInfo("", "", "")
+STEP_S = 0.01
+"""A read has so much of a recording."""
+# A read of a recording waits at most so long, so that a key finds the thread that reads.
+_WAIT_S = 0.1
+
+
+class Read(NamedTuple):
+    """What a source has read."""
+
+    rows: Paired
+    begin: Literal["", "interrupted", "elsewhere"] = ""
+    """Why the rows do not continue those before: after an interruption, or at another place of a recording."""
+    temperature_C: float | None = None
+    """Of the sensor; None where it is not known."""
+    delay_sigma_s: float = 0.0
+    """One sigma of the delay of the wrench after the pose."""
+
+
+class Source(ABC):
+    """Gives paired samples to one stream.
+
+    Attributes
+    ----------
+    info : StreamInfo
+        What the samples are of; known once it is open.
+    temperature : BiasTemperature or None
+        How the bias of the sensor changes with its temperature.
+    warnings : tuple of str
+        What is doubtful about the calibration, and what could not be checked.
+    note : callable
+        Takes the events of the devices; set by the stream.
+    has_ended : bool
+        Whether no more samples come.
+    """
+
+    clock: Clock = REAL
+    info: StreamInfo
+    temperature: BiasTemperature | None = None
+    warnings: tuple[str, ...] = ()
+    note: Callable[[StreamEvent], object]
+    has_ended = False
+
+    def open(self) -> None:  # noqa: B027 - a recording has nothing to open
+        """Begin to read."""
+
+    def close(self) -> None:  # noqa: B027
+        """End to read; safe twice."""
+
+    @abstractmethod
+    def read(self, timeout_s: float) -> Read:
+        """Return the next samples; none while a recording pauses. Raises `DeviceError`; the next call reconnects."""
+
+    def links(self) -> Links:
+        """Return rates, losses and ages of the devices, and the delay between them; by default those of a recording."""
+        rate_Hz, arm_rate_Hz = self.info.sensor_rate_Hz, self.info.arm_rate_Hz
+        return Links(LinkStatus(rate_Hz, rate_Hz, 0, 0.0), LinkStatus(arm_rate_Hz, arm_rate_Hz, 0, 0.0), 0.0, 0.0)
+
+    def beginning(self) -> Iterable[Paired]:
+        """Return samples whose noise is learnt beforehand; devices have none."""
+        return ()
+
+
+class CellSource(Source):
+    """The sensor of a cell, paired with the poses of its arm; without a calibration the sensor alone. It moves nothing.
+
+    Parameters
+    ----------
+    cell : CellConfig or Station
+        An emulated cell is started by `open` and ended with the source.
+    calibration : CalibrationResult or str, optional
+        Of these devices, or the name of a tool: its newest accepted calibration is looked up when the source is opened.
+        Without it only the sensor is read.
+    name : str
+        Of the calibration, such as its path.
+    force : bool
+        Warn instead of raising an error if the calibration is of another arm, sensor or mount; of a tool, take one
+        that was edited by hand too.
+    devices : ForceTorqueSensor and RobotArm, optional
+        Used in place of those that the cell names.
+
+    Raises
+    ------
+    ConfigError
+        When it is opened: the calibration is of another arm, sensor or mount, or the tool has none.
+    ConnectError
+        When it is opened: a device does not answer.
+    """
+
+    def __init__(
+        self,
+        cell: CellConfig | Station,
+        calibration: CalibrationResult | str | None,
+        *,
+        name: str = "",
+        force: bool = False,
+        devices: tuple[ForceTorqueSensor | None, RobotArm | None] = (None, None),
+    ) -> None:
+        self._given, self._wanted, self._name, self._force = cell, calibration, name, force
+        self._devices = devices
+        self.block_s = 0.003
+        """A read has the samples of so long, because a block costs about the same with one sample as with many. May be
+        set at any time: longer ones arrive later and take less of the processor."""
+        self.payload_kg: float | None = None
+        """As configured in the controller; None where it is not reported."""
+        self._arm: RobotArm | None = None
+        self._stack, self._follows = ExitStack(), ExitStack()
+        # The device that has failed, "sensor" or "arm", and why.
+        self._failure: tuple[str, DeviceError] | None = None
+        self._silent_since_ns: int | None = None
+        self._was_interrupted = False
+        self._arrivals: deque[tuple[int, int]] = deque()
+        self._arm_lost = 0
+        self._arm_newest: tuple[int, float] | None = None
+        self._next_ns = 0
+
+    def open(self) -> None:
+        with ExitStack() as stack:
+            self.cell = self._given if isinstance(self._given, CellConfig) else stack.enter_context(self._given).cell
+            self.clock: Clock = self.cell.clock
+            self._sensor = stack.enter_context(self._devices[0] or build_sensor(self.cell))
+            if self._wanted is not None:
+                self._arm = stack.enter_context(closing(self._devices[1] or build_arm(self.cell)))
+                self._arm.open()
+            info = self._chosen(self._wanted, self._described())
+            stack.callback(self._unfollow)
+            self._follow()
+            samples, states = self._first_samples()
+            nominal_Hz = self._sensor.health().nominal_rate_Hz
+            rate_Hz = nominal_Hz if np.isfinite(nominal_Hz) else mean_rate_Hz(samples.t_host_ns)
+            self.info = replace(info, sensor_rate_Hz=rate_Hz)
+            if states is not None:
+                self.info = replace(self.info, arm_rate_Hz=mean_rate_Hz(states.t_host_ns))
+                self._arm_step_s = float(np.median(np.diff(states.t_device_s)))
+            delay_ms = self.cell.sensor.delay_ms
+            delay = self._estimator() if delay_ms is None and self._arm is not None else (delay_ms or 0.0) / 1e3
+            self._pairing = Pairing(nominal_Hz, delay, has_arm=self._arm is not None)
+            if states is not None:
+                self._pairing.add_states(states)
+            self._pairing.add_samples(samples)
+            self._stack = stack.pop_all()
+
+    def close(self) -> None:
+        self._stack.close()
+
+    @property
+    def station(self) -> Station:
+        """The emulated cell; raises `ConfigError` for a real one."""
+        if not isinstance(self._given, Station):
+            raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
+        return self._given
+
+    def _described(self) -> StreamInfo:
+        """Describe the cell, without a calibration and before the rates are known."""
+        arm, offset = _ALONE, None
+        if self._arm is not None:
+            arm, status = self._arm.identify(), self._arm.status()
+            self.payload_kg, offset = status.payload_kg, status.tcp_offset
+        tcp = np.full(6, np.nan) if offset is None else np.array(offset)
+        return StreamInfo(
+            result=None,
+            calibration_name="",
+            arm=arm,
+            sensor=self._sensor.identify(),
+            tool=self.cell.tool.name,
+            # the anchor of all times in files
+            utc_offset_ns=time.time_ns() - self.clock.now_ns(),
+            sensor_rate_Hz=math.nan,
+            arm_rate_Hz=0.0,
+            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm),
+            R_flange_tcp=np.eye(3) if offset is None else Rotation.from_rotvec(tcp[3:]).as_matrix(),
+            p_flange_tcp_m=tcp[:3],
+            versions=versions(),
+            calibration_state="raw readings of the sensor alone: no arm, no calibration",
+            emulated=self.cell.is_emulated,
+        )
+
+    def use_tool(self, name: str) -> StreamInfo:
+        """Take the newest accepted calibration of another tool. Raises `ConfigError`; then nothing has changed."""
+        self.info, self._wanted = self._chosen(name, self.info), name
+        self._pairing.use(self._estimator())
+        return self.info
+
+    def _estimator(self) -> DelayEstimator:
+        return DelayEstimator(self.info.calibration, self.info.p_flange_sensor_m)
+
+    def _chosen(self, wanted: CalibrationResult | str | None, info: StreamInfo) -> StreamInfo:
+        """Add the calibration of the devices and their mounting to a description. Raises `ConfigError`."""
+        if wanted is None:
+            return info
+        calibration, name, warnings = wanted, self._name, tuple[str, ...]()
+        temperature: BiasTemperature | None = None
+        hour_change: Array | None = None
+        mount, tool_name = self.cell.sensor.mount, self.cell.tool.name
+        if isinstance(calibration, str):
+            from ftdrive.store.tools import calibration_of_tool
+
+            url, tool_name = self.cell.store.url, calibration
+            tool = calibration_of_tool(calibration, info.arm, info.sensor, mount, url=url, force=self._force)
+            calibration, name, warnings = tool.calibration, str(tool.path), tool.warnings
+            temperature, hour_change = tool.temperature, tool.hour_change
+        belongs = compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}, mount)
+        if belongs.others and not self._force:
+            raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
+        foreign = bool(belongs.others)
+        verification, state = _trusted(
+            calibration, name, marks_of(calibration, emulated=info.emulated, foreign=foreign)
+        )
+        self.warnings, self.temperature = (*warnings, *belongs.others, *belongs.unknown), temperature
+        return replace(
+            info,
+            result=calibration,
+            calibration_name=name,
+            tool=tool_name,
+            p_flange_sensor_m=sensor_origin_m(self.cell.sensor.height_mm, calibration),
+            verification=verification,
+            calibration_state=state,
+            foreign=foreign,
+            hour_change=hour_change,
+        )
+
+    # -------------------------------------------------------------------------------------------------------- reading
+
+    def read(self, timeout_s: float = STALE_S) -> Read:
+        if self._failure is not None:
+            self._reopen(*self._failure)
+        for left_s in self.clock.looks(timeout_s):
+            if (rows := self._next_rows(left_s)) is not None:
+                self._report_recovery()
+                begin: Literal["", "interrupted"] = "interrupted" if self._was_interrupted else ""
+                self._was_interrupted = False
+                return Read(rows, begin, self._sensor.temperature_C(), self._pairing.delay_sigma_s)
+        role = "arm" if self._pairing.waits_for_pose else "sensor"
+        self._fail(role, DeviceTimeout(f"the {role} sent nothing new for {timeout_s:g} s", "check cable and supply"))
+
+    def _next_rows(self, wait_s: float) -> Paired | None:
+        waits_for_pose = self._pairing.waits_for_pose
+        role = "sensor"
+        try:
+            samples = self._sensor_follow.read(0.0) if waits_for_pose else self._read_sensor(wait_s)
+            if self._arm is not None:
+                role = "arm"
+                states = self._arm_follow.read(wait_s if waits_for_pose else 0.0)
+                self._count(states)
+                self._pairing.add_states(states)
+        except DeviceError as error:
+            self._fail(role, error)
+        self._pairing.add_samples(samples)
+        return self._pairing.take()
+
+    def _read_sensor(self, wait_s: float) -> FtSamples:
+        """Wait for the first samples, then for those of one block; the last of them have just arrived."""
+        blocks = [self._sensor_follow.read(wait_s)]
+        rows = len(blocks[0])
+        wanted = self.block_s * self.info.sensor_rate_Hz
+        # A pause between reads left the newest sample waiting for up to 5 ms, so the block ends with one that just
+        # arrived.
+        while 0 < rows < wanted and len(more := self._sensor_follow.read(self.block_s)):
+            blocks.append(more)
+            rows += len(more)
+        return FtSamples.concatenate(blocks)
+
+    def links(self) -> Links:
+        health = self._sensor.health()
+        texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
+        error = texts.get("sensor", "")
+        sensor = LinkStatus(health.rate_Hz, self.info.sensor_rate_Hz, health.lost, health.age_s, error)
+        # an arm that is not there has no silence
+        arm = LinkStatus(0.0, 0.0, 0, 0.0)
+        if self._arm is not None:
+            now_ns = self.clock.now_ns()
+            recent = sum(n for t_ns, n in self._arrivals if t_ns > now_ns - _RATE_WINDOW_NS)
+            age_s = (now_ns - (self._arm_newest[0] if self._arm_newest else 0)) * 1e-9
+            arm = LinkStatus(float(recent), self.info.arm_rate_Hz, self._arm_lost, age_s, texts.get("arm", ""))
+        return Links(sensor, arm, self._pairing.delay_s, self._pairing.delay_sigma_s)
+
+    def _count(self, states: ArmStates) -> None:
+        if not len(states):
+            return
+        t_ns = int(states.t_host_ns[-1])
+        self._arrivals.append((t_ns, len(states)))
+        while self._arrivals[0][0] < t_ns - _RATE_WINDOW_NS:
+            self._arrivals.popleft()
+        newest_s = float(states.t_device_s[-1])
+        if self._arm_newest is not None and math.isfinite(duration_s := newest_s - self._arm_newest[1]):
+            self._arm_lost += max(round(duration_s / self._arm_step_s) - len(states), 0)
+        self._arm_newest = t_ns, newest_s
+
+    # ---------------------------------------------------------------------------------------------------- interruption
+
+    def _follow(self) -> None:
+        with ExitStack() as stack:
+            self._sensor_follow: Follow[FtSamples] = stack.enter_context(self._sensor.follow())
+            if self._arm is not None:
+                self._arm_follow: Follow[ArmStates] = stack.enter_context(self._arm.follow())
+            self._follows = stack.pop_all()
+
+    def _unfollow(self) -> None:
+        self._follows.close()
+
+    def _first_samples(self) -> tuple[FtSamples, ArmStates | None]:
+        samples, states = [], []
+        for left_s in self.clock.looks(_RATE_S):
+            samples.append(self._sensor_follow.read(min(left_s, 0.01)))
+            if self._arm is not None:
+                states.append(self._arm_follow.read(0.0))
+        found = FtSamples.concatenate(samples), ArmStates.concatenate(states) if states else None
+        for device, rows in zip(("sensor", "arm"), found, strict=True):
+            if rows is not None and len(rows) < 2:
+                raise DeviceTimeout(f"the {device} sent {len(rows)} samples in {_RATE_S:g} s", "check cable and supply")
+        return found
+
+    def _fail(self, role: str, error: DeviceError) -> NoReturn:
+        if self._silent_since_ns is None:
+            self._silent_since_ns = self.clock.now_ns()
+            self.note(StreamEvent(self._silent_since_ns, "stale", f"{role}: {error}", {"device": role}))
+        self._failure = role, error
+        raise error
+
+    def _reopen(self, role: str, failure: DeviceError) -> None:
+        """Open what has ended again; raises the failure that remains."""
+        self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
+        self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
+        self._unfollow()
+        try:
+            self._sensor.open()
+            if self._arm is not None:
+                self._arm.open()
+            self._sensor.check()
+            self._follow()
+        except DeviceError as error:
+            self._failure = role, error
+            raise
+        arm = _ALONE if self._arm is None else self._arm.identify()
+        if arm != self.info.arm or self._sensor.identify() != self.info.sensor:
+            raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
+        self._pairing.forget()
+        self._was_interrupted = True
+        self._failure = None
+        self._arm_newest = None
+
+    def _report_recovery(self) -> None:
+        if self._silent_since_ns is not None:
+            silent_s = (self.clock.now_ns() - self._silent_since_ns) * 1e-9
+            self._silent_since_ns = None
+            text = f"samples arrive again after {silent_s:.1f} s"
+            self.note(StreamEvent(self.clock.now_ns(), "recovered", text, {"silent_s": silent_s}))
+
+
+class RecordingSource(Source):
+    """Paired rows of a recording in place of a cell, at `speed` times its own; infinity is as fast as they are read.
+
+    While it is paused and at its end, `read` returns no rows. The clock is that of the one who watches.
+    """
+
+    def __init__(self, info: StreamInfo, rows: Paired, *, speed: float = 1.0, clock: Clock = REAL) -> None:
+        if not len(rows):
+            raise BadDataset("the recording has no samples: replay another one")
+        self.info, self.rows, self.clock = info, rows, clock
+        self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
+        self._speed = speed
+        # The first row that was not read, whether it is at another place, and up to where a step goes.
+        self._next, self._has_jumped, self._step_to_s = 0, False, -1.0
+        self.is_paused = False
+
+    def open(self) -> None:
+        self._set_out(self.at_s)
+
+    # ----------------------------------------------------------------------------------------------------------- time
+
+    @property
+    def at_s(self) -> float:
+        """Time in the recording of the newest row that was read."""
+        return float(self._seconds[max(self._next - 1, 0)])
+
+    @property
+    def duration_s(self) -> float:
+        """Duration of the recording."""
+        return float(self._seconds[-1])
+
+    @property
+    def has_ended(self) -> bool:  # type: ignore[override]  # it follows from what was read
+        return self._next >= len(self.rows)
+
+    @property
+    def speed(self) -> float:
+        """Relative to the recording; settable."""
+        return self._speed
+
+    @speed.setter
+    def speed(self, speed: float) -> None:
+        if not speed > 0:
+            raise ValueError(f"a speed of {speed} does not replay: give a positive one")
+        self._speed = speed
+        self._set_out(self.at_s)
+
+    def toggle(self) -> None:
+        """Pause, go on after a pause, or begin again after the end."""
+        if self.has_ended:
+            self.seek(0.0)
+        else:
+            self.is_paused = not self.is_paused
+            self._set_out(self.at_s)
+
+    def seek(self, t_s: float) -> None:
+        """Go to a time in the recording; filters and contacts restart there."""
+        self._next = int(np.searchsorted(self._seconds, min(max(t_s, 0.0), self.duration_s)))
+        self._has_jumped = True
+        self._set_out(float(self._seconds[self._next]))
+
+    def step(self) -> None:
+        """Let the next read have the next `STEP_S` of the recording, also while it is paused."""
+        self._step_to_s = float(self._seconds[min(self._next, len(self.rows) - 1)]) + STEP_S
+
+    def _set_out(self, at_s: float) -> None:
+        self._begin_s, self._begin_ns = at_s, self.clock.now_ns()
+
+    # -------------------------------------------------------------------------------------------------------- reading
+
+    def read(self, timeout_s: float = _WAIT_S) -> Read:
+        """Return the rows that are due since the last read, and wait for them for a short time."""
+        if self._step_to_s >= 0:
+            end_s, self._step_to_s = self._step_to_s, -1.0
+        elif self.is_paused or self.has_ended:
+            self.clock.sleep(min(timeout_s, _WAIT_S))
+            end_s = -1.0
+        elif math.isinf(self._speed):
+            end_s = float(self._seconds[self._next]) + STEP_S
+        else:
+            next_s = float(self._seconds[self._next])
+            due_s = (next_s + STEP_S - self._begin_s) / self._speed - (self.clock.now_ns() - self._begin_ns) * 1e-9
+            self.clock.sleep(min(due_s, timeout_s, _WAIT_S))
+            end_s = self._begin_s + (self.clock.now_ns() - self._begin_ns) * 1e-9 * self._speed
+        end = max(self._next, int(np.searchsorted(self._seconds, end_s, "right")))
+        rows = self.rows.rows(slice(self._next, end))
+        self._next = end
+        if self.is_paused:
+            self._set_out(self.at_s)
+        begin: Literal["", "elsewhere"] = "elsewhere" if self._has_jumped else ""
+        self._has_jumped = False
+        return Read(rows, begin)
+
+    def beginning(self) -> Iterable[Paired]:
+        return [self.rows]
+
+    def links(self) -> Links:
+        recent = slice(int(np.searchsorted(self._seconds, self.at_s - 1.0, "right")), self._next)
+        seq = self.rows.seq[: self._next]
+        lost = int(seq[-1] - seq[0]) + 1 - len(seq) if len(seq) else 0
+        rate_Hz = len(self.rows.seq[recent]) / min(1.0, max(self.at_s, 1e-3))
+        return super().links()._replace(sensor=LinkStatus(rate_Hz, self.info.sensor_rate_Hz, lost, 0.0))
+
+
+def _trusted(
+    calibration: CalibrationResult, name: str, marks: tuple[str, ...]
+) -> tuple[VerificationRecord | None, str]:
+    """Return the last verification of a calibration, and what is said of its age and of that."""
+    path = Path(name)
+    verification = verification_near(path, calibration.id) if path.name and path.exists() else None
+    return verification, calibration_in_words(calibration, verification, datetime.now(UTC), marks)

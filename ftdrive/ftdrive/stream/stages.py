@@ -1,0 +1,431 @@
+"""The stages between raw and compensated wrench, in `STAGES`, and the free tool that the first of them subtract.
+
+A stage is a class: from the settings `Stages` it makes one of itself, or none where it has nothing to do. `Processor`
+runs them in this order. What a free tool exerts is subtracted first, whichever settings are on, because contact is
+judged by what that leaves; `Decoder` adds again what was not to be subtracted.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from datetime import datetime
+from typing import ClassVar, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftcalib.after.series import BiasTemperature
+from ftcalib.after.state import Calibrated, Update, compare_with_prediction, tare, with_bias_change
+from ftcalib.after.weighing import Weight, holding
+from ftcalib.compensation import Compensator
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
+from ftcalib.errors import BadDataset
+from ftcalib.files import JSON
+from ftdrive.errors import ConfigError
+from ftdrive.stream.motion import MotionTracker
+from ftdrive.stream.samples import FrameTransform, Paired, Stages, StreamInfo, WrenchFrame
+from ftdrivers.interfaces import Array
+
+# Changes of the temperature that move the bias, and that are an event.
+_STEP_K, _NOTED_K = 0.05, 1.0
+_HOUR_NS = 3600e9
+LOWPASS_ORDER = 2
+"""Butterworth."""
+NOTCH_Q = 10.0
+"""Frequency over width at -3 dB."""
+TARE_S = 0.5
+TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
+"""A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
+
+# Largest motion of the flange during a tare.
+_STILL_RAD, _STILL_M = 5e-4, 5e-4
+
+
+class Passing(NamedTuple):
+    """n samples on their way through the stages, and the wrench that is expected of a free tool, N and N·m."""
+
+    rows: Paired
+    states: NDArray[np.int8]
+    """(n,) states of motion."""
+    felt: Array
+    """(n, 6) inertial wrench that the poses before a sample show."""
+    inertial: Array | None
+    """(n, 6) inertial wrench by the poses on both sides of a sample; None while it is not subtracted."""
+    gravity: Array
+    """(n, 6)"""
+    bias: Array
+    """(6,)"""
+
+
+class Stage(ABC):
+    """A step from the raw to the compensated wrench."""
+
+    is_of_free_tool: ClassVar = False
+    """Whether it subtracts what a free tool exerts: contact is judged behind the last of these."""
+    power_gain = 1.0
+    """Variance of the noise of a sample behind the stage over that before it; one that is not linear states it too."""
+
+    @classmethod
+    @abstractmethod
+    def of(cls, settings: Stages, frame: WrenchFrame, info: StreamInfo) -> Self | None:
+        """Return the stage with these settings; None where it does nothing. Raises `ConfigError` without its needs."""
+
+    @classmethod
+    def words(cls, _settings: Stages) -> str:
+        """Return what it does, for the line that names the stages; empty where it is not named."""
+        return ""
+
+    @abstractmethod
+    def __call__(self, wrench: Array, passing: Passing) -> Array:
+        """Return the next wrenches (n, 6), N and N·m."""
+
+
+class FreeToolAtRest(Stage):
+    """Subtract weight and bias; of a sensor alone, which has no calibration, the tare."""
+
+    is_of_free_tool = True
+
+    @classmethod
+    def of(cls, _settings: Stages, _frame: WrenchFrame, _info: StreamInfo) -> Self:
+        return cls()
+
+    @classmethod
+    def words(cls, settings: Stages) -> str:
+        return ", ".join(name for name in ("bias", "gravity") if getattr(settings, name))
+
+    def __call__(self, wrench: Array, passing: Passing) -> Array:
+        return wrench - passing.gravity - passing.bias
+
+
+class InertialWrench(Stage):
+    """Subtract the inertial wrench of the load; needs a calibration and the position of the sensor."""
+
+    is_of_free_tool = True
+
+    @classmethod
+    def of(cls, settings: Stages, _frame: WrenchFrame, info: StreamInfo) -> Self | None:
+        if not settings.inertia or info.is_raw:
+            return None
+        if not np.isfinite(info.p_flange_sensor_m).all():
+            raise ConfigError(
+                "the inertia stage needs the position of the sensor: set [sensor] height_mm, the height of its origin "
+                "above the flange face"
+            )
+        return cls()
+
+    @classmethod
+    def words(cls, settings: Stages) -> str:
+        return "inertia" if settings.inertia else ""
+
+    def __call__(self, wrench: Array, passing: Passing) -> Array:
+        return wrench if passing.inertial is None else wrench - passing.inertial
+
+
+class Decoder(Stage):
+    """Decode a contact by the matrix of the sensor, as known loads have shown it; needs a calibration.
+
+    Weight or bias that is not to be subtracted is added again as read, because the matrix is that of contacts.
+    """
+
+    def __init__(self, settings: Stages, info: StreamInfo) -> None:
+        self._settings, self._decode = settings, info.calibration.contact.decode
+
+    @classmethod
+    def of(cls, settings: Stages, _frame: WrenchFrame, info: StreamInfo) -> Self | None:
+        return None if info.is_raw else cls(settings, info)
+
+    def __call__(self, wrench: Array, passing: Passing) -> Array:
+        wrench = self._decode(wrench)
+        if not self._settings.gravity:
+            wrench = wrench + passing.gravity
+        return wrench if self._settings.bias else wrench + passing.bias
+
+
+class Filter(Stage):
+    """Notch and low-pass as second-order sections, whose state lasts from block to block.
+
+    It begins in the steady state of its first sample, so that there is no transient. A frequency is between 0 and half
+    the rate of the sensor.
+    """
+
+    def __init__(self, settings: Stages, rate_Hz: float) -> None:
+        from scipy import signal
+
+        sections = []
+        for name, f_Hz in (("notch", settings.notch_Hz), ("low-pass", settings.lowpass_Hz)):
+            if f_Hz is None:
+                continue
+            if not 0 < f_Hz < rate_Hz / 2:
+                raise ConfigError(
+                    f"a {name} of {f_Hz:g} Hz is not possible at {rate_Hz:g} Hz: choose more than 0 and less than "
+                    f"{rate_Hz / 2:g} Hz"
+                )
+            if name == "notch":
+                sections.append(signal.tf2sos(*signal.iirnotch(f_Hz, NOTCH_Q, rate_Hz)))
+            else:
+                sections.append(signal.butter(LOWPASS_ORDER, f_Hz, fs=rate_Hz, output="sos"))
+        self._sections = np.concatenate(sections)
+        self._steady = signal.sosfilt_zi(self._sections)
+        self._run = signal.sosfilt
+        self._state: Array | None = None
+        # the area under |H|² is exact on this grid unless the cut-off is below a thousandth of the rate
+        self.power_gain = float(np.mean(np.abs(signal.sosfreqz(self._sections, 1 << 14)[1]) ** 2))
+
+    @classmethod
+    def of(cls, settings: Stages, _frame: WrenchFrame, info: StreamInfo) -> Self | None:
+        is_on = settings.notch_Hz is not None or settings.lowpass_Hz is not None
+        return cls(settings, info.sensor_rate_Hz) if is_on else None
+
+    @classmethod
+    def words(cls, settings: Stages) -> str:
+        words = [] if settings.notch_Hz is None else [f"notch {settings.notch_Hz:g} Hz (Q {NOTCH_Q:g})"]
+        if settings.lowpass_Hz is not None:
+            words.append(f"low-pass {settings.lowpass_Hz:g} Hz (Butterworth, order {LOWPASS_ORDER})")
+        return ", ".join(words)
+
+    def __call__(self, wrench: Array, _: Passing) -> Array:
+        if not len(wrench):
+            return wrench
+        if self._state is None:
+            self._state = self._steady[:, :, None] * wrench[0]
+        filtered, self._state = self._run(self._sections, wrench, axis=0, zi=self._state)
+        return np.asarray(filtered)
+
+
+class Frame(Stage):
+    """Turn the wrench to the axes and the point of a frame; needs what `FrameTransform` needs."""
+
+    def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
+        self.frame, self._transform = frame, FrameTransform(frame, info)
+        self.matrix = self._transform.matrix
+
+    @classmethod
+    def of(cls, _settings: Stages, frame: WrenchFrame, info: StreamInfo) -> Self:
+        return cls(frame, info)
+
+    def __call__(self, wrench: Array, passing: Passing) -> Array:
+        return self._transform(wrench, passing.rows.R_base_flange)
+
+
+class Deadband(Stage):
+    """Shorten force and torque vectors by a deadband; shorter ones become zero.
+
+    The length counts and not each axis, so that a deadband is the same in all axes. The noise of what remains is that
+    before.
+    """
+
+    def __init__(self, settings: Stages) -> None:
+        self._deadband = np.array([[settings.deadband_N], [settings.deadband_Nm]])
+
+    @classmethod
+    def of(cls, settings: Stages, _frame: WrenchFrame, _info: StreamInfo) -> Self | None:
+        return cls(settings) if settings.deadband_N or settings.deadband_Nm else None
+
+    @classmethod
+    def words(cls, settings: Stages) -> str:
+        is_on = settings.deadband_N or settings.deadband_Nm
+        return f"deadband {settings.deadband_N:g} N, {settings.deadband_Nm:g} N·m" if is_on else ""
+
+    def __call__(self, wrench: Array, _: Passing) -> Array:
+        vectors = wrench.reshape(-1, 2, 3)
+        length = np.maximum(np.linalg.norm(vectors, axis=2, keepdims=True), 1e-300)
+        left = np.maximum(1 - self._deadband / length, 0.0)
+        return np.asarray((vectors * left).reshape(-1, 6))
+
+
+STAGES: tuple[type[Stage], ...] = (FreeToolAtRest, InertialWrench, Decoder, Filter, Frame, Deadband)
+"""All, in their order."""
+
+
+def stages_of(settings: Stages, frame: WrenchFrame, info: StreamInfo) -> tuple[Stage, ...]:
+    """Return the stages of these settings; raises `ConfigError` if one needs what is not configured."""
+    return tuple(stage for kind in STAGES if (stage := kind.of(settings, frame, info)) is not None)
+
+
+def standard_stages(info: StreamInfo) -> Stages:
+    """Return bias and gravity, with inertia where calibration and cell have what it needs; nothing without one."""
+    if info.is_raw:
+        return Stages(bias=False, gravity=False)
+    return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
+
+
+def words_of(settings: Stages) -> list[str]:
+    """Return what each stage does that is on, in their order."""
+    return [words for kind in STAGES if (words := kind.words(settings))]
+
+
+def stages_in_words(settings: Stages) -> str:
+    """Return the stages that are on as one line."""
+    return ", ".join(["raw", *words_of(settings)])
+
+
+# --------------------------------------------------------------------------------------------------- bias and gravity
+
+
+class _Reference(NamedTuple):
+    """The empty tool as calibrated, or since a tare."""
+
+    empty: Calibrated
+    t_ns: int
+    # Temperature of the sensor then; NaN where it is not known.
+    temperature_C: float
+
+
+class FreeTool:
+    """What a tool at rest exerts that touches nothing: bias and weight, after tares, warming and with a held part."""
+
+    def __init__(self, info: StreamInfo, temperature: BiasTemperature | None) -> None:
+        self._calibration, self._rate_Hz = info.calibration, info.sensor_rate_Hz
+        self._p_flange_sensor_m = info.p_flange_sensor_m
+        known_C = self._calibration.provenance.get("temperature_C")
+        # without the temperature at the calibration there is no change since then
+        self._temperature, made_C = (None, np.nan) if known_C is None else (temperature, float(known_C))
+        self._now_C = self._noted_C = made_C
+        self._hour_change = info.hour_change
+        created = self._calibration.provenance.get("created_utc")
+        # Clock of the cell when the calibration was made; None where that is not known.
+        self._made_ns = (
+            round(datetime.fromisoformat(created).timestamp() * 1e9) - info.utc_offset_ns
+            if isinstance(created, str)
+            else None
+        )
+        self._references = [_Reference(self._calibration, 0, made_C)]
+        self.held: Weight | None = None
+        self.empty: Calibrated = self._calibration
+        """The newest reference at the present temperature."""
+        self.expected: Calibrated = self._calibration
+        """The empty tool with the part that is held."""
+        self.load: Calibrated = self._calibration
+        """The tool as calibrated with the part that is held: weight and inertia do not change with the bias."""
+        self._compensator: Compensator = self._calibration.compensator
+        self._bias_change = np.zeros(6)
+
+    def predict(self, rows: Paired) -> tuple[Array, Array]:
+        """Return weight (n, 6) and bias (6,)."""
+        gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
+        return gravity, np.asarray(self._compensator.offset + self._bias_change)
+
+    @property
+    def mass_kg(self) -> float:
+        """Mass of the tool and the part that is held."""
+        return float(np.linalg.norm(self.expected.parameters.gravity_force_base_N)) / self._calibration.g_m_s2
+
+    def motion_tracker(self) -> MotionTracker:
+        """Return a tracker of the motion of this load."""
+        return MotionTracker(self._rate_Hz, self.mass_kg, self.expected.parameters, self._p_flange_sensor_m)
+
+    def hold(self, weight: Weight | None) -> None:
+        """Count a part as part of the tool from now on; None empties the gripper."""
+        self.held = weight
+        self.load = self._with_part(self._calibration)
+        self._compensator = Compensator(self.load.parameters, response=self.load.response)
+        self.expected = self._with_part(self.empty)
+
+    def _with_part(self, empty: Calibrated) -> Calibrated:
+        return empty if self.held is None else holding(empty, self.held, self._calibration.g_m_s2)
+
+    # What follows changes the bias, and returns the change (6,).
+
+    def set_tare(self, update: Update, t_ns: int) -> Array:
+        """Take the bias of an update."""
+        return self._refer([*self._references, _Reference(update, t_ns, self._now_C)])
+
+    def undo_tare(self) -> Array:
+        """Return to the bias before the last tare."""
+        return self._refer(self._references[:-1])
+
+    def follow(self, update: Update, t_ns: int) -> Array:
+        """Take the bias of an update that replaces all tares."""
+        return self._refer([self._references[0], _Reference(update, t_ns, self._now_C)])
+
+    def warm(self, temperature_C: float) -> Array:
+        """Take the bias at a temperature of the sensor."""
+        self._now_C = temperature_C
+        return self._refer(self._references)
+
+    def _refer(self, references: list[_Reference]) -> Array:
+        """Take the newest reference, at the present temperature, as the empty tool."""
+        self._references = references
+        empty, _, then_C = references[-1]
+        if self._temperature is not None:
+            empty = with_bias_change(empty, *self._temperature.change(then_C, self._now_C))
+        before, self._bias_change = self._bias_change, empty.parameters.bias - self._calibration.parameters.bias
+        self.empty, self.expected = empty, self._with_part(empty)
+        return np.asarray(self._bias_change - before)
+
+    def bias_growth(self, t_ns: int) -> Array:
+        """Return the variance (6,) of what the bias has moved since calibration or tare, as earlier runs show."""
+        looked_ns = self._made_ns if self.tare_t_ns is None else self.tare_t_ns
+        if self._hour_change is None or looked_ns is None:
+            return np.zeros(6)
+        return self._hour_change**2 * (max(t_ns - looked_ns, 0) / _HOUR_NS)
+
+    def is_warmed_by(self, temperature_C: float) -> bool:
+        """Whether this temperature of the sensor moves its bias."""
+        return self._temperature is not None and not abs(temperature_C - self._now_C) < _STEP_K
+
+    def warming(self) -> tuple[str, Mapping[str, JSON]] | None:
+        """Return text and values of an event, if the temperature has changed that much since the last one."""
+        if self._temperature is None or abs(self._now_C - self._noted_C) < _NOTED_K:
+            return None
+        self._noted_C = self._now_C
+        change, _ = self._temperature.change(self._references[-1].temperature_C, self._now_C)
+        text = f"sensor at {self._now_C:.1f} °C: bias corrected by {np.linalg.norm(change[:3]):.2f} N"
+        return text, {"temperature_C": self._now_C, "change": change.tolist()}
+
+    @property
+    def tare_wrench(self) -> Array | None:
+        """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
+        if self.tare_t_ns is None:
+            return None
+        return self._references[-1].empty.parameters.bias - self._calibration.parameters.bias
+
+    @property
+    def tare_t_ns(self) -> int | None:
+        """Time of the last tare."""
+        return self._references[-1].t_ns if len(self._references) > 1 else None
+
+
+# --------------------------------------------------------------------------------------------------------------- tare
+
+
+def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
+    """Estimate the bias again from the last `TARE_S` seconds, after earlier tares; None with the reason if refused.
+
+    It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool by
+    more than noise, calibration and a usual drift explain once in a thousand tares. The values are the `change` of the
+    bias (6,), its `force_N` and `torque_Nm`, and the distance from the free tool in `sigmas`.
+    """
+    again = "tare again when arm and tool have rested for half a second"
+    if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.5e9 * TARE_S:
+        return None, f"tare refused: only {len(rows)} samples; {again}", {}
+    R = rows.R_base_flange[-1:]
+    if not is_still(rows):
+        return None, f"tare refused: the arm moves; {again}", {}
+    dwell = mean_and_covariance(rows.raw)
+    (change,), (sigmas,) = compare_with_prediction(
+        current, R, dwell.mean[None], dwell.covariance[None], TARE_DRIFT_N, TARE_DRIFT_NM
+    )
+    force_N, torque_Nm = float(np.linalg.norm(change[:3])), float(np.linalg.norm(change[3:]))
+    values: dict[str, JSON] = {
+        "change": change.tolist(),
+        "force_N": force_N,
+        "torque_Nm": torque_Nm,
+        "sigmas": float(sigmas),
+    }
+    found = f"{force_N:.2f} N and {torque_Nm:.3f} N·m ({sigmas:.1f} sigma)"
+    if not is_stationary(rows.raw):
+        return None, f"tare refused: the reading changes; {again}", values
+    try:
+        update = tare(current, R, [rows.raw], drift_N=TARE_DRIFT_N, drift_Nm=TARE_DRIFT_NM)
+    except BadDataset:
+        why = f"{found} from the free tool, more than drift explains"
+        return None, f"tare refused: {why}; take hand or contact away, or calibrate again", values
+    return update, f"tare: the bias has changed by {found}", values
+
+
+def is_still(rows: Paired) -> bool:
+    """Check whether the arm rests; an unknown position counts as still."""
+    R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
+    return not (
+        np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any()
+    )
