@@ -1,7 +1,7 @@
 """A recording of any length compensated in blocks, without a device."""
 
-from collections.abc import Callable, Collection, Generator, Iterator, Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,22 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
+from ftcalib.after.state import reestimate
+from ftcalib.compensation import Compensator
 from ftcalib.errors import BadDataset
-from ftcalib.model import BIASES, jacobian
+from ftcalib.model import BIASES
 from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.live.processing import Processor
-from ftdrive.live.samples import Block, Paired, StreamEvent, WrenchFrame
 from ftdrive.recording.files import RecordingReader
+from ftdrive.recording.foreign import TablePair, table_words, tables_of
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import ROW, Header, Measured, Source, read_ahead, with_calibration
+from ftdrive.recording.recording import NEEDED, ROW, Header, Measured, Source, read_ahead, with_calibration
+from ftdrive.runs.source import SolveOptions
+from ftdrive.stream.samples import Block, Paired, StreamEvent, StreamInfo, WrenchFrame
+from ftdrive.stream.sources import Read
+from ftdrive.stream.sources import Source as SampleSource
+from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
 # The noise is that of the beginning of a recording.
 _NOISE_S = 30.0
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
-NEEDED = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
-"""Columns without which there is no compensation."""
 # Events of a recording that hold for its compensated one too.
 _KEPT = ("mark", "delay", "stale", "recovered")
 _READING_S = 0.1
@@ -34,41 +38,54 @@ _LEAST_READINGS = 20
 
 
 class Compensated(NamedTuple):
-    """The result of `compensated`."""
+    """The result of `compensate_recording`."""
 
     numbers: dict[str, Any]
+    """Samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and torque in
+    N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction; `bias_change`, if it
+    was estimated; axes, about; calibration, the name, and its marks; `cut`, why it ends early; `delay_s`, the last one
+    that the recording names, with value and sigma."""
     failure: BaseException | None = None
     """What ended the recording early: damage, or Ctrl-C; the numbers and the file hold what was before."""
 
 
-def read_with_calibration(
-    path: Path, calibration: CalibrationResult | None, name: str, columns: Collection[str] = ROW.names or ()
-) -> RecordingReader:
-    """Open a recording, and replace its calibration unless there is no other.
+def source_to_compensate(
+    path: Path,
+    options: SolveOptions,
+    calibration: CalibrationResult | None,
+    name: str,
+    delay_s: float | str | None,
+    *,
+    everything: bool,
+    say: Callable[[str], object],
+) -> tuple[Source, dict[str, float] | None]:
+    """Return the recording with the calibration, and the delay of one of another program with one sigma.
 
-    Parameters
-    ----------
-    path : Path
-    calibration : CalibrationResult, optional
-    name : str
-        Of that calibration.
-    columns : collection of str
-        As in `RecordingReader`.
-
-    Raises
-    ------
-    ConfigError
-        The calibration is of other devices, or `RecordingReader` raises it.
-    BadRecording, OSError
-        As in `RecordingReader`.
+    `name` is that of the calibration, `delay_s` a number or "auto" or None. With `everything`, all columns are read.
+    `say` takes what was recognised in tables.
     """
-    reader = RecordingReader(path, columns)
-    if calibration is not None:
-        info = reader.header.info
-        if others := compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
-            raise ConfigError(f"{path.name} is of other devices than the calibration: {others[0]}")
-        reader.header = with_calibration(reader.header, calibration, name)
-    return reader
+    try:
+        tables = tables_of(path, options.table, options.pair, options.topics)
+    except (BadDataset, ConfigError) as error:
+        if calibration is None:
+            raise type(error)(f"{error}. Give --calibration PATH too") from error
+        raise
+    if tables is None:
+        if delay_s is not None or options.table is not None:
+            raise ConfigError("--delay and --columns describe another program's recording: leave them out")
+        reader = RecordingReader(path, ROW.names or () if everything else NEEDED)
+        if calibration is not None:
+            info = reader.header.info
+            if others := compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
+                raise ConfigError(f"{path.name} is of other devices than the calibration: {others[0]}")
+            reader.header = with_calibration(reader.header, calibration, name)
+        return reader, None
+    if calibration is None:
+        raise ConfigError("the recording has no calibration: give --calibration PATH")
+    if words := table_words(tables):
+        say(f" {words}")
+    pair = TablePair(*tables, calibration, name, delay_s if isinstance(delay_s, float) else None)
+    return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
 
 
 def compensate_recording(
@@ -81,72 +98,39 @@ def compensate_recording(
 ) -> Compensated:
     """Compensate a recording of any length with the calibration of its header, bias and gravity subtracted.
 
-    It is read once, after its beginning was read for the noise; for the bias it is read once more before.
+    It is read once, after its beginning was read for the noise; for `estimated_bias` it is read once more before.
+    `frame` is that of the result. `output` is a new recording for it, and for those events of the old one that still
+    hold. `show` gets what is done and how much of it, in words.
 
-    Parameters
-    ----------
-    source : Source
-    frame : WrenchFrame
-        Of the result.
-    output : Path, optional
-        A new recording for the result, and for those events of the old one that still hold.
-    estimate_bias : bool
-        Whether `estimated_bias` replaces the bias of the calibration.
-    show : callable
-        Gets what is done and how much of it, in words.
-
-    Returns
-    -------
-    numbers : dict
-        samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and torque in
-        N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction; `bias_change`, if
-        it was estimated; axes, about; calibration, the name, and its marks; `cut`, why it ends early; `delay_s`, the
-        last one that the recording names, with value and sigma.
-    failure : exception or None
-        A file that is damaged and Ctrl-C end the recording at the last valid block.
-
-    Raises
-    ------
-    ConfigError
-        The frame needs what is not configured.
-    BadDataset
-        The recording is too short for an estimate.
-    BadRecording
-        Its first block is damaged.
-    OSError
-        The result cannot be written; the error names what was kept.
+    Raises `ConfigError` for a frame that needs what is not configured, `BadDataset` for a recording that is too short
+    for an estimate, `BadRecording` if its first block is damaged, and `OSError` if the result cannot be written, which
+    names what was kept.
     """
     header, change = source.header, None
     if estimate_bias:
         header, change = estimated_bias(source, show=show)
     info = header.info
-    processor = Processor(info, frame)
-    processor.learn_noise(_beginning(source, round(_NOISE_S * info.sensor_rate_Hz)))
-    found = _Sums()
+    blocks, found = _Blocks(source, info, show), _Sums()
     failure: BaseException | None = None
-    with ExitStack() as stack:
-        recorder = None
-        if output is not None:
-            recorder = Recorder([output], info, header.configuration, repeatable=True)
-            stack.callback(recorder.discard)
-        try:
-            blocks = _processed(read_ahead(source.blocks()), processor)
-            # so that no thread processes further
-            with closing(read_ahead(blocks)) as coming:
-                for block, old, new, share in coming:
-                    found.add(block, old, new, recorder)
-                    show(f"Compensating: {share:.0%}")
-        except (BadDataset, BadRecording, KeyboardInterrupt) as error:
-            if not found.samples:
-                raise
-            failure = error
+    stream = Stream(blocks, frame=frame)
+    sinks: list[Sink] = [found]
+    if output is not None:
+        sinks.append(Recorder([output], info, header.configuration, repeatable=True))
+    try:
+        with stream:
+            for _ in pump(stream, sinks):
+                pass
+    except KeyboardInterrupt as error:
+        if not found.samples:
+            raise
+        failure = error
         # a contact at the end is over
-        processor.restart()
-        found.add(None, [], [one for one in processor.take_events() if one.t_host_ns <= found.end_ns], recorder)
-        if recorder is not None:
-            recorder.close()
+        stream.processor.restart()
+        found.add(None, stream.take_events())
+    failure = failure or blocks.failure
     numbers = {
         **found.to_dict(),
+        "delay_s": blocks.delay_s,
         "bias_change": change,
         **frame.to_dict(),
         "calibration": info.calibration_name,
@@ -156,61 +140,82 @@ def compensate_recording(
     return Compensated(numbers, failure)
 
 
-def _processed(
-    measured: Iterator[Measured], processor: Processor
-) -> Generator[tuple[Block | None, Sequence[StreamEvent], Sequence[StreamEvent], float], None, None]:
-    """Yield each block with the events of its recording that still hold, those of the processing, and its share."""
-    for samples, events, share in measured:
-        block = processor.process(samples) if len(samples) else None
-        yield block, [one for one in events if one.kind in _KEPT], processor.take_events(), share
-    yield processor.finish(), [], processor.take_events(), 1.0
+class _Blocks(SampleSource):
+    """A recording of any length, as fast as it is read, with those of its events that still hold."""
+
+    def __init__(self, recording: Source, info: StreamInfo, show: Callable[[str], object]) -> None:
+        self.info, self._recording, self._show = info, recording, show
+        self._newest: Paired | None = None
+        self.failure: Exception | None = None
+        """What ended it early."""
+        self.delay_s: dict[str, Any] | None = None
+
+    def open(self) -> None:
+        self._coming = read_ahead(self._recording.blocks())
+
+    def close(self) -> None:
+        self._coming.close()
+
+    def beginning(self) -> Iterator[Paired]:
+        """Yield the first samples; damage behind them is left to the pass that follows."""
+        left = round(_NOISE_S * self.info.sensor_rate_Hz)
+        with suppress(BadDataset, BadRecording):
+            for block in self._recording.blocks():
+                yield block.samples.rows(slice(left))
+                left -= len(block.samples)
+                if left <= 0:
+                    return
+
+    def read(self, _timeout_s: float = 0.0) -> Read:
+        measured: Measured | None = None
+        try:
+            measured = next(self._coming, None)
+        except (BadDataset, BadRecording) as error:
+            if self._newest is None:
+                raise
+            self.failure = error
+        if measured is None and self._newest is not None:
+            # what waits for later poses is due
+            self.has_ended = True
+            return Read(self._newest.rows(slice(0)))
+        elif measured is None:
+            raise BadDataset("the recording has no samples")
+        samples, events, share = measured
+        for event in events:
+            if event.kind in _KEPT:
+                self.note(event)
+            if event.kind == "delay":
+                self.delay_s = {name: event.values[name] for name in ("value", "sigma")}
+        self._show(f"Compensating: {share:.0%}")
+        self._newest = samples
+        return Read(samples)
 
 
-def _beginning(source: Source, samples: int) -> Iterator[Paired]:
-    """Yield the first samples; damage behind them is left to the pass that follows."""
-    with suppress(BadDataset, BadRecording):
-        for block in source.blocks():
-            yield block.samples.rows(slice(samples))
-            samples -= len(block.samples)
-            if samples <= 0:
-                return
-
-
-class _Sums:
+class _Sums(Sink):
     """What is known of a result, block after block."""
 
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
-        self._begin_ns, self.end_ns, self._seq = 0, 0, 0
+        self._begin_ns, self._end_ns, self._seq = 0, 0, 0
         # raw and compensated, force and torque
         self._squares, self._largest = np.zeros((2, 2)), np.zeros((2, 2))
         self._contacts: list[dict[str, Any]] = []
-        self._delay: dict[str, Any] | None = None
 
-    def add(
-        self, block: Block | None, old: Sequence[StreamEvent], new: Sequence[StreamEvent], recorder: Recorder | None
-    ) -> None:
-        """Add the next block, and the events of the recording and of the result since the one before."""
-        block = block if block is not None and len(block) else None
-        if block is not None:
+    def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
+        if block:
             if not self.samples:
                 self._begin_ns, self._seq = int(block.t_host_ns[0]), int(block.seq[0]) - 1
             self.samples += len(block)
             self._gaps += int(np.count_nonzero(np.diff(block.seq, prepend=self._seq) != 1))
-            self.end_ns, self._seq = int(block.t_host_ns[-1]), int(block.seq[-1])
+            self._end_ns, self._seq = int(block.t_host_ns[-1]), int(block.seq[-1])
             for i, wrench in enumerate((block.raw, block.wrench)):
                 norms = np.square(wrench) @ _OF_FORCE_AND_TORQUE
                 self._squares[i] += norms.sum(axis=0)
                 self._largest[i] = np.maximum(self._largest[i], norms.max(axis=0))
-        for event in old:
-            if event.kind == "delay":
-                self._delay = {name: event.values[name] for name in ("value", "sigma")}
-        self._contacts += [_contact(event, self._begin_ns) for event in new if event.kind == "contact"]
-        if recorder is not None:
-            for event in (*old, *new):
-                recorder.event(event)
-            if block is not None:
-                recorder.write(block)
+        for event in events:
+            if event.kind == "contact":
+                values = {name: event.values[name] for name in ("duration_s", "peak_N", "direction")}
+                self._contacts.append({"t_s": (event.t_host_ns - self._begin_ns) * 1e-9, **values})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the numbers."""
@@ -221,18 +226,12 @@ class _Sums:
         )
         return {
             "samples": self.samples,
-            "duration_s": (self.end_ns - self._begin_ns) * 1e-9,
+            "duration_s": (self._end_ns - self._begin_ns) * 1e-9,
             "raw": raw,
             "compensated": compensated,
             "contacts": self._contacts,
             "gaps": self._gaps,
-            "delay_s": self._delay,
         }
-
-
-def _contact(event: StreamEvent, start_ns: int) -> dict[str, Any]:
-    values = {name: event.values[name] for name in ("duration_s", "peak_N", "direction")}
-    return {"t_s": (event.t_host_ns - start_ns) * 1e-9, **values}
 
 
 def estimated_bias(
@@ -241,20 +240,10 @@ def estimated_bias(
     """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
 
     The estimate is the mean of readings of 0.1 s of what the calibration leaves. Readings far from the median, such as
-    contacts, do not count. Its covariance holds the error of the kept parameters at the orientations of the recording,
-    and the scatter of the readings with its correlation in time.
-
-    Returns
-    -------
-    header : Header
-        With the new bias and its covariance in its calibration.
-    change : dict
-        `value`, new minus old bias, and `sigma`, one standard deviation of the new one: 6 numbers each, N and N·m.
-
-    Raises
-    ------
-    BadDataset
-        The recording is too short.
+    contacts, do not count. Its covariance holds the error of the kept parameters at the mean orientation, and the
+    scatter of the readings with its correlation in time. Returns the header with the new calibration, and
+    `value`, new minus old bias, and `sigma`, one standard deviation of the new one: 6 numbers each, N and N·m. Raises
+    `BadDataset` for a recording that is too short.
     """
     info = source.header.info
     calibration = info.calibration
@@ -268,34 +257,27 @@ def estimated_bias(
             paired = Paired.concatenate([*waiting, samples])
             whole = len(paired) // size * size
             waiting = [paired.rows(slice(whole, None))]
-            left = calibration.compensate(paired.raw[:whole], paired.R_base_flange[:whole])
-            readings.append(left.reshape(-1, size, 6).mean(axis=1))
-            # a view keeps the block
-            orientations.append(paired.R_base_flange[:whole][size // 2 :: size].copy())
+            readings.append(paired.raw[:whole].reshape(-1, size, 6).mean(axis=1))
+            orientations.append(paired.R_base_flange[:whole].reshape(-1, size, 3, 3).mean(axis=1))
     reading, R = np.concatenate(readings), np.concatenate(orientations)
     if len(reading) < _LEAST_READINGS:
         seconds = len(reading) * _READING_S + sum(map(len, waiting)) / info.sensor_rate_Hz
         shortest_s = _LEAST_READINGS * _READING_S
         raise BadDataset(f"{seconds:.1f} s are too short for a bias: record at least {shortest_s:g} s")
-    free = _free(reading)
-    kept = reading[free]
-    change = kept.mean(axis=0)
-    scatter = kept - change
+    # The bias is that of the readings, which no sensor matrix has decoded. The wrench of a free tool is linear in R, so
+    # that means of R are as good as rotations.
+    free_tool = Compensator(calibration.parameters, response=calibration.response)
+    left = np.asarray(free_tool.batch(reading, R), np.float64)
+    free = _free(left)
+    scatter = left[free] - left[free].mean(axis=0)
     correlation = np.clip((scatter[1:] * scatter[:-1]).sum(axis=0) / (scatter**2).sum(axis=0), 0.0, 0.95)
-    J = jacobian(calibration.parameters, R[free]).mean(axis=0)
-    # of the new parameters by those of the old
-    errors = np.eye(15)
-    errors[BIASES] = -J
-    errors[np.ix_(BIASES, BIASES)] = 0.0
-    covariance = errors @ calibration.covariance @ errors.T
-    noise = scatter.T @ scatter / (len(kept) - 1) * ((1 + correlation) / (1 - correlation)).max() / len(kept)
-    covariance[np.ix_(BIASES, BIASES)] += noise
-    old = calibration.parameters
-    parameters = replace(
-        old, force_bias_N=old.force_bias_N + change[:3], torque_bias_Nm=old.torque_bias_Nm + change[3:]
+    noise = scatter.T @ scatter / (len(scatter) - 1) * ((1 + correlation) / (1 - correlation)).max() / len(scatter)
+    update = reestimate(calibration, R[free].mean(axis=0)[None], reading[free].mean(axis=0)[None], noise, "bias")
+    estimated = replace(
+        calibration, parameters=update.parameters, covariance=update.covariance, response=update.response
     )
-    estimated = replace(calibration, parameters=parameters, covariance=covariance)
-    sigma = np.sqrt(np.diag(covariance)[BIASES])
+    change = update.parameters.bias - calibration.parameters.bias
+    sigma = np.sqrt(np.diag(update.covariance)[BIASES])
     header = with_calibration(source.header, estimated, f"{info.calibration_name}, bias estimated")
     return header, {"value": change.tolist(), "sigma": sigma.tolist()}
 

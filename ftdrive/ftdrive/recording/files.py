@@ -1,93 +1,39 @@
-"""Recordings on disk: the file formats by their endings, and which files are recordings."""
+"""Recordings on disk: the file formats by their endings, read and written whole."""
 
-import struct
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
+from functools import reduce
 from importlib import import_module
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from ftcalib.files import open_file
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.live.samples import StreamEvent
-from ftdrive.recording.csv_file import CsvFile, read_csv
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
-from ftdrive.recording.parquet_file import ParquetFile, read_parquet
-from ftdrive.recording.recording import FORMAT, ROW, Header, Measured, Piece, Recording, Rows, measured, read_ahead
+from ftdrive.recording.recording import ROW, Measured, Piece, Recording, changed, divided, in_blocks, read_ahead
+from ftdrive.recording.table_files import CsvFile, ParquetFile, read_csv, read_parquet
 from ftdrivers.installation import missing_extra
 
-_MAGIC: Final = b"\x89MCAP0\r\n"
-
-
-def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of `ftdrive record`: by its ending, CSV by the first line, MCAP by its writer."""
-    ending = Path(path.name.removesuffix(".partial")).suffix
-    if ending == ".csv" and path.is_file():
-        with open_file(path) as file:
-            return file.readline(100).startswith(f"# {FORMAT.partition('/')[0]}/".encode())
-    return ending in ENDINGS and ending != ".csv" and not is_bag(path)
-
-
-def is_bag(path: Path) -> bool:
-    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
-    if path.is_dir():
-        return (path / "metadata.yaml").is_file()
-    if path.suffix in (".bag", ".db3"):
-        return path.is_file()
-    if path.suffix != ".mcap" or not path.is_file():
-        return False
-    with open_file(path) as file:
-        start = file.read(512)
-    try:
-        (profile,) = struct.unpack_from("<I", start, 17)
-        (library,) = struct.unpack_from("<I", start, 21 + profile)
-    except struct.error:
-        return False
-    return start.startswith(_MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
-
-
-class RecordingFile(Protocol):
-    """A new file of one format."""
-
-    samples: int
-    """So many are in the file and remain there, whatever happens."""
-
-    @property
-    def partial(self) -> Path:
-        """Name until it is complete."""
-
-    def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples of one frame, and the events since the samples before."""
-
-    def complete(self) -> None:
-        """Write the end, fsync the file and give it its name."""
-
-    def keep(self) -> None:
-        """End the file without completing it; what was written remains in `partial`."""
-
-    def discard(self) -> None:
-        """Delete what was written."""
+RecordingFile = McapFile | CsvFile | ParquetFile
+"""A new file of one format. Whatever happens, `samples` of those that were appended remain in the file."""
 
 
 class Format(NamedTuple):
     """A file format."""
 
-    new: Callable[[Path, Header], RecordingFile]
+    new: type[RecordingFile]
     read: Callable[[Path, Collection[str]], Generator[Piece, None, str]]
     """Gives the header first, with a piece without samples."""
     package: str
     """Needed for it."""
-    grows: bool = True
-    """Whether a part of a file can be read."""
 
 
 _FORMATS = {
     ".mcap": Format(McapFile, read_mcap, "mcap"),
     ".csv": Format(CsvFile, read_csv, "csv"),
-    ".parquet": Format(ParquetFile, read_parquet, "pyarrow", grows=False),
+    ".parquet": Format(ParquetFile, read_parquet, "pyarrow"),
 }
 ENDINGS = tuple(_FORMATS)
 
@@ -106,15 +52,14 @@ def format_of(path: Path) -> Format:
 
 def grown_as(path: Path) -> Path:
     """Return the file that a stream is written to: of a format that cannot be read before its end, first as MCAP."""
-    return path if format_of(path).grows else path.with_name(f"{path.name}.mcap")
+    return path if format_of(path).new.grows else path.with_name(f"{path.name}.mcap")
 
 
 def require_new_recordings(paths: Sequence[Path]) -> None:
     """Raise `ConfigError` or `OSError` unless a stream can be recorded to all of these files."""
     grown = [grown_as(path) for path in paths]
     for path in (*paths, *grown):
-        format_of(path)
-        partial_of(path)
+        partial_of(path, grows=format_of(path).new.grows)
     if len({path.absolute() for path in grown}) < len(paths):
         raise ConfigError("two outputs name the same file: leave one out")
 
@@ -166,7 +111,7 @@ class RecordingReader:
 
     def blocks(self) -> Iterator[Measured]:
         """Give the samples as measured: wrench and pose with their times. Raises as `pieces`."""
-        return measured(self.pieces())
+        return in_blocks(piece.measured() for piece in self.pieces())
 
     def _pieces(self) -> Generator[Piece, None, None]:
         try:
@@ -176,28 +121,15 @@ class RecordingReader:
 
 
 def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
-    """Read a recording into memory, also the `.partial` of one that was interrupted.
+    """Read a recording of `RecordingReader` into memory.
 
-    Parameters
-    ----------
-    path : str or Path
-        Its ending names the format: .mcap, .csv or .parquet.
-    columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
-
-    Raises
-    ------
-    ConfigError
-        Another ending, or the package for the format is missing.
-    BadRecording
-        Damaged, without a sample, or of another program. A file that was cut is read up to there; `cut` says so.
-    OSError
-        The file does not exist or cannot be read.
+    It raises for a damaged file or one without a sample. A file that was cut is read up to there; `cut` says so.
     """
     # A damaged file raises, because a caller in Python would not see a message.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
+    reduce(changed, events, reader.header)  # a stage of a newer version may begin later
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 
@@ -229,7 +161,8 @@ def write_recording(path: str | Path, recording: Recording | RecordingReader) ->
     try:
         with closing(read_ahead(recording.pieces())) as pieces:
             for piece in pieces:
-                file.append(piece.rows, piece.events)
+                for rows, events in divided(piece):
+                    file.append(rows, events)
         file.complete()
     except BaseException:
         file.discard()

@@ -1,25 +1,36 @@
-"""Recordings of other programs as tables: text, and bags of ROS 1 and ROS 2, which need the extra `ros2`."""
+"""Recordings of other programs: which files are, as tables, and wrench and pose of tables as one recording.
+
+Tables are text, or bags of ROS 1 and ROS 2, which need the extra `ros2`.
+"""
 
 import struct
-from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter1d
 from scipy.spatial.transform import Rotation
 
+from ftcalib import CalibrationResult
 from ftcalib.data.dwell_mean import CHANNELS
 from ftcalib.errors import BadDataset, UsageError
 from ftcalib.files import open_file
 from ftdrive.errors import ConfigError
-from ftdrive.recording.files import is_bag, is_recording
+from ftdrive.recording.files import ENDINGS
+from ftdrive.recording.mcap_file import MAGIC
+from ftdrive.recording.recording import PIECE_ROWS, Header, Measured, in_blocks
+from ftdrive.recording.table_files import FIRST_BYTES
+from ftdrive.runs.calibration import versions
 from ftdrive.runs.source import SolveOptions
-from ftdrive.tables.table import Table
+from ftdrive.stream.pairing import DelayEstimator, pair_blocks
+from ftdrive.stream.samples import Stages, StreamInfo, WrenchFrame
+from ftdrive.tables.table import Table, TableOptions
 from ftdrivers.errors import ProtocolError
 from ftdrivers.installation import missing_extra
-from ftdrivers.interfaces import Array
+from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
 from ftdrivers.ros2.arm import SCHEME, pose_reader_of
 from ftdrivers.ros2.poses import UNIT_TOLERANCE, Joints, PoseReader, Poses
 
@@ -34,21 +45,64 @@ _Column = tuple[NDArray[np.int64], Array]
 # Time of receipt in ns, and content.
 _Message = tuple[int, bytes]
 
+T = TypeVar("T")
+# Seconds: the delay is estimated from all of a recording.
+_WHOLE = 10**6
+_MEAN_S = 0.008
+# Samples before and after a step that show whether it is a gap.
+_NEAR = 100
+_ROUNDS = 20
+# Largest distance of regular times from multiples of their period, in periods.
+_REGULAR = 0.2
 
-def tables_of(source: Any, options: SolveOptions) -> tuple[Table, Table] | None:
+
+def is_recording(path: Path) -> bool:
+    """Whether a file is a recording of `ftdrive record`: by its ending, CSV by the first line, MCAP by its writer."""
+    ending = Path(path.name.removesuffix(".partial")).suffix
+    if ending != ".csv":
+        return ending in ENDINGS and not is_bag(path)
+    if not path.is_file():
+        return False
+    with open_file(path) as file:
+        return file.readline(100).startswith(FIRST_BYTES)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    if path.suffix in (".bag", ".db3"):
+        return path.is_file()
+    if path.suffix != ".mcap" or not path.is_file():
+        return False
+    with open_file(path) as file:
+        start = file.read(512)
+    try:
+        (profile,) = struct.unpack_from("<I", start, 17)
+        (library,) = struct.unpack_from("<I", start, 21 + profile)
+    except struct.error:
+        return False
+    return start.startswith(MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
+
+
+def tables_of(
+    source: Any,
+    options: TableOptions | None = None,
+    pair: tuple[Path, Path] | None = None,
+    topics: tuple[str | None, str | None] = (None, None),
+) -> tuple[Table, Table] | None:
     """Return wrench and poses of another program, which may be one table; None for a recording of ours.
 
     `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
     """
-    if options.pair is not None:
-        wrench, poses = (Table(path, options.table) for path in options.pair)
-        return wrench, poses
+    if pair is not None:
+        return Table(pair[0], options), Table(pair[1], options)
     if isinstance(source, Path):
         if is_recording(source):
             return None
         if is_bag(source):
-            return read_bag(source, *options.topics)
-    table = Table(source, options.table)
+            return read_bag(source, *topics)
+    table = Table(source, options)
     return table, table
 
 
@@ -59,7 +113,7 @@ def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Tab
         has_poses = source.is_dir() or source.suffix == ".json"
         if has_poses and not is_bag(source):
             return None
-    tables = tables_of(source, options)
+    tables = tables_of(source, options.table, options.pair, options.topics)
     if tables is None:
         return Path(source)
     # One table has both streams or poses at rest.
@@ -74,21 +128,9 @@ def table_words(tables: tuple[Table, Table]) -> str:
 def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:
     """Read wrench and pose; times are those of the headers, from the earliest of both.
 
-    Parameters
-    ----------
-    path : Path
-    wrench_topic : str, optional
-        Of WrenchStamped; may be left out if there is only one.
-    pose_topic : str, optional
-        Of PoseStamped; may be left out if there is only one. Otherwise as the address of an arm:
-        ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``.
-
-    Raises
-    ------
-    ConfigError
-        The package rosbags is missing, or a topic has to be named.
-    BadDataset
-        The bag is damaged, or a message cannot be used.
+    The topics, of WrenchStamped and PoseStamped, may be left out if there is only one. `pose_topic` may be as the
+    address of an arm: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
+    `ConfigError` if the package rosbags is missing or a topic has to be named, and `BadDataset`.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -150,11 +192,7 @@ def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_Mes
 
 
 def _numbers(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
-    """Return times (n,) in ns and the numbers (n, count) behind the header of messages.
-
-    The times are those of receipt if no message has a stamp. Raises `BadDataset` for no message, a stamp of zero
-    beside others, a number that is not finite, or frames that differ.
-    """
+    """Return times (n,) in ns, of receipt if no message has a stamp, and numbers (n, count) behind the header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
     received_ns = np.array([received for received, _ in messages])
@@ -208,34 +246,178 @@ def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_
             wrong = lengths[np.argmax(np.abs(lengths - 1))]
             raise BadDataset(f"{topic}: a quaternion has the length {wrong:.3g}: normalize it in its driver")
         return t_ns, np.hstack([quaternion, position])
-    if isinstance(named, Joints):
-        return _from_joints(reader, named, messages)
-    found = [
-        (pose.t_ns, pose.R_base_flange, pose.p_base_flange_m)
-        # a bag may have latched ones late
+    decoded: Iterator[tuple[str, Any]] = (
+        (topic, reader.deserialize(data, named.topics[topic]))
+        # A bag may have latched ones late.
         for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")
         for _, data in messages[topic]
-        for pose in named.read(topic, reader.deserialize(data, named.topics[topic]))
-    ]
+    )
+    found: list[tuple[Any, ...]]
+    if isinstance(named, Joints):
+        found = [
+            (message.header.stamp, *joints.values())
+            for topic, message in decoded
+            if (joints := named.positions(topic, message)) is not None
+        ]
+    else:
+        found = [pose for topic, message in decoded for pose in named.read(topic, message)]
     if not found:
         raise BadDataset(f"the bag has no pose: {named.missing()}")
-    times, R, p = (np.array(column) for column in zip(*found, strict=True))
-    return times, np.hstack([Rotation.from_matrix(R).as_quat(), p])
+    times, *columns = zip(*found, strict=True)
+    if isinstance(named, Joints):
+        # All poses at once: one by one they take longer than the messages.
+        t_ns = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in times])
+        R, p = named.chain.poses(dict(zip(named.chain.names, map(np.array, columns), strict=True)))
+        (topic,) = named.topics
+        return _checked(topic, t_ns, np.hstack([Rotation.from_matrix(R).as_quat(), p]))
+    R, p = map(np.array, columns)
+    return np.array(times), np.hstack([Rotation.from_matrix(R).as_quat(), p])
 
 
-def _from_joints(reader: "AnyReader", named: Joints, messages: Mapping[str, list[_Message]]) -> _Column:
-    """Return what `_poses` does, from all messages at once."""
-    (topic,) = named.topics
-    t_ns: list[int] = []
-    positions: defaultdict[str, list[float]] = defaultdict(list)
-    for _, data in messages[topic]:
-        message: Any = reader.deserialize(data, named.topics[topic])
-        if (found := named.positions(topic, message)) is not None:
-            stamp = message.header.stamp
-            t_ns.append(stamp.sec * 1_000_000_000 + stamp.nanosec)
-            for name, value in found.items():
-                positions[name].append(value)
-    if not t_ns:
-        raise BadDataset(f"the bag has no pose: {named.missing()}")
-    R, p = named.chain.poses({name: np.array(values) for name, values in positions.items()})
-    return _checked(topic, np.array(t_ns), np.hstack([Rotation.from_matrix(R).as_quat(), p]))
+class TablePair:
+    """Two tables, or one with both, as one recording of any length; the devices are unknown.
+
+    `name` is that of the calibration, and `delay_s` that of the wrench after the orientation; None estimates it in a
+    pass of its own. Raises `BadDataset` if a table cannot be used, or the two have no time in common.
+    """
+
+    cut = ""
+
+    def __init__(
+        self, wrench: Table, orientation: Table, calibration: CalibrationResult, name: str, delay_s: float | None
+    ) -> None:
+        self._wrench, self._orientation = wrench, orientation
+        rate_Hz, unknown = wrench.rate_Hz("wrench"), np.full(3, np.nan)
+        info = StreamInfo(
+            result=calibration,
+            calibration_name=name,
+            arm=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+            sensor=DeviceInfo("unknown", NOT_REPORTED, NOT_REPORTED),
+            tool="",
+            utc_offset_ns=0,
+            sensor_rate_Hz=rate_Hz,
+            arm_rate_Hz=orientation.rate_Hz("orientation"),
+            p_flange_sensor_m=unknown,
+            R_flange_tcp=np.eye(3),
+            p_flange_tcp_m=unknown,
+            versions=versions(),
+        )
+        self.header = Header(info, WrenchFrame(), Stages())
+        self.delay_s, self.delay_sigma_s = self._estimated_delay() if delay_s is None else (delay_s, 0.0)
+
+    def blocks(self) -> Iterator[Measured]:
+        """Give the samples in blocks, each with its pose. Raises `BadDataset` behind the last valid one."""
+        # Each call reads from the beginning: a binary copy for a second pass would need 1.4 GB an hour.
+        share = [0.0]
+
+        def samples() -> Iterator[FtSamples]:
+            for block, share[0] in _numbered(self._wrench):
+                yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
+
+        paired = pair_blocks(samples(), _states_of(self._orientation), self.delay_s)
+        # As of other recordings, because the contact test goes in steps.
+        return in_blocks(Measured(block, (), share[0]) for block in paired)
+
+    def _estimated_delay(self) -> tuple[float, float]:
+        """Return the delay and its sigma, from means over `_MEAN_S`."""
+        info = self.header.info
+        size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
+        means = list(_before_a_fault(_means(self._wrench, size)))
+        estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
+        estimator.learn(means, lambda: _before_a_fault(_states_of(self._orientation)))
+        return estimator.delay_s, estimator.sigma_s
+
+
+def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
+    """Yield the parts before a fault, if there are any; the pass that follows reports it."""
+    count = 0
+    try:
+        for part in parts:
+            yield part
+            count += 1
+    except BadDataset:
+        if not count:
+            raise
+
+
+def _means(table: Table, size: int) -> Iterator[FtSamples]:
+    """Yield the mean wrench of each so many samples, numbered, at their mean time."""
+    t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
+    for rows in table.wrenches():
+        t_s, wrench = np.concatenate([t_s, rows.t_s]), np.concatenate([wrench, rows.values])
+        n = len(t_s) // size
+        t_ns = _ns(t_s[: n * size].reshape(n, size).mean(axis=1))
+        means = wrench[: n * size].reshape(n, size, 6).mean(axis=1)
+        yield FtSamples.of(t_ns, np.arange(count, count + n), means)
+        t_s, wrench, count = t_s[n * size :], wrench[n * size :], count + n
+
+
+def _numbered(table: Table) -> Iterator[tuple[FtSamples, float]]:
+    """Give the samples, numbered by their times as in `numbers_of`, and the share of the table before the next ones."""
+    known, number = 0, 0
+    t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0.0
+    for rows in chain(table.wrenches(), [None]):
+        if rows is not None:
+            t_s, wrench, place = np.concatenate([t_s, rows.t_s]), np.concatenate([wrench, rows.values]), rows.place
+            if len(t_s) <= known + 2 * _NEAR:
+                continue
+        numbers = numbers_of(t_s)
+        numbers += number - numbers[max(known - 1, 0)]
+        # what follows shows whether a step is a gap
+        end = len(t_s) if rows is None else len(t_s) - _NEAR
+        if end > known:
+            yield FtSamples.of(_ns(t_s[known:end]), numbers[known:end], wrench[known:end]), place
+            number = int(numbers[end - 1])
+        start = max(end - 2 * _NEAR, 0)
+        t_s, wrench, known = t_s[start:], wrench[start:], end - start
+
+
+def numbers_of(t_s: Array) -> NDArray[np.int64]:
+    """Number samples by their times (n,), so that a sample that is missing is a gap and a late one is not.
+
+    Where each time is near a multiple of the period, a longer step is a gap. Elsewhere, as with times of receipt or of
+    batches, a gap is a step after which the samples stay late by a period or more, by their median and by the earliest.
+    """
+    steps_s = np.diff(t_s)
+    if (step_s := float(np.median(steps_s))) > 0:
+        steps = np.rint(steps_s / step_s)
+        if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
+            return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
+    number = np.arange(len(t_s))
+    # the period is that of all samples, the missing ones included
+    for _ in range(_ROUNDS):
+        before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
+        if np.array_equal(number, before):
+            break
+    return number
+
+
+def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
+    number = np.arange(len(t_s))
+    if period_s == 0:
+        return number
+    steps = np.diff(t_s) / period_s
+    late = t_s / period_s - number
+    # of a sample and those before
+    earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after
+    possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
+    # where the samples beside it are less late
+    for last in possible[np.argsort(-steps[possible])].tolist():
+        near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
+        before, after = (t_s[rows] / period_s - number[rows] for rows in near)
+        missing = min(np.median(after) - np.median(before), after.min() - before.min())
+        number[last + 1 :] += max(round(float(missing)), 0)
+    return number
+
+
+def _states_of(table: Table) -> Iterator[ArmStates]:
+    """Give the orientations of the flange; positions and joints are NaN."""
+    for rows in table.poses():
+        unknown = np.full((len(rows.t_s), 6), np.nan)
+        R = rows.values[:, :9].reshape(-1, 3, 3)
+        yield ArmStates(_ns(rows.t_s), unknown[:, 0], unknown, unknown, R, unknown[:, :3])
+
+
+def _ns(t_s: Array) -> NDArray[np.int64]:
+    return np.rint(t_s * 1e9).astype(np.int64)

@@ -3,27 +3,20 @@
 import os
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, ClassVar
 
 from ftcalib.files import open_file, require_new
 
 
 class GrowingFile:
-    """A new file.
+    """A new file. Raises `OSError` if it or its `.partial` exists already, or the folder cannot be written."""
 
-    Parameters
-    ----------
-    path : Path
-
-    Raises
-    ------
-    OSError
-        The file or its `.partial` exists already, or the folder cannot be written.
-    """
+    grows: ClassVar = True
+    """Whether a part of the file can be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.partial = partial_of(path)
+        self.partial = partial_of(path, grows=self.grows)
         self._file = self.partial.open("xb", buffering=0)
         _lock(self._file)
 
@@ -32,14 +25,13 @@ class GrowingFile:
         """Bytes so far."""
         return self._file.tell()
 
-    def add(self, *contents: bytes) -> int:
+    def add(self, content: bytes) -> int:
         """Append; return where it begins. After an error the file holds what it held before."""
         start = self._file.tell()
+        left = memoryview(content)
         try:
-            for content in contents:
-                left = memoryview(content)
-                while left:
-                    left = left[self._file.write(left) :]
+            while left:
+                left = left[self._file.write(left) :]
         except OSError:
             self._file.seek(start)
             self._file.truncate()
@@ -47,12 +39,18 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Fsync the file and give it its name. Raises `OSError`, also if the name is taken."""
-        # while it is locked, because it may take seconds
-        os.fsync(self._file.fileno())
-        self._file.close()
+        """Write the end, fsync the file and give it its name. Raises `OSError`, also if the name is taken."""
+        try:
+            self._write_end()
+            # While it is locked, because it may take seconds.
+            os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
         require_new(self.path)
         self.partial.rename(self.path)
+
+    def _write_end(self) -> None:
+        """Write what makes the file complete; here nothing."""
 
     def discard(self) -> None:
         """Delete the file."""
@@ -62,12 +60,6 @@ class GrowingFile:
     def keep(self) -> None:
         """Close the file as it is."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.keep()
 
 
 def _lock(file: IO[bytes]) -> bool:
@@ -95,8 +87,11 @@ def _holder(file: IO[bytes]) -> str:
     return "another process"
 
 
-def partial_of(path: Path) -> Path:
-    """Return the name until a file is complete; raises `OSError` if it or the file exists or the folder does not."""
+def partial_of(path: Path, *, grows: bool) -> Path:
+    """Return the name until a file is complete; raises `OSError` if it or the file exists or the folder does not.
+
+    A part of a file that `grows` can be read.
+    """
     partial = path.with_name(path.name + ".partial")
     require_new(path)
     if partial.exists():
@@ -105,7 +100,7 @@ def partial_of(path: Path) -> Path:
                 raise FileExistsError(
                     f"{_holder(file)} still records to {partial}: choose another name, or end that recording first"
                 )
-        if path.suffix == ".parquet":
+        if not grows:
             raise FileExistsError(
                 f"{partial} exists, but its end is missing: delete it. If `record` of an earlier ftdrive was "
                 "interrupted, convert it with that version first"

@@ -1,6 +1,6 @@
 """Recordings as MCAP, for Foxglove, Lichtblick, PlotJuggler and ROS 2 bags. Needs the extra `record`.
 
-Channels of CDR messages: those of `ftdrive.live.ros2`, `/ft_sample` with the other columns, `/events`, and `/tf` for
+Channels of CDR messages: those of `ftdrive.stream.ros2`, `/ft_sample` with the other columns, `/events`, and `/tf` for
 viewers. All times are UTC. The attachments `calibration.json` and `recording.json` hold the header. Each chunk, each
 attachment and the whole data section have a CRC-32.
 
@@ -15,6 +15,7 @@ import zlib
 from collections import defaultdict
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Final
 
@@ -24,10 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from ftcalib.files import MOST_BYTES, open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
-from ftdrive.live import ros2
-from ftdrive.live.samples import StreamEvent, frames_in_flange, matrices
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import ROW, ZSTD_LEVEL, Header, Piece, Rows, changed
+from ftdrive.stream import ros2
+from ftdrive.stream.samples import StreamEvent, matrices
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
@@ -64,17 +65,22 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
     _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
 }
-_WARNINGS: Final = ("gap", "stale", "drift", "tare-refused")
 # Between two messages on /tf: no screen shows more.
 _TRANSFORMS_STEP_NS: Final = 16_666_667
 
-_MAGIC: Final = b"\x89MCAP0\r\n"
+MAGIC: Final = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
+# Stands behind the last record of a file that was cut; no record has it.
+_CUT = 0
 # What precedes the body of a message.
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _NONE: Final = np.zeros(0, np.int64)
+
+
+# Times (n,), sequence numbers, and for each topic its n messages; those of one time follow one another.
+_Group = tuple[NDArray[np.int64], ArrayLike, Mapping[str, ros2.Messages]]
 
 
 class McapFile(GrowingFile):
@@ -97,7 +103,7 @@ class McapFile(GrowingFile):
             schema = _SCHEMAS[topic]
             self._channels.append(Schema(data=schema.text.encode(), encoding="ros2msg", id=number, name=schema.name))
             self._channels.append(Channel(number, topic, "cdr", {}, number))
-        self._add(_MAGIC + _bytes(Start("ros2", f"ftdrive {__version__}"), *self._channels))
+        self._add(MAGIC + _bytes(Start("ros2", f"ftdrive {__version__}"), *self._channels))
         self._attachments: list[McapRecord] = []
         document = header.to_dict()
         for name, content in (("calibration.json", document.pop("calibration")), ("recording.json", document)):
@@ -119,9 +125,9 @@ class McapFile(GrowingFile):
 
         for event in events:
             self._header = changed(self._header, event)
-        content, tables = self._messages(rows, events)
-        if not tables:
+        if not len(rows) and not events:
             return
+        content, tables = self._messages([*self._groups(rows, events)])
         first_ns = min(int(table[:, 0].min()) for table in tables.values())
         last_ns = max(int(table[:, 0].max()) for table in tables.values())
         packed = compress(content, ZSTD_LEVEL)
@@ -130,6 +136,7 @@ class McapFile(GrowingFile):
         for number, table in tables.items():
             places[number] = self.size + len(chunk) + len(indexes)
             indexes += struct.pack("<BQHI", _INDEX, 6 + table.nbytes, number, table.nbytes) + table.tobytes()
+            self._counts[number] += len(table)
         index = ChunkIndex(
             chunk_length=len(chunk),
             chunk_start_offset=self._add(chunk + indexes),
@@ -143,51 +150,41 @@ class McapFile(GrowingFile):
         )
         self._chunks.append(index)
         self._first_ns, self._last_ns = min(first_ns, self._first_ns), max(last_ns, self._last_ns)
-        for number, table in tables.items():
-            self._counts[number] += len(table)
         self.samples += len(rows)
 
-    def _messages(self, rows: Rows, events: Sequence[StreamEvent]) -> tuple[memoryview, dict[int, NDArray[np.uint64]]]:
-        """Return the messages of a chunk, until the next call; for each channel (n, 2) times and places in it."""
+    def _groups(self, rows: Rows, events: Sequence[StreamEvent]) -> Iterator[_Group]:
         offset_ns = self._header.info.utc_offset_ns
-        content, tables = list[NDArray[np.uint8]](), {}
-        size = 0
         if len(rows):
             t_ns = rows["t_host_ns"] + offset_ns
-            bodies = _bodies(rows, t_ns, self._header.frame.id)
-            width = sum(_HEAD.itemsize + body.itemsize for body in bodies.values())
-            samples, start = self._room(width * len(rows)).reshape(len(rows), width), 0
+            yield t_ns, rows["seq"], _bodies(rows, t_ns, self._header.frame.id)
+            some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
+            yield t_ns[some], 0, {ros2.TRANSFORMS: self._transforms(rows[some], t_ns[some])}
+        log = partial(_log, offset_ns=offset_ns)
+        for topic, kind, pack in ((EVENTS, "", log), (LOAD, "load", _load), (TRACKED, "tracked", _tracked)):
+            for event in events:
+                if kind in ("", event.kind):
+                    packed = ros2.ENCODING + pack(event)
+                    yield np.array([event.t_host_ns + offset_ns]), 0, {topic: np.frombuffer(packed, f"V{len(packed)}")}
+
+    def _messages(self, groups: Sequence[_Group]) -> tuple[memoryview, dict[int, NDArray[np.uint64]]]:
+        """Return the messages of a chunk, until the next call; for each channel (n, 2) times and places in it."""
+        widths = [sum(_HEAD.itemsize + body.itemsize for body in bodies.values()) for *_, bodies in groups]
+        messages = self._room(sum(len(t_ns) * width for (t_ns, *_), width in zip(groups, widths, strict=True)))
+        tables, place = defaultdict(list), 0
+        for (t_ns, sequence, bodies), width in zip(groups, widths, strict=True):
+            n, start = len(t_ns), 0
+            records = messages[place : place + n * width].reshape(n, width)
             for topic, body in bodies.items():
                 end = start + _HEAD.itemsize + body.itemsize
-                _fill(samples[:, start:end], _CHANNELS[topic], t_ns, rows["seq"], body)
-                tables[_CHANNELS[topic]] = _table(t_ns, start + width * np.arange(len(rows)))
+                fields = records[:, start:end].view([*_HEAD.descr, ("body", body.dtype)])[:, 0]
+                fields["opcode"], fields["length"] = _MESSAGE, _HEAD.itemsize - 9 + body.itemsize
+                fields["channel"], fields["sequence"] = _CHANNELS[topic], np.bitwise_and(sequence, 0xFFFFFFFF)
+                fields["log"] = fields["publish"] = t_ns
+                fields["body"] = body
+                tables[_CHANNELS[topic]].append(np.stack([t_ns, place + start + width * np.arange(n)], axis=1))
                 start = end
-            some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
-            placed = _records(_CHANNELS[ros2.TRANSFORMS], t_ns[some], self._transforms(rows[some], t_ns[some]))
-            places = samples.size + placed.shape[1] * np.arange(len(some))
-            tables[_CHANNELS[ros2.TRANSFORMS]] = _table(t_ns[some], places)
-            content, size = [placed], samples.size + placed.size
-        if events:
-            times = np.array([event.t_host_ns for event in events]) + offset_ns
-            logs = [_records(_CHANNELS[EVENTS], t, _log(event, int(t))) for t, event in zip(times, events, strict=True)]
-            places = size + np.cumsum([0, *(log.size for log in logs)])
-            tables[_CHANNELS[EVENTS]] = _table(times, places[:-1])
-            content += logs
-            size += sum(log.size for log in logs)
-            for topic, kind, pack in ((LOAD, "load", _load), (TRACKED, "tracked", _tracked)):
-                chosen = [event for event in events if event.kind == kind]
-                if not chosen:
-                    continue
-                times = np.array([event.t_host_ns for event in chosen]) + offset_ns
-                packed = _records(_CHANNELS[topic], times, np.array([pack(event) for event in chosen]))
-                tables[_CHANNELS[topic]] = _table(times, size + packed.shape[1] * np.arange(len(chosen)))
-                content.append(packed)
-                size += packed.size
-        messages, place = self._room(size), size - sum(part.size for part in content)
-        for part in content:
-            messages[place : place + part.size] = part.ravel()
-            place += part.size
-        return messages.data, tables
+            place += n * width
+        return messages.data, {number: np.concatenate(parts).astype("<u8") for number, parts in tables.items()}
 
     def _room(self, size: int) -> NDArray[np.uint8]:
         """Return the first bytes of memory that stays: new one for each chunk takes a third of the time."""
@@ -196,15 +193,10 @@ class McapFile(GrowingFile):
         return self._memory[:size]
 
     def _transforms(self, rows: Rows, t_ns: NDArray[np.int64]) -> NDArray[np.void]:
-        """Pack the frames that the messages name: flange in base, and the others in flange."""
-        R_base_flange = matrices(rows["quaternion_base_flange"])
-        frames = frames_in_flange(self._header.frame, self._header.info, R_base_flange)
-        placed = [("base", "flange", np.nan_to_num(rows["p_base_flange_m"]), R_base_flange)]
-        placed += [("flange", name, p_m, R) for name, (R, p_m) in frames.items()]
-        return ros2.pack_transforms(t_ns, placed)
+        place = matrices(rows["quaternion_base_flange"]), rows["p_base_flange_m"]
+        return ros2.pack_transforms(t_ns, ros2.transforms_of(self._header.frame, self._header.info, *place))
 
-    def complete(self) -> None:
-        """Write the summary and give the file its name. Raises `OSError`."""
+    def _write_end(self) -> None:
         from mcap.records import DataEnd, Footer, Statistics
 
         statistics = Statistics(
@@ -221,9 +213,7 @@ class McapFile(GrowingFile):
         end = _bytes(DataEnd(self._crc))
         summary = _bytes(*self._channels, statistics, *self._attachments, *self._chunks)
         footer = _bytes(Footer(summary_start=self.size + len(end), summary_offset_start=0, summary_crc=0))
-        with self:
-            self.add(end + summary + footer + _MAGIC)
-            super().complete()
+        self.add(end + summary + footer + MAGIC)
 
 
 def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:
@@ -231,61 +221,38 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
     sample["encoding"] = np.void(ros2.ENCODING)
     for name, _ in _SAMPLE:
         sample[name] = rows[name]
-    pose = np.hstack([rows["p_base_flange_m"], rows["quaternion_base_flange"]])
     return {
         ros2.RAW: ros2.pack_wrenches(t_ns, rows["raw"], "sensor"),
         ros2.COMPENSATED: ros2.pack_wrenches(t_ns, rows["wrench"], frame),
-        ros2.POSE: ros2.pack_pose_numbers(t_ns, pose),
+        ros2.POSE: ros2.pack_poses(t_ns, rows["p_base_flange_m"], rows["quaternion_base_flange"]),
         ros2.JOINTS: ros2.pack_joints(t_ns, rows["q_rad"]),
         SAMPLE: sample.view(f"V{sample.itemsize}"),
     }
 
 
-def _records(channel: int, t_ns: ArrayLike, bodies: ros2.Messages) -> NDArray[np.uint8]:
-    records = np.empty((len(bodies), _HEAD.itemsize + bodies.itemsize), np.uint8)
-    _fill(records, channel, t_ns, 0, bodies)
-    return records
-
-
-def _fill(
-    records: NDArray[np.uint8], channel: int, t_ns: ArrayLike, sequence: ArrayLike, bodies: ros2.Messages
-) -> None:
-    fields = records.view([*_HEAD.descr, ("body", bodies.dtype)])[:, 0]
-    fields["opcode"], fields["length"] = _MESSAGE, _HEAD.itemsize - 9 + bodies.itemsize
-    fields["channel"], fields["sequence"] = channel, np.bitwise_and(sequence, 0xFFFFFFFF)
-    fields["log"] = fields["publish"] = t_ns
-    fields["body"] = bodies
-
-
-def _table(t_ns: ArrayLike, places: ArrayLike) -> NDArray[np.uint64]:
-    return np.stack([t_ns, places], axis=1).astype("<u8")
-
-
-def _log(event: StreamEvent, t_ns: int) -> NDArray[np.void]:
+def _log(event: StreamEvent, offset_ns: int) -> bytes:
     """Pack an event as Log: its kind is the name, its values stand in `function` as JSON."""
-    packed = ros2.ENCODING + struct.pack("<iIB3x", *divmod(t_ns, 1_000_000_000), 30 if event.kind in _WARNINGS else 20)
+    stamp = divmod(event.t_host_ns + offset_ns, 1_000_000_000)
+    packed = struct.pack("<iIB3x", *stamp, 30 if event.kind in ros2.WARNINGS else 20)
     for text in (event.kind, event.text, "", json.dumps(dict(event.values))):
         data = text.encode() + b"\0"
         packed += struct.pack("<I", len(data)) + data + bytes(-len(data) % 4)
-    packed += struct.pack("<I", 0)
-    return np.frombuffer(packed, f"V{len(packed)}")
+    return packed + struct.pack("<I", 0)
 
 
-def _load(event: StreamEvent) -> np.void:
+def _load(event: StreamEvent) -> bytes:
     """Pack a weighing, which the events have too; what is not known is NaN."""
     values, nowhere = event.values, [np.nan] * 3
-    numbers = [values["mass_kg"], values["mass_sigma_kg"]]
-    numbers += [*(values["p_sensor_com_m"] or nowhere), *(values["p_sensor_com_sigma_m"] or nowhere)]
-    return np.void(ros2.ENCODING + struct.pack("<8d", *numbers))
+    com_m, sigma_m = values["p_sensor_com_m"] or nowhere, values["p_sensor_com_sigma_m"] or nowhere
+    return struct.pack("<8d", values["mass_kg"], values["mass_sigma_kg"], *com_m, *sigma_m)
 
 
-def _tracked(event: StreamEvent) -> np.void:
+def _tracked(event: StreamEvent) -> bytes:
     """Pack bias and part as followed; an age that is not known is infinite."""
     values = event.values
-    age_s = values["last_seen_s"]
-    numbers = [*values["bias"], *values["sigma"], values["part_kg"], values["part_sigma_kg"]]
-    numbers.append(np.inf if age_s is None else age_s)
-    return np.void(ros2.ENCODING + struct.pack("<15d?", *numbers, values["part_known"]))
+    age_s = np.inf if values["last_seen_s"] is None else values["last_seen_s"]
+    part = values["part_kg"], values["part_sigma_kg"], age_s, values["part_known"]
+    return struct.pack("<15d?", *values["bias"], *values["sigma"], *part)
 
 
 def _event(body: bytes, t_host_ns: int) -> StreamEvent:
@@ -315,32 +282,30 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
     content: _Content | None = None
     size = path.stat().st_size
     with open_file(path) as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
+        if file.read(len(MAGIC)) != MAGIC:
             raise BadRecording("the first bytes are not those of MCAP")
         try:
             for opcode, data in _data_section(file):
                 if opcode == _ATTACHMENT:
                     _add_document(data, documents)
-                elif opcode in (_CHUNK, _INDEX, _DATA_END):
-                    if content is None:
-                        content = _Content(_header(documents), columns)
-                        yield content.piece(0.0)
-                    if opcode == _INDEX:
-                        content.index(data)
-                        continue
+                if opcode not in (_CHUNK, _INDEX, _DATA_END, _CUT):
+                    continue
+                if content is None:
+                    content = _Content(_header(documents), columns)
+                    yield content.piece(0.0)
+                if opcode == _INDEX:
+                    content.indexes.append(data)
+                elif opcode == _CUT:
+                    # The last chunk of an interrupted file may lack the end of its index.
+                    with suppress(ValueError):
+                        content.close_chunk()
+                    yield content.piece(1.0)
+                else:
                     if content.close_chunk():
                         yield content.piece(file.tell() / size)
                     if opcode == _DATA_END:
                         return ""
                     content.open_chunk(data)
-            _require_no_end(file)
-            if content is None:
-                content = _Content(_header(documents), columns)
-                yield content.piece(0.0)
-            # the last chunk of an interrupted file may lack the end of its index
-            with suppress(ValueError):
-                content.close_chunk()
-            yield content.piece(1.0)
         except (MemoryError, OverflowError, TypeError, ValueError, ZstdError, struct.error) as error:
             raise BadRecording(
                 f"a record cannot be read ({error or type(error).__name__}): the file is damaged"
@@ -352,7 +317,7 @@ def _add_document(data: bytes, documents: dict[str, Any]) -> None:
     from mcap.data_stream import ReadDataStream
     from mcap.records import Attachment
 
-    _require_crc(data[:-4], data[-4:])
+    _require_crc(zlib.crc32(data[:-4]), data[-4:])
     attachment = Attachment.read(ReadDataStream(io.BytesIO(data)))
     documents[attachment.name] = parsed_json(attachment.data)
 
@@ -364,35 +329,34 @@ def _header(documents: Mapping[str, Any]) -> Header:
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Give the records of the data section that are complete; raises `ValueError` if its CRC does not fit them."""
-    crc = zlib.crc32(_MAGIC)
+    """Give the records of the data section that are complete, and `_CUT` where its end is missing.
+
+    Raises `ValueError` if its CRC does not fit them, or the file was completed without that end.
+    """
+    crc = zlib.crc32(MAGIC)
     while len(start := file.read(9)) == 9:
         opcode, length = struct.unpack("<BQ", start)
         if not opcode or length > MOST_BYTES:
             raise ValueError(f"a record of the kind {opcode} and {length} bytes")
         data = file.read(length)
         if len(data) < length:
-            return
+            break
         if opcode == _DATA_END:
             _require_crc(crc, data)
             yield opcode, data
             return
         crc = zlib.crc32(data, zlib.crc32(start, crc))
         yield opcode, data
-
-
-def _require_crc(content: bytes | int, stored: bytes) -> None:
-    """Check bytes, or their CRC-32, against the stored one; 0 is none, as other programs write."""
-    (expected,) = struct.unpack("<I", stored)
-    if expected not in (0, zlib.crc32(content) if isinstance(content, bytes) else content):
-        raise ValueError("its bytes differ from their checksum")
-
-
-def _require_no_end(file: IO[bytes]) -> None:
-    """Raise `ValueError` if a file whose data section has no end was completed."""
-    file.seek(-len(_MAGIC), io.SEEK_END)
-    if file.read() == _MAGIC:
+    file.seek(-len(MAGIC), io.SEEK_END)
+    if file.read() == MAGIC:
         raise ValueError("the end of the data is missing")
+    yield _CUT, b""
+
+
+def _require_crc(crc: int, stored: bytes) -> None:
+    """Raise `ValueError` unless a CRC-32 is the stored one; 0 is none, as other programs write."""
+    if struct.unpack("<I", stored) not in ((0,), (crc,)):
+        raise ValueError("its bytes differ from their checksum")
 
 
 class _Content:
@@ -404,7 +368,8 @@ class _Content:
         self._columns: dict[str, list[NDArray[Any]]] = {name: [] for name in ("t_host_ns", *(self._kind.names or ()))}
         self._events: list[StreamEvent] = []
         self._messages = b""
-        self._indexes: list[bytes] = []
+        self.indexes: list[bytes] = []
+        """Of the channels in the chunk; other programs may have divided the file into other chunks."""
 
     def open_chunk(self, data: bytes) -> None:
         """Unpack the messages of a chunk, and check their CRC."""
@@ -415,16 +380,12 @@ class _Content:
         stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(data))), validate_crc=True)
         self._messages = stream.read(size)
 
-    def index(self, data: bytes) -> None:
-        """Take the index of one channel in the chunk; other programs may have divided the file into other chunks."""
-        self._indexes.append(data)
-
     def close_chunk(self) -> bool:
         """Take the messages of the chunk; return whether there is one. Raises `ValueError` unless all are indexed.
 
         The CRC of a chunk covers its messages, not their indexes.
         """
-        messages, indexes, self._messages, self._indexes = self._messages, self._indexes, b"", []
+        messages, indexes, self._messages, self.indexes = self._messages, self.indexes, b"", []
         found = [_indexed(messages, index) for index in indexes]
         _require_complete(
             messages,

@@ -1,4 +1,4 @@
-"""Writers of recordings: files that grow together, a stream recorded in them, and a recording converted."""
+"""Writers of recordings: files that grow together, a stream or raw readings recorded, and a recording converted."""
 
 import signal
 import threading
@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from ftcalib.files import JSON
+from ftcalib.rounding import with_sigma
 from ftdrive.errors import BadRecording
-from ftdrive.live.samples import Block, StreamEvent, StreamInfo
 from ftdrive.recording.files import (
     RecordingFile,
     RecordingReader,
@@ -21,28 +21,17 @@ from ftdrive.recording.files import (
     require_new_recordings,
     write_recording,
 )
+from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, rows_of
+from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
+from ftdrive.stream.stream import Sink, Stream
 
 # Writing takes a few ms, in which the stream waits.
 _FLUSH_NS = 200_000_000
 
 
 class RecordingFiles:
-    """New files that grow together, each with all samples.
-
-    Parameters
-    ----------
-    paths : sequence of Path
-        The ending chooses the format: .mcap, .csv or .parquet.
-    header : Header
-
-    Raises
-    ------
-    ConfigError
-        An ending is unknown, or the package for a format is missing.
-    OSError
-        A file exists, or its folder does not.
-    """
+    """New files that grow together, each with all samples. Raises as `Recorder`."""
 
     def __init__(self, paths: Sequence[Path], header: Header) -> None:
         self.saved: list[Path] = []
@@ -59,10 +48,7 @@ class RecordingFiles:
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
         """Write samples of one frame, and the events since the samples before.
 
-        Raises
-        ------
-        OSError
-            A file cannot be written. None will be completed, and the error names what remains in which `.partial`.
+        Raises `OSError`. Then no file will be completed, and the error names what remains in which `.partial`.
         """
         with _uninterrupted():
             try:
@@ -79,10 +65,7 @@ class RecordingFiles:
     def complete(self) -> None:
         """Complete all files that hold every sample.
 
-        Raises
-        ------
-        OSError
-            A file could not be completed; the others were. It names what remains in which `.partial`.
+        Raises `OSError` if one could not be completed; the others were. It names what remains in which `.partial`.
         """
         files, self._files, failure = self._files, [], None
         with _uninterrupted():
@@ -118,35 +101,36 @@ class RecordingFiles:
         return type(error)(f"{error.strerror or error}: {kept}")
 
 
-class Recorder:
-    """Writes a stream to files, with everything since the first sample; a consumer of blocks and events.
+class Recorder(Sink):
+    """Writes a stream to new files, .mcap, .csv or .parquet by their endings, with everything since the first sample.
 
     Changes of frame and stages become events with the time of the first sample after them. Parquet cannot be read
-    before its end: `x.parquet` is recorded as `x.parquet.mcap`, and converted when the recorder is closed.
+    before its end: `x.parquet` is recorded as `x.parquet.mcap`, and converted at the end. If the stream is
+    `repeatable`, as one from a file, Parquet is written at once. `configuration` is that of the cell, for the header.
+    `duration_s` and `count` are limits of the recording, which then `is_complete`.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        New files; the ending chooses the format: .mcap, .csv or .parquet.
-    info : StreamInfo
-    configuration : mapping
-        Of the cell, for the header.
-    repeatable : bool
-        Whether the stream can be read again, as one from a file: then Parquet is written at once.
-
-    Raises
-    ------
-    ConfigError
-        An ending is unknown, or the package for a format is missing.
-    OSError
-        A file exists, or its folder does not.
+    Raises `ConfigError` for an unknown ending or a missing package, `OSError` for a file that exists or has no folder.
     """
 
+    label, keeps_all = "recording", True
+    is_complete = False
+    _stream: Stream | None = None
+
     def __init__(
-        self, paths: Sequence[Path], info: StreamInfo, configuration: Mapping[str, JSON], *, repeatable: bool = False
+        self,
+        paths: Sequence[Path],
+        info: StreamInfo,
+        configuration: Mapping[str, JSON],
+        *,
+        repeatable: bool = False,
+        duration_s: float | None = None,
+        count: int | None = None,
     ) -> None:
+        self._is_repeatable, self._duration_s, self._count = repeatable, duration_s, count
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
+        self.show: Callable[[str], object] = lambda _: None
+        """Gets in words what is done, because a conversion at the end may take a minute for each hour of samples."""
         require_new_recordings(paths)
         self._info, self._configuration = info, configuration
         self._grown = {path if repeatable else grown_as(path): path for path in paths}
@@ -175,45 +159,45 @@ class Recorder:
         """Mean rate of all samples; 0 if there is only one."""
         return (self.samples - 1) / self.duration_s if self.duration_s else 0.0
 
-    def write(self, block: Block) -> None:
-        """Record samples.
+    def begin(self, stream: Stream) -> None:
+        """Remember the stream, whose delay is recorded at the end; a recording has its own events."""
+        self._stream = None if self._is_repeatable else stream
 
-        Raises
-        ------
-        OSError
-            A file cannot be written. None will be completed, and the error names what remains in which `.partial`.
-        """
-        if not len(block):
-            return
-        self._follow(block)
-        self._blocks.append(block)
-        self.samples += len(block)
-        self.last_ns = int(block.t_host_ns[-1])
-        if self.last_ns - self._blocks[0].t_host_ns[0] >= _FLUSH_NS:
-            self._flush()
-
-    def event(self, event: StreamEvent) -> None:
-        """Record an event of the stream."""
-        if event.kind == "gap":
-            self.gaps += 1
-            self.lost += int(event.values.get("lost", 0))
+    def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
+        """Record what is within the limits. Raises as `RecordingFiles.append`."""
+        if block:
+            left = len(block) if self._count is None else self._count - self.samples
+            if self._duration_s is not None:
+                end_ns = (self.first_ns or int(block.t_host_ns[0])) + round(self._duration_s * 1e9)
+                left = min(left, int(np.searchsorted(block.t_host_ns, end_ns)))
+            if left < len(block):
+                events = [event for event in events if event.t_host_ns < block.t_host_ns[left]]
+                block = block.rows(slice(left))
+                self.is_complete = True
+        for event in events:
+            if event.kind == "gap":
+                self.gaps += 1
+                self.lost += int(event.values.get("lost", 0))
         # `_follow` finds the first sample of each
-        if event.kind not in ("frame", "stages"):
-            self._events.append(event)
+        self._events += [event for event in events if event.kind not in ("frame", "stages")]
+        if block:
+            self._follow(block)
+            self._blocks.append(block)
+            self.samples += len(block)
+            self.last_ns = int(block.t_host_ns[-1])
+            if self.last_ns - self._blocks[0].t_host_ns[0] >= _FLUSH_NS:
+                self._flush()
+            self.show(f"{self.duration_s:.1f} s, {self.samples} samples, gaps: {self.gaps}")
+            self.is_complete |= self.samples == self._count
 
-    def close(self, show: Callable[[str], object] = lambda _: None) -> None:
-        """Complete all files that hold every sample; without a sample there is none.
-
-        Parameters
-        ----------
-        show : callable
-            Gets in words what is done, because a conversion may take a minute for each hour of samples.
-
-        Raises
-        ------
-        OSError
-            A file could not be completed; the others were. It names what remains in which file.
-        """
+    def end(self) -> None:
+        """Complete the files; without a sample there is none. Raises as `RecordingFiles.complete`."""
+        if self._stream is not None:
+            status = self._stream.status()
+            values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
+            delay_ms = with_sigma(1e3 * status.delay_s, 1e3 * status.delay_sigma_s)
+            text = f"the wrench is {delay_ms} ms (1 sigma) after the pose"
+            self._events.append(StreamEvent(self.last_ns, "delay", text, values))
         self._flush()
         if self._files:
             try:
@@ -221,7 +205,7 @@ class Recorder:
             finally:
                 for grown, path in self._grown.items():
                     if grown != path and grown in self._files.saved:
-                        show(f"Converting to {path}")
+                        self.show(f"Converting to {path}")
                         self._convert(self._files, grown, path)
 
     def _convert(self, files: RecordingFiles, grown: Path, path: Path) -> None:
@@ -269,32 +253,40 @@ class Recorder:
             self._files.append(rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW), events)
 
 
+_RAW_ROW: Final = "{:.6f}," + ",".join(["{:.7g}"] * 6) + "\n"
+
+
+class RawTable(Sink):
+    """A new .csv: time in UTC seconds, then the raw wrench in N and N·m, sensor axes, about the sensor origin.
+
+    A tare is not subtracted. A text table has no place for events. Raises as `GrowingFile`.
+    """
+
+    label, keeps_all = "recording", True
+
+    def __init__(self, path: Path, info: StreamInfo) -> None:
+        self._utc_offset_ns = info.utc_offset_ns
+        self._file = GrowingFile(path)
+        self._file.add(b"t,fx,fy,fz,tx,ty,tz\n")
+
+    def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
+        """Write samples."""
+        if block:
+            rows = np.column_stack([(block.t_host_ns + self._utc_offset_ns) * 1e-9, block.raw])
+            self._file.add("".join(_RAW_ROW.format(*row) for row in rows).encode())
+
+    def end(self) -> None:
+        """Complete the file."""
+        self._file.complete()
+
+
 def converted(
     reader: RecordingReader, target: Path, show: Callable[[str], object] = lambda _: None
 ) -> tuple[dict[str, Any], BaseException | None]:
-    """Write a recording of any length as a new file, in blocks.
+    """Write a recording of any length as a new file, and return samples, duration_s and gaps.
 
-    Parameters
-    ----------
-    reader : RecordingReader
-    target : Path
-        Its ending names the format.
-    show : callable
-        Gets in words how much is done.
-
-    Returns
-    -------
-    numbers : dict
-        samples, duration_s, gaps.
-    failure : exception or None
-        A file that is damaged and Ctrl-C end the recording behind the last valid piece.
-
-    Raises
-    ------
-    BadRecording
-        The first piece is damaged.
-    OSError
-        The file cannot be written; the error names what was kept.
+    Damage and Ctrl-C end the file behind the last valid piece, and are returned too. Raises `BadRecording` if the first
+    piece is damaged, and `OSError` as `RecordingFiles`. `show` gets in words how much is done.
     """
     files = RecordingFiles([target], reader.header)
     failure: BaseException | None = None

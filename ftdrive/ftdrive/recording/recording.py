@@ -6,7 +6,7 @@ The pose is stored as a quaternion, so that all formats hold the same bits.
 import json
 from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import MISSING, asdict, dataclass, field, fields, replace
 from itertools import accumulate, pairwise
 from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 
@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult, notebook
 from ftcalib.display import Displayed, Row, Summary
-from ftcalib.errors import BadCalibration
+from ftcalib.errors import BadCalibration, DataError
 from ftcalib.files import JSON, check_format, parsed_json
 from ftcalib.rounding import counted
 from ftdrive.errors import BadRecording
-from ftdrive.live.samples import (
+from ftdrive.runs.verification import VerificationRecord
+from ftdrive.stream.samples import (
     Block,
     Paired,
     Stages,
@@ -30,7 +31,6 @@ from ftdrive.live.samples import (
     quaternions,
     sensor_origin_m,
 )
-from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.interfaces import DeviceInfo, Fact
 
 T = TypeVar("T")
@@ -61,26 +61,29 @@ ROW: Final = np.dtype(
     [(name, kind, (len(names),)) if names else (name, kind) for name, (kind, names) in _GROUPS.items()]
 )
 """One sample, fields as in `Block`; the quaternion is x, y, z, w."""
+NEEDED: Final = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
+"""Columns without which there is no compensation."""
 NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
 """The columns of the table formats, by the field of `ROW` that holds them."""
-COLUMNS: Final = np.dtype([(one, kind) for name, (kind, _) in _GROUPS.items() for one in NUMBERS[name]])
-"""Layout of the bytes of `ROW` with one field a number."""
+
+
+def numbers_in(kind: np.dtype[Any]) -> np.dtype[Any]:
+    """Return the layout of the bytes of `ROW`, or of some of its fields, with one field a number."""
+    return np.dtype([(one, kind[name].base) for name in kind.names or () for one in NUMBERS[name]])
+
+
+COLUMNS: Final = numbers_in(ROW)
+"""The columns of the table formats."""
 
 
 def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
-    """Return the columns of the table formats: times for other programs, then those of `COLUMNS`.
+    """Return the columns of the table formats: times for other programs, then the numbers of the rows.
 
-    Parameters
-    ----------
-    rows : array, shape (n,)
-    start_ns : int
-        `t_host_ns` of the first sample of the recording.
-    utc_offset_ns : int
-        As in `StreamInfo`.
+    `start_ns` is `t_host_ns` of the first sample of the recording.
     """
-    t_ns, numbers = rows["t_host_ns"], rows.view(COLUMNS)
+    t_ns, numbers = rows["t_host_ns"], rows.view(numbers_in(rows.dtype))
     times = {"t_s": (t_ns - start_ns) * 1e-9, "t_utc_s": (t_ns + utc_offset_ns) * 1e-9}
-    return times | {name: numbers[name] for name in COLUMNS.names or ()}
+    return times | {name: numbers[name] for name in numbers.dtype.names or ()}
 
 
 def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
@@ -103,13 +106,13 @@ def rows_of(samples: Block | Paired) -> Rows:
     return rows
 
 
-def _paired_of(*parts: Rows) -> Paired:
+def _paired_of(rows: Rows) -> Paired:
     """Return samples as measured, each with its pose; columns that were not read are 0."""
 
     def column(name: str) -> NDArray[Any]:
-        if name in (parts[0].dtype.names or ()):
-            return np.concatenate([rows[name] for rows in parts])
-        return np.zeros((sum(map(len, parts)), *ROW[name].shape), ROW[name].base)
+        if name in (rows.dtype.names or ()):
+            return np.ascontiguousarray(rows[name])
+        return np.zeros((len(rows), *ROW[name].shape), ROW[name].base)
 
     names = [item.name for item in fields(Paired) if item.name != "R_base_flange"]
     return Paired(R_base_flange=matrices(column("quaternion_base_flange")), **{name: column(name) for name in names})
@@ -139,9 +142,12 @@ class Header:
         """Return the header as JSON; numbers that are not finite are null."""
         info = self.info
         values: dict[str, Any] = {item.name: getattr(info, item.name) for item in fields(StreamInfo)}
-        values |= {name: _finite(values[name]) for name in _ARRAYS}
+        for name in _ARRAYS:
+            if (value := values[name]) is not None:
+                values[name] = np.asarray(np.where(np.isfinite(value), value, None)).tolist()
         values |= {"arm": asdict(info.arm), "sensor": asdict(info.sensor), "versions": dict(info.versions)}
         values["calibration"] = info.calibration.to_dict()
+        del values["result"]
         values["verification"] = None if info.verification is None else info.verification.to_dict()
         frame, stages = self.frame.to_dict(), asdict(self.stages)
         return {"format": FORMAT, **values, "frame": frame, "stages": stages, "configuration": dict(self.configuration)}
@@ -151,27 +157,24 @@ class Header:
         """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            # fields that files of earlier versions lack
-            newer = {"foreign": False}
-            values = {item.name: {**newer, **document}[item.name] for item in fields(StreamInfo)}
-            values |= {name: np.array(values[name], np.float64) for name in _ARRAYS}
+            # files of earlier versions lack fields that have defaults
+            newer = {item.name: item.default for item in fields(StreamInfo) if item.default is not MISSING}
+            known = {**newer, "result": None, **document}
+            values = {item.name: known[item.name] for item in fields(StreamInfo)}
+            values |= {name: np.array(values[name], np.float64) for name in _ARRAYS if values[name] is not None}
             values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
-            values["calibration"] = CalibrationResult.from_dict(values["calibration"])
+            values["result"] = CalibrationResult.from_dict(document["calibration"])
             if values["verification"] is not None:
                 values["verification"] = VerificationRecord.from_dict(values["verification"])
-            stages = {item.name: document["stages"][item.name] for item in fields(Stages)}
-            return cls(StreamInfo(**values), frame_of(document["frame"]), Stages(**stages), document["configuration"])
+            frame, stages = frame_of(document["frame"]), _stages_of(document["stages"])
+            return cls(StreamInfo(**values), frame, stages, document["configuration"])
         except KeyError as error:
             raise BadRecording(f"the header lacks the field {error.args[0]}: the file is damaged") from error
         except (BadCalibration, TypeError, ValueError) as error:
             raise BadRecording(f"the header cannot be read ({error}): the file is damaged") from error
 
 
-_ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m")
-
-
-def _finite(value: NDArray[np.float64]) -> JSON:
-    return np.where(np.isfinite(value), value, None).tolist()  # type: ignore[call-overload]  # None makes it an object
+_ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m", "hour_change")
 
 
 def _device(document: Mapping[str, Any]) -> DeviceInfo:
@@ -186,6 +189,15 @@ def frame_of(values: Mapping[str, Any]) -> WrenchFrame:
     """Build a frame from `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
+
+
+def _stages_of(values: Mapping[str, Any]) -> Stages:
+    """Build stages from a header or an event. One that is not named there did not exist yet, so it was off."""
+    usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
+    off = {name: None if value is None else type(value)() for name, value in usual.items()}
+    if newer := [name for name, value in dict(values).items() if value and name not in off]:
+        raise BadRecording(f"the stage {newer[0]} was on, which this version does not have: use a newer ftdrive")
+    return Stages(**{name: values.get(name, value) for name, value in off.items()})
 
 
 def event_text(event: StreamEvent) -> str:
@@ -212,6 +224,10 @@ class Piece(NamedTuple):
     """Since the piece before."""
     share: float
     """Share of the recording up to the end of this piece, 0 to 1."""
+
+    def measured(self) -> "Measured":
+        """Return the samples as measured."""
+        return Measured(_paired_of(self.rows), self.events, self.share)
 
 
 class Measured(NamedTuple):
@@ -240,7 +256,7 @@ class Source(Protocol):
 
 def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
     """Return a header with another calibration."""
-    info = replace(header.info, calibration=calibration, calibration_name=name, verification=None, calibration_state="")
+    info = replace(header.info, result=calibration, calibration_name=name, verification=None, calibration_state="")
     if not np.isfinite(info.p_flange_sensor_m).all():
         info = replace(info, p_flange_sensor_m=sensor_origin_m(None, calibration))
     return replace(header, info=info)
@@ -262,7 +278,7 @@ class Recording(Displayed):
     @property
     def table(self) -> NDArray[np.void]:
         """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
-        return self.rows.view([(one, COLUMNS[one]) for name in self.rows.dtype.names or () for one in NUMBERS[name]])
+        return self.rows.view(numbers_in(self.rows.dtype))
 
     def to_frame(self) -> Any:
         """Return the samples as a DataFrame of pandas, else of Polars.
@@ -277,12 +293,10 @@ class Recording(Displayed):
         UsageError
             Neither package is installed.
         """
-        columns = {name: self.table[name] for name in self.table.dtype.names or ()}
-        if "t_host_ns" in columns and len(self.rows):
-            t_ns = columns["t_host_ns"]
-            times = {"t_s": (t_ns - t_ns[0]) * 1e-9, "t_utc_s": (t_ns + self.header.info.utc_offset_ns) * 1e-9}
-            columns = times | columns
-        return notebook.frame_of(columns)
+        if "t_host_ns" in (self.rows.dtype.names or ()) and len(self.rows):
+            start_ns = int(self.rows["t_host_ns"][0])
+            return notebook.frame_of(table_of(self.rows, start_ns, self.header.info.utc_offset_ns))
+        return notebook.frame_of({name: self.table[name] for name in self.table.dtype.names or ()})
 
     def _summary(self) -> Summary:
         info = self.header.info
@@ -323,14 +337,14 @@ class Recording(Displayed):
 
     def blocks(self) -> Iterator[Measured]:
         """Give the samples as measured, in blocks."""
-        return measured(self.pieces())
+        return in_blocks(piece.measured() for piece in self.pieces())
 
 
 def changed(header: Header, event: StreamEvent) -> Header:
-    """Return the header that holds after an event."""
+    """Return the header that holds after an event. Raises `BadRecording` for a stage of a newer version."""
     if event.kind == "frame":
         return replace(header, frame=frame_of(event.values))
-    return replace(header, stages=Stages(**event.values)) if event.kind == "stages" else header
+    return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 
 def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
@@ -357,23 +371,22 @@ def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
             yield item
 
 
-def measured(pieces: Iterable[Piece]) -> Iterator[Measured]:
-    """Give samples as measured in blocks of `PIECE_ROWS`, however they are stored, up to an error."""
-    waiting, count, events, share, failure = list[Rows](), 0, list[StreamEvent](), 0.0, None
+def in_blocks(parts: Iterable[Measured]) -> Iterator[Measured]:
+    """Give samples in blocks of `PIECE_ROWS`, however they come, up to an error."""
+    waiting, count, events, share, failure = list[Paired](), 0, list[StreamEvent](), 0.0, None
     try:
-        for piece in pieces:
-            rows = piece.rows
-            events += piece.events
-            share = piece.share
-            while count + len(rows) >= PIECE_ROWS:
+        for part in parts:
+            samples, share = part.samples, part.share
+            events += part.events
+            while count + len(samples) >= PIECE_ROWS:
                 here = PIECE_ROWS - count
-                yield Measured(_paired_of(*waiting, rows[:here]), events, share)
-                waiting, count, events, rows = [], 0, [], rows[here:]
-            waiting.append(rows)
-            count += len(rows)
-    except BadRecording as error:
+                yield Measured(Paired.concatenate([*waiting, samples.rows(slice(here))]), events, share)
+                waiting, count, events, samples = [], 0, [], samples.rows(slice(here, None))
+            waiting.append(samples)
+            count += len(samples)
+    except DataError as error:
         failure = error
     if events or count:
-        yield Measured(_paired_of(*waiting), events, share)
+        yield Measured(Paired.concatenate(waiting), events, share)
     if failure is not None:
         raise failure

@@ -1,7 +1,7 @@
 """The stream for Foxglove, Lichtblick and PlotJuggler: one WebSocket server, its parameters and its scene.
 
-Wrenches, poses and joint angles are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no other
-encoding. Frames, arrows and events are Foxglove's own. A program can tare, and set frame and stages. A page in a
+Wrenches, poses, joint angles and frames are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no
+other encoding. Arrows and events are Foxglove's own. A program can tare, and set frame and stages. A page in a
 browser is served from a short list of origins, and can do so if control is allowed: see `http_gate`.
 """
 
@@ -13,7 +13,7 @@ import stat
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import asdict
-from math import isfinite
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlencode
@@ -21,22 +21,12 @@ from urllib.parse import urlencode
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
-from ftdrive.http_gate import PassingGate, hidden_host
-from ftdrive.live import ros2
-from ftdrive.live.samples import (
-    Block,
-    Picked,
-    Stages,
-    StreamEvent,
-    StreamInfo,
-    WrenchFrame,
-    frames_in_flange,
-    quaternions,
-)
-from ftdrive.live.stream import ProcessedStream
-from ftdrive.servers.parameters import checked_value
+from ftdrive.servers.http_gate import PassingGate, hidden_host
+from ftdrive.servers.parameters import change, parameters_of, with_changes
+from ftdrive.stream import ros2
+from ftdrive.stream.samples import Block, Picked, StreamEvent, quaternions
+from ftdrive.stream.stream import Sink, Stream
 from ftdrivers.installation import missing_extra
 from ftdrivers.interfaces import Array
 
@@ -45,79 +35,52 @@ try:
 except ImportError:
     raise ConfigError(missing_extra("a server", "foxglove-sdk", "stream")) from None
 
-from foxglove import Channel, Context, MessageSchema, Parameter, Schema, Service, ServiceRequest, ServiceSchema
-from foxglove.channels import FrameTransformsChannel, LogChannel, SceneUpdateChannel
-from foxglove.messages import (
-    ArrowPrimitive,
-    Color,
-    FrameTransform,
-    FrameTransforms,
-    Log,
-    LogLevel,
-    Pose,
-    Quaternion,
-    SceneEntity,
-    SceneUpdate,
-    Timestamp,
-    Vector3,
+from foxglove import (
+    Channel,
+    Context,
+    MessageSchema,
+    Parameter,
+    Schema,
+    Service,
+    ServiceRequest,
+    ServiceSchema,
+    messages,
 )
+from foxglove.channels import LogChannel, SceneUpdateChannel
 from foxglove.websocket import Capability, Client, ServerListener, StatusLevel
 
 FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
 """Lengths of the arrows: 10 N and 1 N·m are 100 mm."""
-_ORANGE, _BLUE = Color(r=1.0, g=0.5, b=0.0, a=1.0), Color(r=0.1, g=0.4, b=1.0, a=1.0)
+_ORANGE, _BLUE = messages.Color(r=1.0, g=0.5, b=0.0, a=1.0), messages.Color(r=0.1, g=0.4, b=1.0, a=1.0)
 _HEAD_M = 0.02
 
 
-def _stamp(t_utc_ns: int) -> Timestamp:
-    return Timestamp(*divmod(t_utc_ns, 1_000_000_000))
+def _stamp(t_utc_ns: int) -> messages.Timestamp:
+    return messages.Timestamp(*divmod(t_utc_ns, 1_000_000_000))
 
 
-def _transforms(block: Block, info: StreamInfo, t_utc_ns: int) -> FrameTransforms:
-    """Return the frames of the last sample of a block: flange in base; sensor, tcp and the wrench's frame in flange."""
-    R_base_flange = block.R_base_flange[-1]
-    frames = frames_in_flange(block.frame, info, R_base_flange)
-    return FrameTransforms(
-        transforms=[
-            _transform("base", "flange", R_base_flange, block.p_base_flange_m[-1], t_utc_ns),
-            *(_transform("flange", name, R, p, t_utc_ns) for name, (R, p) in frames.items()),
-        ]
-    )
-
-
-def _transform(parent: str, child: str, R: Array, p_m: Array, t_utc_ns: int) -> FrameTransform:
-    x, y, z = np.nan_to_num(p_m).tolist()
-    return FrameTransform(
-        timestamp=_stamp(t_utc_ns),
-        parent_frame_id=parent,
-        child_frame_id=child,
-        translation=Vector3(x=x, y=y, z=z),
-        rotation=Quaternion(**dict(zip("xyzw", quaternions(R[None])[0].tolist(), strict=True))),
-    )
-
-
-def _arrows(block: Block, t_utc_ns: int) -> SceneUpdate:
+def _arrows(block: Block, t_utc_ns: int) -> messages.SceneUpdate:
     """Return force (orange) and torque (blue) of the last sample, in the frame of the wrench, from its point."""
     force_N, torque_Nm = block.wrench[-1, :3], block.wrench[-1, 3:]
-    entity = SceneEntity(
+    entity = messages.SceneEntity(
         timestamp=_stamp(t_utc_ns),
         frame_id=block.frame.id,
         id="wrench",
         frame_locked=True,
         arrows=[_arrow(FORCE_M_N * force_N, _ORANGE), _arrow(TORQUE_M_NM * torque_Nm, _BLUE)],
     )
-    return SceneUpdate(entities=[entity])
+    return messages.SceneUpdate(entities=[entity])
 
 
-def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:
+def _arrow(vector_m: Array, color: messages.Color) -> messages.ArrowPrimitive:
     length_m = float(np.linalg.norm(vector_m))
     # An arrow points along x. Half a turn about the bisector of x and a direction swaps the two.
     bisector = np.array([1.0, 0.0, 0.0]) + (vector_m / length_m if length_m > 0 else 0.0)
     half_turn = bisector / norm if (norm := np.linalg.norm(bisector)) > 1e-9 else np.array([0.0, 0.0, 1.0])
-    orientation = Quaternion(**dict(zip("xyz", half_turn.tolist(), strict=True)), w=0.0)
+    orientation = messages.Quaternion(**dict(zip("xyz", half_turn.tolist(), strict=True)), w=0.0)
     head_m = min(_HEAD_M, length_m / 2)
-    return ArrowPrimitive(
-        pose=Pose(position=Vector3(), orientation=orientation),
+    return messages.ArrowPrimitive(
+        pose=messages.Pose(position=messages.Vector3(), orientation=orientation),
         shaft_length=length_m - head_m,
         shaft_diameter=0.4 * _HEAD_M,
         head_length=head_m,
@@ -126,48 +89,7 @@ def _arrow(vector_m: Array, color: Color) -> ArrowPrimitive:
     )
 
 
-class _Parameters(ServerListener):
-    """Lets clients read and set `axes`, `about` and each stage. Called in threads of the SDK.
-
-    Parameters
-    ----------
-    stream : ProcessedStream
-    warn : callable
-        Receives the reason when a value is rejected; the parameters keep their values then.
-    """
-
-    def __init__(self, stream: ProcessedStream, warn: Callable[[str], None]) -> None:
-        self._stream = stream
-        self._warn = warn
-
-    def on_get_parameters(
-        self, _client: Client, param_names: list[str], _request: str | None = None
-    ) -> list[Parameter]:
-        """Return those named; all if there are no names."""
-        frame, stages = self._stream.frame, asdict(self._stream.stages)
-        values: dict[str, JSON] = {
-            **frame.to_dict(),
-            # A parameter cannot be None: a filter that is off has 0 Hz.
-            **{name: 0.0 if value is None else value for name, value in stages.items()},
-        }
-        return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
-
-    def on_set_parameters(
-        self, client: Client, parameters: list[Parameter], _request: str | None = None
-    ) -> list[Parameter]:
-        """Set them; return all as they are then."""
-        frame, stages = asdict(self._stream.frame), asdict(self._stream.stages)
-        try:
-            for parameter in parameters:
-                group = frame if parameter.name in frame else stages
-                group[parameter.name] = checked_value(parameter.name, parameter.get_value())
-            self._stream.frame, self._stream.stages = WrenchFrame(**frame), Stages(**stages)
-        except ConfigError as error:
-            self._warn(str(error))
-        return self.on_get_parameters(client, [])
-
-
-TRANSFORMS, ARROWS, EVENTS, STATUS = "/tf", "/wrench_arrows", "/events", "/stream_status"
+ARROWS, EVENTS, STATUS = "/wrench_arrows", "/events", "/stream_status"
 
 VIEWERS: Final = (
     "https://app.foxglove.dev",
@@ -185,12 +107,10 @@ STATUS_HZ = 2.0
 BACKLOG = 1 << 15
 """Messages kept for a client that falls behind: two seconds at 7 kHz. Then the oldest are dropped."""
 
-_WARNINGS = ("tare-refused", "drift", "gap", "stale")
-
 _log = logging.getLogger(__name__)
 
 
-class FoxgloveServer:
+class FoxgloveServer(Sink, ServerListener):
     """Sends a stream to any number of clients.
 
     No client delays the stream. Messages wait in a queue for each client; the SDK drops the oldest when it is full and
@@ -214,9 +134,11 @@ class FoxgloveServer:
         The address cannot be used.
     """
 
+    label = "Foxglove"
+
     def __init__(
         self,
-        stream: ProcessedStream,
+        stream: Stream,
         host: str = "127.0.0.1",
         port: int = 8765,
         *,
@@ -234,17 +156,14 @@ class FoxgloveServer:
                 schema=Schema(name=schema.name, encoding="ros2msg", data=schema.text.encode()),
                 context=context,
             ).base  # checks no types, 15 000 times a second
-            for topic, schema in ros2.SCHEMAS.items()
+            for topic, schema in (ros2.SCHEMAS | {ros2.TRANSFORMS: ros2.TRANSFORMS_SCHEMA}).items()
         } | {
-            TRANSFORMS: FrameTransformsChannel(TRANSFORMS, context=context),
             ARROWS: SceneUpdateChannel(ARROWS, context=context),
             EVENTS: LogChannel(EVENTS, context=context),
             STATUS: Channel(STATUS, message_encoding="json", context=context).base,
         }
         self._sent = dict.fromkeys(self._channels, 0)
         self._arm, self._scene, self._status = Picked(self._info.arm_rate_Hz), Picked(SCENE_HZ), Picked(STATUS_HZ)
-        self._slow_clients = _SlowClients(self._with_clients)
-        sdk.set_log_level("INFO")
         behind = hidden_host()
         options: dict[str, Any] = {
             "name": f"ftdrive: {self._info.tool}, {self._info.calibration_name}",
@@ -258,7 +177,7 @@ class FoxgloveServer:
             capabilities=[Capability.Parameters, Capability.Services],
             supported_encodings=["json"],
             services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
-            server_listener=_Parameters(stream, self._warn),
+            server_listener=self,
         )
         # the SDK sees no Origin, so its rights are those of a server
         self._read_only = sdk.start_server(**options)
@@ -276,6 +195,7 @@ class FoxgloveServer:
             raise ConfigError(
                 f"the server cannot listen on {host}:{port} ({error.strerror}): choose another --port or --host"
             ) from error
+        self._slow_clients = _SlowClients(self._gate.with_clients)
 
     @property
     def port(self) -> int:
@@ -288,44 +208,43 @@ class FoxgloveServer:
         source = {"ds": "foxglove-websocket", "ds.url": f"ws://127.0.0.1:{self.port}"}
         return f"https://app.foxglove.dev?{urlencode(source)}"
 
-    def write(self, block: Block) -> None:
-        """Send a block; never waits."""
-        t_ns = block.t_host_ns + self._info.utc_offset_ns
+    def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
+        """Send samples and events; never waits."""
+        offset_ns = self._info.utc_offset_ns
+        if block:
+            self._send_block(block, block.t_host_ns + offset_ns)
+        for event in events:
+            t_ns = np.array([event.t_host_ns + offset_ns])
+            level = messages.LogLevel.Warning if event.kind in ros2.WARNINGS else messages.LogLevel.Info
+            log = messages.Log(timestamp=_stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
+            self._send(EVENTS, t_ns, partial(list, [log]))
+
+    def _send_block(self, block: Block, t_ns: NDArray[np.int64]) -> None:
         frame = block.frame.id
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
         self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
         # the poses between are interpolated
         if (rows := self._arm.rows(t_ns)).any():
             poses, t_arm_ns = block.rows(rows), t_ns[rows]
-            R, p = poses.R_base_flange, poses.p_base_flange_m
-            self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, R, p).tolist())
+            p_m, R = poses.p_base_flange_m, poses.R_base_flange
+            self._send(ros2.POSE, t_arm_ns, lambda: ros2.pack_poses(t_arm_ns, p_m, quaternions(R)).tolist())
             self._send(ros2.JOINTS, t_arm_ns, lambda: ros2.pack_joints(t_arm_ns, poses.q_rad).tolist())
         newest = t_ns[-1:]
         if self._scene.rows(newest).any():
-            self._send(TRANSFORMS, newest, lambda: [_transforms(block, self._info, int(newest[0]))])
+            self._send(ros2.TRANSFORMS, newest, lambda: self._frames(block, newest))
             self._send(ARROWS, newest, lambda: [_arrows(block, int(newest[0]))])
         if self._status.rows(newest).any():
-            self._send(STATUS, newest, lambda: [json.dumps(_without_nan(self._state())).encode()])
+            self._send(STATUS, newest, lambda: [self._state()])
 
-    def event(self, event: StreamEvent) -> None:
-        """Send an event."""
-        t_ns = np.array([event.t_host_ns + self._info.utc_offset_ns])
-        level = LogLevel.Warning if event.kind in _WARNINGS else LogLevel.Info
-        log = Log(timestamp=_stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
-        self._send(EVENTS, t_ns, lambda: [log])
-
-    def close(self) -> None:
+    def end(self) -> None:
         """Disconnect the clients."""
         self._gate.close()
         self._stop()
+        self._slow_clients.close()
 
     def _stop(self) -> None:
         for server in self._servers:
             server.stop()
-        self._slow_clients.close()
-
-    def _with_clients(self, log: str) -> str:
-        return self._gate.with_clients(log)
 
     def _send(self, topic: str, t_ns: NDArray[np.int64], pack: Callable[[], Sequence[object]]) -> None:
         channel = self._channels[topic]
@@ -334,19 +253,41 @@ class FoxgloveServer:
                 channel.log(message, log_time=t)
             self._sent[topic] += len(t_ns)
 
-    def _state(self) -> dict[str, JSON]:
-        return {
+    def _frames(self, block: Block, t_ns: NDArray[np.int64]) -> Sequence[object]:
+        placed = ros2.transforms_of(block.frame, self._info, block.R_base_flange[-1], block.p_base_flange_m[-1])
+        return list(ros2.pack_transforms(t_ns, placed).tolist())
+
+    def _state(self) -> bytes:
+        state = {
             "frame": str(self._stream.frame),
             "stages": asdict(self._stream.stages),
             "calibration": self._info.calibration_name,
             "verdict": self._info.calibration.verdict,
-            "marks": list(self._info.marks),
+            "marks": self._info.marks,
             "status": asdict(self._stream.status()),
             "sent": self._sent,
         }
+        # JSON has neither arrays nor NaN
+        text = json.dumps(state, default=np.ndarray.tolist)
+        return json.dumps(json.loads(text, parse_constant=lambda _: None)).encode()
 
-    def _warn(self, text: str) -> None:
-        self._control.publish_status(text, StatusLevel.Warning)
+    def on_get_parameters(
+        self, _client: Client, param_names: list[str], _request: str | None = None
+    ) -> list[Parameter]:
+        """Return parameters with these names; all if there are no names. Called in a thread of the SDK."""
+        values = parameters_of(self._stream.frame, self._stream.stages)
+        return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
+
+    def on_set_parameters(
+        self, client: Client, parameters: list[Parameter], _request: str | None = None
+    ) -> list[Parameter]:
+        """Set all or, with a warning, none; return all as they are then. Called in a thread of the SDK."""
+        stream, changes = self._stream, [(one.name, one.get_value()) for one in parameters]
+        try:
+            change(stream, *with_changes(stream.frame, stream.stages, changes))
+        except ConfigError as error:
+            self._control.publish_status(str(error), StatusLevel.Warning)
+        return self.on_get_parameters(client, [])
 
     def _service(self, name: str, action: Callable[[], StreamEvent]) -> Service:
         def handle(_: ServiceRequest) -> bytes:
@@ -385,6 +326,7 @@ class _SlowClients(logging.Handler):
     def __init__(self, with_clients: Callable[[str], str]) -> None:
         super().__init__(logging.INFO)
         self._with_clients = with_clients
+        sdk.set_log_level("INFO")
         logging.getLogger("foxglove").setLevel(logging.WARNING)
         self._source = logging.getLogger("foxglove.websocket.connected_client.send_lossy")
         self._source.setLevel(logging.INFO)
@@ -400,14 +342,3 @@ class _SlowClients(logging.Handler):
         """Stop."""
         self._source.removeHandler(self)
         super().close()
-
-
-def _without_nan(value: JSON) -> JSON:
-    """Return lists for arrays and None for what JSON cannot write."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not isfinite(value) else value

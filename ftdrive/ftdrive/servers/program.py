@@ -7,22 +7,19 @@ program must look at the counter and never at a number alone.
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final, Protocol, get_args
+from typing import Final, get_args
 
 import numpy as np
 
-from ftcalib.after.weighing import Weight
+from ftcalib.files import JSON
 from ftcalib.model import angle_between_vectors
-from ftdrive.live.samples import Block, StreamInfo, Tracking
-from ftdrive.live.stream import BlockReader, CompensatedStream
-from ftdrive.live.weighing import WEIGH_S, CannotWeigh, Scale, load_values
+from ftdrive.stream.samples import Block, StreamEvent, Tracking
+from ftdrive.stream.stream import Sink, Stream, pump
+from ftdrive.stream.weighing import WEIGH_S, CannotWeigh, Scale, load_values
 from ftdrivers.errors import DeviceError
-from ftdrivers.interfaces import Array
-
-if TYPE_CHECKING:
-    from ftdrive.store.weighing_log import WeighingLog
+from ftdrivers.ur.rtde import ProgramRegisters
 
 INTEGERS: Final = ("state", "code", "condition", "number", "live", "tracking")
 DOUBLES: Final = (
@@ -32,11 +29,7 @@ DOUBLES: Final = (
 )
 """What the input registers hold from the first one on, of each kind."""
 TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
-"""Further doubles where bias and part are followed."""
-TRACKINGS: Final[tuple[Tracking, ...]] = get_args(Tracking)
-"""What `tracking` counts: where it is 0, the registers of `TRACKED` are not those of the service."""
-NEVER_S: Final = -1.0
-"""Age of the last look at the bias, before the first one."""
+"""Further doubles where bias and part are followed. Where `tracking` is 0, they are not those of the service."""
 
 STALE_S: Final = 0.05
 """Without a sample for so long the wrench counts as stale."""
@@ -67,33 +60,9 @@ class Condition(IntEnum):
     FREE, CONTACT, UNKNOWN_LOAD, STALE = range(4)
 
 
-CODES: Final = {
-    "": 0,
-    "samples": 1,
-    "moving": 2,
-    "unsteady": 3,
-    "contact": 4,
-    "cable": 5,
-    "changed": 6,
-    "lifted": 7,
-    "not-empty": 8,
-    "command": 9,
-}
-"""Why a request was refused."""
-
-
-class Registers(Protocol):
-    """Registers of the controller, see `ftdrivers.ur.rtde`."""
-
-    @property
-    def request(self) -> tuple[int, int] | None:
-        """Number and command of the last request."""
-
-    def write(self, integers: list[int], doubles: list[float]) -> None:
-        """Set all inputs at once."""
-
-    def close(self) -> None:
-        """Close the connection."""
+_REASONS: Final = "samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "command"
+CODES: Final = {"": 0} | {reason: number for number, reason in enumerate(_REASONS, 1)}
+"""Why a request was refused. Programs on arms know the numbers, so a new reason goes to the end."""
 
 
 def doubles_of(track: Tracking) -> tuple[str, ...]:
@@ -101,94 +70,86 @@ def doubles_of(track: Tracking) -> tuple[str, ...]:
     return DOUBLES if track == "off" else DOUBLES + TRACKED
 
 
-class ProgramService:
+class ProgramService(Sink):
     """Answers one program.
 
     Parameters
     ----------
-    stream : CompensatedStream
+    stream : Stream
         Open, in the frame that the program gets; read here. With `stream.track` the program gets the tracked bias too.
     connect : callable
         Opens the registers, as many as `INTEGERS` and `doubles_of(stream.track)`; called again after they were lost.
     say : callable
         Takes a sentence for the operator, from any thread.
-    log : WeighingLog, optional
-        Keeps the answers.
+    keep : callable
+        Takes each weighing, and each refusal of one; see `WeighingLog.keep`.
     """
+
+    label, keeps_all = "registers", True
 
     def __init__(
         self,
-        stream: CompensatedStream,
-        connect: Callable[[], Registers],
+        stream: Stream,
+        connect: Callable[[], ProgramRegisters],
         say: Callable[[str], object],
-        log: "WeighingLog | None" = None,
+        keep: Callable[[Mapping[str, JSON]], object] = lambda _: None,
     ) -> None:
-        self._stream, self._connect, self._say, self._log = stream, connect, say, log
-        self._registers: Registers | None = connect()
+        self._stream, self._connect, self._say, self._keep = stream, connect, say, keep
+        self._registers: ProgramRegisters | None = connect()
         self._scale = Scale(stream)
         self._lock = threading.Lock()
         self._live = 0
-        self._answered: int | None = None
-        # Number, command and time of the request in progress.
-        self._busy: tuple[int, int, int] | None = None
-        self._tried_ns = 0
+        # Of the last request; None until the first was read, which may be that of a program before us.
+        self._number: int | None = None
+        self._command, self._since_ns, self._due_ns = 0, 0, 0
         self._state, self._code, self._condition = State.READY, 0, Condition.FREE
-        self._wrench = np.zeros(6)
-        self._weight = np.zeros(9)
+        self._wrench, self._weight = [0.0] * 6, [0.0] * 9
         self._newest_ns = 0
         self._ends = threading.Event()
-        self.on_block: Callable[[Block], object] | None = None
-        """Called with each block after its wrench was written."""
+        self._watching = threading.Thread(target=self._watch, daemon=True)
 
     def run(self) -> None:
         """Serve until an exception; a failed device or a lost controller is waited for."""
-        clock = self._stream.clock
-        begin_s = clock.now_s()
-        while clock.now_s() - begin_s < WEIGH_S:
-            self._stream.read()
+        stream, clock = self._stream, self._stream.clock
+        end_s = clock.now_s() + WEIGH_S
+        for _ in pump(stream, until=lambda: clock.now_s() >= end_s, patience_s=0.0):
+            pass
         self._scale.warm_up()
-        watch = threading.Thread(target=self._watch, daemon=True)
-        try:
-            watch.start()
-            # an emulated controller must not wait for a busy computer
-            with clock.keeping_up():
-                self._serve()
-        finally:
-            # Ctrl-C may come while the thread starts: it must not outlive the cell.
-            self._ends.set()
-            if watch.ident is not None:
-                watch.join()
-            self.stop()
+        # an emulated controller must not wait for a busy computer
+        with clock.keeping_up():
+            meanwhile = "The program sees a stale wrench."
+            for _ in pump(stream, [self], patience_s=math.inf, say=self._say, meanwhile=meanwhile):
+                pass
 
-    def _serve(self) -> None:
-        meanwhile = "The program sees a stale wrench."
-        for block in BlockReader(self._stream, math.inf, say=self._say, meanwhile=meanwhile):
-            if block is not None:
-                self.take(block)
-                # nothing records events, and they would pile up as long as the service runs
-                self._stream.take_events()
+    def begin(self, _: Stream) -> None:
+        """Watch for samples and for the controller."""
+        self._watching.start()
 
-    def stop(self) -> None:
-        """Write that the service has ended, and close."""
-        with self._lock:
-            self._state, self._condition = State.STOPPED, Condition.STALE
-            self._write()
-            if self._registers is not None:
-                self._registers.close()
-
-    def take(self, block: Block) -> None:
+    def add(self, block: Block | None, _: Sequence[StreamEvent]) -> None:
         """Write the newest sample of a block, and work on a request."""
+        if not block:
+            return
         t_ns = int(block.t_host_ns[-1])
         with self._lock:
             self._newest_ns = t_ns
-            self._wrench = block.wrench[-1]
+            self._wrench = block.wrench[-1].tolist()
             self._condition = self._judge(block)
             self._work(t_ns)
             # In contact too, because a program must be able to react to a contact force.
             self._live = (self._live + 1) % _COUNT_LIMIT
             self._write()
-        if self.on_block is not None:
-            self.on_block(block)
+
+    def end(self) -> None:
+        """Write that the service has ended, and close."""
+        # Ctrl-C may come while the thread starts: it must not outlive the cell.
+        self._ends.set()
+        if self._watching.ident is not None:
+            self._watching.join()
+        with self._lock:
+            self._state, self._condition = State.STOPPED, Condition.STALE
+            self._write()
+            if self._registers is not None:
+                self._registers.close()
 
     def _watch(self) -> None:
         """Write that the wrench is stale when no sample comes, and reconnect to the controller."""
@@ -209,22 +170,18 @@ class ProgramService:
             self._ends.wait(0.5)
             return
         with self._lock:
-            self._registers = registers
-            self._answered = self._busy = None
+            self._registers, self._number, self._state, self._code = registers, None, State.READY, 0
         self._say("The controller answers again.")
 
     def _write(self) -> None:
         if self._registers is None:
             return
-        busy = self._busy is not None
-        number = self._busy[0] if self._busy is not None else self._answered or 0
-        state = State.BUSY if busy and self._state is not State.STOPPED else self._state
-        tracking = TRACKINGS.index(self._stream.track)
-        integers = [int(state), 0 if busy else self._code, int(self._condition), number, self._live, tracking]
+        tracking = get_args(Tracking).index(self._stream.track)
+        integers = [self._state, self._code, self._condition, self._number or 0, self._live, tracking]
         tracked = self._tracked() if tracking else []
         try:
             # All inputs go in one package, so that a program never reads half of an answer.
-            self._registers.write(integers, [*self._wrench.tolist(), *self._weight.tolist(), *tracked])
+            self._registers.write(integers, [*self._wrench, *self._weight, *tracked])
         except DeviceError as error:
             if self._state is not State.STOPPED:
                 self._say(f"{error}. Trying again.")
@@ -232,10 +189,10 @@ class ProgramService:
             self._registers = None
 
     def _tracked(self) -> list[float]:
-        """Return the tracked change of the bias since the calibration, and the age of the last look at it."""
-        tracked = self._stream.tracked
+        """Return the tracked change of the bias since the calibration, and the age of the last look or -1."""
+        tracked = self._stream.processor.monitor.tracked
         if tracked is None or not np.isfinite(tracked.last_seen_s):
-            return [0.0] * 6 + [NEVER_S]
+            return [*[0.0] * 6, -1.0]
         return [*tracked.bias.tolist(), tracked.last_seen_s + max(self._newest_ns * 1e-9 - tracked.t_s, 0.0)]
 
     def _judge(self, block: Block) -> Condition:
@@ -243,9 +200,8 @@ class ProgramService:
         if not block.in_contact[-1]:
             return Condition.FREE
         R_base_sensor = block.R_base_flange[-1] @ self._stream.info.calibration.R_flange_sensor
-        force_N = R_base_sensor @ self._stream.contact_reading()[:3]
-        down = self._stream.info.calibration.gravity_force_base_N
-        leans_rad = angle_between_vectors(force_N, down)
+        force_N = R_base_sensor @ self._stream.processor.monitor.reading[:3]
+        leans_rad = angle_between_vectors(force_N, self._stream.info.calibration.gravity_force_base_N)
         return Condition.UNKNOWN_LOAD if min(leans_rad, np.pi - leans_rad) < _ALIKE_RAD else Condition.CONTACT
 
     # -------------------------------------------------------------------------------------------------------- requests
@@ -256,56 +212,45 @@ class ProgramService:
         except DeviceError:
             # the next write finds it too
             request = None
-        if request is not None and self._answered is None and self._busy is None:
-            # of a program before us
-            self._answered = request[0]
-            self._state, self._code = State.READY, 0
-        elif request is not None and request[0] != (self._busy[0] if self._busy else self._answered):
-            self._busy, self._tried_ns = (*request, t_ns), t_ns + round(WEIGH_S * 1e9)
-        if self._busy is None:
+        if request is not None and self._number is None:
+            self._number = request[0]
+        elif request is not None and request[0] != self._number:
+            (self._number, self._command), self._since_ns = request, t_ns
+            self._due_ns = t_ns + round(WEIGH_S * 1e9)
+            self._state, self._code = State.BUSY, 0
+        if self._state is not State.BUSY:
             return
-        _, command, since_ns = self._busy
-        if command == Command.STATUS:
+        if self._command == Command.STATUS:
             self._answer("")
-        elif command not in (Command.WEIGH, Command.ZERO):
+        elif self._command not in (Command.WEIGH, Command.ZERO):
             self._answer("command")
-        elif t_ns >= self._tried_ns:
-            self._tried_ns = t_ns + _TRY_NS
+        elif t_ns >= self._due_ns:
+            self._due_ns = t_ns + _TRY_NS
             try:
-                self._weigh(since_ns) if command == Command.WEIGH else self._zero(since_ns)
+                if self._command == Command.WEIGH:
+                    self._weigh()
+                else:
+                    self._scale.zero(self._since_ns)
+                    self._stream.processor.monitor.hold(None)
             except CannotWeigh as refusal:
-                if refusal.code not in _WAITS or (t_ns - since_ns) * 1e-9 > PATIENCE_S:
+                if refusal.code not in _WAITS or (t_ns - self._since_ns) * 1e-9 > PATIENCE_S:
                     self._answer(refusal.code)
-                    if self._log is not None:
-                        self._log.refused(refusal.code)
+                    self._keep({"refused": refusal.code})
             else:
                 self._answer("")
 
     def _answer(self, code: str) -> None:
-        assert self._busy is not None  # noqa: S101 - the callers work on a request
-        self._answered, self._busy = self._busy[0], None
         self._state, self._code = State.REFUSED if code else State.READY, CODES[code]
         if code:
-            self._weight = np.zeros(9)
+            self._weight = [0.0] * 9
 
-    def _weigh(self, since_ns: int) -> None:
-        weight = self._scale.weigh(since_ns)
-        info, known = self._stream.info, weight.is_something
-        mass = [weight.mass_kg if known else 0.0, weight.mass_sigma_kg, weight.least_kg]
-        self._weight = np.array([*mass, *(_placed(weight, info) if known else np.zeros(6))])
-        self._stream.hold(weight if known else None)
-        values = load_values(weight, info)
-        self._stream.note("load", f"weighed for the program: {weight.mass_kg:.4f} kg", values)
-        if self._log is not None:
-            self._log.weighed(values)
-
-    def _zero(self, since_ns: int) -> None:
-        self._scale.zero(since_ns)
-        self._stream.hold(None)
-
-
-def _placed(weight: Weight, info: StreamInfo) -> Array:
-    """Return centre of mass and sigma in flange axes from the flange, (6,)."""
-    R = info.calibration.R_flange_sensor
-    p_m, C = info.p_flange_sensor_m + R @ weight.p_sensor_com_m, R @ weight.com_covariance @ R.T
-    return np.concatenate([p_m, np.sqrt(np.diag(C))])
+    def _weigh(self) -> None:
+        weight = self._scale.weigh(self._since_ns)
+        values = load_values(weight, self._stream.info)
+        mass_kg, place = 0.0, [0.0] * 6
+        if weight.is_something:
+            mass_kg, place = weight.mass_kg, [*values["p_flange_com_m"], *values["p_flange_com_sigma_m"]]
+        self._weight = [mass_kg, weight.mass_sigma_kg, weight.least_kg, *place]
+        self._stream.processor.monitor.hold(weight if weight.is_something else None)
+        self._stream.processor.note("load", f"weighed for the program: {weight.mass_kg:.4f} kg", values)
+        self._keep(values)

@@ -2,17 +2,20 @@
 
 import json
 import socket
+from collections.abc import Sequence
+from contextlib import suppress
 from math import isfinite
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Block, Picked, StreamEvent, StreamInfo
+from ftdrive.stream.samples import Block, Picked, StreamEvent, StreamInfo
+from ftdrive.stream.stream import Sink
 
 RATE_HZ = 200.0
 """A plot of 5 s is about 1000 pixels wide: a higher rate is not visible. PlotJuggler parses datagrams in the thread of
 its window, and the system drops without a count what it does not read in time."""
 
 
-class UdpSender:
+class UdpSender(Sink):
     """Sends raw and compensated wrench at `RATE_HZ`, one sample a datagram, with the UTC in seconds as `timestamp`.
 
     Parameters
@@ -26,6 +29,8 @@ class UdpSender:
         The host is unknown.
     """
 
+    label = "UDP"
+
     def __init__(self, info: StreamInfo, host: str, port: int) -> None:
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -36,12 +41,11 @@ class UdpSender:
         self._address = address
         self._offset_ns = info.utc_offset_ns
         self._picked = Picked(RATE_HZ)
-        self.sent = 0
-        self.dropped = 0
-        """Datagrams that the system did not take."""
 
-    def write(self, block: Block) -> None:
-        """Send what is due of a block; never waits."""
+    def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
+        """Send what is due of a block, and no events: PlotJuggler plots numbers. Never waits."""
+        if not block:
+            return
         few = block.rows(self._picked.rows(block.t_host_ns))
         compensated = f"compensated_{block.frame.id}"
         for i, t_ns in enumerate((few.t_host_ns + self._offset_ns).tolist()):
@@ -52,16 +56,10 @@ class UdpSender:
                 "chi2": chi2 if isfinite(chi2 := float(few.chi2[i])) else None,
                 "in_contact": int(few.in_contact[i]),
             }
-            try:
+            with suppress(OSError):  # no room, or no way there at the moment: the next one is soon
                 self._socket.sendto(json.dumps(values).encode(), self._address)
-                self.sent += 1
-            except OSError:  # no room, or no way there at the moment: the next one is soon
-                self.dropped += 1
 
-    def event(self, event: StreamEvent) -> None:
-        """Send nothing: PlotJuggler plots numbers."""
-
-    def close(self) -> None:
+    def end(self) -> None:
         """Close the socket."""
         self._socket.close()
 

@@ -115,17 +115,8 @@ class Request:
 class Gate:
     """Listens for HTTP, refuses foreign requests, and calls `serve` for each of the others in a thread of its own.
 
-    Parameters
-    ----------
-    bound : tuple of str and int
-        Host and port; 0 lets the system choose, see `port`.
-    origins : collection of str
-        See `refusal`.
-
-    Raises
-    ------
-    OSError
-        The address cannot be used.
+    A port of 0 lets the system choose, see `port`; `origins` are those of `refusal`. Raises `OSError` for an address
+    that cannot be used.
     """
 
     def __init__(self, bound: Address, origins: Collection[str] | None = None) -> None:

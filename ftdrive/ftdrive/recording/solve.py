@@ -1,0 +1,135 @@
+"""Solve what a place holds: poses at rest, or a recording in motion, which is read piece by piece."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ftcalib import CalibrationResult, Known, Setup
+from ftcalib import solve as solve_dataset
+from ftcalib.after.new_tool import new_tool
+from ftcalib.model import STANDARD_GRAVITY_M_S2
+from ftcalib.motion.samples import Means
+from ftcalib.motion.solve import solve_motion
+from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG
+from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.recording.files import RecordingReader
+from ftdrive.recording.foreign import is_bag, moving_source, table_words
+from ftdrive.recording.recording import NEEDED, Header, Recording
+from ftdrive.runs.calibration import made_now
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import RecordedData, SolveOptions, read_source, require_same_cell, solve_in_motion
+from ftdrive.tables.table import Table
+
+Moving = Run | Path | tuple[Table, Table]
+
+
+def _moving(place: Path, options: SolveOptions) -> Moving | None:
+    return Run(place) if place.is_dir() and Run(place).in_motion else moving_source(place, options)
+
+
+def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
+    """Return a recording in motion, which is read when it is solved, or poses. Raises as `read_source`."""
+    if any(options.topics) and (options.pair is not None or not is_bag(place)):
+        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
+    # A bag is read whole, so it is not read to say this.
+    moving = place if is_bag(place) and options.method != "ml" else _moving(place, options)
+    if moving is not None and options.method != "ml":
+        raise ConfigError(f"--method {options.method} is for poses at rest: leave it out for a recording")
+    return read_source(place, options) if moving is None else moving
+
+
+def solve_place(data: Moving | RecordedData, options: SolveOptions) -> CalibrationResult:
+    """Solve what `read_place` returns; with an earlier result only the tool is new.
+
+    Raises `ConfigError` for values that a method cannot use.
+    """
+    if isinstance(data, RecordedData):
+        earlier = options.earlier or data.earlier
+        if earlier is not None:
+            require_same_cell(earlier, data.provenance)
+            return new_tool(earlier, data.dataset, data.provenance)
+        method: Any = options.method
+        try:
+            return solve_dataset(data.dataset, method, **options.of_solution(data), provenance=data.provenance)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    how: dict[str, Any] = {"earlier": options.earlier, "known": options.known, "point_mass": options.point_mass}
+    if isinstance(data, Run):
+        return solve_in_motion(data, **how)
+    return solve_recording(data, up_in_base=options.up_in_base, **how)
+
+
+def solve_recording(
+    source: Path | Recording | tuple[Table, Table],
+    *,
+    known: Known | None,
+    point_mass: bool,
+    up_in_base: Sequence[float] | None,
+    earlier: CalibrationResult | None = None,
+) -> CalibrationResult:
+    """Calibrate from a recording in motion, of `ftdrive record` or of another program on one clock, as `solve_motion`.
+
+    A known direction of gravity means a base that is level with respect to `up_in_base` (3,), the declared up
+    direction. `earlier` is of the same cell with another tool.
+
+    Raises `BadDataset`, `BadRecording`, `ConfigError` or `OSError` if a file cannot be used, or the earlier result is
+    rejected or of another sensor or arm, and `NotObservable` if the motion does not determine the parameters, or
+    contradicts the earlier result.
+    """
+    provenance, height_m, g_m_s2, any_zero = made_now(), None, STANDARD_GRAVITY_M_S2, False
+    accuracy_deg = None
+    if isinstance(source, Path | Recording):
+        wrench, poses, header = _read_in_motion(source)
+        devices = {"arm": asdict(header.info.arm), "sensor": asdict(header.info.sensor)}
+        provenance |= {"recording": getattr(source, "name", "in memory"), "devices": devices}
+        g_m_s2 = header.info.calibration.g_m_s2
+        height_m = float(header.info.p_flange_sensor_m[2])
+        any_zero = header.info.sensor.has_arbitrary_zero
+    else:
+        wrench, poses = Means(), Means()
+        for means, every in ((wrench, source[0].wrenches()), (poses, source[1].poses())):
+            for rows in every:
+                means.add(rows.t_s, rows.values)
+        accuracy_deg = NOMINAL_ORIENTATION_DEG if source[1].has_nominal_kinematics else None
+        names = [table.name for table in source]
+        provenance |= {"wrench": names[0], "orientation": names[1]} if len(set(names)) == 2 else {"recording": names[0]}
+        provenance |= {"table": words} if (words := table_words(source)) else {}
+    if earlier is not None:
+        require_same_cell(earlier, provenance)
+    setup = Setup(up_in_base=up_in_base, sensor_has_arbitrary_zero=any_zero, orientation_accuracy_deg=accuracy_deg)
+    if known is not None and known.gravity_direction_base is not None:
+        known = replace(known, gravity_direction_base=-setup.up)
+    return solve_motion(
+        wrench,
+        poses,
+        known=known,
+        earlier=earlier,
+        point_mass=point_mass,
+        height_m=height_m if height_m is not None and isfinite(height_m) else None,
+        g_m_s2=g_m_s2,
+        setup=setup,
+        provenance=provenance,
+    )
+
+
+def _read_in_motion(source: Path | Recording) -> tuple[Means, Means, Header]:
+    """Read a recording of `ftdrive record`; without positions where it has none. Raises as `RecordingReader.pieces`."""
+    reader = source if isinstance(source, Recording) else RecordingReader(source, NEEDED)
+    wrench, poses = Means(), Means()
+    if isinstance(source, Recording) and (missing := {*NEEDED} - {*(source.rows.dtype.names or ())}):
+        raise BadRecording(f"the recording was read without {', '.join(sorted(missing))}: read it with all columns")
+    start_ns, with_position = None, False
+    for rows in (piece.rows for piece in reader.pieces() if len(piece.rows)):
+        if start_ns is None:
+            start_ns = int(rows["t_host_ns"][0])
+            with_position = bool(np.isfinite(rows["p_base_flange_m"][0]).all())
+        t_s = (rows["t_host_ns"] - start_ns) * 1e-9
+        R = Rotation.from_quat(rows["quaternion_base_flange"]).as_matrix().reshape(-1, 9)
+        wrench.add(t_s, rows["raw"])
+        poses.add(t_s, np.hstack([R, rows["p_base_flange_m"]]) if with_position else R)
+    return wrench, poses, reader.header
