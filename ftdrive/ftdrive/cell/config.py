@@ -32,6 +32,7 @@ FORMAT = "ftdrive.config/1"
 FILE = "ftdrive.toml"
 PREFIX = "FTDRIVE_"
 CLOCK = "FTDRIVE_CLOCK"
+_HOMES = {"config": "~/.config", "data": "~/.local/share", "state": "~/.local/state"}
 
 # Expected mass of a tool whose mass is not configured.
 USUAL_KG = 1.0
@@ -217,14 +218,14 @@ class _SamplingConfig(Sampling):
 
 
 @dataclass(frozen=True, slots=True)
-class SiteConfig:
+class _SiteConfig:
     """The place of the cell."""
 
     g_m_s2: float = entry("local gravity; it scales the mass and nothing else", 9.80665, "m/s²", (9.7, 9.9))
 
 
 @dataclass(frozen=True, slots=True)
-class StoreConfig:
+class _StoreConfig:
     """The store of results and verifications, an index of run folders."""
 
     url: str | None = entry(
@@ -243,8 +244,8 @@ class CellConfig:
     tool: ToolConfig = field(default_factory=ToolConfig)
     workcell: WorkcellConfig = field(default_factory=WorkcellConfig)
     sampling: Sampling = field(default_factory=_SamplingConfig)
-    site: SiteConfig = field(default_factory=SiteConfig)
-    store: StoreConfig = field(default_factory=StoreConfig)
+    site: _SiteConfig = field(default_factory=_SiteConfig)
+    store: _StoreConfig = field(default_factory=_StoreConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
     """Times everything in the cell; an emulated cell has its own. It is in no file."""
 
@@ -285,8 +286,8 @@ SECTIONS: Mapping[str, Any] = {
     "tool": ToolConfig,
     "workcell": WorkcellConfig,
     "sampling": _SamplingConfig,
-    "site": SiteConfig,
-    "store": StoreConfig,
+    "site": _SiteConfig,
+    "store": _StoreConfig,
 }
 _KEYS = {f"{name}.{item.name}": item for name, kind in SECTIONS.items() for item in fields(kind)}
 
@@ -306,43 +307,25 @@ def clock_in_force() -> Clock:
 
 
 def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
-    """Read a cell from all sources.
-
-    Parameters
-    ----------
-    config : Path, optional
-        Read in place of the project's file.
-    flags : mapping
-        Options of the command by key, such as ``{"robot.host": ("--robot", "10.0.0.2")}``.
-    devices : bool
-        Whether arm and sensor are needed; if not, their addresses may be empty.
-
-    Raises
-    ------
-    ConfigError
-        With source, section, key, value and what to do.
-    """
+    """Read a cell from all sources, as `settings`; without `devices` the addresses of arm and sensor may be empty."""
     return cell_of(settings(config, flags), devices=devices)
 
 
 def settings(
     config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, cell: CellConfig | None = None
 ) -> dict[str, Setting]:
-    """Return every key, such as "robot.host", with its value and origin; errors as `load`.
+    """Return every key, such as "robot.host", with its value and origin.
 
-    Parameters
-    ----------
-    config, flags
-        As in `load`.
-    cell : CellConfig, optional
-        An emulated one, which replaces all files and variables.
+    `config` is read in place of the project's file. `flags` are options of the command by key, such as
+    ``{"robot.host": ("--robot", "10.0.0.2")}``. An emulated `cell` replaces all files and variables. Raises
+    `ConfigError` with source, section, key, value and what to do.
     """
     found: dict[str, Setting] = {}
     if cell is not None:
         values = {key: attrgetter(key)(cell) for key in _KEYS}
         found = {key: Setting(value, "emulated cell") for key, value in values.items() if value is not None}
     else:
-        for path in (user_file(), config or Path(FILE)):
+        for path in (user_folder("config") / FILE, config or Path(FILE)):
             if path == config or path.is_file():
                 found |= _from_file(path)
         found |= _from_environment()
@@ -394,11 +377,10 @@ def as_toml(value: Any) -> str:
     return json.dumps(value)
 
 
-def user_file() -> Path:
-    """Return the file for all projects of a user; it need not exist."""
-    home = os.environ.get("XDG_CONFIG_HOME", "")
-    folder = Path(home) if Path(home).is_absolute() else Path("~/.config").expanduser()
-    return folder / "ftdrive" / FILE
+def user_folder(kind: str) -> Path:
+    """Return the folder of a user for "config", "data" or "state"; it need not exist."""
+    home = os.environ.get(f"XDG_{kind.upper()}_HOME", "")
+    return (Path(home) if Path(home).is_absolute() else Path(_HOMES[kind]).expanduser()) / "ftdrive"
 
 
 def _from_file(path: Path) -> dict[str, Setting]:
@@ -507,14 +489,9 @@ WIDTH = 120
 
 
 def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
-    """Return a cell as a file; `workcell.measured` is false in it, whatever the cell has.
+    """Return a cell as a file, with what the devices report; `workcell.measured` is false in it, whatever the cell has.
 
-    Parameters
-    ----------
-    cell : CellConfig
-        Keys that `init` does not ask for are commented out, so that the user's file still counts.
-    found : sequence of str
-        What the devices report about themselves.
+    Keys that `init` does not ask for are commented out, so that the user's file still counts.
     """
     values = {f"{section}.{key}": value for section, keys in cell.to_dict().items() for key, value in keys.items()}
     values["workcell.measured"] = False

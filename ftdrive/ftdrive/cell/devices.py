@@ -52,12 +52,8 @@ def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
 def program_registers(cell: CellConfig, first: int, integers: int, doubles: int) -> ProgramRegisters:
     """Claim registers for answers to the program on the controller.
 
-    Raises
-    ------
-    ConfigError
-        The arm has none.
-    ConnectError
-        Nothing answers, or another client or a fieldbus owns a register.
+    Raises `ConfigError` if the arm has none, and `ConnectError` if nothing answers, or another client or a fieldbus
+    owns a register.
     """
     if cell.robot.driver != "ur":
         raise ConfigError(f"[robot] driver {cell.robot.driver} has no registers: serve-load needs a UR")

@@ -5,7 +5,7 @@ import json
 import platform
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any, Self
@@ -48,17 +48,9 @@ TOOL_MM = (0.0, 200.0, 100.0)
 class Station:
     """One `mocks` process, ended by leaving its `with` block or by the end of ours.
 
-    Its `with` block raises `ConfigError` on another system than Linux.
-
-    Parameters
-    ----------
-    sensor : one of `SENSORS`, "both" (can and serial) or "none"
-    options : sequence of str
-        More options of `python -m ftmocks station`.
-    control_path : str
-        As `control` of `[robot]`.
-    values : mapping
-        Of the configuration, by key such as "tool.name"; they replace those of the usual emulated cell.
+    Its `with` block raises `ConfigError` on another system than Linux. `sensor` is one of `SENSORS`, "both" (can and
+    serial) or "none"; `options` are more of `python -m ftmocks station`; `control_path` is as `[robot] control`.
+    `values` of the configuration, by key such as "tool.name", replace those of the usual emulated cell.
     """
 
     def __init__(
@@ -153,6 +145,13 @@ class Station:
             self._process.stdin.write(json.dumps(request) + "\n")
             self._process.stdin.flush()
         return self._answer()
+
+    def start_mover(self, mode: str, say: Callable[[str], object]) -> None:
+        """Let the cell move its arm, in a mode in which the session does not move it; `say` takes a sentence."""
+        if mover := MOVED_BY.get(mode):
+            request, words = mover
+            self.control(**request)
+            say(f"The cell is emulated: {words}.")
 
     def _answer(self) -> Mapping[str, Any]:
         line = self._process.stdout.readline() if self._process and self._process.stdout else ""

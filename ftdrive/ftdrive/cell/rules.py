@@ -113,6 +113,7 @@ reject_empty = _unless(lambda text: bool(text.strip()), "it is empty, give one o
 reject_sign = _unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
 reject_height = _unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
 reject_store = _unless(lambda url: "://" in url, "it is no address, give one such as sqlite:////data/store.sqlite")
+reject_control = _unless(CONTROL_SETTINGS.__contains__, f"give one of {', '.join(CONTROL_SETTINGS)}")
 reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
 
 
@@ -127,11 +128,6 @@ def reject_model(value: str) -> str | None:
     from ftdrivers.ur.kinematics import MODELS, model_named
 
     return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
-
-
-def reject_control(value: str) -> str | None:
-    """Reject an unknown control path."""
-    return None if value in CONTROL_SETTINGS else f"give one of {', '.join(CONTROL_SETTINGS)}"
 
 
 def reject_mounting(value: str) -> str | None:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Mapping, Sequence
 from decimal import Decimal
+from math import isfinite
 from typing import Final
 
 from ftdrive.errors import ConfigError
@@ -30,19 +31,10 @@ _WALL = re.compile(rf"({'|'.join(map(re.escape, SIDES))})[:\s]*(\S.*)")
 
 
 def number(what: str, text: str, units: Mapping[str, str]) -> float:
-    """Read a number with a decimal point or comma, alone or with a unit.
+    """Read a number with a decimal point or comma, alone or with a unit; `what` is an option, for the message.
 
-    Parameters
-    ----------
-    what : str
-        An option, for the message.
-    units : mapping
-        Factors; the first unit is the one of the result and of a number alone.
-
-    Raises
-    ------
-    ConfigError
-        It is not a number, or has a comma that may separate thousands.
+    The first of `units`, which have factors, is that of the result and of a number alone. Raises `ConfigError` for what
+    is not a number, or has a comma that may separate thousands.
     """
     value = _read(what, text, units)
     if value is None:
@@ -73,10 +65,7 @@ def rows_of(*counts: int) -> Callable[[str, str], list[float]]:
 def wall(what: str, text: str) -> list[float]:
     """Read a wall as the row of `[workcell] planes_mm`: side and distance from the base, or normal and offset in mm.
 
-    Raises
-    ------
-    ConfigError
-        It is neither, or the distance is negative.
+    Raises `ConfigError` if it is neither, or the distance is negative.
     """
     found = _WALL.fullmatch(text.strip().lower())
     if found is None:
@@ -108,3 +97,20 @@ def _read(what: str, text: str, units: Mapping[str, str]) -> float | None:
         whole, point = found[1].replace(",", ""), found[1].replace(",", ".")
         raise ConfigError(f"{what} is '{text}', where the comma has two meanings: write {whole} or {point}")
     return float(Decimal(found[1].replace(",", ".")) * Decimal(units.get(found[2], "1")))
+
+
+def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
+    """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
+    try:
+        values = [float(part) for part in text.split(separator)]
+    except ValueError:
+        values = []
+    if len(values) not in counts or not all(map(isfinite, values)):
+        wanted = " or ".join(map(str, counts))
+        raise ConfigError(f"{option} is '{text}': give {wanted} numbers separated by '{separator}'")
+    return values
+
+
+def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
+    """Read a repeatable option, numbers separated by colons; None if it was not given."""
+    return [numbers(option, text, ":", counts) for text in texts] or None

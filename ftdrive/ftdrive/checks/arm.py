@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from typing import Final
 
@@ -11,17 +12,19 @@ from ftcalib import CalibrationResult
 from ftcalib.after.weighing import true_tool
 from ftcalib.judge import described_cell
 from ftcalib.model import Array, skew
-from ftdrive.cell.config import RobotConfig, ToolConfig
-from ftdrive.checks.check import Check, State, who
+from ftdrive.cell.config import CellConfig, RobotConfig, ToolConfig
+from ftdrive.cell.devices import build_arm
+from ftdrive.checks.check import Check, check_diagnosis, who
 from ftdrive.planning.geometry.kinematics import frames
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, ModelUnknown
-from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Diagnosis, RobotArm
+from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, RobotArm
 from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
 # The centre of the payload may be this far outside the described tool.
 _PAYLOAD_MM: Final = 100.0
 _LINK_S: Final = 0.5
+_CLOCK_S: Final = 1.0
 _LINK_TRIES: Final = 3
 # Random ones, in which an arm is compared with its model.
 _POSTURES: Final = 200
@@ -70,12 +73,6 @@ def check_kinematics(info: DeviceInfo) -> Check:
     off_deg = np.degrees(2 * np.arcsin(chord))
     found = f"kinematics reported, up to {off_mm:.1f} mm and {off_deg:.2f}° from a nominal {info.model}"
     return Check(name, "ok", f"{found}; plans use them")
-
-
-def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
-    """Return what the driver of a robot or a sensor found when it checked its own device."""
-    state: State = "ok" if diagnosis.passed else "failed"
-    return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def check_remote(arm: RobotArm) -> Check:
@@ -152,15 +149,9 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
 
 
 def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
-    """Compare the payload configured in the controller with the load that a calibration has weighed.
+    """Compare the payload that the controller reports with the load that a calibration has weighed.
 
-    Parameters
-    ----------
-    payload_kg : float, optional
-        As the controller reports it.
-    result : CalibrationResult
-    sensor_kg : float, optional
-        Mass of sensor and adapter, which the sensor cannot weigh.
+    `sensor_kg` is the mass of sensor and adapter, which the sensor cannot weigh.
     """
     name = "robot.payload"
     if payload_kg is None:
@@ -181,12 +172,7 @@ def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:
 def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> Check:
     """Check that states of the arm arrive soon and without gaps, in one of three half seconds.
 
-    Parameters
-    ----------
-    usual_s : float
-        Longest median of the time for an answer.
-    gap_s : float
-        Longest time for nine of ten answers.
+    The median time for an answer must be below `usual_s`, and that of nine in ten answers below `gap_s`.
     """
     name, found = "robot.link", ""
     # A computer that is busy for a moment is not a bad link.
@@ -195,7 +181,7 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
             with clock.keeping_up():
                 took_s = _answers_s(arm, clock)
         except DeviceError as error:
-            return Check(name, "failed", error.found, error.fix or "check the robot and the network")
+            return _silent(name, error)
         median_s = float(np.median(took_s))
         found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"
         if median_s < usual_s and np.quantile(took_s, 0.9) < gap_s:
@@ -212,14 +198,75 @@ def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
     return took_s
 
 
-def check_clock(t_host_ns: Sequence[int], t_device_s: Sequence[float]) -> Check:
+def check_clock(arm: RobotArm, clock: Clock) -> Check:
     """Compare the pace of the controller's clock with ours; their readings are never subtracted from each other."""
+    t_host_ns, t_device_s = list[int](), list[float]()
+    try:
+        with clock.keeping_up():
+            while not t_host_ns or t_host_ns[-1] - t_host_ns[0] < _CLOCK_S * 1e9:
+                clock.sleep(0.02)
+                status = arm.status()
+                t_host_ns.append(status.t_host_ns)
+                t_device_s.append(status.t_device_s)
+    except DeviceError as error:
+        return _silent("clock.pace", error)
     host_s = (np.asarray(t_host_ns) - t_host_ns[0]) / 1e9
     pace = float(np.polyfit(host_s, np.asarray(t_device_s) - t_device_s[0], 1)[0])
     found = f"the controller's clock runs at {pace:.4f} of ours, over {host_s[-1]:.1f} s"
     if abs(pace - 1) < 0.02:
         return Check("clock.pace", "ok", found)
     return Check("clock.pace", "warning", found, "close other programs on this computer; look at the network's load")
+
+
+def _silent(name: str, error: DeviceError) -> Check:
+    return Check(name, "failed", error.found, error.fix or "check the robot and the network")
+
+
+def check_flange(arm: RobotArm, status: ArmStatus) -> Check:
+    """Check that poses of the flange can be read without control."""
+    name = "robot.flange"
+    if status.tcp_offset is None:
+        found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"
+        return Check(name, "skipped", found)
+    try:
+        p_mm = 1e3 * arm.state().p_base_flange_m
+    except DeviceError as error:
+        return _silent(name, error)
+    where = ", ".join(f"{value:.0f}" for value in p_mm)
+    return Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base")
+
+
+def examine_arm(
+    cell: CellConfig, stack: ExitStack, *, usual_s: float, gap_s: float
+) -> tuple[list[Check], RobotArm | None]:
+    """Open the arm until the stack ends and make every check that needs no control; None if it does not answer.
+
+    The times are those of `check_link`.
+    """
+    if not cell.robot.host:
+        found = "the sensor is checked alone, because [robot] host and --robot are not set"
+        return [Check("robot.reachable", "skipped", found)], None
+    arm = stack.enter_context(closing(build_arm(cell)))
+    try:
+        arm.open()
+        info, status = arm.identify(), arm.status()
+    except DeviceError as error:
+        return [check_unreachable(error, cell.robot.host)], None
+    flange = check_flange(arm, status)
+    return [
+        Check("robot.reachable", "ok", f"{cell.robot.host} answers"),
+        check_arm(info, cell.robot),
+        check_kinematics(info),
+        check_remote(arm),
+        *map(check_diagnosis, arm.diagnose()),
+        check_safety(status),
+        check_program(status),
+        check_speed(status),
+        check_payload(status, cell.tool, cell.sensor.mass_kg),
+        flange,
+        *([check_link(arm, cell.clock, usual_s=usual_s, gap_s=gap_s)] if flange.state == "ok" else []),
+        check_clock(arm, cell.clock),
+    ], arm
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -242,16 +289,9 @@ def flange_load(
     The sum is ``m = m_tool + m_sensor``, its centre ``(m_tool c_tool + m_sensor c_sensor) / m`` with
     ``c_tool = p_flange_sensor + R_flange_sensor p_sensor_com``.
 
-    Parameters
-    ----------
-    result : CalibrationResult
-    sensor_kg : float
-        Mass of sensor and adapter.
-    height_m : float
-        Of the sensor's origin above the flange face.
-    p_flange_sensor_com_m : array, shape (3,), optional
-        Known centre of mass of sensor and adapter. Default: half way up, on the axis of the flange; its height then
-        counts as known within the whole height, evenly distributed.
+    `sensor_kg` and `p_flange_sensor_com_m` (3,) are of sensor and adapter, `height_m` is that of the sensor's origin
+    above the flange face. By default the centre is half way up, on the axis of the flange. Its height then counts as
+    known within the whole height, evenly distributed.
     """
     # The sensor cannot weigh itself, and gravity does not reveal where its origin is: both are configuration.
     tool_kg, p_sensor_com_m = true_tool(result)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from types import EllipsisType
 from typing import TYPE_CHECKING, Literal
 
-from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
+from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Diagnosis
 
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult
@@ -23,6 +23,12 @@ class Check:
     found: str
     fix: str | None = None
     """The command or the instruction that fixes it."""
+
+
+def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
+    """Return what the driver of a robot or a sensor found when it checked its own device."""
+    state: State = "ok" if diagnosis.passed else "failed"
+    return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def verdict(checks: Sequence[Check]) -> State:
@@ -45,7 +51,7 @@ def who(info: DeviceInfo) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Belonging:
+class _Belonging:
     """Reasons against a calibration belonging to the connected devices, in words."""
 
     others: tuple[str, ...]
@@ -56,7 +62,7 @@ class Belonging:
 
 def compare_devices(
     result: "CalibrationResult", connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
-) -> Belonging:
+) -> _Belonging:
     """Compare the devices of a calibration with the connected ones, by role.
 
     Serial numbers decide where both sides have one; elsewhere another model is another device. The label `mount` of the
@@ -81,7 +87,7 @@ def compare_devices(
     if mount is not ... and isinstance(setup, Mapping) and setup.get("mount", mount) != mount:
         made_as, now = (f"[sensor] mount = {one!r}" if one else "no [sensor] mount" for one in (setup["mount"], mount))
         others.append(f"the calibration was made with {made_as}, but {now} is configured")
-    return Belonging(tuple(others), tuple(unknown))
+    return _Belonging(tuple(others), tuple(unknown))
 
 
 def check_calibration(

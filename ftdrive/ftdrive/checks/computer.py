@@ -226,13 +226,7 @@ def can_details(interface: str) -> Mapping[str, Any]:
 
 
 def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any], *, sys: Path = SYS) -> Check:
-    """Check an interface of the kernel: present, up, not bus-off, and at the sensor's bitrate.
-
-    Parameters
-    ----------
-    details : mapping
-        As `can_details` gives them.
-    """
+    """Check an interface of the kernel, by its `can_details`: present, up, not bus-off, and at the sensor's bitrate."""
     name = "permissions.can"
     up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
     if "/" in interface or interface.startswith("tty"):

@@ -112,33 +112,20 @@ BY_KEY: Final = {question.key: question for question in QUESTIONS}
 class Description:
     """Answers, as texts, to `QUESTIONS`.
 
-    Parameters
-    ----------
-    clock : Clock
-        Of the devices.
-    in_force : mapping
-        Values by key of environment and user's file, and the defaults.
-    simulate : bool
-        The cell is emulated, and no question is about its devices.
-
-    Attributes
-    ----------
-    texts : dict
-        Answers by key: one text, or one for each row.
-    answered : set of str
-        Keys that need no question.
-    reports : dict
-        What devices report about themselves, by the key of their address.
-    places : list of str
-        Where a sensor was found; its number is an answer.
+    `in_force` has values by key of environment and user's file, and the defaults. With `simulate` the cell is emulated,
+    and no question is about its devices.
     """
 
     def __init__(self, clock: Clock, in_force: Mapping[str, Any], *, simulate: bool = False) -> None:
         self.clock, self._in_force, self._simulate = clock, in_force, simulate
         self.texts: dict[str, list[str]] = {}
+        """Answers by key: one text, or one for each row."""
         self.answered: set[str] = set()
+        """Keys that need no question."""
         self.reports: dict[str, str] = {}
+        """What devices report about themselves, by the key of their address."""
         self.places: list[str] = []
+        """Where a sensor was found; its number is an answer."""
 
     @property
     def questions(self) -> list[Question]:
@@ -197,21 +184,10 @@ class Description:
         require_possible(CellConfig(RobotConfig(""), sensor, **{section: kind(**{name: rows})}), self.model)
 
     def look(self, key: str, text: str) -> str:
-        """Read the device at an address or place, and keep what it reports.
+        """Read the device at an address or place, keep what it reports, and return that in words.
 
-        Parameters
-        ----------
-        key : {ROBOT, SENSOR}
-
-        Returns
-        -------
-        str
-            What it reports.
-
-        Raises
-        ------
-        DeviceError or UsageError
-            It does not answer, or there cannot be such an address.
+        `key` is `ROBOT` or `SENSOR`. Raises `DeviceError` if it does not answer, and `UsageError` for what can be no
+        address.
         """
         try:
             return self._look(key, text)
@@ -294,11 +270,6 @@ class Description:
             self.reports = {key: str(words) for key, words in document["reports"].items() if key in texts}
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise ConfigError(f"{draft} is incomplete: delete it") from error
-
-
-def draft_of(output: Path) -> Path:
-    """Return where the answers are kept until a configuration file is written."""
-    return output.with_name(f".{output.name}.draft")
 
 
 def saved_at(draft: Path) -> str:

@@ -37,20 +37,9 @@ def sensor_at(place: str, clock: Clock = REAL) -> str:
 def ask(place: str, clock: Clock = REAL) -> list[Answer]:
     """Probe a port or bus for known sensors, which are only read.
 
-    Parameters
-    ----------
-    place : str
-        A serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN adapter on a
-        serial port with the bit rate of its bus, ``slcan:///dev/ttyACM0?bitrate=250000``.
-    clock : Clock
-        That of the devices, where they are emulated.
-
-    Raises
-    ------
-    UsageError
-        The place has another form.
-    ConnectError
-        It does not exist, is not up, or not permitted.
+    A place is a serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN
+    adapter on a serial port with the bit rate of its bus, ``slcan:///dev/ttyACM0?bitrate=250000``. Raises `UsageError`
+    for another form, and `ConnectError` for a place that does not exist, is not up, or not permitted.
     """
     if "://" in place:
         return _ask_can(place, clock)

@@ -2,7 +2,8 @@
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any, Final
 
@@ -13,7 +14,8 @@ from ftcalib import CalibrationDataset
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.poses.information import Guess, predicted_sigma, special
 from ftdrive.cell.config import CellConfig
-from ftdrive.checks.check import Check, State, who
+from ftdrive.cell.emulated import Station
+from ftdrive.checks.check import Check, State, check_diagnosis, who
 from ftdrive.checks.computer import SensorAddress, latency_command
 from ftdrivers.errors import (
     ConnectError,
@@ -24,9 +26,16 @@ from ftdrivers.errors import (
     ProtocolError,
     StreamBroken,
 )
-from ftdrivers.interfaces import Array, DeviceInfo, Fact, FtSamples, Health
+from ftdrivers.interfaces import Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health, RobotArm
 
+# From the name of a check and the error of a sensor's driver.
+Blame = Callable[[str, DeviceError], Check]
+
+_LOOK_S: Final = 2.0
 _PUSH_N = 2.0
+PUSH_S: Final = 3.0
+_PUSH_WINDOW_S: Final = 0.2
+_SIMULATED_PUSH_N, _SIMULATED_PUSH_S = 15.0, 0.6
 _BETTER_NETWORK = "give the sensor a network of its own, or run fewer programs on this computer"
 _RATE_TOLERANCE = 0.1
 _MUCH_NOISE: Final = 2.0
@@ -115,24 +124,14 @@ def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
 
 
 def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zero_is_arbitrary: bool) -> Check:
-    """Check that what a sensor reads at rest leaves enough of its range.
+    """Check that what a sensor reads at rest (n, 6), N and N·m, leaves enough of its range (6,); None is unknown.
 
-    Parameters
-    ----------
-    wrench : array, shape (n, 6)
-        N and N·m.
-    limits : array, shape (6,), optional
-        The range; None is unknown.
-    cell : CellConfig
-        Has the mass of the tool, if that is known.
-    zero_is_arbitrary : bool
-        The range then holds for changes of the reading.
+    If the zero is arbitrary, the range holds for changes of the reading.
     """
     name = "sensor.rest"
     if zero_is_arbitrary:
-        return Check(
-            name, "skipped", "the zero of this sensor is arbitrary: its range holds for changes of the reading"
-        )
+        found = "the zero of this sensor is arbitrary: its range holds for changes of the reading"
+        return Check(name, "skipped", found)
     if limits is None:
         return Check(name, "skipped", "not compared with the reading at rest: the sensor's range is unknown")
     rest, range_ = np.abs(wrench.mean(axis=0)), np.asarray(limits, dtype=np.float64)
@@ -249,16 +248,9 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
 
 
 def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess) -> list[Check]:
-    """Check the noise of a sensor at rest, and predict the accuracy of a calibration from it.
+    """Check the noise of a sensor at rest, and predict from it the accuracy of a calibration with poses of `average_s`.
 
-    Parameters
-    ----------
-    wrench : array, shape (n, 6)
-        `duration_s` seconds of N and N·m.
-    average_s : float
-        How long each pose is averaged.
-    guess : Guess
-        Mass, and accuracy of sensor and arm; its noise is not used.
+    `guess` holds the mass, and the accuracy of sensor and arm; its noise is not used.
     """
     level = check_level(wrench)
     if level.state == "failed":
@@ -318,26 +310,80 @@ def check_level(wrench: Array) -> Check:
     return Check(name, "ok", found)
 
 
+def examine_sensor(
+    sensor: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, guess: Guess, blame: Blame
+) -> tuple[list[Check], bool]:
+    """Open a sensor and make every check of it at rest; return also whether it measures. `guess` as `check_noise`."""
+    found: list[Check] = []
+    name = "sensor.identity"
+    try:
+        sensor.open()
+        info = sensor.identify()
+        found += check_identity(info)
+        name = "sensor.stream"
+        found += [check_diagnosis(one, "sensor") for one in sensor.diagnose()]
+        samples = sensor.collect(_LOOK_S)
+        health = sensor.health()
+    except DeviceError as error:
+        return [*found, blame(name, error)], False
+    fact = info.facts.get("range")
+    limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
+    return [
+        *found,
+        check_load(limits, cell),
+        check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
+        *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
+        *check_stream(samples, health, address, _LOOK_S),
+        *check_noise(samples.wrench, _LOOK_S, cell.sampling.average_s, guess),
+    ], True
+
+
+def examine_push(
+    sensor: ForceTorqueSensor | None,
+    arm: RobotArm | None,
+    R_flange_sensor: Array | None,
+    sign: int,
+    station: Station | None,
+    is_pushing: Callable[[], bool],
+    blame: Blame,
+) -> tuple[Check, dict[str, Any] | None]:
+    """Measure a push along +X of the base, and check it as `check_push`.
+
+    An emulated cell pushes by itself. Elsewhere `is_pushing` asks for the push, and says whether there is one.
+    """
+    if sensor is None:
+        return Check("push.sign", "skipped", "the sensor does not measure"), None
+    try:
+        R_base_flange = None if arm is None else arm.state().R_base_flange
+    except DeviceError:
+        R_base_flange = None  # robot.flange reports it
+    try:
+        before = sensor.collect(1.0).wrench[:, :3].mean(axis=0)
+        with ExitStack() as stack:
+            if station is None:
+                if not is_pushing():
+                    return Check("push.sign", "skipped", "no push: the standard input is closed"), None
+            elif R_base_flange is not None and R_flange_sensor is not None:
+                force = (R_base_flange @ R_flange_sensor).T @ [_SIMULATED_PUSH_N, 0.0, 0.0]
+                station.control(do="push", wrench=[*force.tolist(), 0.0, 0.0, 0.0])
+                stack.callback(station.control, do="push", wrench=[0.0] * 6)
+            windows = round((PUSH_S if station is None else _SIMULATED_PUSH_S) / _PUSH_WINDOW_S)
+            pieces = (sensor.collect(_PUSH_WINDOW_S).wrench[:, :3] for _ in range(windows))
+            changes = [force_N.mean(axis=0) - before for force_N in pieces]
+    except DeviceError as error:
+        return blame("push.sign", error), None
+    largest = max(changes, key=lambda change: float(np.linalg.norm(change)))
+    return check_push(largest, R_base_flange, R_flange_sensor, sign)
+
+
 def check_push(
     change: Array, R_base_flange: Array | None, R_flange_sensor: Array | None, sign: int
 ) -> tuple[Check, dict[str, Any]]:
-    """Check the sign of a sensor from a push along +X of the base.
+    """Check the sign of a sensor from a push along +X of the base, along which its reading must move.
 
-    Parameters
-    ----------
-    change : array, shape (3,)
-        Force during the push minus force before, N, sensor axes.
-    R_base_flange, R_flange_sensor : array, shape (3, 3), or None
-        Where unknown.
-    sign : int
-        As configured now.
-
-    Returns
-    -------
-    Check
-        A reading is exerted on the sensor, so it must move along +X of the base.
-    dict
-        For sensor, flange and base: force_N and the axis that moved most, such as "-Y"; None where unknown.
+    `change` is force during the push minus force before, N, sensor axes. The orientations are None where unknown, and
+    `sign` is as configured. The second value has, for sensor, flange and base, force_N and the axis that moved most,
+    such as "-Y"; None where unknown.
     """
     flange = None if R_flange_sensor is None else R_flange_sensor @ change
     base = None if flange is None or R_base_flange is None else R_base_flange @ flange

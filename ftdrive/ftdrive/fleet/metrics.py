@@ -5,10 +5,9 @@ from datetime import datetime
 from typing import Any, Final
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.fleet.serve import FleetReading
-from ftdrive.fleet.state import CellState
-from ftdrive.http_gate import PassingGate, hidden_host
-from ftdrive.terminal.text import visible
+from ftdrive.fleet.state import CellState, FleetReading
+from ftdrive.servers.http_gate import PassingGate, hidden_host
+from ftdrive.words.text import visible
 from ftdrivers.installation import missing_extra
 
 try:
@@ -89,19 +88,8 @@ NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STA
 class MetricsServer(Collector):
     """Serves the newest reading at /metrics, without a process or platform metric beside it.
 
-    Parameters
-    ----------
-    host : str
-        Address to listen at.
-    port : int
-        0 lets the system choose; see `port`.
-    page : callable, optional
-        Returns the page of the fleet, which is served at / and made for each load; may raise `BadStore`.
-
-    Raises
-    ------
-    ConfigError
-        The address cannot be used.
+    Port 0 lets the system choose; see `port`. `page` returns the page of the fleet, which is served at / and made for
+    each load; it may raise `BadStore`. Raises `ConfigError` for an address that cannot be used.
     """
 
     def __init__(self, host: str, port: int, page: Callable[[], str] | None = None) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from ftdrive import __version__
 from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed
 from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
-from ftdrive.report.report import templates, with_code
+from ftdrive.report.page import templates, with_code
 from ftdrive.runs.verification import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
@@ -16,18 +16,7 @@ LEAST_SIGMAS = 4.0
 
 
 def page(fleet: Fleet, observed: Observed, store: str) -> str:
-    """Write the page.
-
-    Parameters
-    ----------
-    store : str
-        Name of the store, without its password.
-
-    Raises
-    ------
-    ConfigError
-        The extra `fleet` is not installed.
-    """
+    """Write the page; `store` is the name of the store. Raises `ConfigError` without the extra `fleet`."""
     environment = templates("ftdrive.fleet", "the page of a fleet", "fleet", "--json")
     from markupsafe import Markup
 

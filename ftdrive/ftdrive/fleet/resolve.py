@@ -5,10 +5,12 @@ solved-<version>.json   ftdrive.calibration/2, in the run folder: the result of 
 """
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final
@@ -17,9 +19,10 @@ import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
 from ftcalib.after.series import difference
-from ftcalib.errors import BadCalibration, BadDataset
+from ftcalib.errors import BadCalibration, BadDataset, DataError
 from ftcalib.files import read_file, read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
+from ftcalib.rounding import counted
 from ftdrive import __version__
 from ftdrive.fleet.workers import (
     Call,
@@ -30,7 +33,7 @@ from ftdrive.fleet.workers import (
     folder_of_worker,
     require_version,
 )
-from ftdrive.runs.run import Run, in_motion
+from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
@@ -59,13 +62,37 @@ def is_calibration(folder: Path, since: datetime | None) -> bool:
     return recent and header.get("command") != "verify"
 
 
+def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[str], object]) -> list[Path]:
+    """Return the calibrations among these runs.
+
+    Those without a dataset or a recording in motion are left out; `say` takes how many, and how to finish them.
+    """
+    runs, unfinished = list[Path](), Counter[str]()
+    for run in found:
+        if is_calibration(run, since):
+            if run.is_dir() and not (Run(run).dataset_path.exists() or Run(run).in_motion):
+                unfinished[_how_to_finish(run)] += 1
+            else:
+                runs.append(run)
+    for words, count in unfinished.items():
+        say(f"Left out, because they have no data to solve: {count} runs; {words}.")
+    return runs
+
+
+def _how_to_finish(folder: Path) -> str:
+    try:
+        mode = Run(folder).header().get("mode")
+    except (DataError, OSError):
+        mode = None
+    if mode in ("sweep", "passive"):
+        return f"start again with `ftdrive calibrate --{mode}`"
+    return "`ftdrive calibrate --resume RUN` finishes one"
+
+
 def task_of(folder: Path) -> tuple[bytes, bytes]:
     """Return the newest dataset of a run as its file has it, and what else `solved` needs, as JSON.
 
-    Raises
-    ------
-    BadDataset, BadCalibration, OSError
-        A file of the run is damaged or missing.
+    Raises `BadDataset`, `BadCalibration` or `OSError` for a file of the run that is damaged or missing.
     """
     run = Run(folder)
     found = circumstances_of(run)
@@ -81,11 +108,7 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
 def solve_task(dataset: bytes, task: bytes) -> bytes:
     """Return the calibration file of a task: a pure function of its bytes and of the installed versions.
 
-    Raises
-    ------
-    OtherVersion
-        The task was made by another version.
-    BadDataset, NotObservable
+    Raises `OtherVersion` for a task that was made by another version, else `BadDataset` or `NotObservable`.
     """
     given: dict[str, Any] = json.loads(task)
     require_version(given["version"])
@@ -155,12 +178,8 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
     """Solve runs and write their results as they come; yield each folder with the comparison, or why it failed.
 
     A run that has the result of this version is only compared, and comes first. A file is written whole or not at all,
-    so everything that was yielded remains when the caller stops.
-
-    Raises
-    ------
-    OtherVersion
-        A worker has another version.
+    so everything that was yielded remains when the caller stops. Raises `OtherVersion` if a worker has another
+    version.
     """
     rest = list[Path]()
     for folder in folders:
@@ -170,7 +189,7 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
             rest.append(folder)
 
     def call_of(folder: Path) -> Call:
-        if not in_motion(folder):
+        if not Run(folder).in_motion:
             return solve_task, *task_of(folder)
         if workers.share_files:
             return _solved_motion, folder, __version__
@@ -204,3 +223,54 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
 def _data_of(result: CalibrationResult) -> object:
     """Return the hash of the poses, or of the recording in motion, from which a result was made."""
     return result.provenance.get("dataset_sha256") or result.provenance.get("recording_sha256")
+
+
+@dataclass(slots=True)
+class SolvedAgain:
+    """What solving again has shown, by run."""
+
+    runs: int
+    solved_before: int
+    unchanged: int = 0
+    changed: list[dict[str, Any]] = field(default_factory=list)
+    other_verdict: list[dict[str, Any]] = field(default_factory=list)
+    failed: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, run: Path, found: Comparison | str) -> None:
+        """Add what `solve_again` yields."""
+        here = {"run": str(run)}
+        if isinstance(found, str):
+            self.failed.append({**here, "reason": found})
+            return
+        if found.has_changed:
+            sigmas = found.sigmas if isfinite(found.sigmas) else None
+            self.changed.append({**here, "parameter": found.parameter, "sigmas": sigmas})
+        if found.has_other_verdict:
+            finding = None if found.finding is None else found.finding.to_dict()
+            verdicts = {"before": found.verdict_before, "now": found.verdict, "finding": finding}
+            self.other_verdict.append({**here, **verdicts})
+        self.unchanged += not (found.has_changed or found.has_other_verdict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as JSON."""
+        return {"schema_version": 1, "version": __version__, **asdict(self)}
+
+    def lines(self) -> Iterator[str]:
+        """Yield the counts, and a line for each run that changed, has another verdict, or failed."""
+        now = self.runs - self.solved_before - len(self.failed)
+        yield (
+            f"{counted(self.runs, 'run')} with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
+            f"{len(self.failed)} failed."
+        )
+        yield (
+            f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigmas, "
+            f"{len(self.other_verdict)} with another verdict."
+        )
+        for one in self.changed:
+            how = "was known and differs" if one["sigmas"] is None else f"changed by {one['sigmas']:+.1f} sigmas"
+            yield f"changed: {one['run']}: {one['parameter']} {how}"
+        for one in self.other_verdict:
+            why = f" ({one['finding']['words']})" if one["finding"] else ""
+            yield f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}"
+        for one in self.failed:
+            yield f"failed: {one['run']}: {one['reason']}"

@@ -1,14 +1,16 @@
-"""The state of a fleet, and its words: what the status, its page and the metrics show."""
+"""The state of a fleet, its words, and the loop of its server: what the status, its page and the metrics show."""
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from datetime import datetime
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
 from ftcalib.files import JSON
 from ftcalib.rounding import counted
+from ftdrive.errors import BadStore
 from ftdrive.runs.verification import age_in_words
-from ftdrive.store.records import StoredWeighings, tool_in_words
+from ftdrive.store.records import StoredCell, StoredWeighings, tool_in_words
+from ftdrivers.clock import Clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +97,17 @@ class Fleet:
     cells: tuple[CellState, ...]
     findings: tuple[FleetFinding, ...]
 
+    def is_due(self, one: StoredCell, now: datetime) -> bool:
+        """Whether the mounted tool is due; without a name of it, whether any tool of the cell is."""
+        states = [state for state in self.cells if state.cell == one.name]
+        if one.tool is not None:
+            states = [state for state in states if state.tool in {one.tool, None}]
+        return not states or any(state.is_due(now) for state in states)
+
+    def id_of(self, cell: str, tool: str) -> str | None:
+        """Return the id of the newest accepted calibration of a tool; None without one."""
+        return next((one.calibration_id for one in self.cells if (one.cell, one.tool) == (cell, tool)), None)
+
 
 MOST: Final = 4
 
@@ -160,3 +173,50 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
         if one.drift is not None and one.drift.found:
             found.append(f"{name}: {one.drift.words}: calibrate again, and check the sensor if it goes on")
     return found + [one.words for one in fleet.findings]
+
+
+# Time between two reads of the store.
+EVERY_S: Final = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class FleetReading:
+    """The state of a fleet as it was read last."""
+
+    fleet: Fleet
+    read: datetime
+    """When it was read from the store, UTC."""
+    now: datetime
+    """When it is passed on, UTC; later than `read` while the store cannot be read."""
+    store_up: bool = True
+
+
+def serve(
+    fleet_at: Callable[[datetime], Fleet],
+    update: Callable[[FleetReading], None],
+    clock: Clock,
+    *,
+    say: Callable[[str], None],
+    now: Callable[[], datetime] = lambda: datetime.now(UTC),
+) -> None:
+    """Read the state by `fleet_at` and pass it on to `update` until an exception ends it, such as `KeyboardInterrupt`.
+
+    A store that cannot be read later than at the start ends nothing: the last state stays, with its age, and `say`
+    takes a sentence for the operator. `clock` times the period. Raises `BadStore` at the start.
+    """
+    # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
+    time = now()
+    reading = FleetReading(fleet_at(time), time, time)
+    while True:
+        update(reading)
+        clock.sleep(EVERY_S)
+        was_up, time = reading.store_up, now()
+        try:
+            reading = FleetReading(fleet_at(time), time, time)
+        except BadStore as error:
+            reading = replace(reading, now=time, store_up=False)
+            if was_up:
+                say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - reading.read)} old.")
+        else:
+            if not was_up:
+                say("The store can be read again.")

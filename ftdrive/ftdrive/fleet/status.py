@@ -16,9 +16,9 @@ from scipy.special import fdtrc as f_sf
 
 from ftcalib.after.series import drift_onset, spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
+from ftcalib.rounding import to_place_of
 from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
-from ftdrive.report.document import rounded
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import BriefVerification, StoredCell, StoredResult
 from ftdrive.store.store import Store
@@ -66,8 +66,8 @@ def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
     since = start + timedelta(days=float(onset.t0_days[k]))
     others = int(onset.found.sum()) - 1
     more = f", and {others} more {'component' if others == 1 else 'components'}" if others else ""
-    sign = "-" if rate < 0 else ""
-    words = f"{COMPONENTS[k]} drifts by {sign}{rounded(abs(rate), 2)} {unit} a week since {since:%Y-%m-%d}{more}"
+    size = to_place_of(rate, abs(rate))
+    words = f"{COMPONENTS[k]} drifts by {size} {unit} a week since {since:%Y-%m-%d}{more}"
     return BiasDrift(level, found=True, words=words)
 
 
@@ -368,7 +368,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]
         axis=0,
     )
     largest = (slopes[:3].max(), "N"), (slopes[3:].max(), "N·m")
-    size = " and ".join(f"{rounded(float(slope), 2)} {unit}" for slope, unit in largest if slope)
+    size = " and ".join(f"{to_place_of(slope, float(slope))} {unit}" for slope, unit in largest if slope)
     yield FleetFinding(
         "temperature",
         cells,

@@ -134,21 +134,10 @@ def _begin_worker(lifeline: Connection) -> None:
 
 @contextmanager
 def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Workers]:
-    """Connect to a Dask cluster.
+    """Connect to the Dask cluster of a scheduler, dask://HOST:PORT.
 
-    Parameters
-    ----------
-    address : str
-        Of its scheduler: dask://HOST:PORT.
-
-    Raises
-    ------
-    ConfigError
-        The address has another form, or a worker has another version of ftdrive, numpy or scipy.
-    Unreachable
-        No scheduler answers there, or it has no worker.
-    StreamBroken
-        The scheduler was lost while calls were running.
+    Raises `ConfigError` for another form, or a worker with another version of ftdrive, numpy or scipy; `Unreachable`
+    if no scheduler answers there, or it has no worker; `StreamBroken` if it was lost while calls were running.
     """
     found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
     if found is None:
@@ -205,15 +194,10 @@ def _require_same_versions(found: Any, address: str) -> None:
 
 
 def answers(call_of: Callable[[Path], Call], items: Iterable[Path], workers: Workers) -> Iterator[tuple[Path, Answer]]:
-    """Make a call for each item, and yield item and answer as they come.
+    """Make a call for each item, when it is its turn so that few are in memory; yield item and answer as they come.
 
     A call whose worker died is repeated alone, because the death of a process also breaks the calls that run beside it.
     The cause of a second death is then the call itself.
-
-    Parameters
-    ----------
-    call_of : callable
-        Returns the call of an item when it is its turn, so that few are in memory.
     """
     died = yield from _round(call_of, items, workers, 2 * workers.count)
     died = yield from _round(call_of, died, workers, 1)

@@ -86,7 +86,7 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
         axes.set_title(title)
         axes.set_xlabel(f"base {'xyz'[across]} [m]")
         axes.set_ylabel(f"base {'xyz'[up]} [m]")
-    figure.suptitle(title_of(plan, certifier, on_its_way=len(before) > 0))
+    figure.suptitle(_title_of(plan, certifier, on_its_way=len(before) > 0))
     picture = BytesIO()
     figure.savefig(picture, format="png", dpi=110)
     write_new(path, picture.getvalue())
@@ -102,7 +102,7 @@ def _joints(axes: Any, sweep: Sweep) -> None:
     axes.grid(visible=True)
 
 
-def title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
+def _title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
     """Say what is seen, and what is not."""
     ball = f"sphere of {plan.ball_m:.2f} m"
     moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"

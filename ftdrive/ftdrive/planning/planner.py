@@ -138,21 +138,11 @@ def _reason(poses: int) -> str:
     return f"{poses} of the 24 orientations were requested"
 
 
-def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
+def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
     """Plan a tour of the four most informative reachable poses, for a new tool on a calibrated cell.
 
-    They determine everything, so they determine weight, centre of mass and bias of the tool too: its error
-    is 3 % above that of a tetrahedron of gravity directions.
-
-    Parameters
-    ----------
-    q_rad, guess
-        As of `plan_tour`.
-
-    Raises
-    ------
-    PlanRefused
-        Too few poses are reachable by moves that are proven clear.
+    They determine everything, so they determine weight, centre of mass and bias of the tool too: its error is 3 %
+    above that of a tetrahedron of gravity directions.
     """
     found = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
     if found is None:
@@ -165,19 +155,8 @@ def plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: 
     return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
 
 
-def plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
-    """Plan a tour of tilts with a load on a string: its hook stays at one point, and the arm turns about it.
-
-    Parameters
-    ----------
-    q_rad, guess
-        As of `plan_tour`.
-
-    Raises
-    ------
-    PlanRefused
-        Too few tilts are reachable by moves that are proven clear.
-    """
+def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
+    """Plan a tour of tilts with a load on a string: its hook stays at one point, and the arm turns about it."""
     speeds = speeds.limited(Speeds.with_hung_load())
     q_now = checked_joints(q_rad)
     found = hung_tour(certifier, q_now, HUNG_POSES, speeds)
@@ -199,7 +178,7 @@ def plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: 
     return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
 
 
-def plan_cone(
+def _plan_cone(
     certifier: Certifier,
     q_rad: ArrayLike = USUAL_POSTURE_RAD,
     poses: int = 24,
@@ -208,17 +187,7 @@ def plan_cone(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Plan a tour of chosen poses that keeps the tool axis in a cone about straight down.
-
-    Parameters
-    ----------
-    q_rad, guess
-        As of `plan_tour`.
-    poses : int
-        6 or more.
-    half_angle_rad : float
-        Between the tool axis (flange z) and straight down.
-    """
+    """Plan a tour of 6 chosen poses or more that keeps the tool axis (flange z) within an angle of straight down."""
     q_now = checked_joints(q_rad)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
@@ -236,7 +205,7 @@ def plan_cone(
     return make_plan("cone", why, certifier, found.numbers, found.q_rad, speeds, guess)
 
 
-def plan_box(
+def _plan_box(
     certifier: Certifier,
     q_rad: ArrayLike = USUAL_POSTURE_RAD,
     poses: int = 24,
@@ -248,14 +217,7 @@ def plan_box(
 ) -> Plan:
     """Plan a tour of the special orientations with the flange free in a box. Base, shoulder and elbow move too.
 
-    Parameters
-    ----------
-    q_rad, poses, guess
-        As of `plan_tour`.
-    half_size_m : float
-        Half the length of the edges of the box, which are along the base axes.
-    centre_m : array_like, shape (3,), optional
-        Centre of the box, in base; default: the present flange position.
+    Its edges, twice `half_size_m` long, are along the base axes; its centre in base is by default the present flange.
     """
     q_now = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
@@ -270,23 +232,10 @@ def plan_box(
     return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
 
 
-def plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
-    """Plan one tour through sets of orientations of Yu's Fig. 6.
+def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
+    """Plan one tour through sets of orientations of Yu's Fig. 6, one of `COUNTS` or several, as A+E.
 
-    Parameters
-    ----------
-    q_rad, guess
-        As of `plan_tour`.
-    sets : str
-        One of `ftcalib.poses.selection.COUNTS`, or several, as A+E. Random orientations that are out of reach are
-        replaced by others of the same kind.
-
-    Raises
-    ------
-    ConfigError
-        There is no such set.
-    PlanRefused
-        Too few poses are reachable by moves that are proven clear.
+    Random orientations that are out of reach are replaced by others of the same kind.
     """
     q_now = checked_joints(q_rad)
     try:
@@ -313,24 +262,7 @@ def plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spee
 def plan_verification(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour of poses that are far from those of a calibration.
-
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles.
-    poses : int
-        2 or more.
-    R_fitted : array, shape (k, 3, 3)
-        Orientations R_base_flange of the calibration.
-    guess : Guess
-        As of `plan_tour`.
-
-    Raises
-    ------
-    PlanRefused
-        Too few poses are reachable by moves that are proven clear.
-    """
+    """Plan a tour of two poses or more, far from those of a calibration, `R_fitted` (k, 3, 3); else as `plan_tour`."""
     q_now = checked_joints(q_rad)
     if poses < FEWEST_TO_VERIFY:
         raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
@@ -433,23 +365,22 @@ def plan_for(
 ) -> Plan:
     """Plan a tour for a cell, with its certifier, from joint angles `q_rad` (6,).
 
-    Raises as `plan_cone` with `cone_deg`, `plan_box` with `box_mm`, `plan_sets` with `sets`, `plan_tool` for four
-    poses, else `plan_tour`.
+    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, `ConfigError` for wrong values.
     """
     speeds, guess = speeds_of(cell), guess_of(certifier, cell)
     if tip_unlimited:
         speeds = replace(speeds, tip_m_s=None)
     if cone_deg is not None:
         half_angle_rad = float(np.radians(cone_deg))
-        made = plan_cone(certifier, q_rad, poses, half_angle_rad=half_angle_rad, speeds=speeds, guess=guess)
+        made = _plan_cone(certifier, q_rad, poses, half_angle_rad=half_angle_rad, speeds=speeds, guess=guess)
     elif box_mm is not None:
-        made = plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
+        made = _plan_box(certifier, q_rad, poses, half_size_m=box_mm / 1e3, speeds=speeds, guess=guess)
     elif sets is not None:
-        made = plan_sets(certifier, q_rad, sets, speeds=speeds, guess=guess)
+        made = _plan_sets(certifier, q_rad, sets, speeds=speeds, guess=guess)
     elif certifier.arm.hung is not None:
-        made = plan_hung(certifier, q_rad, speeds=speeds, guess=guess)
+        made = _plan_hung(certifier, q_rad, speeds=speeds, guess=guess)
     elif poses == TOOL_POSES:
-        made = plan_tool(certifier, q_rad, speeds=speeds, guess=guess)
+        made = _plan_tool(certifier, q_rad, speeds=speeds, guess=guess)
     else:
         made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
@@ -475,6 +406,8 @@ def certifier_for(
     model: str | None,
     kinematics: Kinematics | None = None,
     p_flange_hook_m: tuple[float, float, float] | None = None,
+    *,
+    must_be_possible: bool = True,
 ) -> Certifier:
     """Describe arm, tool and surroundings of a cell to the certifier.
 
@@ -487,24 +420,14 @@ def certifier_for(
         The arm's own; without them nominal ones, and more distance is kept.
     p_flange_hook_m : (float, float, float), optional
         Where a load hangs from the tool on a string.
+    must_be_possible : bool
+        Refuse what `require_possible` does; a drawing shows it.
 
     Raises
     ------
     ConfigError
         The arm or tool is missing, a shape is impossible, the arm has no measured shape, or see `require_possible`.
     """
-    certifier = certifier_as_described(cell, model, kinematics, p_flange_hook_m)
-    require_possible(cell, model)
-    return certifier
-
-
-def certifier_as_described(
-    cell: CellConfig,
-    model: str | None,
-    kinematics: Kinematics | None = None,
-    p_flange_hook_m: tuple[float, float, float] | None = None,
-) -> Certifier:
-    """Describe a cell as `certifier_for` does, also one that is impossible."""
     if model is None:
         raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
     if not cell.tool.cylinders_mm:
@@ -514,6 +437,8 @@ def certifier_as_described(
     x, y, z = scene.down_base.tolist()
     hung = None if p_flange_hook_m is None else HungLoad(p_flange_hook_m, (x, y, z))
     arm = ArmModel(model, [_cylinder_from_mm(values) for values in cell.tool.cylinders_mm], kinematics, hung)
+    if must_be_possible:
+        require_possible(cell, model)
     return Certifier(arm, scene)
 
 

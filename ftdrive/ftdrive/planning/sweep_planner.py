@@ -14,11 +14,11 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftcalib.judge.verdict import expected_error
 from ftcalib.motion.estimate import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
 from ftcalib.motion.samples import Motion
 from ftcalib.poses.information import Guess
+from ftcalib.sensor_matrix import expected_error
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
@@ -69,25 +69,8 @@ def plan_sweep(
 ) -> Plan:
     """Plan a sweep around the present posture, or around one that has more room.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles.
-    seconds : float
-        Duration at the planned speed.
-    speeds : Speeds
-        Limits.
-    stop_rad_s2 : float
-        Deceleration of a stop.
-    guess : Guess
-        Of the tool and the noise.
-
-    Raises
-    ------
-    ConfigError
-        `seconds` is out of range.
-    PlanRefused
-        No sweep was proven clear.
+    It lasts `seconds` at the planned speed. Raises `ConfigError` if that is out of range, and `PlanRefused` if no
+    sweep was proven clear.
     """
     if not SECONDS[0] <= seconds <= SECONDS[1]:
         raise ConfigError(f"a sweep of {seconds:g} s does not exist: give {SECONDS[0]:g} to {SECONDS[1]:g} s")

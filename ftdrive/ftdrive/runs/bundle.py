@@ -42,9 +42,9 @@ from ftcalib.files import MOST_BYTES as _MOST_IN_MEMORY
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
+from ftdrive.runs.calibration import sensor_files, versions
 from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
-from ftdrive.runs.run import LOCK, Run, is_run, versions
-from ftdrive.runs.sensor_file import sensor_files
+from ftdrive.runs.run import LOCK, Run, is_run
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
 _URL_HOST = re.compile(r"\b([a-z][a-z0-9+-]*)://(?:[^/@\s]*@)?([A-Za-z0-9][A-Za-z0-9.-]*)")
@@ -233,12 +233,7 @@ class Bundled:
 def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> Bundled:
     """Write a run folder, transcripts and the sensor's matrix to a new zip file, complete or not at all.
 
-    Raises
-    ------
-    BadDataset
-        The folder is no run folder.
-    OSError
-        `path` exists or cannot be written.
+    Raises `BadDataset` if the folder is no run folder, `OSError` if `path` exists or cannot be written.
     """
     folder = folder.resolve()
     if not is_run(folder):

@@ -14,7 +14,7 @@ from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
 from ftcalib.files import read_file
 from ftcalib.model import Array
-from ftcalib.motion.samples import Means
+from ftcalib.motion.samples import Means, measured_s
 from ftcalib.motion.solve import solve_motion
 from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
@@ -30,8 +30,6 @@ _POSES: Final = {
     "R_base_flange": (3, 3),
     "p_base_flange_m": (3,),
 }
-# Number of blocks of samples; of each the one counts that is received the soonest.
-_BLOCKS: Final = 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -132,26 +130,6 @@ def files_of(path: Path) -> list[Path]:
     if not files:
         raise BadDataset(f"{path} has no samples yet: record for some seconds")
     return files
-
-
-def measured_s(count: Any, t_host_ns: Any, start_ns: int) -> Array:
-    """Return the times of measurement (n,): the line over the device's count that is closest below all receipts.
-
-    A computer that starves receives samples late, for seconds on end, but none early. Source: Moon, Skelly, Towsley,
-    "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
-    """
-    from scipy.optimize import linprog
-
-    x, y = np.asarray(count, dtype=np.float64) - float(count[0]), (t_host_ns - start_ns) * 1e-9
-    rough = (y[-1] - y[0]) / max(x[-1], 1.0)
-    late_s = y - rough * x
-    soonest = np.array(
-        [block[np.argmin(late_s[block])] for block in np.array_split(np.arange(len(x)), _BLOCKS) if len(block)]
-    )
-    at, above = x[soonest] / max(x[-1], 1.0), 1e3 * (late_s[soonest] - late_s.min())
-    line = linprog([-0.5, -1.0], np.column_stack([at, np.ones(len(at))]), above, bounds=(None, None))
-    turn_s, offset_s = 1e-3 * np.asarray(line.x, dtype=np.float64)
-    return np.asarray(rough * x + late_s.min() + offset_s + turn_s * x / max(x[-1], 1.0))
 
 
 def solve_motion_file(

@@ -25,14 +25,9 @@ def numbers_in_dataset(records: Sequence[PoseRecord]) -> tuple[int, ...]:
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:
-    """Explain outlying poses, most important first; empty for a quiet run, and without records.
+    """Explain outlying poses of a tour, most important first; empty for a quiet run, and without records.
 
-    Parameters
-    ----------
-    result : CalibrationResult
-        Of the dataset of these records.
-    records : sequence of PoseRecord
-        In the order of the tour.
+    `result` is that of the dataset of these records, which are in the order of the tour.
     """
     if not records:
         return ()

@@ -19,16 +19,12 @@ import logging
 import os
 import platform
 import shlex
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cache
-from importlib.metadata import version
-from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Final, Literal, Self, get_args
 
@@ -36,13 +32,13 @@ import numpy as np
 
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
-from ftcalib.files import check_format, read_file, read_object, write_object
+from ftcalib.files import check_format, newest_path, read_file, read_object, unused_path, write_object
 from ftcalib.model import Array
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord, TourPose
-from ftdrive import __version__
-from ftdrive.cell.config import read_recorded, without_password
+from ftdrive.cell.config import read_recorded
 from ftdrive.errors import ConfigError
+from ftdrive.runs.calibration import made_now
 from ftdrive.runs.numbers import DAMAGE, append_lines, read_arrays, read_line, write_arrays
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.interfaces import FtSamples
@@ -147,7 +143,8 @@ class Run(Displayed):
     @classmethod
     def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":
         """Make a new folder `<UTC time>-<name>` and write its run.json."""
-        now = datetime.now(UTC)
+        made = made_now()
+        now = datetime.fromisoformat(made["created_utc"])
         folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
         number = 1
         while True:
@@ -160,10 +157,8 @@ class Run(Displayed):
         (folder / "poses").mkdir()
         header = {
             "format": RUN_FORMAT,
-            "created_utc": now.isoformat(),
+            **made,
             "created_host_ns": clock.now_ns(),
-            "argv": _command_line(),
-            "versions": versions(),
             **description,
         }
         write_object(folder / "run.json", header, allow_nan=True)
@@ -172,18 +167,18 @@ class Run(Displayed):
     @property
     def calibration_path(self) -> Path:
         """Where the newest result is kept."""
-        return _newest(self.folder / "calibration.json")
+        return newest_path(self.folder / "calibration.json")
 
     @property
     def dataset_path(self) -> Path:
         """Where the newest dataset is kept."""
-        return _newest(self.folder / "dataset.json")
+        return newest_path(self.folder / "dataset.json")
 
     @property
     def motion_path(self) -> Path:
         """Where the newest recording in motion is kept: a file, or a folder of parts."""
         folder = self.folder / "motion"
-        return folder if folder.is_dir() else _newest(self.folder / "motion.npz")
+        return folder if folder.is_dir() else newest_path(self.folder / "motion.npz")
 
     @property
     def in_motion(self) -> bool:
@@ -326,17 +321,12 @@ class Run(Displayed):
 
     def records(self) -> list[PoseRecord]:
         """Read every pose, in the order of the tour; of a pose taken again, the newest."""
-        return [_read_record(_newest(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
+        return [_read_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
         """Return the stops taken, without reading them."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
-
-
-def in_motion(place: Path) -> bool:
-    """Whether a place is a run folder with a recording in motion instead of poses."""
-    return place.is_dir() and Run(place).in_motion
 
 
 def _is_text(value: Any) -> bool:
@@ -398,26 +388,9 @@ class _Whole(dict[str, Any]):
         raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
 
 
-def _numbered(path: Path) -> Iterator[Path]:
-    yield path
-    yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
-
-
 def is_run(folder: Path) -> bool:
     """Whether a folder is that of a run."""
     return (folder / "run.json").is_file()
-
-
-def unused_path(path: Path) -> Path:
-    """Return the first of name, name-2 and so on that does not exist."""
-    return next(one for one in _numbered(path) if not one.exists())
-
-
-def _newest(path: Path) -> Path:
-    found = path
-    for one in takewhile(Path.exists, _numbered(path)):
-        found = one
-    return found
 
 
 def _read_record(path: Path) -> PoseRecord:
@@ -448,23 +421,3 @@ def _record(data: Mapping[str, Any]) -> PoseRecord:
         clock_offset_ns=int(data.get("clock_offset_ns", 0)),
         swings=bool(data.get("swings", False)),
     )
-
-
-def made_now() -> dict[str, Any]:
-    """Return what every file says of its making: when, by which command line, with which versions."""
-    return {"created_utc": datetime.now(UTC).isoformat(), "argv": _command_line(), "versions": versions()}
-
-
-def _command_line() -> list[str]:
-    return [without_password(word) for word in sys.argv]
-
-
-def versions() -> dict[str, str]:
-    """Return the versions of the software behind a result."""
-    return dict(_versions())
-
-
-@cache
-def _versions() -> dict[str, str]:
-    found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
-    return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}

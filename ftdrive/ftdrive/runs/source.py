@@ -1,28 +1,36 @@
 """Datasets, calibrations and recorded runs from any place that commands accept: run folders and single files."""
 
-from collections.abc import Mapping, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from shlex import quote
-from typing import Any, Final
+from typing import Any, Final, Self
+from urllib.parse import parse_qsl
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup, solve
 from ftcalib.after.new_tool import new_tool
 from ftcalib.data.dataset import Orientation
-from ftcalib.errors import BadCalibration, BadDataset, NotObservable
+from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.files import read_file
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG, orientation_accuracy_deg
+from ftdrive.cell.units import numbers
 from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs.calibration import made_now, read_calibration, versions
 from ftdrive.runs.load import Load
 from ftdrive.runs.motion import solve_motion_file
-from ftdrive.runs.run import Run, is_run, made_now, versions
-from ftdrive.runs.sensor_file import with_sensor
+from ftdrive.runs.run import Run
 from ftdrive.tables.table import Table, TableOptions
+from ftdrivers.errors import BadUrl
+from ftdrivers.ros2.poses import Chain
+from ftdrivers.ur.kinematics import MODELS, model_named
 
 
 class RecordedRun:
@@ -85,6 +93,169 @@ class SolveOptions:
     """What is known of a table of another program; None if nothing is."""
     words: tuple[str, ...] = ()
     """The same as typed, quoted for a shell."""
+
+    @classmethod
+    def of_solve(cls, sources: Sequence[Path], given: Mapping[str, Any], *, simulate: bool) -> Self:
+        """Return what the options of `ftdrive solve` mean, by name; raises `ConfigError` if they contradict."""
+        method, drift, earlier, test = (given[name] for name in ("method", "drift", "earlier", "test"))
+        joined, cases, output = (given[name] for name in ("joined", "cases", "output"))
+        wrench, orientation_file = given["wrench"], given["orientation_file"]
+        known = [given[name] for name in ("mass_kg", "level_deg", "mounting_deg")]
+        if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
+            raise ConfigError("--wrench and --orientation-file are one recording: give both, and no DATASET")
+        pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
+        if not (sources or pair or simulate):
+            raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
+        others = (earlier, pair, test, *known, given["up"])
+        if cases and (method != "ml" or drift != "auto" or joined or any(one is not None for one in others)):
+            raise ConfigError(
+                "--table-iii has methods and test sets of its own: leave out --method, --test and other data, --drift "
+                "and known values"
+            )
+        if test is not None and method != "all":
+            raise ConfigError("--test compares methods: add --method all")
+        if given["as_published"] and method != "all" and not method.startswith("carlson-"):
+            raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
+        if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
+            raise ConfigError("--from and --together are for --method ml, one of the two at a time")
+        if joined and pair is not None:
+            raise ConfigError("--together joins poses at rest: leave out --wrench and --orientation-file")
+        if joined and len(sources) < 2:
+            raise ConfigError("--together joins two runs or more: name them, the oldest first")
+        if output is not None and ((len(sources) > 1 and not joined) or method == "all" or cases):
+            raise ConfigError("--output takes one result: give one dataset and one method")
+        return cls(
+            method,
+            given["orientation"],
+            drift,
+            known_values(*known),
+            up_direction(given["up"]),
+            as_published=given["as_published"],
+            earlier=None if earlier is None else read_calibration(earlier),
+            pair=pair,
+            point_mass=given["point_mass"],
+            topics=(given["wrench_topic"], given["pose_topic"]),
+            table=given["table"],
+        )
+
+    def of_solution(self, data: "RecordedData") -> dict[str, Any]:
+        """Return what `ftcalib.solve` and `ftcalib.compare` take beside dataset and provenance."""
+        return {"drift": self.drift, "as_published": self.as_published, **data.circumstances}
+
+
+def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
+    """Return the known values of the options in degrees; None without any. Raises `ConfigError`."""
+    if mass_kg is None and level_deg is None and mounting_deg is None:
+        return None
+    R_flange_sensor = None
+    if mounting_deg is not None:
+        rotation_vector = numbers("--mounting-deg", mounting_deg, ",", (3,))
+        R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
+    try:
+        return Known(
+            R_flange_sensor=R_flange_sensor,
+            gravity_direction_base=None if level_deg is None else -UP_IN_BASE,
+            direction_tolerance_rad=0.0 if level_deg is None else float(np.radians(level_deg)),
+            mass_kg=mass_kg,
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def up_direction(up: str | None) -> list[float] | None:
+    """Return the direction (3,) of `--up`; None without it. Raises `ConfigError`."""
+    if up is None:
+        return None
+    direction = numbers("--up", up, ",", (3,))
+    if not any(direction):
+        raise ConfigError(f"--up is {up}, which is no direction: give 0,0,1 for a robot on a floor")
+    return direction
+
+
+_LINKS: Final = ("tool0", "flange")
+
+
+def table_options(
+    columns: str | None,
+    rate: float | None,
+    euler: str | None,
+    tcp: str | None,
+    wrench_frame: Any,
+    sign: str | None,
+    model: str | None,
+    urdf: str | None,
+) -> TableOptions:
+    """Return what the options of a command say of a table. Raises `ConfigError` or `OSError`."""
+    offset = [0.0] * 6 if tcp is None else numbers("--tcp", tcp, ",", (3, 6))
+    turn = [*offset, 0.0, 0.0, 0.0][3:6]
+    named, text = ({}, {}) if columns is None else _columns(columns)
+    return TableOptions(
+        columns=named,
+        separator=text.get("separator", ""),
+        decimal=text.get("decimal", ""),
+        rate_Hz=rate,
+        euler=euler or "",
+        wrench_axes=wrench_frame,
+        R_flange_tcp=Rotation.from_rotvec(turn).as_matrix(),
+        p_flange_tcp_m=np.array(offset[:3]),
+        sign=-1 if sign == "-1" else 1,
+        forward=_forward(model, urdf),
+    )
+
+
+def _columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
+    """Return the columns that an option or a TOML file names, and what the file says of the text."""
+    if text.endswith(".toml"):
+        try:
+            found = tomllib.loads(read_file(text).decode())
+            columns = found["columns"] if "text" not in found else found.get("columns", {})
+        except (KeyError, ValueError) as error:
+            raise ConfigError(
+                f'{text} names no columns ({error}): write [columns] and lines like fx = "Force X"'
+            ) from error
+        return {str(name): str(column) for name, column in columns.items()}, found.get("text", {})
+    pairs = [part.partition("=") for part in text.split(",")]
+    if not all(name.strip() and column.strip() for name, _, column in pairs):
+        raise ConfigError(f'--columns {text}: give NAME=COLUMN with commas between, such as "t=Time,fx=Force X"')
+    return {name.strip(): column.strip() for name, _, column in pairs}, {}
+
+
+def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Array, Array]] | None:
+    """Return what makes poses of joint angles (n, 6)."""
+    if model is not None and urdf is not None:
+        raise ConfigError("--model and --urdf both describe the arm: leave one out")
+    if urdf is not None:
+        chain = _chain(urdf)
+        return lambda q_rad: chain.poses(dict(zip(chain.names, q_rad.T, strict=True)))
+    if model is None:
+        return None
+    if (name := model_named(model, 3)) is None:
+        raise ConfigError(f"--model {model}: the models are {', '.join(MODELS)}; another arm needs --urdf FILE")
+
+    def forward(q_rad: Array) -> tuple[Array, Array]:
+        found = frames(MODELS[name], q_rad)
+        return found.R_base_flange, found.flange_m
+
+    return forward
+
+
+def _chain(urdf: str) -> Chain:
+    file, _, query = urdf.partition("?")
+    links = dict(parse_qsl(query))
+    chain = failure = None
+    for flange in [links["flange"]] if "flange" in links else _LINKS:
+        try:
+            chain = Chain(Path(file), links.get("base", ""), flange)
+            break
+        except BadUrl as error:
+            failure = failure or error
+    if chain is None:
+        raise ConfigError(f"--urdf {urdf}: {failure}") from failure
+    if len(chain.names) != 6:
+        raise ConfigError(
+            f"--urdf {urdf}: {len(chain.names)} joints move, 6 are read: give the links, FILE?flange=LINK"
+        )
+    return chain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -158,19 +329,10 @@ _TAKEN: Final = "give a path, a DataFrame, arrays by name, or a pair (R_base_fla
 
 
 def as_source(source: Any) -> Any:
-    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either.
+    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either, from what users give.
 
-    Parameters
-    ----------
-    source : str, Path, Run, DataFrame, mapping, Recording, CalibrationDataset or pair of arrays
-        A pair is R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m.
-
-    Raises
-    ------
-    BadDataset
-        The arrays of a pair have other shapes, or are none of rotations and wrenches.
-    TypeError
-        Anything else; the message names the call that helps.
+    A pair is R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m. Raises `BadDataset` for
+    arrays of other shapes, and `TypeError` for anything else, with the call that helps.
     """
     if isinstance(source, str):
         return Path(source)
@@ -229,46 +391,6 @@ def read_dataset(
     if not isinstance(source, Path):
         return Table(source, table).dataset(orientation)
     return read_source(source, SolveOptions(orientation=orientation, table=table)).dataset
-
-
-def read_calibration(path: str | Path, *, accept_edited: bool = False) -> CalibrationResult:
-    """Read a calibration; `CalibrationResult.save` writes it.
-
-    If the present folder has a `sensor.json` of its sensor, the result decodes contacts with that.
-
-    Parameters
-    ----------
-    path : str or Path
-        A calibration.json, or a run folder: its newest calibration.
-    accept_edited : bool
-        Accept a file that was edited by hand; the result is then `is_edited`.
-
-    Raises
-    ------
-    DataError
-        The file is not a calibration that this version can read, is damaged or was edited, or a load was on the tool.
-    OSError
-        It cannot be read.
-
-    Examples
-    --------
-    >>> import ftdrive
-    >>> ftdrive.solve(ftdrive.read_dataset("poses.csv")).save("calibration.json")
-    >>> ftdrive.read_calibration("calibration.json").verdict
-    'good'
-    """
-    path = Path(path)
-    file = Run(path).calibration_path if path.is_dir() else path
-    if is_run(path) and not file.exists():
-        folder = quote(str(path))
-        raise FileNotFoundError(
-            f"{path} has no calibration, because its run was interrupted or its result rejected. Solve its poses:\n"
-            f"ftdrive solve {folder} --output {folder}/calibration.json"
-        )
-    result = CalibrationResult.load(file, accept_edited=accept_edited)
-    if (load := Load.of_header(result.provenance)) is not None:
-        raise BadCalibration(f"{path} was made with {load}: use it with `ftdrive loads solve`, not as that of the tool")
-    return with_sensor(result)
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:

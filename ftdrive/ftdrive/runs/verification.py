@@ -3,7 +3,7 @@
 verification.json   ftdrive.verification/1, in the run folder of the poses: calibration, limits, poses, outcome
 calibration.json    in the same folder, if the operator accepted an update: its provenance names the parent
 
-A verification belongs to a calibration by its id, whatever the paths. `last_verification` looks for `verification.json`
+A verification belongs to a calibration by its id, whatever the paths. `verification_near` looks for `verification.json`
 in the run folders beside that of the calibration, in those in `runs` beside the calibration file, and in those in
 `runs` of the current folder.
 """
@@ -12,10 +12,13 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, Final, Self
 
+import ftcalib
 from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.files import JSON, check_format, read_object, write_object
+from ftdrive.runs.calibration import made_now, marks_of
 
 # The record alone needs no numpy: a list of results starts without it.
 if TYPE_CHECKING:
@@ -31,16 +34,6 @@ FORMAT: Final = "ftdrive.verification/1"
 FALSE_ALARMS: Final = 0.01
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
-
-EMULATED: Final = "EMULATED"
-EDITED: Final = "EDITED BY HAND"
-FOREIGN: Final = "OF ANOTHER CELL"
-# What every output says of some calibrations: a mark, and its meaning in a sentence.
-MARKS: Final[Mapping[str, str]] = {
-    EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
-    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
-    FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it all the same.",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,29 +138,12 @@ class VerificationRecord:
         return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({self.change})" if self.change else "")
 
 
-def last_verification(place: Path) -> VerificationRecord | None:
-    """Return the newest verification of a calibration; None if there is none. Files that cannot be read are ignored.
+def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
+    """Return the newest verification of a calibration; None without one. Files that cannot be read are ignored.
 
-    Parameters
-    ----------
-    place : Path
-        A calibration file or its run folder.
-
-    Raises
-    ------
-    BadCalibration, OSError
-        The calibration cannot be read.
+    `place` is a calibration file, which need not be there, or its run folder.
     """
     # Searched by the id of the calibration: a run folder that is complete gets no more files.
-    from ftcalib import CalibrationResult
-    from ftdrive.runs.run import Run
-
-    path = Run(place).calibration_path if place.is_dir() else place
-    return verification_near(place, CalibrationResult.load(path).id)
-
-
-def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
-    """Return the newest verification of a calibration as `last_verification`; its file need not be in that place."""
     return newest(record for record in _records_near(place) if record.calibration_id == calibration_id)
 
 
@@ -188,18 +164,10 @@ def _records_near(place: Path) -> Iterator[VerificationRecord]:
 
 
 def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "CalibrationDataset | None":
-    """Read the poses of a calibration from its folder; None if they are not there.
-
-    Parameters
-    ----------
-    place : Path
-        The calibration file or its folder.
-    """
-    from ftcalib import CalibrationDataset
-
+    """Read the poses of a calibration, of which `place` is the file or its folder; None if they are not there."""
     for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
         try:
-            dataset = CalibrationDataset.load(path)
+            dataset = ftcalib.CalibrationDataset.load(path)
         except (BadDataset, OSError):
             continue
         if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
@@ -217,16 +185,6 @@ def age_of(calibration: "CalibrationResult", now: datetime) -> list[str]:
     """Return the age of a calibration, such as ["2 h old"]; empty if its file does not say when it was made."""
     created = calibration.provenance.get("created_utc")
     return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
-
-
-def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreign: bool = False) -> tuple[str, ...]:
-    """Return the `MARKS` of a calibration; `emulated` and `foreign` say so of what it is applied to."""
-    found = {
-        EMULATED: emulated or calibration.provenance.get("station") is not None,
-        EDITED: calibration.is_edited,
-        FOREIGN: foreign,
-    }
-    return tuple(mark for mark, applies in found.items() if applies)
 
 
 def calibration_in_words(
@@ -302,6 +260,11 @@ class Verified:
         )
 
     @property
+    def failure(self) -> str:
+        """Why it failed."""
+        return "; ".join(self.exceeded if self.limits.given else (self.verification.reason,))
+
+    @property
     def marks(self) -> tuple[str, ...]:
         """Marks of the calibration, and that of a verification in an emulated cell."""
         return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
@@ -316,10 +279,21 @@ class Verified:
         """What the update estimates, such as "bias", "payload" or "all"."""
         return None if self.update is None else self.update.kind
 
+    def next_command(self, saved: Path | None, again: str = "") -> str:
+        """Return what to type after it, where the update is saved; `again` are options, such as " --simulate"."""
+        if saved is not None:
+            return f"ftdrive live --calibration {quote(str(saved))}{again}"
+        if self.passed:
+            return "ftdrive history   (age and trends of all calibrations)"
+        return f"ftdrive calibrate{again}   (the calibration does not hold any more)"
+
+    @property
+    def updated(self) -> str:
+        """What the update replaces, in words."""
+        return "all values" if self.update_name == "all" else f"the {self.update_name}"
+
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of verification.json."""
-        from ftdrive.runs.run import made_now
-
         found, header = self.verification, self.run.header()
         return {
             "format": FORMAT,
@@ -372,13 +346,7 @@ class Verified:
 
 
 def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: AcceptanceLimits) -> Verified:
-    """Compare the poses of a run, read from its files, with a calibration; write dataset.json and verification.json.
-
-    Parameters
-    ----------
-    path : Path
-        File of the calibration.
-    """
+    """Compare the poses of a run with the calibration of a file; write dataset.json and verification.json."""
     from ftcalib.after.verification import verify
     from ftcalib.data.dataset import pooled_covariance
     from ftcalib.routine import dataset_from, drift_check, is_return
@@ -403,13 +371,9 @@ def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits:
 def save_update(verified: Verified) -> Path:
     """Save the update as a new calibration in the run folder of the verification; its provenance names the parent.
 
-    Raises
-    ------
-    NotObservable
-        The verification has no update.
+    Raises `NotObservable` if the verification has no update.
     """
     from ftcalib.after.state import apply_update
-    from ftdrive.runs.run import made_now
 
     if verified.update is None:
         raise NotObservable("no update makes up for the change: calibrate again")

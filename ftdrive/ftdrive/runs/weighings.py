@@ -20,7 +20,7 @@ from ftcalib.files import JSON, check_format, open_file, read_lines
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
-# Why nothing was weighed: the codes of `ftdrive.live.weighing.WORDS`. Each is a column of the store: a change raises
+# Why nothing was weighed: the codes of `ftdrive.stream.weighing.WORDS`. Each is a column of the store: a change raises
 # `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
@@ -36,12 +36,7 @@ def is_weighings(path: Path) -> bool:
 
 
 class WeighingsFile:
-    """The weighings of one origin on one day; other programs may add lines at the same time.
-
-    Parameters
-    ----------
-    path : Path
-    """
+    """The weighings of one origin on one day, in a file; other programs may add lines at the same time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

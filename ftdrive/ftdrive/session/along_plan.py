@@ -1,14 +1,12 @@
 """A session along a plan: shown, confirmed, approached, driven; and the register of plans driven to their end."""
 
 import json
-import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,6 +16,7 @@ from ftcalib.files import read_file
 from ftcalib.model import Array
 from ftcalib.rounding import to_place_of
 from ftcalib.sampling import Sampling
+from ftdrive.cell.config import user_folder
 from ftdrive.errors import SupervisorGone
 from ftdrive.planning.approach import Approach, plan_approach
 from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
@@ -39,13 +38,8 @@ from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
 
 FORMAT = "ftdrive.completed/1"
-
-
-def _state_file() -> Path:
-    """Return the user's register of completed plans; it need not exist."""
-    home = os.environ.get("XDG_STATE_HOME", "")
-    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/state").expanduser()
-    return folder / "ftdrive" / "completed.ndjson"
+# In the state folder of the user.
+_COMPLETED = "completed.ndjson"
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
@@ -53,7 +47,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
     False for an arm that reports no serial number, because it may be another one.
     """
-    path = _state_file()
+    path = user_folder("state") / _COMPLETED
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
@@ -62,7 +56,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
     """Record that one session drove every move of the plan, slowly, and took every pose."""
-    path = _state_file()
+    path = user_folder("state") / _COMPLETED
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
     with path.open("a", encoding="utf-8") as file:
@@ -360,14 +354,9 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
 
 
 def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
-    """Return the time of all moves: the approach to the first stop, then moves of the plan to the rest.
+    """Return the time of all moves at the plan's speeds: the approach to the first of these stops, then to the rest.
 
-    Parameters
-    ----------
-    plan : Plan
-        With the speeds it is driven at.
-    todo : sequence of int
-        Stops, from 1; where some are left out between two, there is an approach too, counted as a straight move.
+    Stops count from 1. Where some are left out between two, there is an approach too, counted as a straight move.
     """
     total_s = approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
     for stop, following in pairwise(todo):

@@ -163,21 +163,10 @@ class HandGuided:
         self._enough = False
 
     def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:
-        """Take poses.
+        """Take poses until they suffice, which `goal` says in words, after the `earlier` ones of a resumed run.
 
-        Parameters
-        ----------
-        earlier
-            Poses of the resumed run.
-        goal
-            When the poses suffice, in words.
-
-        Raises
-        ------
-        TooFewSamples
-            The sensor is too slow for the time given to a pose.
-        Exception
-            Whatever the arm or the sensor raises; the poses committed so far stand.
+        Raises `TooFewSamples` if the sensor is too slow for the time given to a pose, and whatever arm and sensor
+        raise; the poses committed so far stand.
         """
         self._passes_first = bool(earlier)
         # An emulated clock waits for this thread, which must see each standstill.

@@ -19,10 +19,9 @@ from ftcalib.judge.observability import (
     different_orientations,
     largest_gap,
 )
-from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, weight_and_tilt
 from ftcalib.poses.information import Guess, Prediction, predicted_sigma
 from ftcalib.poses.selection import next_pose
-from ftcalib.published.yu import weight_and_tilt
 from ftcalib.routine import PoseRecord, dataset_from, is_return
 from ftdrive.cell.config import USUAL_KG
 from ftdrive.runs.load import Load

@@ -1,14 +1,15 @@
 """Options of a session, those that exclude one another, and the mode of a resumed run."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, cast, get_args
+from typing import Any, Final, Self, cast, get_args
 
 from ftcalib.published.methods import SPECIAL
 from ftcalib.result import Method
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.certify import Certifier
+from ftdrive.runs.calibration import read_calibration
 from ftdrive.runs.load import Load
 from ftdrive.runs.run import Mode, Run
 from ftdrive.session.guards import Guard, RangeGuard
@@ -19,8 +20,10 @@ _SAVED: Final = ("--output", "--png")
 # Options of a session without a meaning where ftdrive neither plans nor moves.
 _OF_MOTION: Final = ("--plan", "--fast", "--dry-run", "--redo", *_SAVED)
 # Options of `ftdrive calibrate`.
+_MODES: Final[Sequence[Mode]] = ("step", "manual", "listen", "sweep", "passive")
+_AS_GIVEN: Final = ("runs", "sets", "dry_run", "fast", "plan", "output", "png", "resume", "redo", "yes")
 _EXCLUDE_ONE_ANOTHER: Final = (
-    ("--step", "--manual", "--listen", "--sweep", "--passive"),
+    tuple(f"--{mode}" for mode in _MODES),
     ("--quick", "--minimal", "--set", "--plan", "--resume", "--sweep", "--passive"),
     ("--from", "--set"),
     *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
@@ -72,6 +75,21 @@ class SessionOptions:
     """Goes into run.json."""
     load: Load | None = None
     """A weighed load on the tool, or what the resumed run has."""
+
+    @classmethod
+    def of_calibration(cls, given: Mapping[str, Any]) -> Self:
+        """Return what the options of `ftdrive calibrate` mean, by name. Raises `ConfigError`."""
+        earlier, load = given["earlier"], given["load"]
+        poses = 6 if given["minimal"] or given["gripped"] else 24 if earlier is None else 4
+        return cls(
+            poses=12 if given["quick"] else poses,
+            method=method_of_poses(given["method"]),
+            mode=next((name for name in _MODES if given[name]), "auto"),
+            seconds=given["seconds"] or (600.0 if given["passive"] else 20.0),
+            description={} if earlier is None else {"earlier": read_calibration(earlier).to_dict()},
+            load=None if load is None else Load.of(load, given["at"], gripped=given["gripped"]),
+            **{name: given[name] for name in _AS_GIVEN},
+        )
 
     @property
     def by_hand(self) -> bool:

@@ -45,14 +45,8 @@ def record_passively(
     """Record the free tool in motion until two fits in a row are good, the operator presses q, or the time is over.
 
     Each second is on disk before the next. Each fit is shown with its sigmas and with the motion that is missing. It
-    runs in a thread of `fits`, so that a lost device is reported at once.
-
-    Raises
-    ------
-    Declined
-        The operator ended it in the first seconds.
-    DeviceError
-        A device has failed; what was recorded is in the run.
+    runs in a thread of `fits`, so that a lost device is reported at once: a `DeviceError`, and what was recorded is in
+    the run. Raises `Declined` if the operator ended it in the first seconds.
     """
     # Every sample is kept: sums could not judge contact again, and the run could not be solved from its folder.
     cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")

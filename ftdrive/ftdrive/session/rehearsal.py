@@ -1,12 +1,21 @@
-"""A calibration of an emulated cell, without questions."""
+"""A calibration of an emulated cell, without questions, and what a session needs of such a cell."""
 
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, cast
+
+import numpy as np
 
 from ftcalib import CalibrationResult
-from ftdrive.cell.emulated import REAL_PACE, Station
+from ftcalib.accuracy import CONTACT_N
+from ftcalib.loads.model import KnownLoad, LoadRun
+from ftcalib.loads.solve import LoadSolution, solve_loads
+from ftdrive.cell.emulated import REAL_PACE, TOOL_MM, Station
 from ftdrive.errors import Declined, NotAccepted
+from ftdrive.planning.geometry.arm_model import STRING_M
+from ftdrive.runs.load import Load
 from ftdrive.runs.source import Outcome
 from ftdrive.session.events import Event, Key, Operator, Question
 from ftdrive.session.options import SessionOptions
@@ -41,26 +50,12 @@ class _Unkept:
     def __init__(self, operator: Operator, folder: Path) -> None:
         self._operator, self._folder = operator, str(folder)
 
-    @property
-    def has_keys(self) -> bool:
-        return self._operator.has_keys
-
-    @property
-    def pressed_by(self) -> str:
-        return self._operator.pressed_by
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._operator, name)
 
     def show(self, event: Event) -> None:
         if self._folder not in str(event.to_dict()):
             self._operator.show(event)
-
-    def ask(self, question: Question) -> str:
-        return self._operator.ask(question)
-
-    def absence(self) -> str | None:
-        return self._operator.absence()
-
-    def pressed(self) -> Key | None:
-        return self._operator.pressed()
 
 
 def rehearse(
@@ -77,28 +72,33 @@ def rehearse(
     `kept` says whether the folder `runs` outlives the calibration; the other keywords are those of `SessionOptions`.
     """
     chosen = SessionOptions(runs, name, real=False, questions=False, description=station.description, **options)
-    outcome = calibrate(station.cell, operator if kept else _Unkept(operator, runs), chosen)
+    outcome = calibrate(station.cell, operator if kept else cast("Operator", _Unkept(operator, runs)), chosen)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")
     return outcome
 
 
-def short_calibration(operator: Operator, sensor: str | None = None) -> CalibrationResult:
-    """Calibrate an emulated cell with six poses, which takes about 10 s; the run is not kept.
+@contextmanager
+def rehearsed_run(
+    operator: AbstractContextManager[Operator], sensor: str | None = None, **options: Any
+) -> Iterator[Path]:
+    """Make a short run of an emulated cell, with options of `SessionOptions`; yields its folder, deleted afterwards.
 
-    Parameters
-    ----------
-    operator : Operator
-    sensor : str, optional
-        As `sensor_name` takes it.
-
-    Raises
-    ------
-    NotAccepted
-        The result is rejected.
+    The operator is entered for the calibration alone; `sensor` is as `sensor_name` takes it.
     """
-    with Station.of(None, sensor) as station, TemporaryDirectory(prefix="ftdrive-") as runs:
-        result = rehearse(station, Path(runs), "simulated", operator, poses=6, kept=False).result
+    with TemporaryDirectory(prefix="ftdrive-") as runs:
+        with Station.of(None, sensor) as station, operator as shown:
+            outcome = rehearse(station, Path(runs), "simulated", shown, kept=False, **options)
+        yield outcome.run.folder
+
+
+def short_calibration(operator: AbstractContextManager[Operator], sensor: str | None = None) -> CalibrationResult:
+    """Calibrate an emulated cell with six poses, which takes about 10 s; parameters as of `rehearsed_run`.
+
+    Raises `NotAccepted` if the result is rejected.
+    """
+    with TemporaryDirectory(prefix="ftdrive-") as runs, Station.of(None, sensor) as station, operator as shown:
+        result = rehearse(station, Path(runs), "simulated", shown, poses=6, kept=False).result
     if result.verdict == "rejected":
         raise NotAccepted(f"the calibration of the emulated cell was rejected: {result.reasons[0]}")
     return result
@@ -108,3 +108,74 @@ def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Sta
     """Return the emulated cell of a calibration for a stream, not started; `sensor` replaces its sensor."""
     # A stream pairs by the controller's clock.
     return Station.of(calibration.provenance.get("station"), sensor, REAL_PACE)
+
+
+def put_on(station: Station, load: Load) -> None:
+    """Give the emulated cell the load, and its controller the total as payload."""
+    truth = station.truth
+    mass_kg = truth["mass_kg"] + load.mass_kg
+    station.control(do="set-payload", payload_kg=mass_kg + truth["sensor_mass_kg"])
+    if load.p_flange_mm is not None:
+        place = list(load.p_flange_mm)
+        station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M)
+    else:
+        # In the middle between the fingers, about: its place is unknown to the solution.
+        p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])
+        com_m = (truth["mass_kg"] * np.array(truth["p_sensor_com_m"]) + load.mass_kg * p_load_m) / mass_kg
+        station.control(do="payload-shift", mass_kg=mass_kg, p_sensor_com_m=com_m.tolist())
+
+
+_LOAD_KG, _LOAD_SIGMA_KG, _PLACE_SIGMA_MM, _LOAD_POSES = 2.0, 0.002, 0.5, 12
+_HOOKS_MM = {"side": (100.0, 0.0, 50.0), "tip": (0.0, 0.0, 200.0)}
+_DIRECTIONS = 300
+
+
+def rehearse_loads(
+    station: Station,
+    runs: Path,
+    tool: Outcome,
+    operator: Callable[[], AbstractContextManager[Operator]],
+    say: Callable[[str], object],
+) -> LoadSolution:
+    """Hang a load at two places, take poses with each, and solve the sensor's matrix with those of the tool."""
+    truth = station.truth
+    taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
+    for name, hook_mm in _HOOKS_MM.items():
+        say(
+            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. It swings because "
+            "this quick tour moves its hook; `calibrate --load` turns the tool about it."
+        )
+        station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm, swing_deg=0)
+        whole_kg = truth["payload_kg"] + _LOAD_KG
+        moment = truth["payload_kg"] * np.array(truth["payload_cog_m"]) + _LOAD_KG * np.array(hook_mm) / 1e3
+        station.control(do="set-payload", payload_kg=whole_kg, payload_cog_m=(moment / whole_kg).tolist())
+        with operator() as shown:
+            outcome = rehearse(station, runs, f"demo-{name}", shown, poses=_LOAD_POSES)
+        x, y, z = (value / 1e3 for value in hook_mm)
+        load = KnownLoad(name, _LOAD_KG, _LOAD_SIGMA_KG, (x, y, z), _PLACE_SIGMA_MM / 1e3)
+        taken.append((outcome, load))
+    station.control(do="unhang")
+    sets = [LoadRun(one.run.folder.name, one.dataset, load) for one, load in taken if one.dataset is not None]
+    return solve_loads(sets, p_flange_sensor_m=np.array(truth["p_flange_sensor_m"]), g_m_s2=truth["g_m_s2"])
+
+
+def contact_errors(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
+    """Return the error of a contact of 100 N at the tip: as the sensor reads it, decoded, and the sigma of that.
+
+    Root mean square of the length of the force over all directions, N. The reading is computed from the truth, not with
+    the solver's model.
+    """
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    force = CONTACT_N * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    torque = np.cross(np.array(_HOOKS_MM["tip"]) / 1e3 - truth["p_flange_sensor_m"], force)
+    R_flange_sensor = np.array(truth["R_flange_sensor"])
+    exerted = np.concatenate([force @ R_flange_sensor, torque @ R_flange_sensor], axis=1)
+    reading = exerted @ (np.eye(6) + truth["sensor_error"]).T
+    decoded = result.contact.decode(reading)
+    sigma = result.contact_sigma(decoded, np.eye(3))[:, :3]
+    errors = {
+        "as_read_N": reading[:, :3] @ R_flange_sensor.T - force,
+        "decoded_N": decoded[:, :3] @ result.R_flange_sensor.T - force,
+        "sigma_N": sigma,
+    }
+    return {name: float(np.sqrt((error**2).sum(axis=1).mean())) for name, error in errors.items()}

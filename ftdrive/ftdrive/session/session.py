@@ -171,14 +171,9 @@ def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> 
 def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run | None:
     """Guide the operator through the poses of a task; None after a dry run.
 
-    Raises
-    ------
-    Declined
-        The operator ended it.
-    NotAccepted, PlanRefused, ConfigError
-        The session refuses to start.
-    DeviceError, OSError, SupervisorGone
-        The session failed; the poses taken are in the run, which can be resumed.
+    Raises `Declined` if the operator ended it, and `NotAccepted`, `PlanRefused` or `ConfigError` if the session
+    refuses to start. After `DeviceError`, `OSError` or `SupervisorGone` the poses taken are in the run, which can be
+    resumed.
     """
     config = task.cell
     journal = Journal(operator, yes=options.yes)

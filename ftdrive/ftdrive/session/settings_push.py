@@ -2,16 +2,21 @@
 
 A push changes what the controller assumes, so it is refused unless the arm is that of the calibration, rests, and no
 program runs. Every attempt that has sent something leaves a receipt with the old values, from which they are restored.
+
+push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; push-2.json and so on
 """
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 
 from ftcalib import CalibrationResult
+from ftcalib.errors import BadDataset
+from ftcalib.files import check_format, read_object, write_object
 from ftcalib.judge.described_cell import Lean, lean_from
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
@@ -21,11 +26,15 @@ from ftdrive.checks.check import compare_devices
 from ftdrive.checks.sensor import check_level
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.geometry.scene import down_of
-from ftdrive.runs.push_receipt import Receipt, write_receipt
+from ftdrive.runs.calibration import made_now
+from ftdrive.runs.run import Run
 from ftdrive.session.guards import Limits
 from ftdrive.session.preflight import require_no_program
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, Guard, RobotArm
 
+FORMAT: Final = "ftdrive.push/1"
+# Of a receipt, before its number and its ending.
+_RECEIPT: Final = "push"
 # What is typed to send each setting.
 WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 
@@ -38,6 +47,56 @@ _TOLERANCE: Final = 1e-6
 
 # Asks for the word of a setting, such as "payload"; raises `Declined`.
 Ask = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Receipt:
+    """A receipt on disk."""
+
+    path: Path
+    old: ControllerSettings
+    new: ControllerSettings
+    devices: Mapping[str, Mapping[str, Any]]
+    restores: str | None
+    """The receipt whose old values were sent back; None for a push."""
+
+    @classmethod
+    def load(cls, path: Path) -> Self:
+        """Read a receipt; of a run folder the newest of a push. Raises `BadDataset`."""
+        if path.is_dir():
+            return cls._newest(path)
+        try:
+            document = read_object(path, BadDataset)
+            check_format(document, FORMAT, BadDataset)
+            old, new = (_settings(document[name]) for name in ("old", "new"))
+            found = cls(path, old, new, document["devices"], document.get("restores"))
+            found.devices["arm"]["serial"], found.devices["arm"]["model"]
+        except BadDataset as error:
+            raise BadDataset(f"{path}: {error}") from error
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadDataset(f"{path} is damaged ({error!r}): take it from a copy") from error
+        return found
+
+    @classmethod
+    def _newest(cls, run: Path) -> Self:
+        found = {path: re.fullmatch(rf"{_RECEIPT}-?(\d*)\.json", path.name) for path in run.iterdir()}
+        paths = sorted((int(match[1] or 1), path) for path, match in found.items() if match)
+        for _, path in reversed(paths):
+            if (receipt := cls.load(path)).restores is None:
+                return receipt
+        raise BadDataset(f"{run} has no receipt of a push: give the run, or the {_RECEIPT}.json, of an earlier push")
+
+
+def _settings(values: Mapping[str, Any]) -> ControllerSettings:
+    shapes = {"mass_kg": (), "p_flange_com_m": (3,), "inertia_kg_m2": (6,), "up_base_m_s2": (3,)}
+    found: dict[str, Any] = {}
+    for name, shape in shapes.items():
+        if (value := values[name]) is not None:
+            array = np.array(value, np.float64)
+            if array.shape != shape or not np.isfinite(array).all():
+                raise ValueError(f"{name} is {value}")
+            found[name] = tuple(array.tolist()) if shape else float(array)
+    return ControllerSettings(**found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -229,7 +288,7 @@ def send(
         raise
     finally:
         values = {"old": push.old, "new": push.new, "read_back": read_back}
-        path = write_receipt(folder, push.devices, push.reason, values, failure)
+        path = _write_receipt(folder, push.devices, push.reason, values, failure)
     if different := _differences(push.new, read_back):
         raise NotAccepted(f"the controller reports another {' and '.join(different)} than was sent; receipt: {path}")
     return path, read_back
@@ -294,3 +353,28 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
         old.up_base_m_s2 if changed.up_base_m_s2 is not None else None,
     )
     return Push(arm.controller_settings(), back, {"arm": info}, {"restores": str(receipt.path)})
+
+
+def _write_receipt(
+    folder: Path,
+    devices: Mapping[str, DeviceInfo],
+    reason: Mapping[str, Any],
+    values: Mapping[str, ControllerSettings | None],
+    error: str,
+) -> Path:
+    """Write a new receipt into a run folder; return its path.
+
+    `reason` says where the new values come from. `values` holds `old`, `new` (None for a setting that was not to
+    change) and `read_back` (None if it failed), and `error` says why the push failed, or is empty.
+    """
+    receipt = {
+        "format": FORMAT,
+        **made_now(),
+        "devices": {role: asdict(info) for role, info in devices.items()},
+        **reason,
+        **{name: None if one is None else asdict(one) for name, one in values.items()},
+        "error": error or None,
+    }
+    path = Run(folder).new_path(_RECEIPT)
+    write_object(path, receipt)
+    return path

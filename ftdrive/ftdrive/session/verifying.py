@@ -1,29 +1,35 @@
 """A verification: a session with fresh poses, each compared with the prediction of a calibration."""
 
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar, Final, Literal, Self
 
 import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
-from ftcalib.model import Array
+from ftcalib.model import Array, angle_between
 from ftcalib.rounding import to_place_of
 from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
-from ftdrive.errors import BadPlan, PlanRefused
+from ftdrive.errors import BadPlan, ConfigError, Declined, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_verification, speeds_of
 from ftdrive.planning.search.nodes import WRIST_6_RAD, from_usual_wrist
+from ftdrive.runs.calibration import read_calibration
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import fitted_dataset
-from ftdrive.session.events import Compared
+from ftdrive.runs.verification import AcceptanceLimits, Verified, fitted_dataset, save_update, verify_run
+from ftdrive.session.events import Compared, Operator, Question
 from ftdrive.session.live_fit import free_wrench
 from ftdrive.session.open_session import Judge
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.session import take_poses
+
+Answer = Literal["ask", "no", "yes"]
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
@@ -47,6 +53,46 @@ class Verifying:
     """Number of fresh poses."""
     runs: Path
     """Folder of runs: the plan of an earlier verification is driven again if it still fits the cell."""
+
+    @staticmethod
+    def chosen(
+        options: SessionOptions, path: Path | None, poses: int | None, limits: AcceptanceLimits
+    ) -> tuple[Path | None, AcceptanceLimits, SessionOptions]:
+        """Return what is verified and how: as given, or as the run that is resumed was begun. Raises `ConfigError`."""
+        quick, resume = options.fast, options.resume
+        if quick and poses is not None:
+            raise ConfigError("--quick and --poses exclude one another: leave one of them out")
+        if resume is None:
+            return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
+        given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
+        if wrong := [option for option, value in given.items() if value]:
+            raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
+        run = Run(resume)
+        if run.command != "verify":
+            raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
+        begun = run.header()["verification"]
+        options = replace(options, poses=begun["poses"], fast=begun["quick"])
+        return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
+
+    @classmethod
+    def of(cls, cell: CellConfig, path: Path, options: SessionOptions) -> Self:
+        """Verify a calibration file, or that of a run folder; quickly if `options` are fast. Raises as it is read."""
+        calibration = read_calibration(path)
+        path = Run(path).calibration_path if path.is_dir() else path
+        # 12 s of noise would take longer than the poses.
+        if options.fast:
+            cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
+        return cls(cell, calibration, path, options.poses, options.runs)
+
+    def take(self, operator: Operator, limits: AcceptanceLimits, options: SessionOptions) -> Verified:
+        """Guide the operator through the poses, and compare them with the calibration. Raises as `take_poses`."""
+        # The run keeps what is verified and how, so that --resume continues alike.
+        kept = {"path": str(self.path.absolute()), "poses": options.poses, "quick": options.fast}
+        about = {**kept, "limits": asdict(limits), "id": self.calibration.id}
+        run = take_poses(self, operator, replace(options, description={"verification": about, **options.description}))
+        if run is None:
+            raise RuntimeError("a verification is never a dry run")
+        return verify_run(run, self.calibration, self.path, limits)
 
     @property
     def goal(self) -> str:
@@ -121,7 +167,7 @@ class RunningComparison:
         """Add a pose, in place of one with the same `stop`."""
         self.remove(record.stop)
         R_base_flange = record.before.R_base_flange
-        if self._is_fresh(R_base_flange):
+        if angle_between(self._R_fitted, R_base_flange).min(initial=np.inf) >= FRESH_RAD:
             self._fresh.add(record.stop)
         enough = len(self._fresh) >= self._wanted
         hint = "" if record.stop in self._fresh else "this pose is one of the calibration: turn the tool further"
@@ -153,8 +199,13 @@ class RunningComparison:
             return None
         return free_wrench(self._calibration, R_base_flange)
 
-    def _is_fresh(self, R_base_flange: Array) -> bool:
-        if not len(self._R_fitted):
-            return True
-        trace = np.einsum("kij,ij->k", self._R_fitted, R_base_flange)
-        return bool(np.arccos(np.clip((trace - 1) / 2, -1, 1)).min() >= FRESH_RAD)
+
+def save_wanted_update(verified: Verified, update: Answer, ask: Callable[[Question], str]) -> Path | None:
+    """Save the update as a new calibration if there is one and it is wanted; None if not, or no operator answers."""
+    if verified.passed or verified.update is None or update == "no":
+        return None
+    question = Question(f"An update of {verified.updated} is sufficient. Save it as a new calibration?")
+    try:
+        return save_update(verified) if update == "yes" or ask(question) == "yes" else None
+    except Declined:
+        return None

@@ -33,10 +33,11 @@ from sqlalchemy import (
 )
 from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 
+from ftdrive.cell.config import user_folder
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import Record, StoredResult, StoredWeighings, user_folder
+from ftdrive.store.records import Record, StoredResult, StoredWeighings
 from ftdrivers.installation import missing_extra
 
 # Version of the index, kept in the database.
@@ -116,7 +117,7 @@ _WRITERS: Final = 0x66746472697665
 
 def default_file() -> Path:
     """Return the store of a user; it need not exist."""
-    return user_folder() / "store.sqlite"
+    return user_folder("data") / "store.sqlite"
 
 
 class Database:
@@ -184,10 +185,7 @@ class Database:
     def upsert(self, table: Table, first_by: str | None = None) -> Any:
         """Return a statement that inserts rows, or replaces those with the same primary key.
 
-        Parameters
-        ----------
-        first_by : str, optional
-            Replace only rows that have a greater text in this column.
+        With `first_by`, it replaces only rows that have a greater text in this column.
         """
         insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # that of the other is slow
         new = {column.name: insert.excluded[column.name] for column in table.columns}

@@ -1,17 +1,18 @@
 """What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
 
 import hashlib
-import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 from ftcalib.errors import BadDataset, DataError
 from ftcalib.files import JSON, check_format, read_file, read_object
-from ftdrive.runs.verification import EMULATED, FORMAT, VerificationRecord, marks_of
+from ftcalib.rounding import counted, with_sigma
+from ftdrive.runs.calibration import EMULATED, marks_of
+from ftdrive.runs.verification import FORMAT, VerificationRecord
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingsFile, is_weighings
 
 # A list of results needs no numpy.
@@ -83,7 +84,25 @@ class StoredResult:
     @property
     def mass_sigma_kg(self) -> float:
         """One standard deviation of the mass, without the sensor's gain, which all results of a sensor share."""
-        return mass_sigma_kg(self.parameters, self.covariance, self.g_m_s2)
+        return self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
+
+    def to_dict(self, age_days: float | None, check: VerificationRecord | None) -> dict[str, Any]:
+        """Return it with its age and last verification as JSON."""
+        import numpy as np
+
+        from ftcalib.model import BIASES
+
+        kept = {name: value for name, value in asdict(self).items() if name != "numbers"}
+        bias = {name: self.numbers[name] for name in ("force_bias_N", "torque_bias_Nm", "p_sensor_com_m")}
+        sigma = np.sqrt(np.diag(self.covariance))[BIASES].tolist()
+        return {
+            **kept,
+            "age_days": age_days,
+            "mass_sigma_kg": self.mass_sigma_kg,
+            **bias,
+            "bias_sigma": {"force_N": sigma[:3], "torque_Nm": sigma[3:]},
+            "last_verification": None if check is None else check.to_store_dict(),
+        }
 
 
 class BriefVerification(NamedTuple):
@@ -138,20 +157,50 @@ class StoredWeighings:
     mass_kg: float | None
     mass_sigma_kg: float | None
 
+    @classmethod
+    def of(cls, file: WeighingsFile) -> Self:
+        """Return what was read of a file of weighings."""
+        header, last = file.header, file.last
+        return cls(
+            id=file.path.stem,
+            path=str(file.path),
+            day=_text(header.get("day")) or "",
+            tool=_text(header.get("tool")),
+            arm_serial=_text(header.get("arm_serial")),
+            sensor_serial=_text(header.get("sensor_serial")),
+            robot_host=_text(header.get("robot_host")),
+            calibration_id=_text(header.get("calibration_id")),
+            emulated=header.get("emulated") is True,
+            size=file.size,
+            weighings=file.weighings,
+            refusals=dict(file.refusals),
+            last_utc=_utc(last.get("t_utc")),
+            mass_kg=_number(last.get("mass_kg")),
+            mass_sigma_kg=_number(last.get("mass_sigma_kg")),
+        )
+
     @property
     def tool_in_words(self) -> str:
         """Name of the tool, and whether the cell was emulated."""
         return tool_in_words(self.tool, emulated=self.emulated)
 
+    @property
+    def mass_in_words(self) -> str:
+        """Mass of the last part; a dash without one."""
+        if self.mass_kg is None or self.mass_sigma_kg is None:
+            return "-"
+        return f"{with_sigma(self.mass_kg, self.mass_sigma_kg)} kg"
+
+    @property
+    def in_words(self) -> str:
+        """Tool, time and mass of the last part, and how many there were."""
+        refused = sum(self.refusals.values())
+        counts = f"{counted(self.weighings, 'part')}, {refused} refused on this day"
+        time = self.day if self.last_utc is None else self.last_utc[:16].replace("T", " ")
+        return f"{self.tool_in_words}, {time}: {self.mass_in_words}; {counts}"
+
 
 Record = StoredResult | VerificationRecord | StoredWeighings
-
-
-def user_folder() -> Path:
-    """Return the folder of the user's store and weighings; it need not exist."""
-    home = os.environ.get("XDG_DATA_HOME", "")
-    folder = Path(home) if Path(home).is_absolute() else Path("~/.local/share").expanduser()
-    return folder / "ftdrive"
 
 
 def sum_up(days: Iterable[StoredWeighings]) -> list[StoredWeighings]:
@@ -177,11 +226,6 @@ def tool_in_words(tool: str | None, *, emulated: bool) -> str:
     if not emulated:
         return tool or "-"
     return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
-
-
-def mass_sigma_kg(parameters: "Parameters", covariance: "Array", g_m_s2: float) -> float:
-    """Return one standard deviation of the mass from the covariance (15, 15) alone."""
-    return parameters.weight_sigma_N(covariance) / g_m_s2
 
 
 def shows_bias(check: VerificationRecord | BriefVerification) -> bool:
@@ -228,39 +272,13 @@ def _is_run(folder: Path) -> bool:
 def _read_record(path: Path) -> Record:
     """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
 
-    Raises
-    ------
-    BadCalibration, BadDataset
-        The file is damaged or of another format.
-    OSError
+    Raises `BadCalibration` or `BadDataset` for a damaged file or another format, or `OSError`.
     """
     if is_weighings(path):
         file = WeighingsFile(path)
         file.read()
-        return weighings_of(file)
+        return StoredWeighings.of(file)
     return _verification(path) if path.name.startswith("verification") else _result(path)
-
-
-def weighings_of(file: WeighingsFile) -> StoredWeighings:
-    """Return what was read of a file of weighings."""
-    header, last = file.header, file.last
-    return StoredWeighings(
-        id=file.path.stem,
-        path=str(file.path),
-        day=_text(header.get("day")) or "",
-        tool=_text(header.get("tool")),
-        arm_serial=_text(header.get("arm_serial")),
-        sensor_serial=_text(header.get("sensor_serial")),
-        robot_host=_text(header.get("robot_host")),
-        calibration_id=_text(header.get("calibration_id")),
-        emulated=header.get("emulated") is True,
-        size=file.size,
-        weighings=file.weighings,
-        refusals=dict(file.refusals),
-        last_utc=_utc(last.get("t_utc")),
-        mass_kg=_number(last.get("mass_kg")),
-        mass_sigma_kg=_number(last.get("mass_sigma_kg")),
-    )
 
 
 def _result(path: Path) -> StoredResult:

@@ -54,19 +54,10 @@ class Indexed:
 class Store:
     """An index of run folders, and the cells of a fleet. Nothing is opened before the first call of a method.
 
-    Parameters
-    ----------
-    url : str, optional
-        Of an SQLite file or a PostgreSQL database, as SQLAlchemy has it; by default a file of the user.
-    wait_s : float
-        For another writer, and for a server that does not answer.
-
-    Raises
-    ------
-    ConfigError
-        The address is not one of a database, or its driver is not installed.
-    BadStore
-        From every method: the database cannot be read or written, or is of a newer version.
+    `url` is that of an SQLite file or a PostgreSQL database, as SQLAlchemy has it, by default a file of the user.
+    `wait_s` is for another writer, and for a server that does not answer. Raises `ConfigError` for an address that is
+    not one of a database, or if its driver is missing; every method raises `BadStore` if the database cannot be read
+    or written, or is of a newer version.
     """
 
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
@@ -195,14 +186,8 @@ class Store:
     ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
 
-        Also `last_weighings`.
-
-        Parameters
-        ----------
-        newest : int
-            Results of each tool on each arm that are not rejected.
-        since : datetime
-            Verifications and weighings made then or later.
+        Of each tool on each arm it has the `newest` results that are not rejected, of verifications and weighings those
+        from `since` on. Also `last_weighings`.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(*_CHECK).where(database.verifications.c.created_utc >= start)

@@ -9,7 +9,7 @@ from ftcalib.after.series import BiasTemperature
 from ftcalib.errors import BadCalibration
 from ftdrive.checks.check import compare_devices
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.sensor_file import with_sensor
+from ftdrive.runs.calibration import with_sensor
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
@@ -40,25 +40,10 @@ def calibration_of_tool(
     url: str | None = None,
     force: bool = False,
 ) -> Tool:
-    """Return the newest accepted calibration of a tool on these devices.
+    """Return the newest accepted calibration of a tool, a `[tool] name`, on these devices and this `[sensor] mount`.
 
-    Parameters
-    ----------
-    name : str
-        As `[tool] name` was when it was calibrated.
-    arm, sensor : DeviceInfo
-        As connected now.
-    mount : str, optional
-        Label of the mounting, `[sensor] mount`.
-    url : str, optional
-        Of the store.
-    force : bool
-        If no calibration is of these devices, take the newest of any, also one that was edited by hand.
-
-    Raises
-    ------
-    ConfigError
-        There is none; the message lists the tools that are calibrated on these devices.
+    With `force`, if none is of these devices, it is the newest of any, also one that was edited by hand. `url` is that
+    of the store. Raises `ConfigError` if there is none, with the tools that are calibrated on these devices.
     """
     # A tool is a name in its runs, so nothing has to be edited after a calibration.
     store, warnings = Store(url), list[str]()

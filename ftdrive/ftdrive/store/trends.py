@@ -111,7 +111,7 @@ def _estimated(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorTemperature:
+class _SensorTemperature:
     """The bias of one sensor in one mounting against its temperature."""
 
     sensor_serial: str
@@ -167,10 +167,10 @@ class _Run(NamedTuple):
 
 def temperatures(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
-) -> list[SensorTemperature]:
+) -> list[_SensorTemperature]:
     """Fit each sensor on each arm and mount that has runs enough."""
     return [
-        SensorTemperature(*mounted, fit)
+        _SensorTemperature(*mounted, fit)
         for mounted, found in _runs(results, verifications).items()
         if (fit := _fit([run for run in found if run.temperature_C is not None])) is not None
     ]

@@ -10,9 +10,10 @@ from typing import Any, Final
 
 from ftcalib.errors import DataError
 from ftcalib.files import JSON
+from ftdrive.cell.config import user_folder
 from ftdrive.errors import ConfigError
 from ftdrive.runs.weighings import FOLDER, WeighingsFile
-from ftdrive.store.records import user_folder, weighings_of
+from ftdrive.store.records import StoredWeighings
 
 # Time between two writes to the store.
 EVERY_S: Final = 30.0
@@ -28,22 +29,9 @@ _Line = tuple[str, Mapping[str, JSON]]
 class WeighingLog:
     """Writes in a thread of its own, so that a slow disk or database never delays a stream.
 
-    A failed write is reported once, and repeated with the next.
-
-    Parameters
-    ----------
-    origin : mapping
-        `tool`, `calibration_id`, `arm_serial`, `sensor_serial`, `robot_host` and `emulated`.
-    url : str, optional
-        Of the store.
-    say : callable
-        Takes a sentence for the operator, from any thread.
-    folder : Path, optional
-        Of the files; by default that of the user.
-    every_s : float
-        Time between two writes to the store, s.
-    now : callable
-        Returns the time, UTC.
+    A failed write is reported once, and repeated with the next. `origin` has `tool`, `calibration_id`, `arm_serial`,
+    `sensor_serial`, `robot_host` and `emulated`; `url` is that of the store. `say` takes a sentence for the operator,
+    from any thread. `folder` is by default that of the user; `every_s` is the time between two writes to the store, s.
     """
 
     def __init__(
@@ -57,7 +45,7 @@ class WeighingLog:
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._origin, self._url, self._say, self._every_s, self._now = origin, url, say, every_s, now
-        self._folder = folder or user_folder() / FOLDER
+        self._folder = folder or user_folder("data") / FOLDER
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
         self._file: WeighingsFile | None = None
@@ -70,22 +58,15 @@ class WeighingLog:
         self._thread = Thread(target=self._run, daemon=True, name="weighings")
         self._thread.start()
 
-    def weighed(self, values: Mapping[str, JSON]) -> None:
-        """Keep a weighing, as `ftdrive.live.weighing.load_values` has it; returns at once."""
-        self._put(values)
-
-    def refused(self, code: str) -> None:
-        """Keep that nothing was weighed, and why; returns at once."""
-        self._put({"refused": code})
+    def keep(self, values: Mapping[str, JSON]) -> None:
+        """Keep a weighing, as `ftdrive.stream.weighing.load_values` has it, or why there is none; returns at once."""
+        t_utc = self._now().isoformat(timespec="milliseconds")
+        self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 
     def close(self) -> None:
         """Write what is left; waits for some seconds at most."""
         self._lines.put(None)
         self._thread.join(_GOODBYE_S)
-
-    def _put(self, values: Mapping[str, JSON]) -> None:
-        t_utc = self._now().isoformat(timespec="milliseconds")
-        self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 
     # -------------------------------------------------------------------------------------------------- its own thread
 
@@ -141,7 +122,7 @@ class WeighingLog:
             self._lacks_older = False
         if self._file is not None:
             self._file.read()
-            self._store.put_weighings(weighings_of(self._file))
+            self._store.put_weighings(StoredWeighings.of(self._file))
         self._is_new = False
 
     def _attempt(self, failure: str, write: Callable[[], None]) -> None:

@@ -240,7 +240,7 @@ class Columns:
         if column not in self.names and (match := re.fullmatch(r"(.+?)\s*\[([^\]]*)\]", column)):
             column, unit = match[1], match[2]
         same = [i for i, name in enumerate(self.names) if name == column]
-        same = same or [i for i, name in enumerate(self.names) if normalized(name) == normalized(column)]
+        same = same or [i for i, name in enumerate(self.names) if _normalized(name) == _normalized(column)]
         if not same and column.isdecimal() and 1 <= int(column) <= len(self.names):
             same = [int(column) - 1]
         if len(same) != 1:
@@ -322,7 +322,7 @@ _OWN_KEYS: Final = tuple(dict.fromkeys(" ".join(OWN_NAMES.values()).split()))
 _OTHER_NAMES: Final = {"tx": "mx", "ty": "my", "tz": "mz", "t": "time"}
 
 
-def normalized(name: str) -> str:
+def _normalized(name: str) -> str:
     """Return a name in lower case, with `_` for all that is no letter or digit."""
     return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
 
@@ -353,11 +353,11 @@ def _keys_of(name: str) -> Iterator[tuple[str, str]]:
     """Give the keys of a name with the unit that each leaves: `fx [N]`, `t_ms`, `x (mm)`."""
     match = _BEHIND.fullmatch(name) if len(name) <= _LONGEST_NAME else None
     if match and match["bracket"] is not None and re.search(r"[^\W\d]|°|^$", match["bracket"]):
-        yield normalized(match["name"]), match["bracket"].strip()
+        yield _normalized(match["name"]), match["bracket"].strip()
         return
-    yield normalized(name), ""
+    yield _normalized(name), ""
     if match and match["suffix"] in _SUFFIXES:
-        yield normalized(match["name"]), match["suffix"]
+        yield _normalized(match["name"]), match["suffix"]
 
 
 def _written_out(way: str) -> list[str]:

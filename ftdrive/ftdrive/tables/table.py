@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset
-from ftcalib.data.dataset import LARGEST, MATRIX_COLUMNS, QUATERNION_COLUMNS, VECTOR_COLUMNS, Orientation, rotations_of
+from ftcalib.data.dataset import LARGEST, Orientation, proper_rotations
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, QUIET, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
@@ -39,7 +39,9 @@ _KIND: Final = {
     "acceleration": "acceleration",
     **dict.fromkeys((*_AXES, "joints"), "angle"),
 }
-_COLUMNS: Final = {"matrix": MATRIX_COLUMNS, "quaternion": QUATERNION_COLUMNS, "vector": VECTOR_COLUMNS}
+_LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
+# A quaternion rounded to two decimals differs from length 1 by no more.
+_ROUNDED_LENGTH = 0.01
 # More than two turns in rad, or than any arm reaches in m: the numbers are degrees and mm.
 _MOST_RAD, _MOST_M = 4 * np.pi, 10.0
 _UNITS_OF_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -500,13 +502,8 @@ class Table:
             R = _of_angles(numbers, self.options.euler or form, _AXES[form])
         elif form == "angles":
             raise BadDataset(_ANGLES_ONLY)
-        elif form == "vector" and (largest := float(np.linalg.norm(numbers, axis=1).max(initial=0.0))) > _MOST_RAD:
-            raise BadDataset(
-                f"a rotation vector of {largest:.0f} rad has degrees, or is three angles: name its unit, --columns "
-                f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (axes of the base) or XYZ (axes of the tool)'
-            )
         else:
-            R = rotations_of(_COLUMNS[form], numbers)
+            R = _rotations(form, numbers)
         R = R @ self.options.R_flange_tcp.T
         return R, None if p is None else p - R @ self.options.p_flange_tcp_m
 
@@ -564,6 +561,28 @@ def _of_angles(angles: Array, euler: str, axes: str) -> Array:
     if sequence.lower() != axes and sorted(sequence.lower()) == sorted(axes):
         angles = angles[:, [axes.index(axis) for axis in sequence.lower()]]
     return Rotation.from_euler(sequence, angles).as_matrix()
+
+
+def _rotations(form: str, numbers: Array) -> Array:
+    """Return the rotations (n, 3, 3) in these numbers (n, k). Raises `BadDataset`."""
+    if form == "matrix":
+        return proper_rotations(numbers.reshape(-1, 3, 3))
+    length = np.linalg.norm(numbers, axis=1)
+    if form == "quaternion":
+        for i in np.flatnonzero(np.abs(length - 1) > _ROUNDED_LENGTH):
+            raise BadDataset(f"row {i + 1}: the quaternion has length {length[i]:.3g}, not 1: check qx, qy, qz, qw.")
+        return Rotation.from_quat(numbers).as_matrix()
+    if (largest := float(length.max(initial=0.0))) > _MOST_RAD:
+        raise BadDataset(
+            f"a rotation vector of {largest:.0f} rad has degrees, or is three angles: name its unit, --columns "
+            f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (axes of the base) or XYZ (axes of the tool)'
+        )
+    if largest > _LONGEST_VECTOR_RAD:
+        raise BadDataset(
+            f"row {length.argmax() + 1}: the rotation vector is {largest:.0f} rad long, more than 2π: rx, ry, rz "
+            "look like degrees, convert them to rad."
+        )
+    return Rotation.from_rotvec(numbers).as_matrix()
 
 
 def _upright(gravity: Array) -> Array:

@@ -33,7 +33,7 @@ _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")
 _UNIT_LENGTH = 20
 
 
-class TextFormat(NamedTuple):
+class _TextFormat(NamedTuple):
     """How a table is written."""
 
     separator: str
@@ -179,7 +179,7 @@ def seconds_of(dates: NDArray[Any]) -> Array:
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
-def _format_in(text: IO[str], separator: str, decimal: str) -> TextFormat:
+def _format_in(text: IO[str], separator: str, decimal: str) -> _TextFormat:
     """Recognise the format of a text from its first lines, of which a long header needs more. Raises `BadDataset`."""
     head = text.read(_FIRST)
     while True:
@@ -196,7 +196,7 @@ class _NoNumbers(BadDataset):
     """The lines so far have no row of numbers."""
 
 
-def _format_of(head: str, more: bool, separator: str, decimal: str) -> TextFormat:
+def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextFormat:
     if "\0" in head:
         raise BadDataset("it is no text table: give a CSV file")
     lines = head.split("\n")
@@ -223,7 +223,7 @@ def _format_of(head: str, more: bool, separator: str, decimal: str) -> TextForma
     words += [f"names in line {header[-1][0] + 1}"] if header and header[-1][0] else []
     words += ["units below the names"] if units else []
     dates = [i for i, cell in enumerate(rows[first]) if _DATE.fullmatch(cell)]
-    return TextFormat(separator, decimal, names, units or [""] * count, dates, first + 1, ", ".join(words))
+    return _TextFormat(separator, decimal, names, units or [""] * count, dates, first + 1, ", ".join(words))
 
 
 def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, str, int, int]:

@@ -73,6 +73,10 @@ class Bodies:
             self.rounding_m.take(index),
         )
 
+    def height_above(self, normal: Array, offset_m: float) -> Array:
+        """Exact distance (...) to the half-space `normal · x < offset_m`; negative inside."""
+        return np.asarray(self.centre_m @ normal - offset_m - _extent(self, -normal))
+
 
 def dot(a: Array, b: Array) -> Array:
     """Scalar products (...) of vectors (..., 3)."""
@@ -84,11 +88,6 @@ def _extent(bodies: Bodies, direction: Array) -> Array:
     along = dot(bodies.axis, direction)
     across = np.sqrt(np.maximum(1 - along**2, 0.0))
     return bodies.half_length_m * np.abs(along) + bodies.radius_m * across + bodies.rounding_m
-
-
-def height_above(bodies: Bodies, normal: Array, offset_m: float) -> Array:
-    """Exact distance (...) of bodies to the half-space `normal · x < offset_m`; negative inside."""
-    return np.asarray(bodies.centre_m @ normal - offset_m - _extent(bodies, -normal))
 
 
 def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:

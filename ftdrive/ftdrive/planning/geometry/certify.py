@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ftdrive.planning.geometry.arm_model import ArmModel, Bodies, dot, height_above, separation, separation_from_box
+from ftdrive.planning.geometry.arm_model import ArmModel, Bodies, dot, separation, separation_from_box
 from ftdrive.planning.geometry.scene import Scene
 from ftdrivers.ur.kinematics import Array
 
@@ -203,7 +203,7 @@ class Certifier:
         distance = np.empty(len(row))
         for k, plane in enumerate(self.scene.planes):
             at = np.flatnonzero(thing == k)
-            distance[at] = height_above(bodies.at(row[at], body[at]), np.array(plane.normal), plane.offset_m)
+            distance[at] = bodies.at(row[at], body[at]).height_above(np.array(plane.normal), plane.offset_m)
         for k, box in enumerate(self.scene.boxes):
             at = np.flatnonzero(thing == len(self.scene.planes) + k)
             corners = np.array(box.low_m), np.array(box.high_m)

@@ -67,21 +67,11 @@ def chosen_tour(
     speeds: Speeds,
     guess: Guess,
 ) -> Chosen | None:
-    """Choose poses and find a short closed tour through them, base, shoulder and elbow at rest.
+    """Choose four poses or more and find a short closed tour through them, base, shoulder and elbow at rest.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles; another posture of joints 1 to 3 is used if it lowers the predicted error.
-    poses : int
-        4 or more.
-    half_angle_rad : float
-        Between the tool axis (flange z) and straight down; pi for any orientation.
-
-    Returns
-    -------
-    Chosen or None
-        None if too few poses are reachable, or if they are not informative enough to estimate everything.
+    Another posture of joints 1 to 3 than that of `q_rad` is used if it lowers the predicted error. The tool axis
+    (flange z) stays within an angle of straight down. None if too few poses are reachable, or if they are not
+    informative enough to estimate everything.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
     lumps = certifier.arm.travel_m[:, 5].any()
@@ -122,23 +112,10 @@ def _at(
 def verification_tour(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, speeds: Speeds
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Choose poses far from those of a calibration, and find a short closed tour through them.
+    """Choose two poses or more far from those of a calibration, `R_fitted` (k, 3, 3), and find a short closed tour.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles; joints 1 to 3 move only if the wrist alone has no such tour here.
-    poses : int
-        2 or more.
-    R_fitted : array, shape (k, 3, 3)
-        Orientations R_base_flange of the calibration.
-
-    Returns
-    -------
-    numbers : tuple of int
-        From 101 on, in the order of choice.
-    q_rad : array, shape (n, 6)
-        In the order of travel. None instead of both if too few poses are reachable.
+    Joints 1 to 3 move only if the wrist alone has no such tour here. Returns numbers, from 101 on in the order of
+    choice, and joint angles (n, 6) in the order of travel; None if too few poses are reachable.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
     directions = max(DIRECTIONS_OF_A_LUMP, poses // 2)
@@ -158,19 +135,9 @@ def tour_of_sets(
 ) -> tuple[Nodes, Array] | None:
     """Find a short closed tour through a number of orientations of each of several kinds.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        As of `verification_tour`.
-    kinds : sequence of (array of shape (m, 3, 3), int)
-        Orientations R_base_flange, and how many of them are wanted: the first ones that are reachable.
-
-    Returns
-    -------
-    index : int array, shape (n,)
-        In the order of travel: the place among the wanted orientations, counted through all kinds.
-    q_rad : array, shape (n, 6)
-        None instead of both if too few poses of a kind are reachable.
+    Each kind has orientations (m, 3, 3) and how many of them are wanted: the first ones that are reachable. Returns,
+    in the order of travel, the places among the wanted orientations, counted through all kinds, and joint angles
+    (n, 6); None if too few poses of a kind are reachable.
     """
     kind = np.repeat(np.arange(len(kinds)), [len(R) for R, _ in kinds])
     wanted = [count for _, count in kinds]
@@ -189,23 +156,9 @@ def hung_tour(
 ) -> tuple[tuple[int, ...], Array, Array] | None:
     """Choose tilts with a load on a string, spread evenly about straight down, and find a short closed tour.
 
-    The hook stays at one point at each of them: nearest to where it is, with the tool turned least.
-
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles.
-    poses : int
-        4 or more.
-
-    Returns
-    -------
-    numbers : tuple of int
-        From 101 on, in the order of choice.
-    q_rad : array, shape (n, 6)
-        In the order of travel.
-    hook_m : array, shape (3,)
-        In base. None instead of all three if too few poses are reachable.
+    The hook stays at one point at each of them: nearest to where it is, with the tool turned least. Returns numbers,
+    from 101 on in the order of choice, joint angles (n, 6) in the order of travel, and the hook (3,) in base; None if
+    too few poses are reachable.
     """
     q_now, down = np.asarray(q_rad, dtype=np.float64), certifier.scene.down_base
     hooks = _hooks(certifier, q_now)

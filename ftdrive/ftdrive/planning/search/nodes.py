@@ -61,21 +61,8 @@ def box_nodes(
 ) -> tuple[Array, Nodes]:
     """All free joint vectors with the flange in one of these orientations, at one of 27 places in a box.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles; the joints stay in their windows around them.
-    R_base_flange : array, shape (m, 3, 3)
-    centre_m : array, shape (3,)
-        Of the box, for the centre of the flange, in base.
-    half_size_m : float
-        Half the length of its edges, which are along the base axes.
-
-    Returns
-    -------
-    q : array, shape (n, 6)
-    group : int array, shape (n,)
-        Index of the orientation.
+    The joints stay in their windows around `q_rad`. The edges of the box, twice `half_size_m` long, are along the base
+    axes. Returns joint vectors (n, 6), and the index (n,) of the orientation of each.
     """
     places = centre_m + half_size_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)
     group, place = (index.ravel() for index in np.indices((len(R_base_flange), len(places))))
@@ -85,19 +72,8 @@ def box_nodes(
 def hung_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array, hook_m: Array) -> tuple[Array, Nodes]:
     """All free joint vectors with the flange in one of these orientations and the hook of the load at one point.
 
-    Parameters
-    ----------
-    q_rad : array_like, shape (6,)
-        Present joint angles; the joints stay in their windows around them.
-    R_base_flange : array, shape (m, 3, 3)
-    hook_m : array, shape (3,)
-        In base.
-
-    Returns
-    -------
-    q : array, shape (n, 6)
-    group : int array, shape (n,)
-        Index of the orientation.
+    The joints stay in their windows around `q_rad`. Returns joint vectors (n, 6), and the index (n,) of the
+    orientation.
     """
     hung = certifier.arm.hung
     p_flange_hook_m = np.zeros(3) if hung is None else np.array(hung.p_flange_m)

@@ -116,17 +116,7 @@ def _tour_of(
 def shortest_tour(
     cost_s: Array, group: Nodes, allowed: NDArray[np.bool_], *, start: Nodes | None = None, shakes: int = SHAKES
 ) -> Nodes | None:
-    """Order of nodes of a short closed tour over allowed moves, one of each group; None where none was found.
-
-    Parameters
-    ----------
-    cost_s : array, shape (n, n)
-    group : int array, shape (n,)
-    allowed : bool array, shape (n, n)
-    start : int array, optional
-        A tour to begin from.
-    shakes : int
-    """
+    """Order of nodes of a short closed tour over allowed moves, one of each group; None where none was found."""
     groups = [np.flatnonzero(group == g) for g in range(group.max() + 1)] if len(group) else []
     if len(groups) < 2 or not all(len(nodes) for nodes in groups):
         return None

@@ -1,0 +1,211 @@
+"""A calibration as commands use it: the origin that files state, reading, the matrix of its sensor, and its marks.
+
+The matrix is in `sensor.json`, in the folder where commands run, beside ftdrive.toml. A later one is `sensor-2.json`,
+and so on; the newest counts. It belongs to the sensor, so it serves every tool.
+"""
+
+import logging
+import platform
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING, Any, Final
+
+import ftcalib
+from ftcalib.errors import BadCalibration
+from ftcalib.files import JSON, newest_path
+from ftdrive import __version__
+from ftdrive.cell.config import without_password
+from ftdrive.errors import NotAccepted
+
+# A list of results needs no numpy.
+if TYPE_CHECKING:
+    from ftcalib import CalibrationResult, SensorMatrix
+
+_NAME: Final = re.compile(r"sensor(?:-(\d+))?\.json")
+# Facts of a sensor that change what its matrix means. Counts differ between calibration slots.
+_FACTS: Final = {
+    "counts_per_N": "counts per N",
+    "counts_per_Nm": "counts per N·m",
+    "range": "range",
+    "sign": "sign",
+}
+
+_log = logging.getLogger(__name__)
+
+EMULATED: Final = "EMULATED"
+EDITED: Final = "EDITED BY HAND"
+FOREIGN: Final = "OF ANOTHER CELL"
+# What every output says of some calibrations: a mark, and its meaning in a sentence.
+MARKS: Final[Mapping[str, str]] = {
+    EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
+    EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
+    FOREIGN: "The calibration is OF ANOTHER CELL: arm, sensor or mounting differ, and --force applies it all the same.",
+}
+
+
+def made_now() -> dict[str, Any]:
+    """Return what every file says of its making: when, by which command line, with which versions."""
+    argv = [without_password(word) for word in sys.argv]
+    return {"created_utc": datetime.now(UTC).isoformat(), "argv": argv, "versions": versions()}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of the software behind a result."""
+    found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
+
+
+def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "CalibrationResult":
+    """Read a calibration; `CalibrationResult.save` writes it.
+
+    If the present folder has a `sensor.json` of its sensor, the result decodes contacts with that.
+
+    Parameters
+    ----------
+    path : str or Path
+        A calibration.json, or a run folder: its newest calibration.
+    accept_edited : bool
+        Accept a file that was edited by hand; the result is then `is_edited`.
+
+    Raises
+    ------
+    DataError
+        The file is not a calibration that this version can read, is damaged or was edited, or a load was on the tool.
+    OSError
+        It cannot be read.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> ftdrive.solve(ftdrive.read_dataset("poses.csv")).save("calibration.json")
+    >>> ftdrive.read_calibration("calibration.json").verdict
+    'good'
+    """
+    path = Path(path)
+    file = newest_path(path / "calibration.json") if path.is_dir() else path
+    if not file.exists() and (path / "run.json").is_file():
+        folder = quote(str(path))
+        raise FileNotFoundError(
+            f"{path} has no calibration, because its run was interrupted or its result rejected. Solve its poses:\n"
+            f"ftdrive solve {folder} --output {folder}/calibration.json"
+        )
+    result = ftcalib.CalibrationResult.load(file, accept_edited=accept_edited)
+    if result.provenance.get("load") is not None:
+        from ftdrive.runs.load import Load
+
+        load = Load.of_header(result.provenance)
+        raise BadCalibration(f"{path} was made with {load}: use it with `ftdrive loads solve`, not as that of the tool")
+    return with_sensor(result)
+
+
+def require_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
+    """Raise `NotAccepted` for a rejected result that was shown; it mentions the missing file if one was requested."""
+    if result.verdict == "rejected":
+        unsaved = " and was not saved" if to_be_saved else ""
+        codes = ", ".join(dict.fromkeys(one.code for one in result.findings if one.severity != "note"))
+        raise NotAccepted(f"the result is rejected{unsaved}: its findings say what to fix ({codes})")
+
+
+def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreign: bool = False) -> tuple[str, ...]:
+    """Return the `MARKS` of a calibration; `emulated` and `foreign` say so of what it is applied to."""
+    found = {
+        EMULATED: emulated or calibration.provenance.get("station") is not None,
+        EDITED: calibration.is_edited,
+        FOREIGN: foreign,
+    }
+    return tuple(mark for mark, applies in found.items() if applies)
+
+
+def sensor_files(folder: Path = Path()) -> list[Path]:
+    """Return the files of a folder, the oldest first."""
+    return sorted(filter(_number, folder.glob("sensor*.json")), key=_number)
+
+
+def next_sensor_file(folder: Path = Path()) -> Path:
+    """Return the name of the next file."""
+    number = 1 + max(map(_number, sensor_files(folder)), default=0)
+    return folder / (f"sensor-{number}.json" if number > 1 else "sensor.json")
+
+
+def _number(path: Path) -> int:
+    """Return the number of a sensor's file; 0 of any other."""
+    name = _NAME.fullmatch(path.name)
+    return int(name[1] or 1) if name else 0
+
+
+def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
+    """Return what identifies a sensor in the provenance of a result, or in what a dataset has.
+
+    Its model, serial number, counts per unit (which differ between calibration slots), range, sign, and whether it is
+    emulated; None for what is not reported.
+    """
+    from ftdrivers.interfaces import NOT_REPORTED
+
+    devices = origin.get("devices")
+    sensor = devices.get("sensor") if isinstance(devices, Mapping) else None
+    sensor = sensor if isinstance(sensor, Mapping) else {}
+    facts = sensor.get("facts")
+    facts = facts if isinstance(facts, Mapping) else {}
+    values = {name: fact.get("value") if isinstance(fact := facts.get(name), Mapping) else None for name in _FACTS}
+    named = {name: one if isinstance(one := sensor.get(name), str) else None for name in ("model", "serial")}
+    serial = None if named["serial"] in ("", NOT_REPORTED) else named["serial"]
+    is_emulated = bool(origin.get("station") or origin.get("emulated"))
+    return {**named, "serial": serial, **values, "emulated": is_emulated}
+
+
+def difference(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
+    """Return why a matrix is not that of a sensor with this identity, as half a sentence; empty if it is."""
+    theirs = sensor.provenance.get("sensor")
+    if not isinstance(theirs, Mapping):
+        return "it was saved without the model and the range of its sensor: run `ftdrive loads solve` again"
+    if identity["serial"] is None or theirs.get("serial") is None:
+        whose = "this calibration" if identity["serial"] is None else "that file"
+        return f"the sensor of {whose} reports no serial number: name it by serial=NAME in the sensor's address"
+    words = {"serial": "serial number", "model": "model", **_FACTS, "emulated": "emulated"}
+    for name, what in words.items():
+        if (ours := _comparable(identity[name])) != (other := _comparable(theirs.get(name))):
+            return f"its {what} is {_shown(other)}, that of this calibration {_shown(ours)}"
+    return ""
+
+
+def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "CalibrationResult":
+    """Return a calibration that decodes contacts by the newest matrix of its sensor in a folder, if there is one.
+
+    A warning says why the newest matrix of the same serial number, or of a sensor without one, is not used.
+
+    Raises `BadCalibration` or `OSError` if that file cannot be read.
+    """
+    identity = sensor_identity(calibration.provenance)
+    unused = ""
+    for path in reversed(sensor_files(folder)):
+        sensor = ftcalib.SensorMatrix.load(path)
+        if not (why := difference(sensor, identity)):
+            return replace(calibration, sensor=sensor)
+        theirs = sensor.provenance.get("sensor")
+        known = theirs.get("serial") if isinstance(theirs, Mapping) else sensor.provenance.get("serial")
+        if not unused and (known is None or identity["serial"] in (None, known)):
+            unused = f"{path.name} is not used: {why}"
+    if unused:
+        _log.warning("%s", unused)
+    return calibration
+
+
+def _comparable(value: JSON) -> JSON:
+    """Return numbers without the rounding of a file."""
+    if isinstance(value, list | tuple):
+        return [_comparable(one) for one in value]
+    return float(f"{value:.9g}") if isinstance(value, float | int) and not isinstance(value, bool) else value
+
+
+def _shown(value: JSON) -> str:
+    if value is None:
+        return "not known"
+    if isinstance(value, list):
+        return ", ".join(map(_shown, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
