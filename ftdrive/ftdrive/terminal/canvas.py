@@ -4,10 +4,11 @@ import os
 import select
 import signal
 import sys
+import threading
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, redirect_stderr
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr
 from io import StringIO
 from types import FrameType
 from typing import TextIO
@@ -16,7 +17,7 @@ from urllib.parse import urlsplit
 from rich.control import Control
 
 from ftdrive.errors import SupervisorGone
-from ftdrive.http_gate import is_loopback
+from ftdrive.servers.http_gate import is_loopback
 from ftdrive.terminal.console import CommandConsole, qr_code
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.lines import FAINT, STRONG, Line
@@ -30,12 +31,12 @@ _CHUNK = 256
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    Parameters
-    ----------
-    address : str
-        Of the page in the browser, whose QR code the key `v` shows; empty without a page.
+    `address` is that of the page in the browser, whose QR code the key `v` shows; empty without a page.
     """
 
+    is_over = False
+    failure: BaseException | None = None
+    """What has ended the reading."""
     cover: Sequence[Line] = ()
     """Shown instead of the drawing until a key is pressed."""
     entry: tuple[Callable[[str], object], str, str] | None = None
@@ -43,7 +44,6 @@ class Canvas(ABC):
 
     def __init__(self, address: str = "") -> None:
         self._address = address
-        self._is_over = False
         self._drawn: list[Line] = []
         self._size = (0, 0)
 
@@ -52,8 +52,8 @@ class Canvas(ABC):
         """Return the lines; those that are missing stay empty. What it raises ends the screen."""
 
     @abstractmethod
-    def reading(self) -> AbstractContextManager[None]:
-        """Read in another thread while the screen is shown, because drawing must not keep a stream waiting."""
+    def turns(self) -> Iterable[object]:
+        """Read a stream turn after turn, until the screen `is_over`."""
 
     @abstractmethod
     def act(self, key: str) -> None:
@@ -64,7 +64,9 @@ class Canvas(ABC):
         return Line("─ ", FAINT).add(self._address).add("  v", STRONG).add(" QR code", FAINT) if self._address else None
 
     def lines(self, width: int, height: int) -> list[Line]:
-        """Return what the terminal shows: `height` lines of `width` cells."""
+        """Return what the terminal shows: `height` lines of `width` cells; raises what has ended the reading."""
+        if self.failure is not None:
+            raise self.failure
         shown = self.draw(width, height)
         lines = [Line().join(line).fit(width) for line in (self.cover or shown)[:height]]
         lines += [Line().to(width)] * (height - len(lines))
@@ -78,11 +80,17 @@ class Canvas(ABC):
     def press(self, key: str) -> None:
         """Do what a stroke of the keyboard stands for."""
         if self.entry is not None:
-            self._type(*self.entry, key)
+            take, hint, text = self.entry
+            if len(key) == 1 or key == "backspace":
+                self.entry = take, hint, text + key if len(key) == 1 else text[:-1]
+            elif key in {"enter", "escape"}:
+                self.entry = None
+                if text and key == "enter":
+                    take(text)
         elif self.cover:
             self.cover = ()
         elif key == "q":
-            self._is_over = True
+            self.is_over = True
         elif key == "v" and self._address:
             is_ours = is_loopback(urlsplit(self._address).hostname or "")
             words = "of this computer only: a tablet needs --view-address" if is_ours else "who has it sees the page"
@@ -90,14 +98,6 @@ class Canvas(ABC):
             self.cover = [Line(f" {self._address}"), Line(f" {words}"), *code, Line(" Any key returns.")]
         else:
             self.act(key)
-
-    def _type(self, take: Callable[[str], object], hint: str, text: str, key: str) -> None:
-        if len(key) == 1 or key == "backspace":
-            self.entry = take, hint, text + key if len(key) == 1 else text[:-1]
-        elif key in {"enter", "escape"}:
-            self.entry = None
-            if text and key == "enter":
-                take(text)
 
     def run(self, keys: TextIO | None = None, output: TextIO | None = None) -> None:
         """Show the screen until `q` or Ctrl-C, then restore the terminal and show what was printed on stderr meanwhile.
@@ -119,12 +119,30 @@ class Canvas(ABC):
             keyboard = stack.enter_context(Keyboard(keys.fileno()))
             # the last, because a terminal that is blocked may keep the others waiting
             stack.enter_context(self.reading())
-            while not self._is_over:
+            while not self.is_over:
                 rest = _sent(fd, rest or self._changes(console, fd))
                 if why := supervisor.absence():
                     raise SupervisorGone(why)
                 while (key := keyboard.stroke()) is not None:
                     self.press(key)
+
+    @contextmanager
+    def reading(self) -> Iterator[None]:
+        """Read in another thread while the screen is shown, because drawing must not keep a stream waiting."""
+        thread = threading.Thread(target=self._read, name="reading", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            self.is_over = True
+            thread.join()
+
+    def _read(self) -> None:
+        try:
+            for _ in self.turns():
+                pass
+        except BaseException as error:  # the main thread raises it
+            self.failure = error
 
     @contextmanager
     def _signals_end_it(self) -> Iterator[None]:
@@ -135,7 +153,7 @@ class Canvas(ABC):
         received = list[int]()
 
         def end(number: int, _: FrameType | None) -> None:
-            self._is_over = True
+            self.is_over = True
             received.append(number)
 
         with ExitStack() as handlers:

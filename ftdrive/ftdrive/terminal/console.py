@@ -13,7 +13,8 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.text import NARROWEST, as_typed, glued, is_command, unglued, visible
+from ftdrive.terminal.text import NARROWEST, glued, unglued
+from ftdrive.words.text import as_typed, is_command, visible
 
 # A command that takes longer says at what it works, also in a pipe.
 _PATIENCE_S: Final = 2.0
@@ -39,7 +40,8 @@ class CommandConsole(Console):
 
     def print_next(self, *commands: str) -> None:
         """Print what the user can do next: commands, each with why behind it."""
-        self.print("Next", style="bold cyan")
+        if commands:
+            self.print("Next", style="bold cyan")
         for command in commands:
             self.print(self._next(command), soft_wrap=True)
 
@@ -76,6 +78,15 @@ def print_address(words: str, address: str) -> None:
     if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
         words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
+
+
+def print_page(url: str, *, shared: bool) -> None:
+    """Print the address of a page, for other devices also as a QR code."""
+    print_address("The page is shown until this command ends, at ", url)
+    if shared:
+        for row in qr_code(url):
+            messages.print(row)
+        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
 
 
 def qr_code(address: str) -> list[str]:

@@ -30,11 +30,7 @@ class Keyboard:
     """Keys of a screen, read by a thread. The terminal settings are restored on every exit from the context.
 
     A session takes requests (`pressed`), which letters of a word are not. Other screens take each stroke (`stroke`).
-
-    Parameters
-    ----------
-    fd : int
-        Of a terminal, see `usable`.
+    `fd` is that of a terminal, see `usable`.
     """
 
     def __init__(self, fd: int) -> None:
@@ -109,11 +105,12 @@ class Keyboard:
         self._thread.start()
 
     def _stop(self) -> None:
-        self._restore()
         thread, self._thread = self._thread, None
         if thread is not None:
+            # before the terminal discards what was typed: a read of a key that is discarded would never end
             os.close(self._wake)
             thread.join()
+        self._restore()
         self._keys.clear()
         self._strokes.clear()
 

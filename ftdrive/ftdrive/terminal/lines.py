@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rich.cells import cell_len, set_cell_size
 from rich.text import Text
 
-from ftdrive.terminal.text import visible
+from ftdrive.words.text import visible
 from ftdrivers.interfaces import Array
 
 BAD, WARNING, GOOD = "red bold", "bold black on yellow", "green"
@@ -71,11 +71,9 @@ class Line:
     @classmethod
     def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
         """Build a line of characters, each with its own style."""
-        line, start = cls(), 0
-        for style, alike in groupby(styles):
-            end = start + sum(1 for _ in alike)
-            line.add("".join(text[start:end]), style)
-            start = end
+        line = cls()
+        for style, alike in groupby(zip(text, styles, strict=True), key=lambda cell: cell[1]):
+            line.add("".join(character for character, _ in alike), style)
         return line
 
     def as_text(self) -> Text:
@@ -87,28 +85,16 @@ class Line:
 
 
 Dots = NDArray[np.bool_]
-Codes = NDArray[np.uint8]
-"""Packed characters: the bits of their dots."""
 
 # Bit of each dot in a character, by row and column (Unicode block U+2800).
-_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint8)
+_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.uint32)
 
 
 def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
-    """Draw the range from `low` to `high` (n,) in each column of dots, without a gap between neighbours.
+    """Draw the range from `low` to `high` (n,) in each column of dots (4 rows, n), without a gap between neighbours.
 
-    A column with a NaN stays empty.
-
-    Parameters
-    ----------
-    rows : int
-        Rows of characters.
-    full : float
-        Value at the upper edge; minus this at the lower one. Larger values are drawn on the edge.
-
-    Returns
-    -------
-    array, shape (4 rows, n)
+    A column with a NaN stays empty. The upper edge is at `full` and the lower at minus this; larger values are drawn
+    on the edge.
     """
     low, high = low.copy(), high.copy()
     joined = np.isfinite(low[1:]) & np.isfinite(low[:-1])
@@ -122,22 +108,21 @@ def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
         return np.asarray((dot >= top) & (dot <= bottom))
 
 
-def level(value: float, rows: int, full: float) -> int | None:
-    """Return the row of dots of a value; None outside the plot."""
-    dot = int(_dot(np.array(value), rows, full))
-    return dot if 0 <= dot < 4 * rows else None
-
-
-def characters(dots: Dots) -> Codes:
-    """Pack dots (4 m, 2 n) into characters (m, n)."""
+def characters(dots: Dots) -> NDArray[np.str_]:
+    """Pack dots (4 m, 2 n) into characters (m, n), blank where no dot is set."""
     rows, columns = len(dots) // 4, dots.shape[1] // 2
-    cells = dots.reshape(rows, 4, columns, 2).astype(np.uint8)
-    return np.asarray(np.einsum("ribj,ij->rb", cells, _BITS), np.uint8)
+    codes = np.einsum("ribj,ij->rb", dots.reshape(rows, 4, columns, 2).astype(np.uint32), _BITS)
+    return np.where(codes, 0x2800 + codes, ord(" ")).astype(np.uint32).view("U1")
 
 
-def row_text(row: Codes) -> str:
-    """Return one row of packed characters as text, with a blank for an empty one."""
-    return np.where(row, 0x2800 + row.astype("<u4"), ord(" ")).astype("<u4").tobytes().decode("utf-32-le")
+def plot(
+    low: Array, high: Array, rows: int, full: float, in_contact: NDArray[np.bool_], under: Dots | None = None
+) -> list[Line]:
+    """Draw an `envelope` (n,) in lines of n / 2 characters, before the dots `under` it; contact has its own colour."""
+    ink = characters(envelope(low, high, rows, full))
+    drawn, cells = ink != " ", ink if under is None else np.where(ink != " ", ink, characters(under))
+    styles = np.where(drawn, np.where(in_contact, CONTACT, TRACE), FAINT)
+    return [Line.of_cells(*row) for row in zip(cells.tolist(), styles.tolist(), strict=True)]
 
 
 def _dot(value: Array, rows: int, full: float) -> Array:

@@ -4,22 +4,24 @@
 lines.
 """
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from ftdrive.checks.check import Check, check_calibration
 from ftdrive.checks.sensor import AXES
 from ftdrive.runs.verification import fitted_dataset
+from ftdrive.stream.feed import SPANS_S, Feed, PlotColumns
+from ftdrive.stream.samples import Axes, Point
+from ftdrive.stream.sources import RecordingSource
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, characters, envelope, level
-from ftdrive.terminal.live_feed import Feed, after
-from ftdrive.terminal.live_view import SPANS_S, PlotColumns, Summary, View
+from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, envelope, plot
+from ftdrive.words.stream import Summary, View, full_scale
 
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
@@ -48,23 +50,10 @@ _HELP = """\
 
 
 def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> None:
-    """Show a stream until the user quits.
+    """Read and show the open stream of a feed until the user quits, with findings that the stream does not know.
 
-    Parameters
-    ----------
-    feed : Feed
-        Of an open stream, which is read here and closed by the caller.
-    checks : sequence of Check
-        Findings about the cell that the stream does not know, such as "robot.payload".
-    address : str
-        Of the page in the browser, if there is one.
-
-    Raises
-    ------
-    DeviceError
-        The stream had failed when the user quit.
-    SupervisorGone
-        The terminal was closed.
+    `address` is that of the page in the browser, if there is one. Raises `DeviceError` if the stream had failed when
+    the user quit, and `SupervisorGone` if the terminal was closed.
     """
     info = feed.stream.info
     dataset = None
@@ -77,8 +66,8 @@ def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> Non
     finally:
         for path in feed.recorded:
             messages.print(f" Recorded: {path}")
-    if feed.reader.failure is not None:
-        raise feed.reader.failure
+    if screen.failure is not None:
+        raise screen.failure
 
 
 class LiveScreen(Canvas):
@@ -89,19 +78,12 @@ class LiveScreen(Canvas):
         self._feed, self._summary = feed, summary
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the present state; raises what has ended the thread that reads."""
-        if self._feed.crash is not None:
-            raise self._feed.crash
+        """Draw the present state."""
         return frame(self._summary.view(), width, height, self.page())
 
-    @contextmanager
-    def reading(self) -> Iterator[None]:
-        """Let the feed read."""
-        self._feed.start()
-        try:
-            yield
-        finally:
-            self._feed.stop()
+    def turns(self) -> Iterator[object]:
+        """Read for the screen and the page."""
+        return self._feed.turns(until=lambda: self.is_over)
 
     def act(self, key: str) -> None:
         """Do what a key stands for."""
@@ -112,11 +94,42 @@ class LiveScreen(Canvas):
         elif key == "p":
             self._summary.reset_peaks()
         elif key == "g":
-            self._summary.span_s = after(self._summary.span_s, SPANS_S)[0]
+            self._summary.span_s = SPANS_S[(SPANS_S.index(self._summary.span_s) + 1) % len(SPANS_S)]
         elif key == "b":
-            self.entry = partial(self._feed.request, "b"), "text of the mark, then Enter; Esc leaves", ""
-        else:
-            self._feed.request("space" if key == " " else key)
+            mark = self._feed.stream.mark
+            self.entry = lambda text: self._feed.do(partial(mark, text)), "text of the mark, then Enter; Esc leaves", ""
+        elif (action := _actions(self._feed).get(key)) is not None:
+            self._feed.do(action)
+
+
+_SEEK_S = 5.0
+
+
+def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
+    """Return what each key does between two reads."""
+    stream = feed.stream
+    found: dict[str, Callable[[], object]] = {
+        "x": partial(feed.next_frame, "axes", get_args(Axes)),
+        "a": partial(feed.next_frame, "about", get_args(Point)),
+        "1": partial(feed.switch_stage, "bias"),
+        "2": partial(feed.switch_stage, "gravity"),
+        "3": partial(feed.switch_stage, "inertia"),
+    }
+    if stream.info.is_raw:
+        words = "raw readings have neither stages nor other axes: start with --calibration for these"
+        found = dict.fromkeys(found, partial(feed.note, words))
+    found |= {"t": stream.tare, "u": stream.undo_tare, "4": partial(feed.switch_stage, "lowpass_Hz")}
+    found |= {"r": feed.switch_recording, "f": feed.push_tool}
+    if isinstance(replay := stream.source, RecordingSource):
+        found |= {
+            " ": replay.toggle,
+            "left": lambda: replay.seek(replay.at_s - _SEEK_S),
+            "right": lambda: replay.seek(replay.at_s + _SEEK_S),
+            ".": replay.step,
+            **dict.fromkeys("+=", lambda: setattr(replay, "speed", 2 * replay.speed)),
+            "-": lambda: setattr(replay, "speed", replay.speed / 2),
+        }
+    return found
 
 
 # From this width on the plots stand beside the table.
@@ -128,18 +141,12 @@ _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
 def frame(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
-    """Draw the screen, with the address of a page in the browser.
-
-    Returns
-    -------
-    list of Line
-        `height` lines of `width` cells.
-    """
+    """Draw the screen as `height` lines of `width` cells, with the address of a page in the browser."""
     head = live_panels.head(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
     body = _wide(view, width, rows) if width >= _WIDE else _narrow(view, width, rows)
-    return [*head, *body, *[Line().to(width)] * (rows - len(body)), foot][:height]
+    return [line.fit(width) for line in [*head, *body, *[Line()] * (rows - len(body)), foot][:height]]
 
 
 def _narrow(view: View, width: int, rows: int) -> list[Line]:
@@ -148,7 +155,7 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
     if rows - len(body) >= 3 * _LEAST_PLOT_ROWS + 10:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
-    links = [separator, *live_panels.links(view, width)]
+    links = [separator, *live_panels.links(view)]
     # a refusal is read to its end
     if rows - len(body) - len(links) - 1 >= max(1, live_panels.newest_rows(view, width)):
         body += links
@@ -162,8 +169,8 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
 
 def _wide(view: View, width: int, rows: int) -> list[Line]:
     separator = Line("─" * _LEFT, FAINT)
-    left = [*live_panels.table(view, _LEFT, with_trace=False), separator, *live_panels.links(view, _LEFT), separator]
-    for extra in (live_panels.others(view, _LEFT), live_panels.sphere(view, _LEFT), live_panels.identity(view, _LEFT)):
+    left = [*live_panels.table(view, _LEFT, with_trace=False), separator, *live_panels.links(view), separator]
+    for extra in (live_panels.others(view), live_panels.sphere(view), live_panels.identity(view, _LEFT)):
         if extra and rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
             left += [*extra, separator]
     left += live_panels.events(view, _LEFT, max(0, rows - len(left)))
@@ -181,24 +188,18 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
     if each < 2 or cells < 8:
         return []
     columns = view.columns(2 * cells)
-    full = [live_panels.full_scale(columns, view.reading, first) for first in (0, 3)]
+    full = [full_scale(columns, view.reading, first) for first in (0, 3)]
     drawn = [_plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
     below = 6 // across
     beside = [parts for first in range(below) for parts in zip(*drawn[first::below], strict=True)]
-    lines = []
-    for parts in (*beside, [_time_axis(columns, cells) for _ in range(across)]):
+    axis, half, lines = Line(" " * _GUTTER).add(f"-{columns.span}", FAINT), f"-{columns.span_s / 2:.0f}", []
+    axis.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT).to(_GUTTER + cells - 3).add("now", FAINT)
+    for parts in (*beside, [axis] * across):
         line = Line()
         for part in parts:
             line.join(part.fit(width // across))
-        lines.append(line.fit(width))
+        lines.append(line)
     return lines
-
-
-def _time_axis(columns: PlotColumns, cells: int) -> Line:
-    span, half = f"-{live_panels.span(columns)}", f"-{columns.span_s / 2:.0f}"
-    line = Line(" " * _GUTTER).add(span, FAINT)
-    line.to(_GUTTER + cells // 2 - len(half)).add(half, FAINT)
-    return line.to(_GUTTER + cells - 3).add("now", FAINT)
 
 
 def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
@@ -208,34 +209,24 @@ def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, w
     """
     reading, unit = view.reading, "N" if i < 3 else "N·m"
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
-    if with_value and reading is not None and not view.silent:
-        places = live_panels.decimals(reading, i // 3 * 3)
-        head.add(f"{reading.wrench[i]:+z.{places}f} ± {live_panels.digits(reading.sigma[i], places)} {unit} ")
-    contact = columns.contact_cells
-    cells = len(contact)
-    marks = {
-        column // 2
-        for note in view.notes
-        if note.is_mark and note.t_host_ns is not None and (column := columns.column_of(note.t_host_ns)) is not None
-    }
-    shown = slice(head.width - _GUTTER, cells)
-    text, styles = (["━" if it else "─" for it in contact], [CONTACT if it else FAINT for it in contact])
-    for cell in marks:
-        text[cell], styles[cell] = "◆", STRONG
-    head.join(Line.of_cells(text[shown], styles[shown]))
+    if with_value and view.live is not None:
+        head.add(f"{' ± '.join(live_panels.component(view.live, i))} {unit} ")
+    contact, marks = columns.contact_cells, [column // 2 for column in columns.marks]
+    cells, start = len(contact), head.width - _GUTTER
+    text, styles = np.where(contact, "━", "─"), np.where(contact, CONTACT, FAINT)
+    text[marks], styles[marks] = "◆", STRONG
+    head.join(Line.of_cells(text[start:].tolist(), styles[start:].tolist()))
 
     rows -= 1
-    ink = characters(envelope(columns.low[i], columns.high[i], rows, full))
     under = np.zeros((4 * rows, 2 * cells), np.bool_)
     if reading is not None and np.isfinite(sigma := reading.sample_sigma[i]):
         for value in (-sigma, 0.0, sigma):
-            if (dot := level(value, rows, full)) is not None:
-                under[dot, ::4] = True
-    under[::2, [2 * cell for cell in marks]] = True
-    paper = characters(under)
+            flat = np.full(2 * cells, value)
+            under |= envelope(flat, flat, rows, full)
+    under[:, np.arange(2 * cells) % 4 > 0] = False
+    under[::2, 2 * np.array(marks, np.intp)] = True
     lines = [head]
-    for row in range(rows):
+    for row, drawn in enumerate(plot(columns.low[i], columns.high[i], rows, full, contact, under)):
         label = f"{full:+g}" if row == 0 else f"{-full:+g}" if row == rows - 1 else "0" if row == rows // 2 else ""
-        line = Line(f"{label:>{_GUTTER - 1}} ", FAINT)
-        lines.append(line.join(live_panels.layers(ink[row], paper[row], contact)))
+        lines.append(Line(f"{label:>{_GUTTER - 1}} ", FAINT).join(drawn))
     return lines

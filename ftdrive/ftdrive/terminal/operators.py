@@ -9,9 +9,10 @@ from typing import Any, Final, TextIO
 
 from ftdrive.errors import Declined
 from ftdrive.session.events import SCHEMA_VERSION, Asked, Event, Key, Question
-from ftdrive.terminal.session_text import SessionText, TextLine
 from ftdrive.terminal.supervisor import Supervisor
-from ftdrive.terminal.text import in_whole_words, visible
+from ftdrive.terminal.text import in_whole_words
+from ftdrive.words.session import SessionText
+from ftdrive.words.text import TextLine, visible
 
 # Letters and words of one meaning in every question. s and r stand for no word that moves an arm.
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
@@ -116,14 +117,9 @@ class JsonOperator(_Keyless):
 
 
 class PlainOperator(_Keyless):
-    """Plain lines on stderr, without colour and without keys.
+    """Plain lines on stderr, without colour and without keys; `verbose` is that of `SessionText`.
 
-    Parameters
-    ----------
-    quiet : bool
-        Print lines only before a question, which may refer to them.
-    verbose : bool
-        Print every check, the table of the plan and the estimate after each pose.
+    If `quiet`, lines are printed only before a question, which may refer to them.
     """
 
     def __init__(

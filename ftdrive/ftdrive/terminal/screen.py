@@ -6,22 +6,15 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
-from itertools import pairwise
-from statistics import median
 from threading import RLock
-from typing import Literal, Self, TextIO
+from typing import Self, TextIO
 
 import numpy as np
-from numpy.typing import ArrayLike
 from rich.cells import cell_len
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
-from scipy.spatial.transform import Rotation
 
-from ftcalib.rounding import decimals, to_place_of, with_sigma
-from ftcalib.routine import DriftCheck
 from ftdrive.errors import Declined, SupervisorGone
 from ftdrive.session.events import (
     Asked,
@@ -30,109 +23,43 @@ from ftdrive.session.events import (
     Event,
     GuardTripped,
     Key,
-    Noted,
     Operator,
-    PoseTaken,
     Question,
-    RunOpened,
     State,
     StateChanged,
-    rms_sigma,
 )
-from ftdrive.session.live_fit import GREEN
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line
-from ftdrive.terminal.report import drift_in_words
-from ftdrive.terminal.session_text import SessionText, TextLine, in_words, sigmas_of
 from ftdrive.terminal.supervisor import Supervisor
-from ftdrive.terminal.text import as_typed
+from ftdrive.words.session import (
+    ESTIMATES,
+    OFF_SIGMA,
+    SessionText,
+    SessionView,
+    coverage_in_words,
+    differences,
+    drift_so_far,
+    in_words,
+    pose_in_words,
+    progress_in_words,
+    residual_in_words,
+    rounded_estimate,
+    sigmas_of,
+    state_in_words,
+)
+from ftdrive.words.text import TextLine, as_typed
 from ftdrivers.interfaces import Array
 
 REFRESH_HZ = 4
 KEYS = {Key.KEEP: "finish", Key.REDO: "redo", Key.SKIP: "skip", Key.PAUSE: "pause", Key.STOP: "quit"}
 
-# Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
-ESTIMATES = (
-    ("mass kg", 1.0, "mass_kg", 1),
-    ("centre mm", 1e3, "p_sensor_com_m", 2),
-    ("F bias N", 1.0, "force_bias_N", 2),
-    ("T bias N·m", 1.0, "torque_bias_Nm", 3),
-    ("mounting deg", 180 / np.pi, "R_flange_sensor", 4),
-    ("tilt a deg", 180 / np.pi, "tilt_alpha_rad", 6),
-    ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
-)
 _COLOUR = {"green": "bold green", "amber": "bold yellow", "red": "bold red"}
 _FACES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _CUBE_WIDTH = 25
-_NUMBER_WIDTH = 9
 _TABLE_WIDTH = 53
+_NUMBER_WIDTH = 9
 _NARROWEST_BAR = 8
-_OFF_SIGMA = 5.0
-# A standard deviation below this, N or N·m, comes from rounding: its value was not fitted.
-_ROUNDED = 1e-9
-_ASCII = str.maketrans(
-    dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
-    | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
-)
-
-
-@dataclass
-class SessionView:
-    """The state that the screen draws."""
-
-    command: str = "calibrate"
-    now: StateChanged | None = None
-    since_s: float = 0.0
-    """Start of the state, in the clock of `frame`."""
-    folder: str = ""
-    resume: str = ""
-    taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
-    """By stop, with the time."""
-    last: PoseTaken | None = None
-    estimated: Estimated | None = None
-    compared: dict[int, Compared] = field(default_factory=dict)
-    """By stop, in a verification."""
-    drift: DriftCheck | None = None
-    note: Noted | GuardTripped | None = None
-    tripped: bool = False
-    """A guard has stopped the arm, and STOP and HOLD repeat its words."""
-    waiting: tuple[Key, ...] = ()
-    ascii_only: bool = False
-    """The terminal's encoding is ASCII."""
-    keys: Literal["live", "asking", "over"] = "live"
-    """Whether keys are read now."""
-
-    def update(self, event: Event, now_s: float) -> None:
-        """Update the state from an event."""
-        match event:
-            case RunOpened():
-                self.folder, self.resume = event.folder, event.resume
-            case StateChanged():
-                self.now, self.since_s = event, now_s
-                self.tripped = self.tripped and event.state in {State.STOP, State.HOLD}
-            case PoseTaken():
-                self._take(event, now_s)
-            case Estimated():
-                self.estimated = event
-            case Compared():
-                self.compared[event.stop] = event
-            case Noted(warning=True):
-                self.note = event
-            case GuardTripped():
-                self.note, self.tripped = event, True
-
-    def shown(self, text: str) -> str:
-        """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
-        return text.translate(_ASCII) if self.ascii_only else text
-
-    def _take(self, event: PoseTaken, now_s: float) -> None:
-        self.taken[event.stop] = event, now_s
-        self.last, self.note = event, None
-        first, first_s = self.taken[min(self.taken)]
-        if event.number == first.number and event.stop != first.stop:
-            sigma = np.hypot(first.sigma, event.sigma)
-            self.drift = DriftCheck(np.subtract(event.mean, first.mean), sigma, now_s - first_s)
 
 
 def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
@@ -141,13 +68,14 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
     If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
-    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *state_lines(view, now_s, width)])]
+    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
     if view.folder or view.last is not None:
+        drift = drift_so_far(view)
         blocks += [
             (3, _last(view)),
             (9, [_rule(width)]),
             *_findings(view, width, with_cube=wide and height > 20),
-            (5, [_drift(view)]),
+            (5, [Text(f"drift  {drift.words}", drift.style)]),
         ]
     note = "" if view.note is None else in_words(view.note)
     blocks += [
@@ -166,26 +94,8 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
     return Group(*lines)
 
 
-def _kept_poses(view: SessionView) -> int:
-    return max(len(view.taken), view.estimated.poses if view.estimated else 0)  # more if resumed
-
-
-def progress_in_words(view: SessionView, now_s: float) -> str:
-    """Return how many poses are kept, and how long the others take, in the clock of `SessionView.since_s`."""
-    times_s = sorted(at_s for _, at_s in view.taken.values())
-    kept = _kept_poses(view)
-    left = view.last.stops - kept if view.last else 0
-    if len(times_s) <= 2 or left <= 0:
-        return f"{kept} kept"
-    # a stop with questions takes longer than usual
-    usual_s = median(b - a for a, b in pairwise(times_s))
-    # a hold does not shorten the rest
-    rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
-    return f"{kept} kept, about {_minutes(rest_s)} left"
-
-
 def _title(view: SessionView, now_s: float, width: int) -> Text:
-    kept, right = _kept_poses(view), progress_in_words(view, now_s)
+    kept, right = view.kept, progress_in_words(view, now_s)
     name = f"ftdrive {view.command}"
     room = width - len(name) - len(right)
     if view.last is None or room < _NARROWEST_BAR + 4:
@@ -197,50 +107,28 @@ def _title(view: SessionView, now_s: float, width: int) -> Text:
     )
 
 
-def state_lines(view: SessionView, now_s: float, width: int) -> list[Text]:
-    """Return the state of the session, in lines of at most `width`."""
-    now = view.now
-    if now is None:
-        return [Text("recording" if view.folder else "starting")]
-    if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        # the motion before the question is over
-        return [Text("WAITS for an answer", "bold cyan")]
-    line = Text()
-    if now.stop is not None:
-        line.append(f"pose {now.stop}/{now.stops}" if now.stops is not None else f"pose {now.stop}", "bold")
-        line.append(f" R{now.number:02d}  " if now.number is not None else "  ")
-    stopped = now.state in {State.STOP, State.HOLD}
-    line.append(now.state.upper(), "bold red" if stopped else "bold cyan")
-    line.append(f"  {_minutes(now_s - view.since_s)}" if now.state is not State.HOLD else "")
-    words = "" if view.tripped else now.words
+def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
+    where, state, words = state_in_words(view, now_s)
+    stopped = view.now is not None and view.now.state in {State.STOP, State.HOLD}
+    style = "" if view.now is None else "bold red" if stopped else "bold cyan"
+    line = Text.assemble((f"{where}  " if where else "", "bold"), (state, style))
     if len(line) + 2 + len(words) > width:
         return [line, *_folded(view, words, width)]
-    line.append(f"  {words}" if words else "")
-    return [line]
+    return [line.append(f"  {words}" if words else "")]
 
 
 def _last(view: SessionView) -> list[Text]:
     pose, fit = view.last, view.estimated
     if pose is None:
         return []
-    force_N, torque_Nm = rms_sigma(pose.sigma)
-    line = Text(
-        f"R{pose.number:02d}: settled {pose.settle_s:.1f} s, {pose.samples} samples, "
-        f"sigma {force_N:.2g} N {to_place_of(torque_Nm, torque_Nm)} N·m"
-    )
-    if pose.attempts > 1:
-        line.append(f", {pose.attempts} tries")
-    if not pose.steady:
-        line.append(", NOT STEADY", "bold yellow")
+    line = Text(pose_in_words(pose), "" if pose.steady else "bold yellow")
     if view.compared:
         return [line]
-    if fit is None or fit.residual_sigma is None or fit.residual_force_N is None:
+    if fit is None or fit.residual_sigma is None:
         return [line, Text("     residual: no fit before it", "dim")]
-    off = fit.residual_sigma > _OFF_SIGMA
-    residual = Text("     residual ")
-    residual.append(f"{fit.residual_force_N:.3f} N, {fit.residual_sigma:.1f} sigma", "bold yellow" if off else "")
-    residual.append(" OUT OF LINE: press r to redo" if off else " against the fit before it")
-    return [line, residual]
+    off = fit.residual_sigma > OFF_SIGMA
+    residual = Text(f"     residual {residual_in_words(fit)}", "bold yellow" if off else "")
+    return [line, residual.append(" OUT OF LINE: press r to redo" if off else "")]
 
 
 def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
@@ -248,12 +136,11 @@ def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[i
         return [*_estimates(view, with_cube=with_cube), *_coverage(view, width)]
     lines = [Text("measured minus predicted, ± one sigma expected", "dim")]
     for event in view.compared.values():
-        size, expected = (
-            (np.linalg.norm(vector[:3]), np.linalg.norm(vector[3:])) for vector in (event.residual, event.sigma)
+        force, torque, sigmas = differences(event)
+        numbers = f"{force:>16} N {torque:>18} N·m {sigmas:>6} sigma"
+        lines.append(
+            Text.assemble(f"R{event.number:02d}", (numbers, "bold yellow" if sigmas_of(event) > OFF_SIGMA else ""))
         )
-        sigmas = sigmas_of(event)
-        numbers = f"{size[0]:8.3f} ± {expected[0]:.3f} N {size[1]:9.4f} ± {expected[1]:.4f} N·m {sigmas:6.1f} sigma"
-        lines.append(Text.assemble(f"R{event.number:02d}", (numbers, "bold yellow" if sigmas > _OFF_SIGMA else "")))
     hint = next(iter(reversed(view.compared.values()))).hint if view.compared else ""
     return [(1, lines), (4, _folded(view, hint, width))]
 
@@ -285,20 +172,6 @@ def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Te
     return Text(f"{label:<13}{numbers:<27}  ± {sigma}")
 
 
-def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
-    """Return the values of an estimate times `factor`, and their largest sigma; nothing before there is a fit."""
-    if fit is None or name not in fit.values:
-        return [], ""
-    value: ArrayLike = fit.values[name]
-    if name == "R_flange_sensor":
-        value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
-    values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
-    digits = decimals(sigma)
-    while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
-        digits -= 1
-    return [f"{one:.{digits}f}" for one in values], to_place_of(sigma, sigma)
-
-
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
     """Draw the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
     face = None
@@ -324,36 +197,8 @@ def _coverage(view: SessionView, width: int) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     if fit is None:
         return [(1, [Text("coverage  nothing yet", "dim")])]
-    line = Text("coverage  ")
-    line.append(fit.light.upper(), _COLOUR.get(fit.light, "bold"))
-    for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
-        value, goal = getattr(fit, name), GREEN[name]
-        line.append(f"   {what} {value:.1f}" if value < 100 else f"   {what} >100")
-        line.append("" if value <= goal else f" (goal {goal:g})")
-    line.append(f"   gap {fit.empty_cap_deg:.0f}°")
+    line = Text.assemble("coverage  ", (fit.light.upper(), _COLOUR.get(fit.light, "bold")), coverage_in_words(fit))
     return [(1, [line]), (4, _folded(view, f"helps most: {fit.hint}" if fit.hint else "", width))]
-
-
-def _drift(view: SessionView) -> Text:
-    fit = view.estimated
-    if view.drift is not None:
-        words, bad = drift_in_words(view.drift)
-        return Text(f"drift  {words}", "bold yellow" if bad else "")
-    if fit is None or not fit.values:
-        when = "the fit" if view.command == "calibrate" else "the first pose is measured again"
-        return Text(f"drift  not known before {when}", "dim")
-    if "drift" not in fit.values:
-        return Text("drift  none seen so far")
-    change, sigma = fit.values["drift"], fit.sigma["drift"]
-    fitted = sigma > _ROUNDED
-    sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
-    parts = [
-        f"{with_sigma(np.linalg.norm(change[some]), np.max(sigma[some]))} {unit}"
-        for some, unit in ((slice(3), "N"), (slice(3, 6), "N·m"))
-        if fitted[some].any()
-    ]
-    words = f"drift  {', '.join(parts)} since the first pose"
-    return Text(words if sure else f"{words}, perhaps", "yellow" if sure else "")
 
 
 def _keys(view: SessionView) -> list[Text]:
@@ -396,23 +241,11 @@ def _end_of(text: str, width: int) -> str:
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
-def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 59.5 else f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"
-
-
 class Screen:
     """An operator at a terminal: messages scroll above a frame, questions are asked below it.
 
-    Parameters
-    ----------
-    console : rich Console
-        A terminal.
-    keyboard : Keyboard, optional
-        Without it there are no keys; questions are still answered by lines.
-    verbose : bool
-        Print every check, the table of the plan and each pose above the frame.
-    command : str
-        The task: "calibrate" or "verify".
+    Without a keyboard there are no keys; questions are still answered by lines. If verbose, every check, the table of
+    the plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
     """
 
     pressed_by = "the operator"

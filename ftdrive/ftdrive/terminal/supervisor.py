@@ -19,16 +19,7 @@ class Supervisor:
 
     Within its `with` block the hang-up of the terminal (SIGHUP) is noticed too, unless it is ignored, as under `nohup`.
     The end of an input matters only if its writer was there when a question was asked: answers that were all prepared
-    before, and an input that no question is read from, may end.
-
-    Parameters
-    ----------
-    stdin : TextIO
-        Answers come from there.
-    output : TextIO
-        Shows the session.
-    name : str
-        Of the output, for messages.
+    before, and an input that no question is read from, may end. `name` is that of the output, for messages.
     """
 
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:

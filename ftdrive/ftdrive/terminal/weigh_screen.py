@@ -1,15 +1,15 @@
 """The screen of `ftdrive weigh`: one large number."""
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from itertools import takewhile
 from textwrap import wrap
 
-from ftcalib.after.weighing import Weight
 from ftcalib.rounding import counted, to_place_of
-from ftdrive.live.weighing import UNZEROED_KG, Weighing, line_of, worth_of
+from ftdrive.stream.weighing import Weighing, line_of
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.lines import STRONG, Line
+from ftdrive.words.stream import devices
+from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
 # Three rows of each figure, three characters wide.
@@ -23,72 +23,42 @@ _ROWS = (
 class WeighScreen(Canvas):
     """The scale. What ends its reading ends the screen: an error of a device, or of the recording.
 
-    Parameters
-    ----------
-    weighing : Weighing
-    address : str
-        Of the page in the browser, if there is one.
+    `turns` reads the stream that it weighs, see `pump`; `address` is that of the page in the browser, if there is one.
     """
 
-    def __init__(self, weighing: Weighing, address: str = "") -> None:
+    def __init__(self, weighing: Weighing, turns: Iterable[object], address: str = "") -> None:
         super().__init__(address)
-        self._weighing = weighing
-        self._failure: BaseException | None = None
+        self._weighing, self._turns = weighing, turns
 
     def draw(self, width: int, height: int) -> list[Line]:
-        """Draw the present state; raises what has ended the thread that reads."""
-        if self._failure is not None:
-            raise self._failure
+        """Draw the present state."""
         info, shown = self._weighing.stream.info, self._weighing.shown
-        weight = shown.measured
-        mass = "- - -" if weight is None else f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
-        sigma = "" if weight is None else self._sigma_line(weight, shown.count)
+        mass, beside = NO_MASS, list[str]()
+        if (weight := shown.measured) is not None:
+            mass = f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
+            beside = [worth_of(weight)] if shown.count is None else [counted(shown.count, "part"), worth_of(weight)]
+            if self._weighing.joins:
+                beside.append(f"{counted(weight.poses, 'pose')} joined, turn the tool for more")
+            zero, helps = zero_in_words(self._weighing)
+            beside += [zero] if helps else []
         keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
-        title = "   ".join(["ftdrive weigh", f"tool {info.tool}", *info.marks])
+        title = "   ".join(["ftdrive weigh", devices(info), *info.marks])
         lines = [Line(f"  {title}"), self.page() or Line(), Line()]
         lines += [Line(f"  {row}", STRONG) for row in large(mass)]
-        for text in ("", sigma, line_of(shown), self._weighing.note):
+        for text in ("", "   ".join(beside), line_of(shown), self._weighing.note):
             lines += [Line(f"  {line}") for line in wrap(text, max(width - 4, 1)) or [""]]
         return [*lines, *[Line()] * (height - 1 - len(lines)), Line(f"  {keys}q quit")]
 
-    @contextmanager
-    def reading(self) -> Iterator[None]:
+    def turns(self) -> Iterator[object]:
         """Read and weigh."""
-        ends = threading.Event()
-
-        def read() -> None:
-            try:
-                for _ in self._weighing.states():
-                    if ends.is_set():
-                        return
-            except BaseException as error:  # the main thread raises it
-                self._failure = error
-
-        thread = threading.Thread(target=read, name="weigh screen", daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            ends.set()
-            # a zero may take seconds
-            thread.join(2.0)
+        return takewhile(lambda _: not self.is_over, self._turns)
 
     def act(self, key: str) -> None:
         """Tare the empty gripper, or begin or stop to join the poses of one load."""
-        if self._weighing.moving:
-            return
-        if key == "z":
+        if key == "z" and not self._weighing.moving:
             self._weighing.request_zero()
-        elif key == "p":
+        elif key == "p" and not self._weighing.moving:
             self._weighing.joins = not self._weighing.joins
-
-    def _sigma_line(self, weight: Weight, count: int | None) -> str:
-        words = [worth_of(weight)] if count is None else [counted(count, "part"), worth_of(weight)]
-        if self._weighing.joins:
-            words.append(f"{counted(weight.poses, 'pose')} joined, turn the tool for more")
-        if weight.least_kg > UNZEROED_KG and not self._weighing.moving:
-            words.append("not zeroed: press z with an empty gripper")
-        return "   ".join(words)
 
 
 def large(text: str) -> list[str]:

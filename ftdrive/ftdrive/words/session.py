@@ -1,11 +1,16 @@
-"""The texts of a session and of a push: what is planned, asked, estimated, changed."""
+"""A session and a push in words: what is planned, asked, estimated, changed; and the state that a face shows."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import median
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
 
-from ftcalib.rounding import to_place_of, with_sigma
+from ftcalib.rounding import decimals, to_place_of, with_sigma
+from ftcalib.routine import DriftCheck
 from ftdrive.checks.arm import FlangeLoad, margin_in_words
 from ftdrive.planning.plan import Plan
 from ftdrive.session.events import (
@@ -15,6 +20,7 @@ from ftdrive.session.events import (
     Estimated,
     Event,
     GuardTripped,
+    Key,
     MotionRecorded,
     Noted,
     Planned,
@@ -24,31 +30,39 @@ from ftdrive.session.events import (
     StateChanged,
     rms_sigma,
 )
+from ftdrive.session.live_fit import GREEN
 from ftdrive.session.settings_push import Push
+from ftdrive.words.result import drift_in_words
+from ftdrive.words.text import TextLine
 from ftdrivers.interfaces import ControllerSettings
 
+# Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
+ESTIMATES = (
+    ("mass kg", 1.0, "mass_kg", 1),
+    ("centre mm", 1e3, "p_sensor_com_m", 2),
+    ("F bias N", 1.0, "force_bias_N", 2),
+    ("T bias N·m", 1.0, "torque_bias_Nm", 3),
+    ("mounting deg", 180 / np.pi, "R_flange_sensor", 4),
+    ("tilt a deg", 180 / np.pi, "tilt_alpha_rad", 6),
+    ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
+)
+_NUMBER_WIDTH = 9
+# A standard deviation below this, N or N·m, comes from rounding: its value was not fitted.
+_ROUNDED = 1e-9
+OFF_SIGMA = 5.0
+"""A pose that differs by more is out of line."""
 
-@dataclass(frozen=True, slots=True)
-class TextLine:
-    """A line of text."""
-
-    head: str
-    """A mark or indent; a folded line continues below the first word after it."""
-    words: str
-    style: str = ""
-    """Style of rich, for a terminal with colour."""
+_ASCII = str.maketrans(
+    dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
+    | {"±": "+-", "°": " deg", "·": ".", "…": "~", "✔": "ok", "✘": "FAIL"}
+)
 
 
 class SessionText:
-    """Turns events into lines, in sections with headings.
+    """Turns events into lines, in sections with headings; `poses` have a line each, unless a screen shows them already.
 
-    Parameters
-    ----------
-    verbose : bool
-        Print a line for each check, the table of the plan, and the estimate after each pose. Otherwise passed checks
-        share one line, and the plan has three.
-    poses : bool
-        Print a line for each pose. A live screen shows them already.
+    `verbose` adds a line for each check, the table of the plan, and the estimate after each pose. Otherwise passed
+    checks share one line, and the plan has three.
     """
 
     def __init__(self, *, verbose: bool = False, poses: bool = True) -> None:
@@ -160,54 +174,65 @@ def _head_and_words(event: Event) -> tuple[str, str]:
             return "", "\n".join(filter(None, (event.plan.in_words(), event.stop_words, event.way_words)))
         case Noted():
             return "! " if event.warning else "", event.words
-        case PoseTaken() | MotionRecorded():
-            return "", _pose_in_words(event) if isinstance(event, PoseTaken) else _motion_in_words(event)
+        case PoseTaken():
+            return "", f"{event.stop}/{event.stops} {pose_in_words(event)}"
         case Estimated():
             return "  ", _estimate_in_words(event)
         case Compared():
             return "  ", _comparison_in_words(event)
+        case _:
+            return "", _sentence(event)
+
+
+def _sentence(event: Event) -> str:
+    match event:
+        case MotionRecorded():
+            amount = f"{event.samples} samples of the sensor, {event.states} of the arm"
+            return f"recorded {amount}; {event.duration_s:.1f} s"
         case GuardTripped():
-            return "", f"STOPPED by guard {event.hazard}: {event.words}"
+            return f"STOPPED by guard {event.hazard}: {event.words}"
         case Asked():
             colon = "" if event.question.endswith("?") else ":"
-            return "", f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
+            return f"{event.question}{colon} {event.answer}{' (--yes)' if event.by == '--yes' else ''}"
         case _:
-            return "", ""
+            return ""
 
 
-def _motion_in_words(event: MotionRecorded) -> str:
-    words = f"recorded {event.samples} samples of the sensor, {event.states} of the arm"
-    return f"{words}; {event.duration_s:.1f} s"
-
-
-def _pose_in_words(event: PoseTaken) -> str:
+def pose_in_words(event: PoseTaken) -> str:
+    """Describe an average, by the number of its orientation."""
     force_N, torque_Nm = rms_sigma(event.sigma)
-    words = (
-        f"{event.stop}/{event.stops} R{event.number:02d}: settled {event.settle_s:.1f} s, {event.samples} samples in "
-        f"{event.average_s:.1f} s, sigma {force_N:.2g} N {to_place_of(torque_Nm, torque_Nm)} N·m"
-    )
-    if event.attempts > 1:
-        words += f", {event.attempts} attempts"
-    return words if event.steady else words + ", NOT STEADY"
+    flags = [*["NOT STEADY"] * (not event.steady), *[f"{event.attempts} attempts"] * (event.attempts > 1)]
+    settled = f"settled {event.settle_s:.1f} s, {event.samples} samples in {event.average_s:.1f} s"
+    sigma = f"sigma {force_N:.2g} N {to_place_of(torque_Nm, torque_Nm)} N·m"
+    return f"R{event.number:02d}: {', '.join([*flags, settled, sigma])}"
 
 
 def _estimate_in_words(event: Estimated) -> str:
     words = f"coverage {event.light}"
     if "mass_kg" in event.values:
         words += f", mass {with_sigma(event.values['mass_kg'], event.sigma['mass_kg'])} kg"
-    if event.residual_sigma is not None and event.residual_force_N is not None:
-        words += f", {event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
+    if residual := residual_in_words(event):
+        words += f", {residual}"
     return f"{words}; helps most: {event.hint}" if event.hint else words
 
 
+def residual_in_words(event: Estimated) -> str:
+    """Describe how far the newest pose was from the fit before it; empty without one."""
+    if event.residual_sigma is None or event.residual_force_N is None:
+        return ""
+    return f"{event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
+
+
 def _comparison_in_words(event: Compared) -> str:
-    """Describe how far a pose is from the prediction, and how far it is expected to be (one sigma)."""
-    found, expected = (
-        f"{np.linalg.norm(vector[:3]):.3f} N, {np.linalg.norm(vector[3:]):.4f} N·m"
-        for vector in (event.residual, event.sigma)
-    )
-    words = f"{found} from the prediction, {expected} expected, {sigmas_of(event):.1f} sigma"
+    force, torque, sigmas = differences(event)
+    words = f"{force} N, {torque} N·m from the prediction, {sigmas} sigma"
     return f"{words}; {event.hint}" if event.hint else words
+
+
+def differences(event: Compared) -> tuple[str, str, str]:
+    """Return how far a pose is from the prediction, ± one sigma expected, N and N·m, and the largest in sigmas."""
+    (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (event.residual, event.sigma))
+    return f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}", f"{sigmas_of(event):.1f}"
 
 
 def sigmas_of(event: Compared) -> float:
@@ -291,3 +316,146 @@ def _numbers(value: ArrayLike | None, form: str, scale: float = 1.0) -> str:
         return "not reported"
     numbers = [f"{one:{form}}" for one in scale * np.atleast_1d(value)]
     return numbers[0] if np.ndim(value) == 0 else f"({', '.join(numbers)})"
+
+
+@dataclass
+class SessionView:
+    """The state that the screen draws."""
+
+    command: str = "calibrate"
+    now: StateChanged | None = None
+    since_s: float = 0.0
+    """Start of the state, in the clock of `frame`."""
+    folder: str = ""
+    resume: str = ""
+    taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
+    """By stop, with the time."""
+    last: PoseTaken | None = None
+    estimated: Estimated | None = None
+    compared: dict[int, Compared] = field(default_factory=dict)
+    """By stop, in a verification."""
+    drift: DriftCheck | None = None
+    note: Noted | GuardTripped | None = None
+    tripped: bool = False
+    """A guard has stopped the arm, and STOP and HOLD repeat its words."""
+    waiting: tuple[Key, ...] = ()
+    ascii_only: bool = False
+    """The terminal's encoding is ASCII."""
+    keys: Literal["live", "asking", "over"] = "live"
+    """Whether keys are read now."""
+
+    def update(self, event: Event, now_s: float) -> None:
+        """Update the state from an event."""
+        match event:
+            case RunOpened():
+                self.folder, self.resume = event.folder, event.resume
+            case StateChanged():
+                self.now, self.since_s = event, now_s
+                self.tripped = self.tripped and event.state in {State.STOP, State.HOLD}
+            case PoseTaken():
+                self._take(event, now_s)
+            case Estimated():
+                self.estimated = event
+            case Compared():
+                self.compared[event.stop] = event
+            case Noted(warning=True):
+                self.note = event
+            case GuardTripped():
+                self.note, self.tripped = event, True
+
+    def shown(self, text: str) -> str:
+        """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
+        return text.translate(_ASCII) if self.ascii_only else text
+
+    @property
+    def kept(self) -> int:
+        """How many poses are kept; of a run that was resumed only the fit knows them all."""
+        return max(len(self.taken), self.estimated.poses if self.estimated else 0)
+
+    def _take(self, event: PoseTaken, now_s: float) -> None:
+        self.taken[event.stop] = event, now_s
+        self.last, self.note = event, None
+        first, first_s = self.taken[min(self.taken)]
+        if event.number == first.number and event.stop != first.stop:
+            sigma = np.hypot(first.sigma, event.sigma)
+            self.drift = DriftCheck(np.subtract(event.mean, first.mean), sigma, now_s - first_s)
+
+
+def progress_in_words(view: SessionView, now_s: float) -> str:
+    """Return how many poses are kept, and how long the others take, in the clock of `SessionView.since_s`."""
+    times_s = sorted(at_s for _, at_s in view.taken.values())
+    kept = view.kept
+    left = view.last.stops - kept if view.last else 0
+    if len(times_s) <= 2 or left <= 0:
+        return f"{kept} kept"
+    # a stop with questions takes longer than usual
+    usual_s = median(b - a for a, b in pairwise(times_s))
+    # a hold does not shorten the rest
+    rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
+    return f"{kept} kept, about {_minutes(rest_s)} left"
+
+
+def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
+    """Return where a session is, such as "pose 3/24 R05", its state with how long it lasts, and words about it."""
+    now = view.now
+    if now is None:
+        return "", "recording" if view.folder else "starting", ""
+    if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
+        # the motion before the question is over
+        return "", "WAITS for an answer", ""
+    where = "" if now.stop is None else f"pose {now.stop}" + (f"/{now.stops}" if now.stops is not None else "")
+    where += f" R{now.number:02d}" if where and now.number is not None else ""
+    lasts = "" if now.state is State.HOLD else f"  {_minutes(now_s - view.since_s)}"
+    return where, f"{now.state.upper()}{lasts}", "" if view.tripped else now.words
+
+
+def coverage_in_words(fit: Estimated) -> str:
+    """Describe how well the orientations so far determine the result, beside its light."""
+    words = ""
+    for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
+        value, goal = getattr(fit, name), GREEN[name]
+        words += f"   {what} {f'{value:.1f}' if value < 100 else '>100'}" + (
+            f" (goal {goal:g})" if value > goal else ""
+        )
+    return f"{words}   gap {fit.empty_cap_deg:.0f}°"
+
+
+def drift_so_far(view: SessionView) -> TextLine:
+    """Describe the drift of the bias since the first pose, as the fit has it or as the first pose measured again."""
+    fit = view.estimated
+    if view.drift is not None:
+        words, bad = drift_in_words(view.drift)
+        return TextLine("", words, "bold yellow" if bad else "")
+    if fit is None or not fit.values:
+        when = "the fit" if view.command == "calibrate" else "the first pose is measured again"
+        return TextLine("", f"not known before {when}", "dim")
+    if "drift" not in fit.values:
+        return TextLine("", "none seen so far")
+    change, sigma = fit.values["drift"], fit.sigma["drift"]
+    fitted = sigma > _ROUNDED
+    sure = bool((np.abs(change) > 4 * sigma)[fitted].any())
+    parts = [
+        f"{with_sigma(np.linalg.norm(change[some]), np.max(sigma[some]))} {unit}"
+        for some, unit in ((slice(3), "N"), (slice(3, 6), "N·m"))
+        if fitted[some].any()
+    ]
+    words = f"{', '.join(parts)} since the first pose"
+    return TextLine("", words if sure else f"{words}, perhaps", "yellow" if sure else "")
+
+
+def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
+    """Return the values of an estimate times `factor`, and their largest sigma; nothing before there is a fit."""
+    if fit is None or name not in fit.values:
+        return [], ""
+    value: ArrayLike = fit.values[name]
+    if name == "R_flange_sensor":
+        value = Rotation.from_matrix(np.asarray(value)).as_rotvec()
+    values, sigma = factor * np.atleast_1d(value), factor * float(np.max(fit.sigma[name]))
+    digits = decimals(sigma)
+    while digits and len(f"{-np.abs(values).max():.{digits}f}") > _NUMBER_WIDTH - 1:
+        digits -= 1
+    return [f"{one:.{digits}f}" for one in values], to_place_of(sigma, sigma)
+
+
+def _minutes(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 59.5 else f"{int(seconds) // 60}:{int(seconds) % 60:02d} min"

@@ -1,0 +1,250 @@
+"""The questions of `ftdrive init` in a terminal, about what is not answered yet."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ftcalib.errors import UsageError
+from ftdrive.checks.description import (
+    BASE_AXES,
+    MODEL,
+    QUESTIONS,
+    ROBOT,
+    SENSOR,
+    WALLS,
+    Description,
+    Question,
+    saved_at,
+)
+from ftdrive.checks.discovery import is_place, places
+from ftdrive.errors import ConfigError
+from ftdrive.terminal.console import hanging, messages
+from ftdrive.terminal.text import echo, in_whole_words
+from ftdrive.words.text import visible
+from ftdrivers.errors import DeviceError
+
+
+class _Back(Exception):
+    """The operator wants the question before."""
+
+
+class Interview:
+    """Asks in the terminal for what is not answered yet; `draft` is None with --yes, which takes the usual answers."""
+
+    def __init__(self, described: Description, draft: Path | None, again: str) -> None:
+        self._described, self._draft, self._again = described, draft, again
+        self._addresses: dict[str, str] = {}
+
+    def take_draft(self, *, asked: bool) -> None:
+        """Take the answers of a draft; if `asked`, only after a yes."""
+        if self._draft is None or not self._draft.exists():
+            return
+        when = saved_at(self._draft)
+        if asked:
+            words = f"Go on with the answers of {when}? [yes/no]: "
+            if self._until(words, None, "an answer", _yes_or_no, back=False).strip().lower() == "no":
+                self._draft.unlink()
+                return
+        self._described.load(self._draft)
+        if not asked:
+            say(f"The answers of {when} are filled in from {self._draft}. Delete it to begin without them.")
+
+    def take_options(self, given: dict[str, Any]) -> None:
+        """Take the answers that options give; raises `ConfigError` for those that cannot be used."""
+        for question in QUESTIONS:
+            if not (option := given.get(question.name)):
+                continue
+            texts = list(option) if question.repeats else [option]
+            for text in texts:
+                self._described.judge(question, text)
+            self._described.texts[question.key] = texts
+            if question.key in (ROBOT, SENSOR):
+                self._addresses[question.key] = option
+                self._described.answered.discard(question.key)
+                self._described.reports.pop(question.key, None)
+            else:
+                self._described.answered.add(question.key)
+
+    def look(self, key: str, text: str) -> None:
+        """Read a device, and print what it reports; raises as `Description.look`."""
+        say(self._described.look(key, text), "  ✔ ")
+
+    def run(self) -> None:
+        """Ask until everything is answered, and confirmed in a summary."""
+        if self._draft is not None:
+            say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the question before.")
+        while True:
+            questions = self._described.questions
+            at = next((i for i, one in enumerate(questions) if one.key not in self._described.answered), len(questions))
+            try:
+                if at == len(questions):
+                    if self._draft is None or self._confirmed():
+                        return
+                    continue
+                self._answer(questions[at])
+                self._described.answered.add(questions[at].key)
+                self._save()
+            except _Back:
+                self._described.answered.discard(questions[max(0, at - 1)].key)
+
+    def _save(self) -> None:
+        if self._draft is not None:
+            self._described.save(self._draft)
+
+    def _answer(self, question: Question) -> None:
+        described, key = self._described, question.key
+        if key in (ROBOT, SENSOR):
+            self._find(question)
+        elif question.repeats:
+            self._answer_rows(question)
+        else:
+            usual = self._former(question)
+            words = f"{question.label}, {question.how}" + " (Enter: unknown)" * (usual == "")
+            described.texts[key] = [self._ask(question, words, usual)]
+        if key in (ROBOT, MODEL) and described.without_shape:
+            say(described.without_shape, "  ! ")
+
+    def _former(self, question: Question) -> str | None:
+        texts = self._described.texts.get(question.key)
+        return texts[0] if texts else self._described.usual(question)
+
+    def _answer_rows(self, question: Question) -> None:
+        """Ask for rows until an empty answer; "back" removes the last one."""
+        described = self._described
+        rows = described.texts.setdefault(question.key, [])
+        if question.key == WALLS and self._draft is not None:
+            say(BASE_AXES)
+        for row in rows:
+            say(row, "  = ")
+        while True:
+            words = "  next (Enter: no more)" if rows else f"{question.label}, {question.how}"
+            usual = "" if rows else question.usual
+            words += " (Enter: none)" * (usual == "" and not rows)
+            try:
+                text = self._ask(question, words, usual).strip()
+            except _Back:
+                if not rows:
+                    raise
+                say(f"removed {rows.pop()}", "  = ")
+                continue
+            if not text:
+                return
+            rows.append(text)
+            self._save()
+
+    def _find(self, question: Question) -> None:
+        """Ask for the address of a device until one answers; the operator may keep one that does not."""
+        described, key = self._described, question.key
+        text = self._addresses.pop(key, None)
+        usual = self._former(question)
+        words = f"{question.label}, {question.how}"
+        if key == SENSOR and text is None and self._draft is not None:
+            described.places = places()
+            for i, place in enumerate(described.places, start=1):
+                say(f"  {i}) {place}")
+            if described.places:
+                words, usual = f"{question.label}: a number, a URL, or a port to probe", usual or "1"
+        failed: str | None = None
+        while True:
+            if text is None:
+                text = self._ask(question, words, usual)
+            if text == failed:
+                described.keep(key, text)
+                return
+            try:
+                self.look(key, text)
+            except (DeviceError, UsageError) as error:
+                if self._draft is None:
+                    raise
+                say(str(error), "  ✘ ")
+                keeps = isinstance(error, DeviceError) and not (key == SENSOR and is_place(text))
+                failed = usual = text if keeps else None
+            else:
+                return
+            words = "Another address, or Enter to keep it" if keeps else "Another address"
+            text = None
+
+    def _confirmed(self) -> bool:
+        """Show all answers; return whether they are to be written, False after a number, whose question is open again.
+
+        Raises `_Back` if the last question is to be asked again.
+        """
+        described = self._described
+        questions = described.questions
+        for i, one in enumerate(questions, start=1):
+            texts = "; ".join(filter(None, described.texts.get(one.key, [])))
+            report = described.reports.get(one.key, "not read") if one.key in (ROBOT, SENSOR) else ""
+            say(f"{texts or 'none'}{report and f' ({report})'}", f"{i:>3}) {one.label}: ")
+
+        def accept(answer: str) -> None:
+            if not answer.strip():
+                described.cell()
+            elif not (answer.strip().isdecimal() and 0 < int(answer) <= len(questions)):
+                raise ConfigError(f"'{answer.strip()}' is not a number of 1 to {len(questions)}")
+
+        words = "Enter writes the file, a number changes that answer: "
+        if number := self._until(words, "", "the summary", accept).strip():
+            described.answered.discard(questions[int(number) - 1].key)
+        return not number
+
+    def _ask(self, question: Question, words: str, usual: str | None) -> str:
+        """Return an answer that can be used, "" for no more rows; Enter and --yes take `usual`."""
+
+        def accept(text: str) -> None:
+            if question.repeats and not text:
+                self._described.judge_rows(question)
+            else:
+                self._described.judge(question, text)
+
+        if self._draft is None:
+            if usual is None:
+                raise ConfigError(f"{question.option} is missing and has no default: {words[0].lower()}{words[1:]}")
+            accept(usual)
+            return usual
+        words = f"{words} [{usual}]: " if usual else f"{words}: "
+        return self._until(words, usual, question.option, accept)
+
+    def _until(
+        self, words: str, usual: str | None, what: str, accept: Callable[[str], None], *, back: bool = True
+    ) -> str:
+        """Ask until an answer is accepted; raises as `_prompt`, and `_Back` for an answer that wants it."""
+        while True:
+            answer = self._prompt(words, usual, what)
+            if back and answer.strip().lower() == "back":
+                raise _Back
+            try:
+                accept(answer)
+            except ConfigError as error:
+                say(str(error), "  ✘ ")
+            else:
+                return answer
+
+    def _prompt(self, words: str, usual: str | None, what: str) -> str:
+        """Ask once; raises `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
+        shown = in_whole_words(words, sys.stderr)
+        try:
+            return str(click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True))
+        except click.Abort as abort:
+            # The next message begins a line.
+            echo(err=True)
+            kept = ""
+            if self._draft is not None and self._draft.exists():
+                kept = f"the answers so far are kept in {self._draft}, go on with them:\n{self._again}"
+            if isinstance(abort.__context__, EOFError):
+                raise ConfigError(f"the input ended before {what} was given" + (kept and f"; {kept}")) from abort
+            if kept:
+                say(kept[0].upper() + kept[1:], "  ! ")
+            raise
+
+
+def _yes_or_no(answer: str) -> None:
+    if answer.strip().lower() not in ("yes", "no"):
+        raise ConfigError("Enter yes or no.")
+
+
+def say(words: str, head: str = "") -> None:
+    """Print on stderr; further lines continue below the first word after the head."""
+    messages.print(hanging(head, words), soft_wrap=True)

@@ -1,0 +1,1 @@
+"""Models in words: pure functions, and the view models of screens and pages."""

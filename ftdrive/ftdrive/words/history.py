@@ -1,0 +1,60 @@
+"""What the store has, as rows of tables and as lines: results, their trends, weighings."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+
+from ftdrive.runs.verification import VerificationRecord
+from ftdrive.store.history import age_days
+from ftdrive.store.records import StoredResult, StoredWeighings
+from ftdrive.words.text import GLUE
+
+DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
+_TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
+# Shown if a result has one.
+_OPTIONAL = {"°C", "parent"}
+
+
+def day_row(one: StoredWeighings) -> tuple[str, ...]:
+    """Return the weighings of a day below `DAY_TITLES`."""
+    return (
+        one.day,
+        one.arm_serial or one.robot_host or "-",
+        one.tool_in_words,
+        f"{one.weighings}",
+        ", ".join(f"{number} {code}" for code, number in one.refusals.items() if number) or "-",
+        "-" if one.last_utc is None else one.last_utc[11:19],
+        one.mass_in_words,
+        Path(one.path).name,
+    )
+
+
+def result_table(
+    results: Iterable[StoredResult], last: Mapping[str, VerificationRecord], now: datetime
+) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
+    """Return titles and rows, with the last verification of each result by its id."""
+    rows = [_row(one, last.get(one.id), now) for one in results]
+    shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
+    return [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows]
+
+
+def _row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> tuple[str, ...]:
+    verified = "-"
+    if check is not None:
+        since = age_days(check.created_utc, now)
+        age = "" if since is None else f" {since:.0f}{GLUE}d"
+        verified = ("passed" if check.passed else "FAILED") + age
+        verified += f", {check.change}" if check.change else ""
+    return (
+        one.id[:6],
+        "-" if one.created_utc is None else one.created_utc[:10],
+        one.arm_serial or one.arm_model or "-",
+        one.tool_in_words,
+        one.verdict,
+        f"{one.mass_kg:.4f}",
+        verified,
+        " ".join(f"{value:.2f}" for value in one.numbers["force_bias_N"]),
+        one.run,
+        "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
+        f"{one.parent[:6]} ({one.update})" if one.parent else "",
+    )

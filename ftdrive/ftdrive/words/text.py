@@ -1,0 +1,93 @@
+"""Text for any reader: names that cannot command a terminal, and commands as they are typed."""
+
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+COMMANDS: Final[Mapping[str, str]] = {
+    "demo": "Calibrate an emulated cell: no hardware, 25 s.",
+    "init": "Ask about the cell, probe it, write ftdrive.toml. Moves nothing.",
+    "config": "Show the configuration and the source of each value.",
+    "plan": "Plan a tour proven clear of collisions. Needs no robot.",
+    "calibrate": "Drive the tour, average the sensor at each pose, solve.",
+    "verify": "Compare fresh poses with a calibration's prediction.",
+    "doctor": "Check robot, sensor and computer. Moves nothing.",
+    "devices": "List serial ports and CAN interfaces.",
+    "solve": "Solve a recorded run, a dataset or a CSV file.",
+    "report": "Report a calibration in one file: verdict, findings, figures.",
+    "live": "Show the raw and the compensated wrench.",
+    "weigh": "Weigh what the gripper holds, in half a second.",
+    "loads": "Check the sensor by a known weight, or correct its matrix by several.",
+    "push": "Set payload or gravity in the controller as calibrated.",
+    "record": "Record raw and compensated wrench with pose and events.",
+    "history": "List results and verifications, with their trends.",
+    "fleet": "Watch many cells: what is due, what drifts, solve all again.",
+    "diff": "Compare two calibrations, in sigmas.",
+    "convert": "Convert a recording between MCAP, CSV and Parquet.",
+    "compensate": "Compensate a recording. Needs no device.",
+    "stream": "Serve the wrench to Foxglove, Lichtblick and PlotJuggler.",
+    "serve-load": "Give weight and contact wrench to a UR program.",
+    "ros2": "Publish the wrench as topics of ROS 2, with tare service and diagnostics.",
+    "replay": "Repeat a recorded run through the same routine and solver.",
+    "bundle": "Write a run into one file for a bug report, without addresses.",
+    "export": "Write a plan or a calibration for another program.",
+    "transcript": "Record or play the bytes on a sensor's wire.",
+    "completion": "Print the completion of a shell: bash, zsh or fish.",
+}
+"""A command, whose module is `ftdrive.commands.NAME`, and its line in the help."""
+_COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMANDS)}|help)\b|--)")
+GLUE: Final = "\ue000"
+"""A space where no line of help or of a table ends: of private use, so no message has one."""
+
+
+def as_typed(text: str) -> str:
+    """Return a message whose commands begin with `uv run` if this program was started so: nothing else would work."""
+    return _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text  # uv run sets it
+
+
+def is_command(line: str) -> bool:
+    """Whether a line is a command and nothing else; it is never broken, so that it can be copied."""
+    return line.startswith(("ftdrive ", "uv run ftdrive "))
+
+
+# All but tab and the end of a line; with those that turn the direction of writing, and bytes that are no text.
+_CONTROL = re.compile(
+    "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]|\r(?!\n)"
+)
+
+
+def visible(text: str) -> str:
+    r"""Return text with control characters as in a Python string, such as `\x1b`; safe on any screen.
+
+    Examples
+    --------
+    >>> print(visible("gripper\x1b[2J"))
+    gripper\x1b[2J
+    """
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape", "surrogatepass").decode(), text)
+
+
+def in_one_line(text: str) -> str:
+    r"""Return text with its newlines as `\n`, but for those before a command, so that a name cannot begin a line.
+
+    Examples
+    --------
+    >>> print(in_one_line("there is no a\nerror: b; run\nftdrive devices"))
+    there is no a\nerror: b; run
+    ftdrive devices
+    """
+    first, *others = text.replace("\r", "\\r").split("\n")
+    return first + "".join(("\n" if is_command(line) else "\\n") + line for line in others)
+
+
+@dataclass(frozen=True, slots=True)
+class TextLine:
+    """A line of text."""
+
+    head: str
+    """A mark or indent; a folded line continues below the first word after it."""
+    words: str
+    style: str = ""
+    """Style of rich, for a terminal with colour."""
