@@ -1,6 +1,6 @@
 """The formats of an exported calibration as data: keys, units, signs and frames of each target.
 
-Without numpy, because help and completion must be fast. `registry.py` writes a row, and names the values in it.
+Without numpy, because help and completion must be fast. `registry.py` has what a row names, and writes it.
 """
 
 from collections.abc import Mapping
@@ -15,6 +15,13 @@ Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 MAX_FORCE_ERROR_N: Final = 0.1
 # mc_rtc/constants.h. The force must be right, so the mass for this gravity differs from ours by up to 0.3 %.
 MC_RTC_G_M_S2: Final = 9.80665
+
+_SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
+
+
+def plain(text: str) -> str:
+    """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
+    return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,12 +1,16 @@
 """Writes the rows of `formats.py`, the complete JSON and YAML, and says how far a target is from the calibration."""
 
 import json
+import re
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from math import degrees
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+import yaml
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
@@ -15,23 +19,13 @@ from ftcalib.compensation import Compensator
 from ftcalib.files import JSON
 from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_rotation, skew
 from ftdrive import __version__
-from ftdrive.errors import NotAccepted
-from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format
-from ftdrive.exports.shared import (
-    Exported,
-    R_frame_sensor,
-    Settings,
-    gravity_m_s2,
-    inertia_kg_m2,
-    inertia_note,
-    numbers,
-    payload_inertia_kg_m2,
-    plain,
-    quaternion_xyzw,
-    rpy_rad,
-    yaml_text,
-)
-from ftdrive.runs.verification import MARKS, VerificationRecord, marks_of
+from ftdrive.checks.arm import FlangeLoad, flange_load
+from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format, plain
+from ftdrive.runs.calibration import MARKS, marks_of
+from ftdrive.runs.run import Run, is_run
+from ftdrive.runs.verification import VerificationRecord
+from ftdrive.stream.samples import sensor_origin_m
 
 FORMAT = "ftdrive.export/1"
 
@@ -40,6 +34,257 @@ _FIELDS = (
     *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
 )
+
+
+# Also inside a comment of XML, where `--` is an error.
+_NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
+# ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z.
+# ROS users have base_link; without the turn a tilt would be wrong without a message.
+_R_BASE_LINK_BASE = np.diag([-1.0, -1.0, 1.0])
+# ur_description/urdf/ur_macro.xacro, joint flange-tool0: rpy = (π/2, 0, π/2). x of `flange` points out.
+_R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Names and measured values; None where not measured. Raises `ConfigError` for a name that files cannot take."""
+
+    base_frame: str = "base"
+    """The controller's base, or the `base_link` of a UR in ROS, with any prefix."""
+    flange_frame: str = "tool0"
+    """With z out of the flange, or the `flange` of ROS-Industrial with x out, with any prefix."""
+    sensor_frame: str = "ft_sensor"
+    """Also the name of the sensor, where a target has one."""
+    tool_frame: str = "tool"
+    height_mm: float | None = None
+    """Height of the sensor's origin above the flange face."""
+    sensor_mass_kg: float | None = None
+    """Mass of sensor and adapter."""
+    sensor_com_mm: tuple[float, ...] | None = None
+    """Centre of mass of sensor and adapter, from the flange, in flange axes; None: half way up on the flange axis."""
+    verification: VerificationRecord | None = None
+    """The last one of the calibration; None if there is none."""
+
+    def __post_init__(self) -> None:
+        for field_name in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
+            if not _NAME.fullmatch(name := getattr(self, field_name)):
+                option = field_name.replace("_", "-")
+                raise ConfigError(
+                    f"--{option} is {name!r}: use letters, digits and _ . / -, a letter or _ first, no --"
+                )
+        frames = self.flange_frame, self.sensor_frame, self.tool_frame
+        if len(set(frames)) < len(frames):
+            raise ConfigError(f"the frames of flange, sensor and tool are {', '.join(frames)}: give each its own name")
+
+
+def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:
+    """Return height (mm) and mass (kg) of the sensor as configured at a calibration, file or run; None if unknown."""
+    folder = path if path.is_dir() else path.resolve().parent
+    if path.is_dir() or (folder.name == calibration.provenance.get("run") and is_run(folder)):
+        sensor = Run(folder).header().get("config", {}).get("sensor", {})
+        return sensor.get("height_mm"), sensor.get("mass_kg")
+    setup: Any = calibration.provenance.get("setup")
+    mass = setup.get("sensor_mass_kg") if isinstance(setup, dict) else None
+    return None, float(mass) if isinstance(mass, int | float) else None
+
+
+def _yaml(document: Any) -> str:
+    """Return YAML that keeps every bit of a float and the order of the keys."""
+    # YAML 1.1 reads 1e-05 as a text and yes as true; PyYAML quotes what must be quoted.
+    return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
+
+
+@dataclass(frozen=True, slots=True)
+class _Values:
+    """The values of one export by name: of `_VALUES`, of the calibration and of the settings, in the unit of the name.
+
+    Raises `ConfigError` for one that was not measured.
+    """
+
+    target: str
+    calibration: CalibrationResult
+    settings: Settings
+
+    def __getitem__(self, name: str) -> Any:
+        base, _, form = name.rpartition("_")
+        if name in _VALUES:
+            value = _VALUES[name](self)
+        elif form in _FORMS:
+            value = _FORMS[form](self[base])
+        elif name.startswith("minus_"):
+            value = -np.array(self[name.removeprefix("minus_")])
+        else:
+            value = getattr(self.calibration if hasattr(self.calibration, name) else self.settings, name)
+        # No file has a negative zero.
+        return (np.ravel(value) + 0.0).tolist() if isinstance(value, np.ndarray) else value
+
+    def filled(self, node: Any) -> Any:
+        """Return a part of a row with its values."""
+        if isinstance(node, Mapping):
+            return {key: self.filled(value) for key, value in node.items()}
+        if isinstance(node, list):
+            return [each for one in node for each in (self[one[1:]] if "*" in str(one) else [self.filled(one)])]
+        return self[node[1:]] if isinstance(node, str) and node.startswith("$") else node
+
+    @property
+    def is_turned(self) -> bool:
+        """Whether the base frame is that of ROS."""
+        return self.settings.base_frame.endswith("base_link")
+
+    @property
+    def R_frame_flange(self) -> Array:
+        """Orientation (3, 3) of the flange, z out, in the frame of that name."""
+        return _R_FLANGE_TOOL0 if self.settings.flange_frame.endswith("flange") else np.eye(3)
+
+    @property
+    def R_frame_sensor(self) -> Array:
+        """Orientation (3, 3) of the sensor in the flange frame."""
+        return self.R_frame_flange @ self.calibration.R_flange_sensor
+
+    @property
+    def gravity_base_m_s2(self) -> Array:
+        """(3,), axes of the controller's base, pointing down; along -z if nothing hangs."""
+        if self.calibration.mass_kg == 0.0:
+            return np.array([0.0, 0.0, -self.calibration.g_m_s2])
+        return self.calibration.gravity_force_base_N / self.calibration.mass_kg
+
+    @property
+    def p_flange_sensor_m(self) -> Array:
+        """(3,), the sensor's origin in the flange."""
+        if self.settings.height_mm is None:
+            raise ConfigError(
+                f"{self.target} needs the height of the sensor's origin above the flange face, which gravity cannot "
+                "show: give --height MM, or set [sensor] height_mm before the next calibration"
+            )
+        return sensor_origin_m(self.settings.height_mm)
+
+    @property
+    def payload(self) -> FlangeLoad:
+        """All that the flange carries."""
+        height_m = float(self.p_flange_sensor_m[2])
+        if self.settings.sensor_mass_kg is None:
+            raise ConfigError(
+                f"{self.target} needs the mass of sensor and adapter, because the sensor cannot weigh itself: give "
+                "--sensor-mass KG from scale or datasheet (0 for a sensor inside the arm)"
+            )
+        com_mm = self.settings.sensor_com_mm
+        sensor_com_m = None if com_mm is None else np.array(com_mm) / 1e3
+        return flange_load(self.calibration, self.settings.sensor_mass_kg, height_m, sensor_com_m)
+
+    @property
+    def inertia_kg_m2(self) -> Array | None:
+        """(3, 3) of the tool about its centre of mass, sensor axes; None if motion did not identify that of a body."""
+        if self.calibration.motion is None:
+            return None
+        J = self.calibration.motion.inertia_kg_m2
+        # A body has positive moments, none larger than the sum of the others.
+        low, middle, high = np.linalg.eigvalsh(J)
+        return J if low > 0 and high <= low + middle else None
+
+
+def _rpy_rad(v: _Values) -> Array:
+    """Orientation of the sensor as URDF has it: roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    with warnings.catch_warnings():
+        # At a pitch of 90 degrees roll is set to zero.
+        warnings.simplefilter("ignore")
+        return Rotation.from_matrix(v.R_frame_sensor).as_euler("xyz")
+
+
+def _quaternion(v: _Values) -> Array:
+    """Orientation of the sensor, scalar last and not negative."""
+    return Rotation.from_matrix(v.R_frame_sensor).as_quat(canonical=True)
+
+
+def _payload_inertia(v: _Values) -> str:
+    """Inertia of all that the flange carries, about its centre of mass, flange axes; the sensor itself is a point."""
+    if (J := v.inertia_kg_m2) is None:
+        return "0, 0, 0, 0, 0, 0"
+    payload, Q, (tool_kg, p_sensor_com_m) = v.payload, v.calibration.R_flange_sensor, true_tool(v.calibration)
+    tool_m = v.p_flange_sensor_m + Q @ p_sensor_com_m - payload.p_flange_com_m
+    sensor_kg = payload.mass_kg - tool_kg
+    # The moments of the two points about their common centre.
+    reduced_kg = tool_kg + (tool_kg**2 / sensor_kg if sensor_kg > 0 else 0.0)
+    total = Q @ J @ Q.T + reduced_kg * (tool_m @ tool_m * np.eye(3) - np.outer(tool_m, tool_m))
+    return str(_FORMS["fixed"](total[_DIAGONAL_FIRST]))
+
+
+def _inertia_note(v: _Values) -> str:
+    motion = v.calibration.motion
+    if motion is None or v.inertia_kg_m2 is None:
+        why = "" if motion is None else " well enough"
+        return f"The inertia was not identified{why}: zeros stand for a point mass. Take the values of a CAD model."
+    sigma = 1e3 * float(np.sqrt(np.diag(motion.covariance)[15:21].max()))
+    return f"The inertia was identified from motion, with a sigma of {sigma:.2g} g·m2 at most."
+
+
+def _point_mass(v: _Values, what: str) -> str:
+    """Return a comment of XML and the start of its next line, or nothing if the inertia was identified."""
+    if v.inertia_kg_m2 is not None:
+        return ""
+    return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
+
+
+def _assumed(v: _Values) -> str:
+    """Note about the centre of mass of the sensor; empty if it was measured."""
+    if not v.settings.sensor_mass_kg or v.settings.sensor_com_mm is not None:
+        return ""
+    return (
+        f"The centre of mass of sensor and adapter ({v.settings.sensor_mass_kg:g} kg) is taken half way up, on the "
+        "axis of the flange, as `ftdrive push` does: give --sensor-com X,Y,Z if you know it."
+    )
+
+
+_DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+# How a name ends that stands for a value in a certain form.
+_FORMS: Mapping[str, Callable[[Any], Any]] = {
+    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as ROS messages have a vector
+    "words": lambda value: ", ".join(map(str, value)),
+    "spaced": lambda value: " ".join(map(repr, value)),
+    "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # the URScript manual mentions no exponents
+    "yaml": lambda value: _yaml(value).removesuffix("\n").removesuffix("\n..."),
+}
+_VALUES: Mapping[str, Callable[[_Values], Any]] = {
+    "base_axes": lambda v: "the base of the controller" + ", turned by 180° about z" * v.is_turned,
+    "mc_rtc_mass_kg": lambda v: v.calibration.weight_N / MC_RTC_G_M_S2,
+    "com_mm": lambda v: 1e3 * v.calibration.p_sensor_com_m,
+    "gravity_m_s2": lambda v: (_R_BASE_LINK_BASE if v.is_turned else np.eye(3)) @ v.gravity_base_m_s2,
+    "gravity_base_m_s2": lambda v: v.gravity_base_m_s2,
+    "gravity_direction": lambda v: v.gravity_base_m_s2 / np.linalg.norm(v.gravity_base_m_s2),
+    "rpy_rad": _rpy_rad,
+    "quaternion": _quaternion,
+    "quaternion_wxyz": lambda v: np.roll(_quaternion(v), 1),
+    "origin_m": lambda v: v.R_frame_flange @ v.p_flange_sensor_m,
+    "frame_com_m": lambda v: v.R_frame_flange @ v.p_flange_sensor_m + v.R_frame_sensor @ v.calibration.p_sensor_com_m,
+    "payload_kg": lambda v: v.payload.mass_kg,
+    "payload_com_m": lambda v: v.payload.p_flange_com_m,
+    "payload_inertia": _payload_inertia,
+    "assumed": _assumed,
+    "true_kg": lambda v: true_tool(v.calibration)[0],
+    "true_com_m": lambda v: true_tool(v.calibration)[1],
+    "J": lambda v: np.zeros(9) if (J := v.inertia_kg_m2) is None else J,
+    "inertia_note": _inertia_note,
+    "urdf_point_mass": lambda v: _point_mass(v, ""),
+    "mujoco_point_mass": lambda v: _point_mass(v, "inertia "),
+    "mujoco_inertia": lambda v: (
+        'diaginertia="0 0 0"'
+        if (J := v.inertia_kg_m2) is None
+        else f'fullinertia="{_FORMS["spaced"](J[_DIAGONAL_FIRST].tolist())}"'
+    ),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """The text of one target, and what must be known with it."""
+
+    text: str
+    notes: tuple[str, ...]
+    """What the user of the target must know; sentences."""
+    elsewhere: Mapping[str, JSON]
+    """What the target reads from another place, by its name there."""
+    max_force_error_N: float
+    """Largest difference to `CalibrationResult.compensate` of a free tool over all orientations."""
+    max_torque_error_Nm: float
 
 
 def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
@@ -56,7 +301,7 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
     """
     result = calibration.to_dict()
     response, decoder = calibration.response, calibration.contact.decoder
-    origin_m = None if settings.height_mm is None else settings.p_flange_sensor_m("json").tolist()
+    origin_m = None if settings.height_mm is None else sensor_origin_m(settings.height_mm).tolist()
     made, last = calibration.provenance.get("created_utc"), settings.verification
     return {
         "format": FORMAT,
@@ -99,12 +344,6 @@ def _compensations(calibration: CalibrationResult, target: Format) -> tuple[Comp
     return ours, Compensator(parameters, response=response if "response" in target.expresses else None)
 
 
-def largest_difference(one: Compensator, other: Compensator) -> tuple[float, float]:
-    """Return the largest norms of the difference of force (N) and torque (N·m) over all orientations."""
-    matrix, offset = other.matrix - one.matrix, other.offset - one.offset
-    return _largest_norm(matrix[:3], offset[:3]), _largest_norm(matrix[3:], offset[3:])
-
-
 def _largest_norm(matrix: Array, offset: Array) -> float:
     """Maximise |matrix @ vec(R) + offset| over rotations R.
 
@@ -122,127 +361,31 @@ def _largest_norm(matrix: Array, offset: Array) -> float:
     return float(norms.max())
 
 
-@dataclass(frozen=True, slots=True)
-class _Values:
-    """The values that a row names: `_VALUES`, and fields of the calibration and of the settings."""
-
-    target: str
-    calibration: CalibrationResult
-    settings: Settings
-
-    def __getitem__(self, name: str) -> Any:
-        """Return a value in the unit of its name; raises `ConfigError` if it was not measured."""
-        base, _, form = name.rpartition("_")
-        if name in _VALUES:
-            value = _VALUES[name](self)
-        elif form in _FORMS:
-            value = _FORMS[form](self[base])
-        elif name.startswith("minus_"):
-            value = -np.array(self[name.removeprefix("minus_")])
-        else:
-            value = getattr(self.calibration if hasattr(self.calibration, name) else self.settings, name)
-        return numbers(value) if isinstance(value, np.ndarray) else value
-
-    def filled(self, node: Any) -> Any:
-        """Return a part of a row with its values."""
-        if isinstance(node, Mapping):
-            return {key: self.filled(value) for key, value in node.items()}
-        if isinstance(node, list):
-            return [each for one in node for each in (self[one[1:]] if "*" in str(one) else [self.filled(one)])]
-        return self[node[1:]] if isinstance(node, str) and node.startswith("$") else node
-
-
-_DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-# How a name ends that stands for a value in a certain form.
-_FORMS: Mapping[str, Callable[[Any], Any]] = {
-    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as ROS messages have a vector
-    "words": lambda value: ", ".join(map(str, value)),
-    "spaced": lambda value: " ".join(map(repr, value)),
-    "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # the URScript manual mentions no exponents
-    "yaml": lambda value: yaml_text(value).removesuffix("\n").removesuffix("\n..."),
-}
-_VALUES: Mapping[str, Callable[[_Values], Any]] = {
-    "mc_rtc_mass_kg": lambda v: v.calibration.weight_N / MC_RTC_G_M_S2,
-    "com_mm": lambda v: 1e3 * v.calibration.p_sensor_com_m,
-    "gravity_m_s2": lambda v: v.settings.R_frame_base @ gravity_m_s2(v.calibration),
-    "gravity_direction": lambda v: (g := gravity_m_s2(v.calibration)) / np.linalg.norm(g),
-    "rpy_rad": lambda v: rpy_rad(R_frame_sensor(v.calibration, v.settings)),
-    "quaternion_wxyz": lambda v: np.roll(quaternion_xyzw(R_frame_sensor(v.calibration, v.settings)), 1),
-    "quaternion": lambda v: quaternion_xyzw(R_frame_sensor(v.calibration, v.settings)),
-    "origin_m": lambda v: v.settings.p_frame_sensor_m(v.target),
-    "frame_com_m": lambda v: (
-        v.settings.p_frame_sensor_m(v.target) + R_frame_sensor(v.calibration, v.settings) @ v.calibration.p_sensor_com_m
-    ),
-    "payload_kg": lambda v: v.settings.payload(v.target, v.calibration)[0],
-    "payload_com_m": lambda v: v.settings.payload(v.target, v.calibration)[1],
-    "payload_inertia": lambda v: (
-        "0, 0, 0, 0, 0, 0"
-        if (J := payload_inertia_kg_m2(v.calibration, v.settings, v.target)) is None
-        else _FORMS["fixed"](numbers(J[_DIAGONAL_FIRST]))
-    ),
-    "gravity_base_m_s2": lambda v: gravity_m_s2(v.calibration),
-    "true_kg": lambda v: true_tool(v.calibration)[0],
-    "true_com_m": lambda v: true_tool(v.calibration)[1],
-    "J": lambda v: np.zeros(9) if (J := inertia_kg_m2(v.calibration)) is None else J,
-    "inertia_note": lambda v: inertia_note(v.calibration),
-    "urdf_point_mass": lambda v: _point_mass(v.calibration, ""),
-    "mujoco_point_mass": lambda v: _point_mass(v.calibration, "inertia "),
-    "mujoco_inertia": lambda v: (
-        'diaginertia="0 0 0"'
-        if (J := inertia_kg_m2(v.calibration)) is None
-        else f'fullinertia="{_FORMS["spaced"](numbers(J[_DIAGONAL_FIRST]))}"'
-    ),
-}
-
-
-def _point_mass(calibration: CalibrationResult, what: str) -> str:
-    """Return a comment of XML and the start of its next line, or nothing if the inertia was identified."""
-    if inertia_kg_m2(calibration) is not None:
-        return ""
-    return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
-
-
-def _written(name: str, calibration: CalibrationResult, settings: Settings) -> Exported:
-    """Write a target. Raises `ConfigError` if a value was not measured."""
-    if name == "json":
-        return Exported(json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n")
-    if name == "yaml":
-        return Exported(yaml_text(_document(calibration, settings)))
-    row, values = FORMATS[name], _Values(name, calibration, settings)
-    text = row.content.format_map(values) if isinstance(row.content, str) else yaml_text(values.filled(row.content))
-    notes = (note.format_map(values) for note in row.notes)
-    return Exported(text, tuple(note for note in notes if note), values.filled(row.elsewhere))
-
-
 def export(
     calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
 ) -> Exported:
-    """Write a calibration for one target.
+    """Write a calibration for the target of this name in `FORMATS`.
 
-    Parameters
-    ----------
-    name : str
-        A key of `FORMATS`.
-    max_force_error_N : float
-        The target may differ by so much from `CalibrationResult.compensate`, in any orientation.
-
-    Raises
-    ------
-    ConfigError
-        The target needs a value that was not measured.
-    NotAccepted
-        The calibration is rejected, or the target would differ by more.
+    In any orientation it may differ from `CalibrationResult.compensate` by `max_force_error_N`. Raises `ConfigError` if
+    a value was not measured, and `NotAccepted` if the calibration is rejected or the target would differ by more.
     """
     if calibration.verdict == "rejected":
         raise NotAccepted(
             f"the calibration is rejected and not exported: {'; '.join(calibration.reasons)}. Calibrate again"
         )
-    target = FORMATS[name]
-    exported = _written(name, calibration, settings)
+    target, values = FORMATS[name], _Values(name, calibration, settings)
+    if isinstance(target.content, str):
+        text = target.content.format_map(values)
+    elif name == "json":
+        text = json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n"
+    else:
+        text = _yaml(values.filled(target.content) or _document(calibration, settings))
+    notes = [MARKS[mark] for mark in marks_of(calibration)]
     force_N, torque_Nm = 0.0, 0.0
-    notes = list(exported.notes)
     if target.subtracts:
-        force_N, torque_Nm = largest_difference(*_compensations(calibration, target))
+        ours, theirs = _compensations(calibration, target)
+        matrix, offset = theirs.matrix - ours.matrix, theirs.offset - ours.offset
+        force_N, torque_Nm = _largest_norm(matrix[:3], offset[:3]), _largest_norm(matrix[3:], offset[3:])
         if lost := list(_lost(calibration, target)):
             words = (
                 f"{name} cannot express {' and '.join(lost)}: its reading of a free tool differs from that of ftdrive "
@@ -253,21 +396,18 @@ def export(
                     f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
                     f"({', '.join(_lossless(calibration, target))}), or accept it: --max-force-error {_above(force_N)}"
                 )
-            notes.insert(0, f"{words}.")
-        if "response" not in target.expresses:
-            notes += _undecoded(name, calibration)
-    notes[:0] = [MARKS[mark] for mark in marks_of(calibration)]
+            notes.append(f"{words}.")
+    notes += filter(None, (note.format_map(values) for note in target.notes))
+    if target.subtracts and "response" not in target.expresses:
+        notes += _undecoded(name, calibration)
+    elsewhere = values.filled(target.elsewhere)
     # The file has every digit.
     shown, exact = (
-        [
-            *notes,
-            *(f"Also set {place} = {_describe_value(value, form)}." for place, value in exported.elsewhere.items()),
-        ]
+        [*notes, *(f"Also set {place} = {_describe_value(value, form)}." for place, value in elsewhere.items())]
         for form in (".6g", "")
     )
-    origin = _made_by(calibration, settings.verification)
-    text = _with_header(exported.text, target.comment, [origin, target.description, *exact])
-    return Exported(text, tuple(shown), exported.elsewhere, force_N, torque_Nm)
+    header = [_made_by(calibration, settings.verification), target.description, *exact]
+    return Exported(_with_header(text, target.comment, header), tuple(shown), elsewhere, force_N, torque_Nm)
 
 
 def _above(value: float) -> str:

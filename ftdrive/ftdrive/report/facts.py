@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
+from ftcalib.accuracy import error_map, force_sigma_at_tip, tip_of
 from ftcalib.after.series import difference
-from ftcalib.after.weighing import known_contact, true_tool
+from ftcalib.after.weighing import true_tool
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
 from ftcalib.judge.observability import assess, axes_along, largest_gap
@@ -21,42 +21,45 @@ from ftcalib.routine import drift_check
 from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.report.subject import Subject
+from ftdrive.runs.calibration import MARKS, marks_of
 from ftdrive.runs.pose_hints import hints, names_of
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import MARKS, marks_of
-from ftdrive.terminal.report import (
+from ftdrive.words.result import (
     contact_in_words,
     drift_in_use,
     drift_in_words,
     error_in_words,
-    force_sigma_at_tip,
+    error_source,
     mass_in_words,
+    residuals_in_words,
     sensor_in_words,
-    tip_of,
 )
 
-NAMES = {
-    "R_flange_sensor": "mounting of the sensor",
-    "gravity_force_base_N": "weight in base",
+_LABELS = {
+    "R_flange_sensor": "mounting",
+    "gravity_force_base_N": "weight",
     "force_bias_N": "force bias",
     "p_sensor_com_m": "centre of mass",
     "torque_bias_Nm": "torque bias",
 }
 
 
+def label_of(parameter: str) -> str:
+    """Name an error coordinate or its vector, such as "force bias x" for "force_bias_N.x"."""
+    name, _, axis = parameter.partition(".")
+    return f"{_LABELS[name]} {axis}".strip()
+
+
 def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
     """Compare a result with an earlier one of other data.
 
-    Returns
-    -------
-    dict
-        `sensors`: on what the errors of the sensor rest, before and now; `parameters`: for each error coordinate its
-        `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known exactly in both; `groups`: `name`, `chi2`,
-        `dof`, `p_value`; `same_data`: whether both rest on one dataset, so that the test does not apply.
+    `sensors` says on what the errors of the sensor rest, before and now. `parameters` have for each error coordinate
+    its `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known exactly in both. `groups` are tests. With
+    `same_data` both rest on one dataset, so that the tests do not apply.
     """
     found = difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
-    tests = {NAMES[name]: test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
+    tests = {label_of(name): test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
     return {
         "id": before.id,
         "verdict": before.verdict,
@@ -74,61 +77,18 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
     }
 
 
-# Grid of elevation and azimuth.
-STEP_DEG = 10
-# Turns of the tool about its axis at each direction, over a whole turn.
-TURNS = 12
-
-
-def error_map(result: CalibrationResult) -> dict[str, Any]:
-    """Return the error of the compensation of a free tool over the directions of the tool axis, one standard deviation.
-
-    Returns
-    -------
-    dict
-        `elevation_deg` (n,) and `azimuth_deg` (m,) of flange z in base axes; `force_N` and `torque_Nm`, each a dict of
-        `map` (n, m): largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations,
-        `worst_direction` (3,) of flange z in base, and that direction as `axes` and in `words`.
-    """
-    elevation = np.radians(np.arange(-90, 91, STEP_DEG))
-    azimuth = np.radians(np.arange(-180, 181, STEP_DEG))
-    R = orientations(elevation, azimuth)
-    variance = np.diagonal(result.wrench_covariance(R), axis1=-2, axis2=-1)
-    document: dict[str, Any] = {
-        "elevation_deg": np.degrees(elevation).round().tolist(),
-        "azimuth_deg": np.degrees(azimuth).round().tolist(),
-    }
-    for k, name in enumerate(("force_N", "torque_Nm")):
-        error = np.sqrt(variance[..., 3 * k : 3 * k + 3].sum(axis=-1))
-        worst = np.unravel_index(int(np.argmax(error)), error.shape)
-        direction = R[worst][:, 2]
-        document[name] = {
-            "map": error.max(axis=-1).tolist(),
-            "largest": float(error.max()),
-            "rms": result.predicted_error()[k],
-            "worst_direction": direction.tolist(),
-            "axes": _along_axes(direction),
-            "words": _direction_in_words(direction, "base"),
-        }
-    return document
-
-
 # Forces at the tip whose sigma is drawn, N.
 FORCES_N = np.arange(0.0, 101.0, 5.0)
 
 
 def contact_error(result: CalibrationResult) -> dict[str, Any]:
-    """Return the sigma of a force at the tip.
+    """Return the sigma of a force at the tip, as the length of its error over all directions.
 
-    Returns
-    -------
-    dict
-        `source` of the errors of the sensor; `words`; `tip_m` (3,) from the sensor origin, sensor axes; `force_N` (n,)
-        and `sigma_N` (n,), length of the error, over all directions; `without_loads_N` (n,), and mass and centre of
-        mass of the `tool` without errors of the sensor, both null where no loads are known.
+    `tip_m` (3,) is from the sensor origin, sensor axes. Where no loads are known, the sigma `without_loads_N` (n,) and
+    the `tool` without errors of the sensor are null.
     """
     without, tool = None, None
-    if known_contact(result) is not None:
+    if result.known_contact is not None:
         without = force_sigma_at_tip(replace(result, sensor=None), FORCES_N).tolist()
         mass_kg, p_sensor_com_m = true_tool(result)
         tool = {"mass_kg": mass_kg, "p_sensor_com_m": p_sensor_com_m.tolist()}
@@ -143,20 +103,13 @@ def contact_error(result: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
-    """Return R_base_flange (n, m, TURNS, 3, 3): flange z in these directions, turned about itself.
-
-    Parameters
-    ----------
-    elevation_rad : array, shape (n,)
-        From the base xy-plane.
-    azimuth_rad : array, shape (m,)
-        About base z, from base x.
-    """
-    tip, turn = np.meshgrid(np.pi / 2 - elevation_rad, azimuth_rad, indexing="ij")
-    point = Rotation.from_euler("ZY", np.stack([turn, tip], axis=-1).reshape(-1, 2)).as_matrix()
-    spin = Rotation.from_rotvec(np.outer(np.linspace(0, 2 * np.pi, TURNS, endpoint=False), [0, 0, 1])).as_matrix()
-    return np.asarray(point[:, None] @ spin).reshape(*tip.shape, TURNS, 3, 3)
+def _error_map(result: CalibrationResult) -> dict[str, Any]:
+    """Return the error over the directions of the tool axis, with the worst one in words."""
+    found = error_map(result)
+    for one in (found["force_N"], found["torque_Nm"]):
+        one["axes"] = _along_axes(direction := np.array(one["worst_direction"]))
+        one["words"] = _direction_in_words(direction, "base")
+    return found
 
 
 def _along_axes(direction: Array) -> str:
@@ -190,17 +143,18 @@ NOTABLE_CORRELATION = 0.7
 _LONG = ("steps", "made_for", "description")
 
 
-def facts_of(subject: Subject) -> dict[str, Any]:
+def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Collect the facts; sections that the source has no data for are null.
 
-    Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file.
+    Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file, and `trust` its
+    age and last verification, from `ftdrive.report.subject`.
     """
     # All formats are written from these facts, so they cannot disagree.
     result, dataset = subject.result, subject.dataset
     sweep = _planned_sweep(subject.run)
     R_base_flange = dataset.R_base_flange if dataset is not None else None if sweep is None else sweep.R_base_flange
     force_N, torque_Nm = result.likely_error().tolist()
-    last = (subject.trust or {}).get("last_verification")
+    last = (trust or {}).get("last_verification")
     failed = last is not None and not last["passed"] and result.verdict != "rejected"
     return {
         "format": FORMAT,
@@ -208,24 +162,26 @@ def facts_of(subject: Subject) -> dict[str, Any]:
         "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(subject.source),
         "id": result.id,
-        "about": about_of(result),
+        "about": _about_of(result),
         "verdict": result.verdict,
         "marks": {mark: MARKS[mark] for mark in marks_of(result)},
         "findings": [one.to_dict() for one in result.findings],
         "hints": [one.to_dict() for one in hints(result, subject.records)],
-        "trust": subject.trust,
+        "trust": trust,
         "next_step": NEXT_STEP["failed" if failed else result.verdict],
         "error": {
             "words": error_in_words(result),
+            "source": error_source(result),
             "force_N": force_N,
             "torque_Nm": torque_Nm,
             "cross_validated": not result.noise_explains,
         },
-        "error_map": error_map(result),
+        "error_map": _error_map(result),
         "contact": contact_error(result),
         "correlation": _correlation(result.covariance),
         "cross_validation": _cross_validation(subject),
         "poses": _poses(subject),
+        "residuals": residuals_in_words(result),
         "mass": mass_in_words(result),
         "drift": _drift(subject),
         "noise": _noise(subject),
@@ -239,7 +195,7 @@ def facts_of(subject: Subject) -> dict[str, Any]:
     }
 
 
-def about_of(result: CalibrationResult) -> str:
+def _about_of(result: CalibrationResult) -> str:
     """Name arm, sensor, tool and time of a calibration, as far as it knows them."""
     known = result.provenance
     setup, devices = known.get("setup") or {}, known.get("devices") or {}
@@ -375,12 +331,8 @@ def _tour(run: Run, stops: int) -> dict[str, Any]:
         "created_utc": header.get("created_utc"),
         "stops": stops,
         "emulated": header.get("station") is not None,
-        "devices": _plain(header.get("devices", {})),
-        "config": _plain(header.get("config", {})),
+        "devices": header.get("devices", {}),
+        "config": header.get("config", {}),
         "plan_error": why_not,
         "plan": None if plan is None else {name: value for name, value in plan.to_dict().items() if name not in _LONG},
     }
-
-
-def _plain(value: Any) -> Any:
-    return {str(k): _plain(v) for k, v in value.items()} if isinstance(value, Mapping) else value

@@ -10,13 +10,17 @@ from contextlib import contextmanager
 from io import StringIO
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from ftcalib.model import Array
-from ftdrive.errors import ConfigError
-from ftdrive.report.document import label_of, shown_poses
-from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS, Facts
-from ftdrivers.installation import missing_extra
+from ftdrive.planning.plan import JOINTS
+from ftdrive.report.facts import label_of
+from ftdrive.report.sections import LIMIT_SIGMAS, SUSPICIOUS_SIGMAS, Facts, shown_poses
 from ftdrivers.sweep import WRISTS, Sweep
 
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
@@ -37,7 +41,6 @@ LONG_S = 200
 MOST_DOTS = 400
 # Weaker correlations are not drawn.
 INVISIBLE = 0.02
-_MARKERS = "osD"
 _STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "ftdrive",
@@ -62,18 +65,7 @@ _STYLE: Mapping[Any, Any] = {
 
 
 def draw(name: str, facts: Facts) -> str:
-    """Draw the figure of this name as an SVG element without links, scripts or fixed ink.
-
-    Raises
-    ------
-    ConfigError
-        There is no matplotlib.
-    """
-    try:
-        import matplotlib as mpl
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise ConfigError(missing_extra("a figure", "matplotlib", "report")) from None
+    """Draw the figure of this name as an SVG element without links, scripts or fixed ink."""
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
@@ -99,8 +91,6 @@ def _inlined(svg: str, name: str) -> str:
 
 
 def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
-    from matplotlib.ticker import MaxNLocator
-
     found = facts["error_map"]
     elevation, azimuth = (np.radians(found[name]) for name in ("elevation_deg", "azimuth_deg"))
     axes = figure.add_subplot()
@@ -171,8 +161,6 @@ def _dots(axes: Any, directions: Any, **style: Any) -> None:
 
 
 def _sweep(figure: Any, facts: Facts) -> None:
-    from ftdrive.planning.plan import JOINTS
-
     axes, sweep = figure.add_subplot(), Sweep.from_dict(facts["motion"]["sweep"])
     t_s = np.linspace(0.0, sweep.duration_s, 400)
     q_deg = np.degrees(sweep.at(t_s))
@@ -183,9 +171,6 @@ def _sweep(figure: Any, facts: Facts) -> None:
 
 
 def _correlation(figure: Any, facts: Facts) -> None:
-    from matplotlib.collections import PolyCollection
-    from matplotlib.colors import to_rgba
-
     axes = figure.add_subplot()
     matrix = np.abs(np.array(facts["correlation"]["matrix"]))
     n = len(matrix)
@@ -238,12 +223,9 @@ def _contact(figure: Any, facts: Facts) -> None:
 
 def _pose_residuals(figure: Any, facts: Facts) -> None:
     poses, axes = shown_poses(facts["poses"]), figure.add_subplot()
-    places = np.arange(len(poses))
     sizes = [pose["sigmas"] for pose in poses]
-    bars = axes.bar(places, sizes, color=[SERIES[0] if pose["used"] else BAD for pose in poses])
-    for bar, pose in zip(bars, poses, strict=True):
-        if not pose["used"]:
-            bar.set_hatch("///")
+    hatches = [None if pose["used"] else "///" for pose in poses]
+    axes.bar(range(len(poses)), sizes, color=[SERIES[0] if pose["used"] else BAD for pose in poses], hatch=hatches)
     axes.axhline(1, color=INK, linewidth=1)
     axes.axhline(SUSPICIOUS_SIGMAS, color=INK, linewidth=1, linestyle="--")
     axes.set_ylabel("residual, sigma")
@@ -261,16 +243,9 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
     both = figure.subplots(2, 1, sharex=True)
     for k, (axes, scale, label) in enumerate(zip(both, (1, 1e3), ("N", "mN·m"), strict=True)):
         axes.axhline(0, color=INK, linewidth=1)
-        for j in range(3):
-            axes.plot(
-                at[order],
-                scale * residual[:, 3 * k + j],
-                _MARKERS[j] + "-",
-                color=SERIES[j],
-                markersize=3.5,
-                linewidth=0.9,
-                label=f"{'FT'[k]}{'xyz'[j]}",
-            )
+        axes.set_prop_cycle(color=SERIES, marker=list("osD"))
+        names = [f"{'FT'[k]}{axis}" for axis in "xyz"]
+        axes.plot(at[order], scale * residual[:, 3 * k : 3 * k + 3], markersize=3.5, linewidth=0.9, label=names)
         axes.set_ylabel(label)
         axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 1.0), borderaxespad=0.1)
     unit = "min" if long else "s"

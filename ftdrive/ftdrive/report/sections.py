@@ -1,15 +1,18 @@
-"""The sections of a report, in the order in which a reader needs them."""
+"""The sections of a report, in the order in which a reader needs them: sentences, tables and figures from its facts."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
 
-from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
+from ftcalib.estimates import FIXED_BELOW, axes_of, values_of
 from ftcalib.rounding import to_place_of, with_sigma
-from ftdrive.report.document import Figure, Section, Table, capital, label_of, rounded, shown_poses
-from ftdrive.terminal.report import SIGMA_OF_THE_TOOL
+from ftdrive.report.facts import label_of
+from ftdrive.report.subject import MAY_BE_MISSING
+from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
 
 Facts = Mapping[str, Any]
 
@@ -18,13 +21,74 @@ SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
 
 
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Cells as text; the first of each row is its heading."""
+
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    folded: bool = False
+    """A long one, which a page shows on request."""
+
+    @property
+    def narrow(self) -> bool:
+        """Whether it fits beside a figure."""
+        return 2 < len(self.columns) <= 4
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure by its name, with what a reader sees in it and what good looks like."""
+
+    name: str
+    alt: str
+    caption: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """One heading; `name` is its anchor."""
+
+    name: str
+    title: str
+    text: Sequence[str] = ()
+    figures: Sequence[Figure] = ()
+    tables: Sequence[Table] = ()
+
+
+def rounded(value: float | None, digits: int = 3) -> str:
+    """Write a number with this many significant digits, without an exponent; "-" for None."""
+    if value is None:
+        return "-"
+    if value == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    places = max(digits - 1 - math.floor(math.log10(abs(value))), 0)
+    return f"{value:.{min(places, 9)}f}"
+
+
+def capital(words: str) -> str:
+    """Begin a sentence with a capital letter."""
+    return words[:1].upper() + words[1:]
+
+
+def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
+    """Choose the poses to list and draw, in their order: all, or the worst quarter and evenly spread others."""
+    if len(poses) <= most:
+        return list(poses)
+    size = np.array([pose["sigmas"] or pose["force_N"] for pose in poses])
+    worst = np.argsort(-size)[: most // 4]
+    even = np.linspace(0, len(poses) - 1, most - len(worst)).astype(int)
+    return [poses[row] for row in np.unique([*worst, *even])]
+
+
 def estimates(facts: Facts) -> Section:
     """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
     result, strong = facts["result"], facts["correlation"]["strong"]
-    rows = "poses" if facts["motion"] is None else "parts of the motion"
+    taken = "poses" if facts["motion"] is None else "parts of the motion"
     pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
     text = [
-        f"Method {result['method']}, {result['n_poses']} {rows}, gravity {result['g_m_s2']:g} m/s². Wrenches are on "
+        f"Method {result['method']}, {result['n_poses']} {taken}, gravity {result['g_m_s2']:g} m/s². Wrenches are on "
         "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
         f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
     ]
@@ -34,37 +98,22 @@ def estimates(facts: Facts) -> Section:
         "Correlation of the estimates. Good: faint everywhere beside the diagonal. A strong field means that the poses "
         "hardly separate two parameters: add other orientations.",
     )
-    tables = [Table("", ("quantity", "estimate", "± 1 sigma"), list(_estimate_rows(result)))]
+    rows = [(name, value, sigma) for _, _, name, _, value, sigma in estimate_rows(result)]
+    tables = [Table("", ("quantity", "estimate", "± 1 sigma"), rows)]
     if facts["mass"] is not None:
         text.append(f"Sigma: {SIGMA_OF_THE_TOOL}. Mass as read: {facts['mass']}.")
     if result["response"] is not None:
         columns = ("entry", "value", "± 1 sigma")
-        tables.append(Table("Gain and cross-talk of the sensor", columns, _response(result), folded=True))
+        rows = list(_response(result["response"]))
+        tables.append(Table("Gain and cross-talk of the sensor", columns, rows, folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)
 
 
-def _estimate_rows(result: Facts) -> Iterator[tuple[str, str, str]]:
-    fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(result["covariance"]).max()))
-    for label, scale, unit, key in quantities_of(result):
-        values, sigmas = (values_of(source[key], key) * scale for source in (result, result["sigma"]))
-        fixed = sigmas <= fixed_below * scale
-        for axis, value, sigma, known in zip(axes_of(len(values)), values, sigmas, fixed, strict=True):
-            name = f"{label} {axis}, {unit}" if len(values) > 1 else f"{label}, {unit}"
-            spread = 0.0 if known else float(sigma)
-            yield name, to_place_of(value, spread), "fixed" if known else to_place_of(spread, spread)
-
-
-def _response(result: Facts) -> list[tuple[str, str, str]]:
+def _response(response: Facts) -> Iterator[tuple[str, str, str]]:
     kinds = (("force_gain", 100, "%", "force gain"), ("cross_talk_m", 1e3, "mN·m/N", "cross-talk"))
-    return [
-        (
-            f"{label} {_AXES[i]}{_AXES[j]}, {unit}",
-            *_pair(scale * result["response"][key][i][j], scale * result["response"]["sigma"][key][i][j]),
-        )
-        for key, scale, unit, label in kinds
-        for i in range(3)
-        for j in range(i, 3)
-    ]
+    for (key, scale, unit, label), (i, j) in product(kinds, combinations_with_replacement(range(3), 2)):
+        value, sigma = (scale * one[key][i][j] for one in (response, response["sigma"]))
+        yield f"{label} {_AXES[i]}{_AXES[j]}, {unit}", *_pair(value, sigma)
 
 
 def _pair(value: float, sigma: float, sign: str = "") -> tuple[str, str]:
@@ -76,6 +125,7 @@ def error(facts: Facts) -> Section:
     force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
     text = [
         f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
+        f"Its source: {facts['error']['source']}.",
         f"Worst direction of the tool axis for the force: {force['words']}, {rounded(force['largest'])} N.",
         f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
     ]
@@ -147,27 +197,18 @@ def cross_validation(facts: Facts) -> Section:
         text.append(f"Methods are not compared. {found['reason']}")
         return Section("cross-validation", "Cross-validation", text)
     solved = [one for one in found["methods"] if "reason" not in one]
+    errors = {"residual": "residual", "cross_validated": "left out"}
     rows = [
         (
             one["method"],
             rounded(one["mass_kg"], 4),
             f"{math.degrees(one['rotation_difference_rad']):.2f}",
-            rounded(one["residual"]["force_rms_N"]),
-            rounded(one["residual"]["torque_rms_Nm"]),
-            rounded(one["cross_validated"]["force_rms_N"]),
-            rounded(one["cross_validated"]["torque_rms_Nm"]),
+            *(rounded(one[kind][key]) for kind in errors for key in ("force_rms_N", "torque_rms_Nm")),
         )
         for one in solved
     ]
-    columns = (
-        "method",
-        "mass, kg",
-        "mounting differs, °",
-        "residual, N",
-        "residual, N·m",
-        "left out, N",
-        "left out, N·m",
-    )
+    of_errors = (f"{words}, {unit}" for words in errors.values() for unit in ("N", "N·m"))
+    columns = ("method", "mass, kg", "mounting differs, °", *of_errors)
     tables = [Table("Methods on the same poses", columns, rows)]
     if missing := [(one["method"], one["reason"]) for one in found["methods"] if "reason" in one]:
         tables.append(Table("Methods without a result", ("method", "reason"), missing, folded=True))
@@ -186,10 +227,8 @@ def cross_validation(facts: Facts) -> Section:
 def residuals(facts: Facts) -> Section:
     """Show the residuals of each pose, and in time; of a motion, of its parts."""
     result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
-    sums = result["residual"]
     text = [
-        f"Residuals: force {rounded(sums['force_rms_N'])} N rms, {rounded(sums['force_max_N'])} N at most; torque "
-        f"{rounded(sums['torque_rms_Nm'])} N·m rms, {rounded(sums['torque_max_Nm'])} N·m at most.",
+        f"Residuals: {facts['residuals']}.",
         f"They are {result['noise_factor']:.2f} times the measured noise (p = {_p_value_in_words(result['p_value'])})."
         if result["p_value"] is not None
         else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
@@ -434,12 +473,11 @@ def provenance(facts: Facts) -> Section:
 
 
 def _last_verification(trust: Facts) -> Iterator[str]:
-    # From folders and store, the later one: a store may be new, and a folder may have moved.
     if last := trust.get("last_verification"):
         outcome = "passed" if last["passed"] else "FAILED"
         yield f"Last verification {last['created_utc'][:16]} UTC, {outcome}: {last['reason']}. File {last['path']}."
     if trust.get("store_error"):
-        yield f"A later verification may be missing, because {trust['store_error']}."
+        yield f"{capital(MAY_BE_MISSING.format(trust['store_error']))}."
 
 
 def motion(facts: Facts) -> Section:
@@ -457,34 +495,23 @@ def motion(facts: Facts) -> Section:
         f"Principal moments of inertia about the centre of mass: {', '.join(rounded(1e3 * one) for one in principal)} "
         "g·m². Good: all positive, and each at most the sum of the others.",
     ]
-    rows = [
-        (f"{'xyz'[i]}{'xyz'[j]}", f"{1e3 * moments[i, j]:.3f}", f"{1e3 * of_moments[i, j]:.3f}")
-        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    ]
+    entries = (1e3 * values_of(one, "inertia_kg_m2") for one in (moments, of_moments))
+    rows = [(axes, f"{value:.3f}", f"{sigma:.3f}") for axes, value, sigma in zip(axes_of(6), *entries, strict=True)]
     tables = [Table("Inertia about the centre of mass, sensor axes, g·m²", ("axes", "estimate", "± 1 sigma"), rows)]
-    touches = [
-        (
-            f"{one['t_s']:.1f}",
-            *(rounded(one[key], 2) for key in ("duration_s", "force_N", "torque_Nm")),
-        )
-        for one in found["contacts"]
-    ]
+    keys, columns = ("duration_s", "force_N", "torque_Nm"), ("at, s", "for, s", "force, N", "torque, N·m")
+    touches = [(f"{one['t_s']:.1f}", *(rounded(one[key], 2) for key in keys)) for one in found["contacts"]]
     if touches:
-        columns = ("at, s", "for, s", "force, N", "torque, N·m")
         tables.append(Table("Contact, which was left out", columns, touches))
     else:
         text.append("No contact was found.")
-    figures = []
-    if found["sweep"] is not None:
-        figures.append(
-            Figure(
-                "sweep",
-                f"Angles of the three wrist joints against time in the planned sweep of "
-                f"{found['sweep']['duration_s']:.0f} s.",
-                "The planned sweep: wrist joints against time at the planned speed. It begins and ends at rest.",
-            )
-        )
-    return Section("motion", "Motion", text, figures, tables)
+    if found["sweep"] is None:
+        return Section("motion", "Motion", text, (), tables)
+    figure = Figure(
+        "sweep",
+        f"Angles of the three wrist joints against time in the planned sweep of {found['sweep']['duration_s']:.0f} s.",
+        "The planned sweep: wrist joints against time at the planned speed. It begins and ends at rest.",
+    )
+    return Section("motion", "Motion", text, [figure], tables)
 
 
 def sections_of(facts: Mapping[str, Any]) -> list[Section]:

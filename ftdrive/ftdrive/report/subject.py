@@ -13,9 +13,12 @@ from ftcalib.files import read_object
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.run import Run, in_motion, is_run
+from ftdrive.runs.run import Run, is_run
 from ftdrive.runs.source import SolveOptions, read_source, solve_in_motion
-from ftdrive.runs.verification import VerificationRecord, age_of, newest, verification_near
+from ftdrive.runs.verification import age_of, newest, verification_near
+
+# If a store cannot be read: why.
+MAY_BE_MISSING = "a later verification may be missing, because {}"
 
 
 def trust(
@@ -23,39 +26,24 @@ def trust(
 ) -> dict[str, Any]:
     """Return age and last verification of a result; a store that cannot be read is named in `store_error`.
 
-    Parameters
-    ----------
-    result : CalibrationResult
-    source : Path
-        Its file or run folder.
-    store_url : callable
-        Reads `[store] url`; None is the user's store.
-    now : datetime
+    `source` is its file or run folder. `store_url` reads `[store] url`; None is the user's store.
     """
-    kept, error = _of_store(result.id, store_url)
-    last = newest(one for one in (verification_near(source, result.id), kept) if one is not None)
-    words = ", ".join([*age_of(result, now), "not verified" if last is None else last.in_words(now)])
-    return {"words": words, "last_verification": None if last is None else _plain(last), "store_error": error}
-
-
-def _of_store(calibration_id: str, url: Callable[[], str | None]) -> tuple[VerificationRecord | None, str]:
-    """Return what the store has, and why it cannot be read."""
+    # SQLAlchemy takes a quarter of a second, for which help need not wait.
     from ftdrive.store.store import Store
 
+    last, error = verification_near(source, result.id), ""
     try:
-        return Store(url()).last_verification(calibration_id), ""
-    except (BadStore, ConfigError) as error:
-        return None, str(error)
-
-
-def _plain(one: VerificationRecord) -> dict[str, Any]:
-    return {
-        "created_utc": None if one.created_utc is None else one.created_utc.astimezone(UTC).isoformat(),
-        "passed": one.passed,
-        "change": one.change,
-        "reason": one.reason or "",
-        "path": str(one.path),
-    }
+        # From folders and store, the later one: a store may be new, and a folder may have moved.
+        last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
+    except (BadStore, ConfigError) as unreadable:
+        error = str(unreadable)
+    words = ", ".join([*age_of(result, now), "not verified" if last is None else last.in_words(now)])
+    found = None
+    if last is not None:
+        made = None if last.created_utc is None else last.created_utc.astimezone(UTC).isoformat()
+        about = {"passed": last.passed, "change": last.change, "reason": last.reason or "", "path": str(last.path)}
+        found = {"created_utc": made, **about}
+    return {"words": words, "last_verification": found, "store_error": error}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,26 +62,14 @@ class Subject:
     parent: CalibrationResult | None = None
     parent_name: str = ""
     """Name of the result to compare with, or why there is none."""
-    trust: Mapping[str, Any] | None = None
-    """Age and last verification, from `ftdrive.report.subject`; None if nothing was looked up."""
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
     """Read a calibration file, a run folder, a dataset.json or a CSV file; solve what is not solved.
 
     A run folder keeps its saved result if that rests on its present poses and no option asks for another one. A
-    calibration file in a run folder is reported with the data of that run.
-
-    Parameters
-    ----------
-    source : Path
-    options : SolveOptions
-    parent : Path, optional
-        Calibration file or run folder of the result to compare with. Default: the parent that the result names.
-
-    Raises
-    ------
-    ConfigError, DataError, NotObservable, OSError
+    calibration file in a run folder is reported with the data of that run. It is compared with `parent`, by default
+    the parent that the result names. Raises `ConfigError`, `DataError`, `NotObservable` or `OSError`.
     """
     if _is_calibration(source):
         if options != SolveOptions():
@@ -110,16 +86,15 @@ def _is_calibration(source: Path) -> bool:
     if source.is_dir() or source.suffix != ".json":
         return False
     try:
-        return str(read_object(source, BadCalibration, accept_changed=True).get("format", "")).startswith(
-            "ftdrive.calibration/"
-        )
+        found = read_object(source, BadCalibration, accept_changed=True).get("format")
+        return str(found).startswith("ftdrive.calibration/")
     except BadCalibration:
         return False
 
 
 def _of_result(source: Path, result: CalibrationResult) -> Subject:
     folder = source.absolute().parent
-    if is_run(folder) and not in_motion(folder):
+    if is_run(folder) and not Run(folder).in_motion:
         data = read_source(folder, SolveOptions())
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
@@ -127,28 +102,19 @@ def _of_result(source: Path, result: CalibrationResult) -> Subject:
     return Subject(source, result, "")
 
 
-def _in_motion(source: Path, options: SolveOptions) -> Subject:
-    """Return the subject of a run in motion, which has no dataset."""
-    run = Run(source)
-    if options == SolveOptions() and run.calibration_path.is_file():
-        result = CalibrationResult.load(run.calibration_path)
-    else:
-        result = solve_in_motion(run, options.known)
-    return Subject(source, result, " ".join([run.solve_command, *options.words]), run=run)
-
-
 def _of_data(source: Path, options: SolveOptions) -> Subject:
-    if in_motion(source):
-        return _in_motion(source, options)
-    data = read_source(source, options)
+    run, saved = Run(source) if source.is_dir() else None, None
+    if run is not None and options == SolveOptions() and run.calibration_path.is_file():
+        saved = CalibrationResult.load(run.calibration_path)
+    if run is not None and run.in_motion:
+        command = " ".join([run.solve_command, *options.words])
+        return Subject(source, saved or solve_in_motion(run, options.known), command, run=run)
+    data, result = read_source(source, options), saved
     solved_with = {"drift": options.drift, **data.circumstances}
-    run = Run(source) if source.is_dir() else None
-    result, method = None, cast("Method", options.method)
+    method = cast("Method", options.method)
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
     if run is not None and options == SolveOptions():
         method, command = run.method, run.solve_command
-    if run is not None and options == SolveOptions() and run.calibration_path.is_file():
-        result = CalibrationResult.load(run.calibration_path)
     if result is None or result.provenance.get("dataset_sha256") != data.dataset.sha256():
         result = solve(data.dataset, method, **solved_with, provenance=data.provenance)
         solved_with |= {"default": result} if method == "ml" else {}

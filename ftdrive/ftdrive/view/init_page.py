@@ -17,8 +17,7 @@ from ftdrive.cell.units import SIDES
 from ftdrive.checks.description import BASE_AXES, BOXES, BY_KEY, MODEL, ROBOT, SENSOR, TOOL, WALLS, Description
 from ftdrive.checks.discovery import places
 from ftdrive.errors import ConfigError
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_as_described
-from ftdrive.terminal.console import hanging, messages
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for
 from ftdrive.view.page import Page
 from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, button, controls, lines, select, text_field
 from ftdrive.view.scene import arm_parts, camera, label, legend, size_of, surroundings
@@ -75,10 +74,15 @@ class _Field:
 
 
 class InitPage:
-    """Fills a page with the form, and fills in a description from it; `draft` keeps the answers after each change."""
+    """Fills a page with the form, and fills in a description from it; `draft` keeps the answers after each change.
 
-    def __init__(self, page: Page, described: Description, draft: Path, name: str) -> None:
-        self._page, self._described, self._draft, self._name = page, described, draft, name
+    `say` takes what a device reports, with a mark to stand before it.
+    """
+
+    def __init__(
+        self, page: Page, described: Description, draft: Path, name: str, say: Callable[[str, str], object]
+    ) -> None:
+        self._page, self._described, self._draft, self._name, self._say = page, described, draft, name, say
         # Only the thread of `run` changes anything: the server's thread puts here what a viewer has done.
         self._todo: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._asked: dict[str, None] = {}
@@ -108,6 +112,11 @@ class InitPage:
             # What was typed meanwhile is judged together.
             for _ in range(max(1, self._todo.qsize())):
                 self._todo.get()()
+
+    def conclude(self, *words: str) -> None:
+        """Show at the top, and where Write was pressed, that the file is written."""
+        written = lines(*words, head="Written", tone=GOOD)
+        self._page.put({"result": written, "form/words": written, "form/write": None})
 
     def _on(self, name: str, act: Callable[[Any], object]) -> None:
         def put(_: str, value: object) -> None:
@@ -216,7 +225,7 @@ class InitPage:
             if (error := ended.get()) is not None:
                 raise error
             words = self._found[field.name][0]
-            messages.print(hanging(f"  {words[:2]}", words[2:]), soft_wrap=True)
+            self._say(words[2:], f"  {words[:2]}")
 
     def _look_at(self, field: _Field, end: Callable[[Exception | None], object]) -> None:
         """Read one device; then call `end` with an error that no device raises, or with None."""
@@ -238,7 +247,7 @@ class InitPage:
         workcell = WorkcellConfig(planes_mm=planes, boxes_mm=boxes)
         cell = CellConfig(RobotConfig(""), SensorConfig(""), ToolConfig(cylinders_mm=tool or _NO_TOOL), workcell)
         model = None if self._described.without_shape else self._described.model
-        certifier = certifier_as_described(cell, model or "ur5e")
+        certifier = certifier_for(cell, model or "ur5e", must_be_possible=False)
         found, size_m = certifier.too_near(USUAL_POSTURE_RAD) if model else [], size_of(certifier)
         names = {f"plane {i}": field for i, field in enumerate(rows[WALLS], start=2)}
         names |= {f"box {i}": field for i, field in enumerate(rows[BOXES], start=1)}

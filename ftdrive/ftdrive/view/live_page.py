@@ -1,33 +1,36 @@
-"""The page of the live wrench: one large force, the tool with its arrows, six plots, events."""
+"""The pages of a stream: the live wrench with the tool, its arrows and six plots; and the scale with its mass."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import Any, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from ftcalib.judge.observability import axes_along
 from ftcalib.rounding import to_place_of
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import AXES
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Axes, Point, StreamInfo, frames_in_flange
-from ftdrive.live.stages import stages_in_words
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.terminal.live_panels import full_scale, line_of_force, meaning, time_of_day
-from ftdrive.terminal.live_view import SPANS_S, ShownWrench, Summary, View
+from ftdrive.stream.feed import SPANS_S, Feed
+from ftdrive.stream.samples import Axes, Point, StreamInfo, frames_in_flange
+from ftdrive.stream.stages import stages_in_words
+from ftdrive.stream.weighing import Weighing, line_of
 from ftdrive.view import parts, scene
 from ftdrive.view.page import Page
 from ftdrive.view.parts import Part
+from ftdrive.words import stream as words
+from ftdrive.words.stream import ShownWrench, Summary, View
+from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 
 # Plots follow each so many drawings of the rest. A plot is about 250 pixels wide, so a column has two of them.
 _PLOT_EACH, _COLUMNS, _EVENTS = 5, 128, 30
-# Fewer sigmas may be noise, which has neither arrow nor direction. An arm that moves less is not drawn again.
-_SIGNIFICANT, _STILL_RAD = 4.0, 1e-4
+# An arm that moves less is not drawn again.
+_STILL_RAD = 1e-4
 _SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 _M_PER_N, _M_PER_NM = 0.01, 0.1
 _LEGEND = (
@@ -38,9 +41,11 @@ _LEGEND = (
 )
 _FOR_ALL = "Axes and point change for all viewers, in the terminal, and in what it prints and records."
 _PLOTS = "blue: smallest to largest value, grey: ± 1 sigma of a free tool, orange: contact"
+# Noise has no arrow, see `ShownWrench.is_significant`.
+_TONES = {words.CONTACT: parts.WARN, words.FREE: parts.GOOD}
 _ROWS = (("State", "", "large"), ("Force on the tool", "N", "huge"), ("Torque", "N·m", "large"))
-BLANK = "\u00a0"
-"""Keeps the place of a line that is empty at times, so that no button moves under a finger."""
+# Keeps the place of a line that is empty at times, so that no button moves under a finger.
+_BLANK = "\u00a0"
 
 
 class LivePage:
@@ -58,12 +63,12 @@ class LivePage:
         self._drawn, self._q_rad = 0, np.full(6, np.inf)
         self._arm = None if certifier is None else certifier.arm
         page.put(_still(certifier))
-        page.on("tare", lambda *_: feed.request("t"))
-        page.on("undo", lambda *_: feed.request("u"))
-        replay = self._summary.view().replay
-        page.on("play", lambda *_: feed.request("seek" if replay and replay.has_ended else "space", "0"))
-        page.on("seek", lambda _, t_s: feed.request("seek", str(t_s)))
-        page.on("speed", lambda _, speed: feed.request("speed", speed))
+        page.on("tare", lambda *_: feed.do(feed.stream.tare))
+        page.on("undo", lambda *_: feed.do(feed.stream.undo_tare))
+        if (replay := self._summary.view().replay) is not None:
+            page.on("play", lambda *_: feed.do(replay.toggle))
+            page.on("seek", lambda _, t_s: feed.do(partial(replay.seek, t_s)))
+            page.on("speed", lambda _, speed: feed.do(partial(setattr, replay, "speed", float(speed))))
         page.on("axes", lambda _, axes: self._set_frame(axes=axes))
         page.on("about", lambda _, about: self._set_frame(about=about))
         page.on("span", lambda _, span: setattr(self._summary, "span_s", int(span.split()[0])))
@@ -80,9 +85,8 @@ class LivePage:
         if not self._page.viewers:
             self._drawn = 0
             return
-        # an old number is never shown as live
-        reading = None if view.silent else view.reading
-        shown = {**words(view, reading), **self._scene(view, reading), **self._controls(view)}
+        reading = view.live
+        shown = {**texts(view, reading), **self._scene(view, reading), **self._controls(view)}
         if self._drawn % _PLOT_EACH == 0 or reading is None:
             shown["plots"] = None if reading is None else plots(view, reading)
         self._page.put(shown)
@@ -118,10 +122,11 @@ class LivePage:
             if not np.isfinite(p_m).all():
                 p_m = forward(arm.kinematics, reading.q_rad).p_m
         p_m = np.nan_to_num(p_m)
-        shown["scene/flange"] = scene.axes(0.1, p_m, scene.turned(reading.R_base_flange))
+        turn = Rotation.from_matrix(reading.R_base_flange).as_quat(scalar_first=True)
+        shown["scene/flange"] = scene.axes(0.1, p_m, turn)
         shown["scene/flange name"] = scene.label("flange", p_m)
-        p_base_m, wrench_base = in_base(reading, view.info, p_m)
-        drawn = wrench_base * np.repeat([is_significant(reading, first) for first in (0, 3)], 3)
+        p_base_m, wrench_base = _in_base(reading, view.info, p_m)
+        drawn = wrench_base * np.repeat([reading.is_significant(first) for first in (0, 3)], 3)
         return shown | scene.wrench_parts(p_base_m, drawn, _M_PER_N, _M_PER_NM)
 
 
@@ -138,56 +143,47 @@ def _still(certifier: Certifier | None) -> dict[str, Part | None]:
     return shown | {"scene/camera": camera, "scene/legend": scene.legend(*rows)}
 
 
-def in_base(reading: ShownWrench, info: StreamInfo, p_base_flange_m: Array) -> tuple[Array, Array]:
+def _in_base(reading: ShownWrench, info: StreamInfo, p_base_flange_m: Array) -> tuple[Array, Array]:
     """Return reference point (3,) and wrench (6,) in base axes."""
     R, frame = reading.R_base_flange, reading.frame
     R_flange_axes, p_flange_m = frames_in_flange(frame, info, R).get(frame.id, (np.eye(3), np.zeros(3)))
     return p_base_flange_m + R @ p_flange_m, (reading.wrench.reshape(2, 3) @ (R @ R_flange_axes).T).ravel()
 
 
-def is_significant(reading: ShownWrench, first: int) -> bool:
-    """Whether the force (`first` 0) or the torque (3) is more than noise; it is not before the noise is known."""
-    size, sigma = reading.size(first)
-    return size > _SIGNIFICANT * sigma
-
-
-def words(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
+def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
     """Return a silent device, contact, force and torque, what they are, and events."""
-    what, line = "waiting for samples", str(line_of_force(reading)) or BLANK
-    rows = [parts.number(name, "--", unit, note=BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
+    what, (state, _), info = words.WAITING, words.state(view), view.info
+    rows = [parts.number(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
     if reading is not None:
-        what = f"{meaning(reading.stages)}, {reading.frame}; stages: {stages_in_words(reading.stages)}"
-        state, tone = (f"contact, {view.contact_s:.1f} s", parts.WARN) if reading.in_contact else ("free", parts.GOOD)
-        if np.isnan(reading.chi2):
-            state, tone = "noise not known yet", parts.QUIET
-        rows[0] |= {"value": state, "note": line, "tone": tone}
-        rows[1:] = [_size(reading, 0), _size(reading, 3)]
+        what = f"{words.meaning(view)}, {reading.frame}; stages: {stages_in_words(reading.stages)}"
+        value = f"{state}, {view.contact_s:.1f} s" if state == words.CONTACT else state
+        note = words.line_of_force(reading) or _BLANK
+        rows[0] |= {"value": value, "note": note, "tone": _TONES.get(state, parts.QUIET)}
+        rows[1:] = [_size(view, reading, 0), _size(view, reading, 3)]
     notes = [
-        note.words if note.t_host_ns is None else f"{time_of_day(view.info, note.t_host_ns)} {note.words}"
+        note.words if note.t_host_ns is None else f"{words.time_of_day(info, note.t_host_ns)} {note.words}"
         for note in islice(view.notes, _EVENTS)
     ]
     return {
         "alert": parts.lines(view.silent, head="No live values", tone=parts.BAD) if view.silent else None,
         "numbers": parts.numbers(*rows),
-        "table": parts.lines(devices(view.info), tone=parts.WARN if view.info.marks else parts.QUIET),
+        "table": _devices(info),
         "table/what": parts.lines(what, tone=parts.QUIET),
         "events": parts.lines(*notes, head="Events, newest first") if notes else None,
     }
 
 
-def devices(info: StreamInfo) -> str:
-    """Name arm, sensor and tool, and whether they are emulated."""
-    return " · ".join(filter(None, [info.arm.model, info.sensor.model, info.tool, *info.marks]))
+def _devices(info: StreamInfo) -> Part:
+    """Name arm, sensor and tool, and what every output says of the cell, such as that it is emulated."""
+    texts = " · ".join([words.devices(info), *info.marks])
+    return parts.lines(texts, tone=parts.WARN if info.marks else parts.QUIET)
 
 
-def _size(reading: ShownWrench, first: int) -> Part:
-    (size, sigma), note, (name, unit, large) = reading.size(first), BLANK, _ROWS[2 if first else 1]
-    axes, _, about = str(reading.frame).partition(", ")
-    if is_significant(reading, first):
-        along = " and ".join(axes_along(reading.wrench[first : first + 3] / size))
-        note = f"{'turns about' if first else 'towards'} {along} of {axes}"
-    name += f" {about}" if first else f", {meaning(reading.stages)}"
+def _size(view: View, reading: ShownWrench, first: int) -> Part:
+    (size, sigma), (name, unit, large) = reading.size(first), _ROWS[2 if first else 1]
+    name += f" {str(reading.frame).partition(', ')[2]}" if first else f", {words.meaning(view)}"
     around = f"± {to_place_of(sigma, sigma)} (1 sigma)" if np.isfinite(sigma) else ""
+    note = words.direction(reading, first) or _BLANK
     return parts.number(name, to_place_of(size, sigma), unit, sigma=around, note=note, size=large)
 
 
@@ -197,7 +193,46 @@ def plots(view: View, reading: ShownWrench) -> Part:
     low, high, sigma = parts.plain(past.low, 3), parts.plain(past.high, 3), np.nan_to_num(reading.sample_sigma)
     for i, (axis, unit) in enumerate(zip(AXES, ["N"] * 3 + ["N·m"] * 3, strict=True)):
         label = f"{axis} {to_place_of(reading.wrench[i], reading.sigma[i], '+z')}"
-        full[unit] = full_scale(past, reading, i // 3 * 3)
+        full[unit] = words.full_scale(past, reading, i // 3 * 3)
         found.append({"label": label, "unit": unit, "low": low[i], "high": high[i], "sigma": float(sigma[i])})
     contact, step_s = past.in_contact.astype(int).tolist(), past.column_ns * 1e-9
     return {"kind": "plots", "span_s": past.span_s, "step_s": step_s, "full": full, "contact": contact, "plots": found}
+
+
+class WeighPage:
+    """Fills a page with a scale: the mass and what it is worth, or why there is none, and the age of the zero.
+
+    With `controls` viewers may tare the empty gripper.
+    """
+
+    def __init__(self, page: Page, weighing: Weighing, *, controls: bool) -> None:
+        self._page, self._weighing = page, weighing
+        page.on("zero", lambda *_: weighing.request_zero())
+        if controls and not weighing.moving:
+            page.put({"controls": parts.controls(parts.button("zero", "Zero the empty gripper"))})
+
+    def draw(self) -> None:
+        """Show mass, count and age of the zero, or why there is no mass, if there is a viewer."""
+        if not self._page.viewers:
+            return
+        weighing, shown = self._weighing, self._weighing.shown
+        mass, (zero, helps) = (
+            parts.number("Mass in the gripper", NO_MASS, "", note=_BLANK, size="huge"),
+            zero_in_words(weighing),
+        )
+        if (weight := shown.measured) is not None:
+            kg, sigma = (to_place_of(one, weight.mass_sigma_kg, "z") for one in (weight.mass_kg, weight.mass_sigma_kg))
+            mass |= {"value": kg, "unit": "kg", "sigma": f"± {sigma} kg", "note": worth_of(weight)}
+        rows = [mass]
+        if weighing.part_kg is not None:
+            rows.append(parts.number("Parts", "-" if shown.count is None else str(shown.count), "", size="large"))
+        line = parts.lines(line_of(shown), tone=parts.BAD if shown.stale else parts.WARN if shown.refusal else "")
+        self._page.put(
+            {
+                "alert": line if shown.stale else None,
+                "state": _devices(weighing.stream.info),
+                "numbers": parts.numbers(*rows),
+                "table/line": None if shown.stale else line,
+                "table/zero": parts.lines(zero, weighing.note, tone=parts.WARN if helps else ""),
+            }
+        )

@@ -21,19 +21,13 @@ _TEXT: Final = 10_000
 
 
 class Page:
-    """What all browsers that show the page see, and what they may ask for.
-
-    Attributes
-    ----------
-    url : str
-        With the token, without which nothing is served.
-    viewers : int
-        Number of browsers that show the page.
-    """
+    """What all browsers that show the page see, and what they may ask for."""
 
     def __init__(self, title: str) -> None:
         self.url = ""
+        """With the token, without which nothing is served."""
         self.viewers = 0
+        """Number of browsers that show the page."""
         self._lock = threading.Lock()
         # A part with its text and the version of the page that brought it.
         self._parts: dict[str, tuple[Part | None, str, int]] = {}

@@ -5,7 +5,6 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
@@ -78,14 +77,8 @@ def arm_parts(
 ) -> dict[str, Part | None]:
     """Return an arm with its tool at joint angles (6,); without them what takes it away.
 
-    Parameters
-    ----------
-    ghost : bool
-        Transparent: where the arm will be.
-    clear : bool
-        The tool is transparent, so that a wrench inside it is seen.
-    bad : collection of str
-        Bodies that are drawn red.
+    A `ghost` is transparent: where the arm will be. With `clear` the tool is, so that a wrench inside it is seen.
+    Bodies named in `bad` are red.
     """
     names = [f"scene/{name}/{i}" for i in range(len(arm.names))]
     if q_rad is None:
@@ -138,23 +131,16 @@ def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: 
         if vector.any():
             ends = plain([p_base_m, p_base_m + m * vector])
             parts[f"scene/{name}"] = {"kind": "arrow", "ends": ends, "colour": name}
-    if wrench_base[:3].any():
-        parts["scene/line of action"] = path(line_of_action(p_base_m, wrench_base)[0], FORCE)
+    force, torque = wrench_base[:3], wrench_base[3:]
+    if squared := float(force @ force):
+        # Along this line the force alone explains the torque, as far as one can.
+        foot, along = p_base_m + np.cross(force, torque) / squared, 0.5 * force / np.sqrt(squared)
+        parts["scene/line of action"] = path(np.array([foot - along, foot + along]), FORCE)
     return parts
 
 
 NO_WRENCH: Final[dict[str, Part | None]] = {"scene/force": None, "scene/torque": None, "scene/line of action": None}
 """What takes the arrows of a wrench away."""
-
-
-def line_of_action(p_m: Array, wrench: Array, half_m: float = 0.5) -> Array:
-    """Return the line (1, 2, 3) along which a force alone explains force and, as far as one can, torque about `p_m`."""
-    force, torque = wrench[:3], wrench[3:]
-    squared = float(force @ force)
-    if squared == 0:
-        return np.broadcast_to(p_m, (1, 2, 3)).copy()
-    foot, along = p_m + np.cross(force, torque) / squared, half_m * force / np.sqrt(squared)
-    return np.array([[foot - along, foot + along]])
 
 
 def size_of(certifier: Certifier) -> float:
@@ -171,8 +157,3 @@ def turned_up(axis: Array) -> Array:
     half = np.where(down, np.array([1.0, 0.0, 0.0]), half / np.where(down, 1.0, length))
     x, y, z = np.moveaxis(half, -1, 0)
     return np.stack([z, -y, x, np.zeros_like(x)], axis=-1)
-
-
-def turned(R: Array) -> Array:
-    """Return the quaternion (4,), w first, of a rotation (3, 3)."""
-    return np.asarray(Rotation.from_matrix(R).as_quat(scalar_first=True))

@@ -17,13 +17,21 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.session import events
 from ftdrive.session.events import Event, Key, Operator, Question, State
 from ftdrive.session.guards import Guard, RangeGuard, Seen
-from ftdrive.terminal.screen import ESTIMATES, SessionView, progress_in_words, rounded_estimate, state_lines
-from ftdrive.terminal.session_text import in_words, sigmas_of
-from ftdrive.terminal.text import as_typed
 from ftdrive.view import scene
 from ftdrive.view.page import HUNG_S, Page
 from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, bar, bars, controls, lines, numbers, table
 from ftdrive.view.plan_page import PLAN_LEGEND, Timeline, describe, plan_parts
+from ftdrive.words.session import (
+    ESTIMATES,
+    SessionView,
+    differences,
+    in_words,
+    progress_in_words,
+    rounded_estimate,
+    sigmas_of,
+    state_in_words,
+)
+from ftdrive.words.text import as_typed
 
 log = logging.getLogger(__name__)
 
@@ -281,8 +289,7 @@ def asked(question: Question | None) -> Part | None:
 def _state(view: SessionView, note: str, stopped_by: str) -> Parts:
     """Return state, progress and time left, as the terminal says them, the last note, and what has stopped the arm."""
     now, last, now_s = view.now, view.last, time.monotonic()
-    head, words = state_lines(view, now_s, 10_000)[0].plain, "" if now is None else now.words
-    below = words if head.endswith(words) else ""
+    where, state, words = state_in_words(view, now_s)
     stopped = now is not None and now.state in {State.STOP, State.HOLD}
     progress = None if last is None else lines(left := progress_in_words(view, now_s))
     if last is not None and now is not None and now.stops is not None:
@@ -293,7 +300,7 @@ def _state(view: SessionView, note: str, stopped_by: str) -> Parts:
         alert, red = f"Stop was pressed by {stopped_by}.", True
     return {
         "alert": None if alert is None else lines(alert, tone=BAD if red else WARN),
-        "state": lines(below, head=head.removesuffix(below).strip(), tone=BAD if stopped else ""),
+        "state": lines(words, head=f"{where}  {state}".strip(), tone=BAD if stopped else ""),
         "state/progress": progress,
         "state/note": lines(note, tone=QUIET) if note else None,
     }
@@ -309,9 +316,7 @@ def _results(view: SessionView) -> Parts:
         parts["table/words"] = lines(in_words(fit).strip())
     rows = []
     for one in view.compared.values():
-        (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (one.residual, one.sigma))
-        sizes = f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}"
-        rows.append((f"R{one.number:02d}", *sizes, f"{sigmas_of(one):.1f}"))
+        rows.append((f"R{one.number:02d}", *differences(one)))
         parts["table/words"] = lines(in_words(one).strip())
     return parts | ({"table/compared": table(rows, ("", "N off", "N·m off", "sigmas"))} if rows else {})
 

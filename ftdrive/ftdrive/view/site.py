@@ -10,19 +10,19 @@ import secrets
 import socket
 import sys
 import webbrowser
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
 from html import escape
 from http import HTTPStatus
 from importlib.util import find_spec
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from time import monotonic
 from typing import Final
 
 from ftdrive.errors import ConfigError
-from ftdrive.http_gate import Address, Gate, Request, is_loopback, with_port
+from ftdrive.servers.http_gate import Address, Gate, Request, is_loopback, with_port
 from ftdrive.view.page import Page
 from ftdrivers.installation import missing_extra
 
@@ -39,20 +39,9 @@ _VIEWERS: Final = 300
 _BODY_BYTES: Final = 1 << 15
 _BODY_S: Final = 5.0
 # Nothing from elsewhere, no inline script, no other page around this one. uPlot sets styles of elements.
-_POLICY: Final = "; ".join(
-    (
-        "Content-Security-Policy: default-src 'none'",
-        "script-src 'self'",
-        "style-src 'self' 'unsafe-inline'",
-        "connect-src 'self'",
-        "img-src data:",
-        "base-uri 'none'",
-        "form-action 'none'",
-        "frame-ancestors 'none'",
-    )
-)
 _SAFE: Final = (
-    _POLICY,
+    "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+    "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "Referrer-Policy: no-referrer",
     "Cache-Control: no-store",
     "Cross-Origin-Resource-Policy: same-origin",
@@ -66,18 +55,8 @@ _log = logging.getLogger(__name__)
 class Site(Gate):
     """Serves a page to browsers that have opened its address with the token once, and keep it as a cookie.
 
-    Parameters
-    ----------
-    page : Page
-    bound : tuple of str and int
-        Host and port; 0 lets the system choose, see `port`.
-
-    Raises
-    ------
-    ConfigError
-        The extra `viz` is not installed.
-    OSError
-        The address cannot be used.
+    A port of 0 lets the system choose, see `port`. Raises `ConfigError` if the extra `viz` is not installed, and
+    `OSError` for an address that cannot be used.
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
@@ -214,18 +193,9 @@ class Site(Gate):
 
 @contextmanager
 def serve(title: str, address: Address | None = None) -> Iterator[Page]:
-    """Serve a page while the block runs. Needs the extra `viz`.
+    """Serve a page while the block runs. Raises `ConfigError` if the address is not usable or the extra `viz` missing.
 
-    Parameters
-    ----------
-    title : str
-    address : tuple of str and int, optional
-        Host and port. Without it only this computer is served: at port 8080, or another one if that is taken.
-
-    Raises
-    ------
-    ConfigError
-        The address cannot be used, or the extra is missing.
+    Without an address only this computer is served: at port 8080, or another one if that is taken.
     """
     page = Page(title)
     try:
@@ -254,35 +224,19 @@ def _reached_at(host: str) -> str:
 
 
 @contextmanager
-def announced(page: Page, address: Address | None = None) -> Iterator[None]:
-    """Print the address of a page, as a QR code too for another device; open it where this computer has a screen."""
-    from ftdrive.terminal.console import messages, print_address, qr_code
-
-    print_address("The page is shown until this command ends, at ", page.url)
-    if address is not None and not is_loopback(address[0]):
-        for row in qr_code(page.url):
-            messages.print(row)
-        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
-    elif sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
-        with _only_ours(page.url) as file:
-            webbrowser.open(file.as_uri())
-            yield
+def announced(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
+    """Print the address of a page, also for other devices if it is `shared`; else open it if there is a screen."""
+    shared = address is not None and not is_loopback(address[0])
+    print_page(page.url, shared=shared)
+    if shared or (sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
+        yield
         return
-    yield
-
-
-@contextmanager
-def _only_ours(url: str) -> Iterator[Path]:
-    """Yield a file that redirects to an address: as an argument of the browser, `ps` would show it to every user."""
-    folder = Path(mkdtemp(prefix="ftdrive-"))  # only its owner may enter it
-    file = folder / "page.html"
-    try:
-        file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(url)}">')
-        yield file
-    finally:
-        file.unlink(missing_ok=True)
-        with suppress(OSError):
-            folder.rmdir()
+    # As an argument of the browser, `ps` would show the address to every user. Only its owner may enter the folder.
+    with TemporaryDirectory(prefix="ftdrive-", ignore_cleanup_errors=True) as folder:
+        file = Path(folder, "page.html")
+        file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(page.url)}">')
+        webbrowser.open(file.as_uri())
+        yield
 
 
 @cache

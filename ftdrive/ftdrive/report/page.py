@@ -1,15 +1,11 @@
-"""One report as a page or as JSON."""
+"""The facts of a report as a self-contained page."""
 
-import json
 import re
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 from ftdrive import __version__
 from ftdrive.errors import ConfigError
-from ftdrive.report.document import Section, capital
-from ftdrive.report.figures import draw
-from ftdrive.report.sections import sections_of
+from ftdrive.report.sections import Facts, capital, sections_of
 from ftdrivers.installation import missing_extra
 
 if TYPE_CHECKING:
@@ -17,11 +13,14 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 
-def page(facts: Mapping[str, Any], sections: Sequence[Section]) -> str:
-    """Write the page. Raises `ConfigError` without the extra `report`."""
+def page(facts: Facts) -> str:
+    """Write the page of the facts from `ftdrive.report.facts.facts_of`. Raises `ConfigError` without jinja2."""
     environment = templates("ftdrive.report", "a report in HTML", "report", "--format json")
     from markupsafe import Markup
 
+    from ftdrive.report.figures import draw
+
+    sections = sections_of(facts)
     environment.filters["sentence"] = lambda text: with_code(capital(text))
     drawn = {one.name: Markup(draw(one.name, facts)) for section in sections for one in section.figures}
     template = environment.get_template("report.html.j2")
@@ -54,30 +53,3 @@ def with_code(text: str) -> "Markup":
     from markupsafe import Markup, escape
 
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))
-
-
-Format = Literal["html", "json"]
-
-
-def report(facts: Mapping[str, Any], form: Format = "html") -> str:
-    """Write the report of these facts.
-
-    Parameters
-    ----------
-    facts : mapping
-        From `ftdrive.report.facts.facts_of`.
-    form : {"html", "json"}
-
-    Returns
-    -------
-    str
-        A self-contained page, or the facts as one JSON object.
-
-    Raises
-    ------
-    ConfigError
-        A page is asked for without the extra `report`.
-    """
-    if form == "json":
-        return json.dumps(facts, allow_nan=False) + "\n"
-    return page(facts, sections_of(facts))
