@@ -26,12 +26,13 @@ if TYPE_CHECKING:
     from ftcalib.known import Known, Setup
     from ftcalib.result import CalibrationResult
     from ftdrive.library import open_arm, open_sensor, open_stream, plan_tour, read_recording, solve
-    from ftdrive.live.contact import Contact
-    from ftdrive.live.samples import Stages, WrenchFrame
-    from ftdrive.live.weighing import weigh
     from ftdrive.recording.files import write_recording
+    from ftdrive.runs.calibration import read_calibration
     from ftdrive.runs.run import Run
-    from ftdrive.runs.source import read_calibration, read_dataset
+    from ftdrive.runs.source import read_dataset
+    from ftdrive.stream.contact import Contact
+    from ftdrive.stream.samples import Stages, WrenchFrame
+    from ftdrive.stream.weighing import weigh
     from ftdrive.tables.table import TableOptions
 
 __version__ = "0.1.0"
@@ -71,12 +72,13 @@ _MODULES = {
     "ftcalib.known": ("Known", "Setup"),
     "ftcalib.result": ("CalibrationResult",),
     "ftdrive.library": ("open_arm", "open_sensor", "open_stream", "plan_tour", "read_recording", "solve"),
-    "ftdrive.live.contact": ("Contact",),
-    "ftdrive.live.samples": ("Stages", "WrenchFrame"),
-    "ftdrive.live.weighing": ("weigh",),
+    "ftdrive.stream.contact": ("Contact",),
+    "ftdrive.stream.samples": ("Stages", "WrenchFrame"),
+    "ftdrive.stream.weighing": ("weigh",),
     "ftdrive.recording.files": ("write_recording",),
     "ftdrive.runs.run": ("Run",),
-    "ftdrive.runs.source": ("read_calibration", "read_dataset"),
+    "ftdrive.runs.calibration": ("read_calibration",),
+    "ftdrive.runs.source": ("read_dataset",),
     "ftdrive.tables.table": ("TableOptions",),
 }
 

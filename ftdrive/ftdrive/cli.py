@@ -2,15 +2,13 @@
 
 import atexit
 import gc
-import importlib
 import logging
 import os
-import platform
 import signal
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from errno import ENOSPC
+from importlib import import_module
 from io import StringIO
 from types import FrameType
 from typing import Any
@@ -19,8 +17,9 @@ import click
 
 from ftcalib.errors import DataError, DeviceError, UsageError
 from ftdrive import __version__
-from ftdrive.errors import SupervisorGone, exit_code
-from ftdrive.terminal.text import COMMANDS, GLUE, WholeWords, echo, in_one_line
+from ftdrive.errors import SupervisorGone, exit_code, in_a_sentence
+from ftdrive.terminal.text import WholeWords, echo
+from ftdrive.words.text import COMMANDS, GLUE, in_one_line
 
 _EPILOG = f"""\
 Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device, 4 stream failed,
@@ -51,6 +50,15 @@ def _closed_pipe() -> Iterator[None]:
 
 
 class _LazyGroup(click.Group):
+    """A command whose commands are imported when they are called: `modules` has the module and the help line of each.
+
+    A mistyped command is answered with the name that is most like it.
+    """
+
+    def __init__(self, *args: Any, modules: Mapping[str, tuple[str, str]], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._modules = modules
+
     @_closed_pipe()
     def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
         return super().make_context(*args, **kwargs)
@@ -60,30 +68,40 @@ class _LazyGroup(click.Group):
         return super().invoke(ctx)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(COMMANDS)
+        return list(self._modules)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name in self.commands or cmd_name not in self._modules:
+            return self.commands.get(cmd_name)
+        module = import_module(f"ftdrive.commands.{self._modules[cmd_name][0]}")
+        command: click.Command = getattr(module, cmd_name.replace("-", "_"))
+        return command
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        if not (args[0].startswith("-") or ctx.resilient_parsing) and self.get_command(ctx, args[0]) is None:
+        typed = args[0]
+        if not (typed.startswith("-") or ctx.resilient_parsing or self.get_command(ctx, typed)):
             from ftdrive.mistakes import close_command
 
-            ctx.fail(f"No such command '{args[0]}'.{close_command(args[0])}")
+            ctx.fail(f"No such command '{typed}'.{close_command(typed, [*self._modules, *self.commands])}")
         return super().resolve_command(ctx, args)
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name == "help":
-            return _help
-        if cmd_name not in COMMANDS:
-            return None
-        # Imported only when the command is called: help is fast.
-        name = cmd_name.replace("-", "_")
-        command: click.Command = getattr(importlib.import_module(f"ftdrive.commands.{name}"), name)
-        return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+            formatter.write_dl([(name, line) for name, (_, line) in self._modules.items()])
+
+
+_MODULES = {name: (name.replace("-", "_"), line) for name, line in COMMANDS.items()}
+_FLEET = {
+    "add": ("fleet.cells", "Add the cells of CELLS.TOML to the store."),
+    "index": ("fleet.cells", "Add the runs in the folders RUNS to the store."),
+    "remove": ("fleet.cells", "Remove cells from the store."),
+    "serve": ("fleet.status", "Serve the state of all cells to Prometheus, and as a page."),
+    "solve": ("fleet.solve", "Solve runs again with this version, and compare."),
+    "status": ("fleet.status", "List all cells: what is due, and what drifts."),
+    "verify": ("fleet.verify", "Verify cells one after the other, with an operator at each."),
+}
 
 
 @click.command("help")
@@ -93,7 +111,7 @@ def _help(words: tuple[str, ...]) -> None:
     cli.main([*words, "--help"], prog_name="ftdrive", standalone_mode=False)
 
 
-@click.group(cls=_LazyGroup, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=_LazyGroup, modules=_MODULES, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("-v", "--verbose", count=True, help="Print details on stderr; -vv also prints debug messages.")
 @click.option(
     "-q", "--quiet", is_flag=True, help="Print only answers, errors and, before a question, what it is about."
@@ -112,6 +130,14 @@ def cli(verbose: int, quiet: bool) -> None:
         messages.quiet, messages.verbose = quiet, bool(verbose)
 
 
+cli.add_command(_help)
+
+
+@cli.group("fleet", cls=_LazyGroup, modules=_FLEET)
+def _fleet() -> None:
+    """Watch many cells: which are due, which sensor drifts, what is wrong in several of them."""
+
+
 class _MessageHandler(logging.Handler):
     """Prints log records on stderr, above a live screen if there is one."""
 
@@ -123,17 +149,6 @@ class _MessageHandler(logging.Handler):
                 echo(self.format(record), err=True)
                 return
             messages.print(self.format(record))
-
-
-def in_a_sentence(error: BaseException) -> str:
-    """Return the message of an error; for an error of the system also its file and what to check."""
-    if isinstance(error, ModuleNotFoundError):
-        return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
-    if isinstance(error, OSError) and error.errno == ENOSPC:
-        return f"{error.strerror}: make room where the output goes"
-    return str(error)
 
 
 def main() -> int:

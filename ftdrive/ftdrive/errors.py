@@ -1,6 +1,8 @@
 """Errors of the application itself, below those of `ftcalib.errors`, and the exit code of each error."""
 
+import platform
 import sys
+from errno import ENOSPC
 from pathlib import Path
 
 from ftcalib.errors import AcceptanceError, DataError, DeviceError, FtdriveError, TooFewSamples, UsageError
@@ -16,14 +18,7 @@ class BadPlan(DataError):
 
 
 class BadRecording(DataError):
-    """A file does not contain a recording that this version can read.
-
-    Parameters
-    ----------
-    problem : str
-    path : Path, optional
-        Of the file; it stands before the problem.
-    """
+    """A file does not contain a recording that this version can read; its path stands before the problem."""
 
     def __init__(self, problem: str, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
@@ -57,12 +52,7 @@ class Declined(FtdriveError):
 class SupervisorGone(FtdriveError):
     """The operator, or the program in their place, does not follow the session any more.
 
-    Parameters
-    ----------
-    why : str
-        What was closed.
-    effect : str
-        What happens therefore, and what to do.
+    `why` says what was closed, and `effect` what happens therefore and what to do.
     """
 
     def __init__(self, why: str, effect: str = "the session ends, the arm at rest; continue it with --resume") -> None:
@@ -89,3 +79,14 @@ def exit_code(error: BaseException) -> int | None:
     if isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names:
         return 2  # not on this system, as `termios` on Windows
     return next((code for kind, code in _EXIT_CODES if isinstance(error, kind)), None)
+
+
+def in_a_sentence(error: BaseException) -> str:
+    """Return the message of an error; for an error of the system also its file and what to check."""
+    if isinstance(error, ModuleNotFoundError):
+        return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+    if isinstance(error, OSError) and error.errno == ENOSPC:
+        return f"{error.strerror}: make room where the output goes"
+    return str(error)

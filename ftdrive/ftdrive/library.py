@@ -1,6 +1,8 @@
 """The functions of `import ftdrive` that join several rooms: solve, open devices and streams, plan a tour."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -8,24 +10,39 @@ import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Setup
 from ftcalib import solve as solve_dataset
+from ftcalib.after.weighing import drift_since
+from ftcalib.errors import FtdriveError
 from ftcalib.likelihood.session import Drift
+from ftcalib.loads.check import LoadCheck, check_load
+from ftcalib.loads.model import LoadRun
+from ftcalib.loads.solve import LoadSolution, solve_loads
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.result import Method
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, cell_of, settings
+from ftcalib.sensor_matrix import SensorMatrix
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, cell_of, read_recorded, recorded_cell, settings
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import EMULATED, Station, emulated_cell
 from ftdrive.errors import ConfigError
-from ftdrive.live.contact import Contact
-from ftdrive.live.processing import SENSOR_FRAME
-from ftdrive.live.samples import Stages, Tracking, WrenchFrame
-from ftdrive.live.stream import CompensatedStream
+from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
-from ftdrive.recording.files import is_recording
+from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.files import read_recording as read_ours
-from ftdrive.recording.foreign import moving_source, tables_of
+from ftdrive.recording.foreign import TablePair, is_recording, moving_source, tables_of
 from ftdrive.recording.recording import ROW, Recording, rows_of
-from ftdrive.runs.source import SolveOptions, as_source, read_calibration, read_dataset
+from ftdrive.recording.replay import is_run_folder
+from ftdrive.recording.solve import solve_recording
+from ftdrive.runs.calibration import difference, read_calibration, sensor_files, sensor_identity
+from ftdrive.runs.load import Load, mass_of
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import RecordedData, SolveOptions, as_source, read_dataset, read_source
+from ftdrive.session.rehearsal import NoOperator, short_calibration, station_of
+from ftdrive.stream.contact import Contact
+from ftdrive.stream.processing import SENSOR_FRAME
+from ftdrive.stream.samples import Stages, Tracking, WrenchFrame
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream, pump
+from ftdrive.stream.weighing import WEIGH_S, CannotWeigh, Scale
 from ftdrive.tables.table import TableOptions
 from ftdrivers.interfaces import ForceTorqueSensor, RobotArm
 
@@ -85,8 +102,6 @@ def solve(
         if moving is not None:
             if method != "ml":
                 raise ValueError(f"method {method} is for poses at rest: leave it out for a recording")
-            from ftdrive.recording.in_motion import solve_recording
-
             return solve_recording(moving, known=known, point_mass=False, up_in_base=setup.up_in_base)
         source = read_dataset(source, table=table)
     return solve_dataset(
@@ -149,9 +164,7 @@ def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableO
     """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
     if calibration is None:
         raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
-    from ftdrive.recording.table_pair import TablePair  # with the filters of a stream
-
-    tables = tables_of(source, SolveOptions(table=table))
+    tables = tables_of(source, table)
     if tables is None:
         raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
     pair = TablePair(*tables, calibration, "", None)
@@ -226,9 +239,10 @@ def open_arm(host: str, *, model: str | None = None, driver: str = "ur") -> Robo
 
 
 def open_stream(
-    config: str | Path | CellConfig | None = None,
+    config: str | Path | CellConfig | Station | None = None,
     calibration: str | Path | CalibrationResult | None = None,
     *,
+    name: str = "",
     tool: str | None = None,
     simulate: bool = False,
     sensor: ForceTorqueSensor | None = None,
@@ -238,21 +252,23 @@ def open_stream(
     on_contact: Callable[[Contact], object] | None = None,
     force: bool = False,
     track: Tracking = "off",
-) -> CompensatedStream:
+) -> Stream:
     """Return the stream of compensated samples of a cell, for use with `with`. The arm is only read.
 
     Parameters
     ----------
-    config : str, Path or CellConfig, optional
-        A configuration file instead of ./ftdrive.toml, or the cell itself.
+    config : str, Path, CellConfig or Station, optional
+        A configuration file instead of ./ftdrive.toml, or the cell itself; an emulated one is started by the stream.
     calibration : str, Path or CalibrationResult
         A calibration.json or its run folder.
+    name : str
+        Name of a `CalibrationResult` in recordings and on screens; a file has its path.
     tool : str
         Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
-        store and from the run folders in ./runs. `CompensatedStream.use_tool` switches to another one.
+        store and from the run folders in ./runs. `Stream.use_tool` switches to another one.
     simulate : bool
         An emulated cell instead of `config`: that of `calibration`, or the one that ./ftdrive.toml describes, which is
-        calibrated with six poses first, in about 10 s. `CompensatedStream.station` controls it.
+        calibrated with six poses first, in about 10 s. `Stream.station` controls it.
     sensor, arm : ForceTorqueSensor, RobotArm, optional
         Devices of your own, used in place of those in the configuration. With both no configuration is read.
     frame : WrenchFrame
@@ -261,9 +277,9 @@ def open_stream(
         What is done to the raw wrench.
     on_contact : callable
         Called with each `Contact` when it has lasted 40 to 60 ms, and again when it is over (`contact.over`), by the
-        thread that reads. `CompensatedStream.on_contact` may be set at any time.
+        thread that reads. `Stream.on_contact` may be set at any time.
     force : bool
-        Apply a calibration of another arm, sensor or mount, with a warning in `CompensatedStream.warnings`, or one that
+        Apply a calibration of another arm, sensor or mount, with a warning in `Stream.warnings`, or one that
         was edited by hand, with a mark in `StreamInfo.marks`.
     track : "off", "show" or "apply"
         Follow bias and held part while the arm works: `stream.status().tracked`. Only `apply` corrects the wrench.
@@ -287,23 +303,19 @@ def open_stream(
     if isinstance(calibration, str | Path):
         name, given = str(calibration), read_calibration(calibration, accept_edited=force)
     else:
-        name, given = "", calibration
+        given = calibration
     cell: CellConfig | Station
     chosen: CalibrationResult | str
     if simulate:
-        from ftdrive.session.rehearsal import NoOperator, short_calibration, station_of
-
         if any(one is not None for one in (config, tool, sensor, arm)):
             raise ConfigError("simulate=True opens an emulated cell: leave config, tool, sensor and arm out")
-        given = short_calibration(NoOperator()) if given is None else given
+        given = short_calibration(nullcontext(NoOperator())) if given is None else given
         cell, chosen = station_of(given), given
     else:
         chosen = _only_one(given, tool)
-        cell = _cell(config, sensor, arm)
-    stream = CompensatedStream(cell, chosen, name=name, frame=frame, stages=stages, force=force, devices=(sensor, arm))
-    stream.track = track
-    stream.on_contact = on_contact
-    return stream
+        cell = config if isinstance(config, Station) else _cell(config, sensor, arm)
+    source = CellSource(cell, chosen, name=name, force=force, devices=(sensor, arm))
+    return Stream(source, frame=frame, stages=stages, track=track, on_contact=on_contact)
 
 
 def _only_one(calibration: CalibrationResult | None, tool: str | None) -> CalibrationResult | str:
@@ -389,5 +401,117 @@ def plan_tour(
     return plan_for(cell, certifier_for(cell, cell.robot.model), q_rad, poses)
 
 
+def certifier_of(stream: Stream, replayed: Path | None, say: Callable[[str], object]) -> Certifier | None:
+    """Describe arm and tool of the cell of a stream, or of the run or recording that it replays.
+
+    None for a table of another program, and where the cell does not describe them; `say` takes why.
+    """
+    try:
+        if replayed is None:
+            cell = stream.cell
+        elif is_run_folder(replayed):
+            cell = recorded_cell(Run(replayed).header()["config"])
+        else:
+            cell = recorded_cell(read_recorded(RecordingReader(replayed).header.configuration))
+    except (FtdriveError, KeyError, TypeError):
+        return None
+    try:
+        return certifier_for(cell, stream.info.arm.model)
+    except ConfigError as error:
+        say(f" The page shows no arm: {error}")
+        return None
+
+
 def _rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, row)) for row in rows)
+
+
+# So much of the load as known must show, for the reading to be that of it.
+_SHOWS = 0.5
+
+
+def check_known_load(
+    stream: Stream, load: Load, poses: int, wait_s: float, *, replayed: bool
+) -> tuple[LoadCheck, int, float]:
+    """Average the load at rest until enough poses are joined, or until a recording ends, and compare.
+
+    A recording is tared by the last rest of the free tool before the load. Return also the number of poses, and how
+    many seconds before them the tool was tared.
+    """
+    scale, refusal, best, due_ns = Scale(stream), CannotWeigh("samples"), None, 0
+    end_s = stream.clock.now_s() + wait_s
+    for rows in pump(stream, until=None if replayed else lambda: stream.clock.now_s() > end_s, patience_s=0.0):
+        if not rows or rows.t_host_ns[-1] < due_ns:
+            continue
+        due_ns = rows.t_host_ns[-1] + round(1e9 * WEIGH_S / 5)
+        try:
+            weight = scale.weigh(more=best is not None)
+            if weight.mass_kg > _SHOWS * load.mass_kg:
+                best = (scale.poses, *stream.processor.monitor.reference())
+                if not replayed and weight.poses >= poses:
+                    break
+            elif not replayed:
+                refusal = CannotWeigh("samples")
+            elif best is None and stream.processor.monitor.reference()[1] > WEIGH_S:
+                scale.zero()
+        except CannotWeigh as error:
+            refusal = error
+    if best is None and refusal.code == "samples":
+        raise ConfigError(f"no load of about {load.mass_kg:g} kg hangs at rest: hang it, or check MASS (kg)")
+    if best is None:
+        raise refusal
+    measured, reference, tare_age_s = best
+    drift, p_m = drift_since(tare_age_s), stream.info.p_flange_sensor_m
+    found = check_load(stream.info.calibration, reference, load, measured, drift=drift, p_flange_sensor_m=p_m)
+    return found, len(measured[0]), tare_age_s
+
+
+def solve_load_runs(
+    paths: Sequence[Path], tool_mass: str | None, say: Callable[[str], object]
+) -> tuple[LoadSolution, SensorMatrix]:
+    """Fit the matrix of a sensor to runs, the tool alone and with loads; also return what was known of it before.
+
+    `tool_mass` is the mass as weighed, such as "1.300±0.002", else that of the cells. `say` takes what was known.
+    Raises `ConfigError` for runs of different sensors, and what `read_source` raises.
+    """
+    read = [_run_of(path) for path in paths]
+    identity, data = read[0][1:]
+    if other := next((one for _, one, _ in read if one != identity), None):
+        name, ours = next((name, value) for name, value in identity.items() if other[name] != value)
+        raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give those of one")
+    of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
+    weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
+    prior = _prior(data, identity, [path.name for path in paths], say)
+    solution = solve_loads(
+        [run for run, _, _ in read],
+        prior,
+        p_flange_sensor_m=data.p_flange_sensor_m,
+        g_m_s2=data.g_m_s2,
+        setup=data.setup,
+        tool_mass_kg=weighed,
+        provenance={
+            "serial": identity["serial"],
+            "sensor": identity,
+            "created_utc": datetime.now(UTC).isoformat(timespec="seconds"),
+        },
+    )
+    return solution, prior
+
+
+def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
+    """Read one run with its load, the identity of its sensor, and what is known of its cell."""
+    data = read_source(path, SolveOptions())
+    origin = data.provenance if "devices" in data.provenance else data.dataset.meta
+    return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), sensor_identity(origin), data
+
+
+def _prior(
+    data: RecordedData, identity: dict[str, Any], names: list[str], say: Callable[[str], object]
+) -> SensorMatrix:
+    """Return what is known of the sensor before these runs: by earlier loads, its data sheet, or as usual."""
+    for path in reversed(sensor_files()):
+        known = SensorMatrix.load(path)
+        if not difference(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:
+            say(f"Begins with {path.name} of {str(known.provenance.get('created_utc'))[:10]}.")
+            return known
+    return SensorMatrix.declared(data.setup)

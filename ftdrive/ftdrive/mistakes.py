@@ -11,7 +11,6 @@ from typing import Final, NamedTuple
 import click
 
 from ftcalib.files import open_file
-from ftdrive.terminal.text import COMMANDS
 
 
 class Kind(NamedTuple):
@@ -85,7 +84,7 @@ _ALIKE = 0.75
 
 def kind_of(path: Path) -> str | None:
     """Return the kind of a file or folder, by its first bytes and its ending; None for one that no command takes."""
-    from ftdrive.recording.files import is_bag, is_recording
+    from ftdrive.recording.foreign import is_bag, is_recording
     from ftdrive.runs.run import is_run
 
     with suppress(OSError):
@@ -192,9 +191,9 @@ def existing(group: click.Group, arguments: Sequence[str]) -> str:
     return ""
 
 
-def close_command(name: str) -> str:
+def close_command(name: str, names: Sequence[str]) -> str:
     """Return a question that names the command most like a mistyped one; empty if there is none."""
-    return _question(get_close_matches(name, [*COMMANDS, "help"], 1))
+    return _question(get_close_matches(name, names, 1))
 
 
 def _question(names: Iterable[str]) -> str:

@@ -7,21 +7,13 @@ from pathlib import Path
 import click
 
 from ftcalib.files import require_new
-from ftdrive.commands.common import (
-    EMULATED_SENSOR,
-    FILE,
-    FOLDER,
-    JSON,
-    NewFile,
-    check_simulate,
-    rehearsed_run,
-    simulate,
-    write_json,
-)
+from ftdrive.commands.options import EMULATED_SENSOR, FILE, FOLDER, JSON, NewFile, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.mistakes import kind_of
 from ftdrive.runs.bundle import write_bundle
+from ftdrive.session.rehearsal import rehearsed_run
 from ftdrive.terminal.console import beside, hanging
+from ftdrive.terminal.screen import open_operator
 
 
 @click.command()
@@ -56,7 +48,7 @@ def bundle(
     for file in transcripts:
         if kind_of(file) != "transcript":
             raise ConfigError(f"--transcript: {file} is not a file of `ftdrive transcript record`")
-    with nullcontext(run) if run is not None else rehearsed_run(sensor) as folder:
+    with nullcontext(run) if run is not None else rehearsed_run(open_operator(), sensor) as folder:
         path = output or Path(f"{folder.resolve().name}.zip")
         try:
             require_new(path)

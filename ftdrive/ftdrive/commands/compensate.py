@@ -2,47 +2,41 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from ftcalib.errors import BadDataset
 from ftcalib.rounding import with_sigma
-from ftdrive.commands.common import BAG_TOPICS, FILE, FORCE, FRAME, JSON, NewFile, numbers, read_frame, write_json
-from ftdrive.commands.tables import TABLE
+from ftdrive.cell.units import numbers
+from ftdrive.commands.options import BAG_TOPICS, FILE, FORCE, FRAME, JSON, PATH, TABLE, NewFile, write_json
 from ftdrive.errors import ConfigError
+from ftdrive.recording.compensation import compensate_recording, source_to_compensate
+from ftdrive.recording.files import format_of
+from ftdrive.recording.foreign import is_bag
+from ftdrive.runs.calibration import MARKS, read_calibration
+from ftdrive.runs.source import SolveOptions
+from ftdrive.stream.samples import WrenchFrame
+from ftdrive.tables.table import TableOptions
+from ftdrive.terminal.console import beside, messages, working
 from ftdrive.terminal.text import echo
-
-if TYPE_CHECKING:
-    from ftcalib import CalibrationResult
-    from ftdrive.live.samples import Axes
-    from ftdrive.recording.recording import Source
-    from ftdrive.runs.source import SolveOptions
-    from ftdrive.tables.table import TableOptions
-
-_EXISTING = click.Path(exists=True, path_type=Path)
-CALIBRATION = click.option(
-    "--calibration", metavar="PATH", type=_EXISTING, help="A calibration.json or its run folder."
-)
-BIAS = click.option(
-    "--bias",
-    type=click.Choice(["keep", "estimate"]),
-    default="keep",
-    show_default=True,
-    help="Keep the calibration's bias, or estimate it from the recording: for sensors that are zeroed at start.",
-)
 
 
 @click.command()
-@click.argument("path", metavar="[RECORDING]", required=False, type=_EXISTING)
-@CALIBRATION
+@click.argument("path", metavar="[RECORDING]", required=False, type=PATH)
+@click.option("--calibration", metavar="PATH", type=PATH, help="A calibration.json or its run folder.")
 @click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: table of the wrench.")
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: table of the poses of the flange.")
 @BAG_TOPICS
 @TABLE
 @click.option("--delay", metavar="S|auto", help="Of another program: delay of the wrench, s.  [default: auto]")
 @FORCE
-@BIAS
+@click.option(
+    "--bias",
+    type=click.Choice(["keep", "estimate"]),
+    default="keep",
+    show_default=True,
+    help="Keep the calibration's bias, or estimate it from the recording: for sensors that are zeroed at start.",
+)
 @FRAME
 @click.option("-o", "--output", type=NewFile(), help="Save the result as a new .mcap, .csv or .parquet.")
 @JSON
@@ -53,12 +47,11 @@ def compensate(
     orientation_file: Path | None,
     wrench_topic: str | None,
     pose_topic: str | None,
-    table: "TableOptions | None",
+    table: TableOptions | None,
     delay: str | None,
     force: bool,
     bias: str,
-    axes: "Axes",
-    about: str,
+    frame: WrenchFrame,
     output: Path | None,
     as_json: bool,
 ) -> None:
@@ -68,11 +61,6 @@ def compensate(
     table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), each at its own rate, or
     a bag of ROS 1 or ROS 2. --columns and the options beside it say what a table does not.
     """
-    from ftdrive.recording.compensation import compensate_recording
-    from ftdrive.recording.files import format_of, is_bag
-    from ftdrive.runs.source import SolveOptions, read_calibration
-    from ftdrive.terminal.console import beside, messages, working
-
     if output is not None:
         format_of(output)
     if path is not None and (wrench is not None or orientation_file is not None):
@@ -81,14 +69,15 @@ def compensate(
         raise ConfigError(_missing(wrench, orientation_file, calibration))
     if (wrench_topic or pose_topic) and not (path and is_bag(path)):
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
-    frame = read_frame(axes, about)
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
     delay_s = delay if delay is None or delay == "auto" else numbers("--delay", delay, ",", [1])[0]
     options = SolveOptions(pair=pair, topics=(wrench_topic, pose_topic), table=table)
     what = path or wrench or Path()
     with working("Reading") as show:
-        source, found = _open(what, options, loaded, str(calibration), delay_s, everything=output is not None)
+        source, found = source_to_compensate(
+            what, options, loaded, str(calibration), delay_s, everything=output is not None, say=messages.print
+        )
         found_numbers, failure = compensate_recording(
             source, frame, output, estimate_bias=bias == "estimate", show=show
         )
@@ -124,43 +113,7 @@ def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Pa
     return f"missing: {missing}. Type\nftdrive compensate {line}"
 
 
-def _open(
-    path: Path,
-    options: "SolveOptions",
-    calibration: "CalibrationResult | None",
-    name: str,
-    delay_s: float | str | None,
-    *,
-    everything: bool,
-) -> tuple["Source", dict[str, float] | None]:
-    """Return the recording with the calibration, and the delay of one of another program with one sigma."""
-    from ftdrive.recording.compensation import NEEDED, read_with_calibration
-    from ftdrive.recording.foreign import table_words, tables_of
-    from ftdrive.recording.recording import ROW
-    from ftdrive.recording.table_pair import TablePair
-    from ftdrive.terminal.console import messages
-
-    try:
-        tables = tables_of(path, options)
-    except (BadDataset, ConfigError) as error:
-        if calibration is None:
-            raise type(error)(f"{error}. Give --calibration PATH too") from error
-        raise
-    if tables is None:
-        if delay_s is not None or options.table is not None:
-            raise ConfigError("--delay and --columns describe another program's recording: leave them out")
-        return read_with_calibration(path, calibration, name, ROW.names or () if everything else NEEDED), None
-    if calibration is None:
-        raise ConfigError("the recording has no calibration: give --calibration PATH")
-    if words := table_words(tables):
-        messages.print(f" {words}")
-    pair = TablePair(*tables, calibration, name, delay_s if isinstance(delay_s, float) else None)
-    return pair, {"value": pair.delay_s, "sigma": pair.delay_sigma_s}
-
-
 def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
-    from ftdrive.runs.verification import MARKS
-
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:

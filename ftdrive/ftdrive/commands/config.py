@@ -8,7 +8,9 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, check_simulate, simulate, write_json
+from ftdrive.cell.config import RULES, WIDTH, document, settings, without_password
+from ftdrive.cell.emulated import Station
+from ftdrive.commands.options import EMULATED_SENSOR, FILE, JSON, check_simulate, simulate, write_json
 from ftdrive.terminal.text import Group, echo
 
 
@@ -29,12 +31,8 @@ def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as
     An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the
     default.
     """
-    from ftdrive.cell.config import RULES, WIDTH, document, settings, without_password
-
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:
-        from ftdrive.cell.emulated import Station
-
         with Station.of(None, sensor) as station:
             found = settings(cell=station.cell)
     else:

@@ -4,12 +4,16 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.common import JSON, NewFile, write_json
+from ftdrive.commands.options import JSON, PATH, NewFile, write_json
 from ftdrive.errors import BadRecording, ConfigError
+from ftdrive.recording.files import RecordingReader, format_of
+from ftdrive.recording.foreign import is_recording
+from ftdrive.recording.recorder import converted
+from ftdrive.terminal.console import beside, messages, working
 
 
 @click.command()
-@click.argument("source", metavar="IN", required=False, type=click.Path(exists=True, path_type=Path))
+@click.argument("source", metavar="IN", required=False, type=PATH)
 @click.argument("target", metavar="OUT", required=False, type=NewFile())
 @click.option("-o", "--output", type=NewFile(), help="The same as OUT.")
 @JSON
@@ -18,10 +22,6 @@ def convert(source: Path | None, target: Path | None, output: Path | None, as_js
 
     IN may also be the .partial of a recording that was interrupted; OUT is complete then.
     """
-    from ftdrive.recording.files import RecordingReader, format_of, is_recording
-    from ftdrive.recording.recorder import converted
-    from ftdrive.terminal.console import beside, messages, working
-
     if source is None or (target is None) is (output is None):
         raise ConfigError(f"give one recording and one new file. Type\nftdrive convert {source or 'IN'} -o NEW.csv")
     target = target or output or Path()

@@ -9,8 +9,11 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from ftcalib.errors import UsageError
+from ftdrive.cell.config import clock_in_force
+from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
-from ftdrive.commands.common import JSON, check_simulate, simulate, write_json
+from ftdrive.checks.discovery import ask
+from ftdrive.commands.options import JSON, check_simulate, simulate, write_json
 from ftdrive.terminal.console import answer, hanging
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
@@ -47,8 +50,6 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
         }
     )
     if places:
-        from ftdrive.cell.config import clock_in_force
-
         clock = clock_in_force()
         found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
     if as_json:
@@ -74,8 +75,6 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
 
 def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
     """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
-    from ftdrive.checks.discovery import ask
-
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
         answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
@@ -86,8 +85,6 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
 
 
 def _emulated(failures: list[Exception]) -> dict[str, Any]:
-    from ftdrive.cell.emulated import Station
-
     with Station("both") as station:
         serial, can = station.endpoints["sensors"]["serial"], station.endpoints["sensors"]["can"]
         places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")

@@ -1,19 +1,22 @@
 """`ftdrive diff`: the difference of two calibrations, in sigmas."""
 
-from dataclasses import dataclass
+from dataclasses import asdict
 from math import degrees, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import click
 
+from ftcalib import CalibrationResult
+from ftcalib.after.series import ChiSquare, Difference, Estimated, difference
+from ftcalib.model import PARAMETER_NAMES
 from ftcalib.rounding import to_place_of
-from ftdrive.commands.common import JSON, store_url, write_json
+from ftdrive.commands.options import JSON, write_json
 from ftdrive.errors import ConfigError
+from ftdrive.runs.calibration import EMULATED, marks_of, read_calibration
+from ftdrive.store import open_store
 from ftdrive.terminal.text import echo
-
-if TYPE_CHECKING:
-    from ftcalib.after.series import ChiSquare, Difference, Estimated
+from ftdrive.words.result import sensor_in_words
 
 _SIGNIFICANT = 0.01
 _ROWS = (
@@ -25,9 +28,8 @@ _ROWS = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Side:
-    calibrated: "Estimated"
+class _Side(NamedTuple):
+    calibrated: Estimated
     id: str
     path: str
     created_utc: str | None
@@ -35,11 +37,6 @@ class _Side:
     mass_sigma_kg: float
     # Whether it was made in an emulated cell.
     emulated: bool
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON, without the calibration itself."""
-        names = ("id", "path", "created_utc", "mass_kg", "mass_sigma_kg", "emulated")
-        return {name: getattr(self, name) for name in names}
 
 
 @click.command()
@@ -52,19 +49,25 @@ def diff(first: str, second: str, as_json: bool) -> None:
     The differences B minus A are given in sigmas of both together, and tested jointly with both covariances. A rotation
     is compared as one rotation about the flange axes. The exit code is 0 whatever the difference is.
     """
-    from ftcalib.after.series import difference
-
     a, b = _side(first), _side(second)
     found, sensors = difference(a.calibrated, b.calibrated), _sensors(a, b)
-    mass_sigma_kg = (a.mass_sigma_kg**2 + b.mass_sigma_kg**2) ** 0.5
+    mass_change_kg, sigma_kg = b.mass_kg - a.mass_kg, (a.mass_sigma_kg**2 + b.mass_sigma_kg**2) ** 0.5
     if as_json:
+        sides = {"a": a._asdict(), "b": b._asdict()}
+        for one in sides.values():
+            del one["calibrated"]
+        values = zip(
+            PARAMETER_NAMES, found.change.tolist(), found.sigma.tolist(), found.in_sigmas.tolist(), strict=True
+        )
         write_json(
             {
                 "schema_version": 1,
-                "a": a.to_dict(),
-                "b": b.to_dict(),
-                "mass_kg": {"change": b.mass_kg - a.mass_kg, "sigma": mass_sigma_kg},
-                "parameters": [_parameter(found, i) for i in range(15)],
+                **sides,
+                "mass_kg": {"change": mass_change_kg, "sigma": sigma_kg},
+                "parameters": [
+                    {"name": name, "change": change, "sigma": sigma, "in_sigmas": ratio if isfinite(ratio) else None}
+                    for name, change, sigma, ratio in values
+                ],
                 "groups": {name: _as_json(test) for name, test in found.groups.items()},
                 "joint": _as_json(found.joint),
                 "significant": found.joint.p_value < _SIGNIFICANT,
@@ -78,7 +81,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
     if sensors is not None:
         echo(f"One contact reads differently: errors of the sensor are {sensors[0]} in A, {sensors[1]} in B.")
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
-    echo(_line("mass, kg", b.mass_kg - a.mass_kg, mass_sigma_kg))
+    echo(_line("mass, kg", mass_change_kg, sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
@@ -90,21 +93,16 @@ def diff(first: str, second: str, as_json: bool) -> None:
 
 def _side(text: str) -> _Side:
     """Find a calibration by path or id; raises `ConfigError`."""
-    from ftdrive.runs.source import read_calibration
-    from ftdrive.runs.verification import EMULATED, marks_of
-    from ftdrive.store.records import mass_sigma_kg
-    from ftdrive.store.store import Store
-
     if (path := Path(text)).exists():
         result = read_calibration(path)
-        sigma_kg = mass_sigma_kg(result.parameters, result.covariance, result.g_m_s2)
+        sigma_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
         created = result.provenance.get("created_utc")
         emulated = EMULATED in marks_of(result)
         made = created if isinstance(created, str) else None
         return _Side(result, result.id, text, made, result.mass_kg, sigma_kg, emulated)
     if len(text) < 4 or not set(text) <= set("0123456789abcdef"):
         raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or 4 digits or more of an id")
-    store = Store(store_url())
+    store = open_store()
     found = store.find(text)
     if not found:
         raise ConfigError(f"the store {store.name} has no result {text}…: `ftdrive history` lists them")
@@ -117,9 +115,6 @@ def _side(text: str) -> _Side:
 
 def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
     """Say on what the errors of the sensor under contact rest in A and B; None if that is the same, or not known."""
-    from ftcalib import CalibrationResult
-    from ftdrive.terminal.report import sensor_in_words
-
     first, second = a.calibrated, b.calibrated
     # A result of the store has no sensor.
     if not (isinstance(first, CalibrationResult) and isinstance(second, CalibrationResult)):
@@ -136,7 +131,7 @@ def _line(label: str, change: float, sigma: float) -> str:
     return f"{label:22}{to_place_of(change, sigma, '+'):>12}{spread:>12}{ratio}"
 
 
-def _describe_difference(found: "Difference", sensors: tuple[str, str] | None) -> str:
+def _describe_difference(found: Difference, sensors: tuple[str, str] | None) -> str:
     joint = found.joint
     if joint.dof == 0:
         but = "" if sensors is None else f", the errors of the sensor are not: {sensors[0]} in A, {sensors[1]} in B"
@@ -148,18 +143,5 @@ def _describe_difference(found: "Difference", sensors: tuple[str, str] | None) -
     return f"They differ significantly ({test}): {', '.join(changed) or 'several parameters together'}."
 
 
-def _parameter(found: "Difference", i: int) -> dict[str, Any]:
-    from ftcalib.model import PARAMETER_NAMES
-
-    ratio = float(found.in_sigmas[i])
-    return {
-        "name": PARAMETER_NAMES[i],
-        "change": float(found.change[i]),
-        "sigma": float(found.sigma[i]),
-        "in_sigmas": ratio if isfinite(ratio) else None,
-    }
-
-
-def _as_json(test: "ChiSquare") -> dict[str, Any]:
-    chi2 = test.chi2 if isfinite(test.chi2) else None
-    return {"chi2": chi2, "dof": test.dof, "p_value": test.p_value}
+def _as_json(test: ChiSquare) -> dict[str, Any]:
+    return asdict(test) | ({} if isfinite(test.chi2) else {"chi2": None})

@@ -8,13 +8,24 @@ from typing import Any
 
 import click
 
-from ftcalib.rounding import counted, with_sigma
-from ftdrive.commands.common import FOLDER, JSON, STORE, open_store, write_json
+from ftdrive.commands.options import FOLDER, JSON, STORE, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.verification import VerificationRecord
+from ftdrive.store import open_store
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, StoredWeighings, read_records, record_paths
-from ftdrive.terminal.text import GLUE, echo, print_table
+from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.text import echo, print_table
+from ftdrive.words.history import DAY_TITLES, day_row, result_table
+
+# Fewer records have no three pairs of runs, and numpy takes as long as all else of a short list.
+_FEWEST_RUNS = 4
+_HOUR = "bias, {sensor_serial}: moves by {force_N:.2g} N, {torque_Nm:.2g} N·m an axis in an hour (1 sigma)"
+_MOUNTED = ("sensor_serial", "arm_serial", "mount")
+# Most days of weighings that are listed.
+_MOST_DAYS = 20
+# An earlier weighing is not the last one of a list.
+_RECENT = timedelta(days=90)
 
 
 @click.command()
@@ -67,15 +78,19 @@ def history(
     _print_left_out(left_out)
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
-    warmth = []
-    if any(one.temperature_C is not None for one in results):
-        from ftdrive.store.trends import temperatures
+    warmth, moved = [], list[dict[str, Any]]()
+    if len(results) + len(checks) >= _FEWEST_RUNS or any(one.temperature_C is not None for one in results):
+        from ftdrive.store.trends import hour_changes, temperatures
 
         warmth = temperatures(results, checks)
-    moved = _hour_changes(results, checks)
+        mounted = (
+            dict(zip(_MOUNTED, key, strict=True)) | {"force_N": float(change[0]), "torque_Nm": float(change[3])}
+            for key, change in hour_changes(results, checks).items()
+        )
+        moved = [*mounted]
     last = {check.calibration_id: check for check in checks}
     if as_json:
-        rows = [_as_json(one, last.get(one.id), now) for one in results]
+        rows = [one.to_dict(age_days(one.created_utc, now), last.get(one.id)) for one in results]
         about = {
             "trends": [one.to_dict() for one in found],
             "temperature": [one.to_dict() for one in warmth],
@@ -86,65 +101,24 @@ def history(
         write_json({"schema_version": 1, "store": name, "results": rows, **about})
         return
     if not results:
-        _say("No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder.")
+        messages.print(
+            "No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder."
+        )
         return
-    _print_table([_row(one, last.get(one.id), now) for one in results])
+    titles, shown = result_table(results, last, now)
+    print_table(titles, shown, folding={"arm", "tool", "verified", "run", "parent"})
     trend_lines = (f"trend: {drift}" for drift in found)
     warmth_lines = (line for one in warmth for line in one.lines())
-    weighing_lines = (f"last weighing: {_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
-    hour_lines = (
-        "bias, {sensor_serial}: moves by {force_N:.2g} N, {torque_Nm:.2g} N·m an axis in an hour (1 sigma)".format(
-            **one
-        )
-        for one in moved
-    )
-    for line in (*trend_lines, *warmth_lines, *hour_lines, *weighing_lines):
+    weighing_lines = (f"last weighing: {one.in_words}" for one in weighed if one.mass_kg is not None)
+    for line in (*trend_lines, *warmth_lines, *map(_HOUR.format_map, moved), *weighing_lines):
         echo(line)
-    if advice:
-        from ftdrive.terminal.console import answer, hanging
-
-        for words in advice:
-            answer.print(hanging(" ! ", words, answer), style="yellow")
-
-
-def _hour_changes(results: Sequence[StoredResult], checks: Sequence[VerificationRecord]) -> list[dict[str, Any]]:
-    """Give how far the bias of each sensor moves in an hour, one standard deviation of an axis, where runs show it."""
-    if len(results) + len(checks) < _FEWEST_RUNS:
-        return []
-    from ftdrive.store.trends import hour_changes
-
-    return [
-        {
-            "sensor_serial": serial,
-            "arm_serial": arm,
-            "mount": mount,
-            "force_N": float(change[0]),
-            "torque_Nm": float(change[3]),
-        }
-        for (serial, arm, mount), change in hour_changes(results, checks).items()
-    ]
+    for words in advice:
+        answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
 def _print_left_out(left_out: Sequence[str]) -> None:
-    if left_out:
-        from ftdrive.terminal.console import hanging, messages
-
-        for words in left_out:
-            messages.print(hanging(" left out: ", words))
-
-
-def _say(words: str) -> None:
-    from ftdrive.terminal.console import messages
-
-    messages.print(words)
-
-
-# Fewer records have no three pairs of runs, and numpy is not needed.
-_FEWEST_RUNS = 4
-# Most days of weighings that are listed.
-_MOST_DAYS = 20
-# An earlier weighing is not the last one of a list.
-_RECENT = timedelta(days=90)
+    for words in left_out:
+        messages.print(hanging(" left out: ", words))
 
 
 def _show_weighings(days: Sequence[StoredWeighings], name: str, left_out: Sequence[str], as_json: bool) -> None:
@@ -152,89 +126,6 @@ def _show_weighings(days: Sequence[StoredWeighings], name: str, left_out: Sequen
     if as_json:
         write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})
     elif not days:
-        _say("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
+        messages.print("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
     else:
-        print_table(_DAY_TITLES, [_day_row(one) for one in days], folding={"arm", "tool", "refused"})
-
-
-_DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
-
-
-def _day_row(one: StoredWeighings) -> tuple[str, ...]:
-    return (
-        one.day,
-        one.arm_serial or one.robot_host or "-",
-        one.tool_in_words,
-        f"{one.weighings}",
-        ", ".join(f"{number} {code}" for code, number in one.refusals.items() if number) or "-",
-        "-" if one.last_utc is None else one.last_utc[11:19],
-        _mass_in_words(one),
-        Path(one.path).name,
-    )
-
-
-def _weighing_in_words(one: StoredWeighings) -> str:
-    refused = sum(one.refusals.values())
-    counts = f"{counted(one.weighings, 'part')}, {refused} refused on this day"
-    time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
-    return f"{one.tool_in_words}, {time}: {_mass_in_words(one)}; {counts}"
-
-
-def _mass_in_words(one: StoredWeighings) -> str:
-    if one.mass_kg is None or one.mass_sigma_kg is None:
-        return "-"
-    return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"
-
-
-_TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
-# Shown if a result has one.
-_OPTIONAL = {"°C", "parent"}
-
-
-def _row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> tuple[str, ...]:
-    verified = "-"
-    if check is not None:
-        since = age_days(check.created_utc, now)
-        age = "" if since is None else f" {since:.0f}{GLUE}d"
-        verified = ("passed" if check.passed else "FAILED") + age
-        verified += f", {check.change}" if check.change else ""
-    return (
-        one.id[:6],
-        "-" if one.created_utc is None else one.created_utc[:10],
-        one.arm_serial or one.arm_model or "-",
-        one.tool_in_words,
-        one.verdict,
-        f"{one.mass_kg:.4f}",
-        verified,
-        " ".join(f"{value:.2f}" for value in one.numbers["force_bias_N"]),
-        one.run,
-        "" if one.temperature_C is None else f"{one.temperature_C:.0f}",
-        f"{one.parent[:6]} ({one.update})" if one.parent else "",
-    )
-
-
-def _print_table(rows: Sequence[Sequence[str]]) -> None:
-    shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
-    print_table(
-        [_TITLES[n] for n in shown],
-        [[row[n] for n in shown] for row in rows],
-        folding={"arm", "tool", "verified", "run", "parent"},
-    )
-
-
-def _as_json(one: StoredResult, check: VerificationRecord | None, now: datetime) -> dict[str, Any]:
-    import numpy as np
-
-    from ftcalib.model import BIASES
-
-    kept = {name: value for name, value in asdict(one).items() if name != "numbers"}
-    bias = {name: one.numbers[name] for name in ("force_bias_N", "torque_bias_Nm", "p_sensor_com_m")}
-    sigma = np.sqrt(np.diag(one.covariance))[BIASES].tolist()
-    return {
-        **kept,
-        "age_days": age_days(one.created_utc, now),
-        "mass_sigma_kg": one.mass_sigma_kg,
-        **bias,
-        "bias_sigma": {"force_N": sigma[:3], "torque_Nm": sigma[3:]},
-        "last_verification": None if check is None else check.to_store_dict(),
-    }
+        print_table(DAY_TITLES, [day_row(one) for one in days], folding={"arm", "tool", "refused"})

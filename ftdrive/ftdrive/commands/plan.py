@@ -1,40 +1,55 @@
 """`ftdrive plan`: a tour proven clear, without an arm."""
 
-from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
+from math import inf, isfinite
 from pathlib import Path
 from shlex import quote
 from threading import Event
-from typing import TYPE_CHECKING
+from typing import Any
 
 import click
+import numpy as np
 
-from ftdrive.commands.common import (
+from ftdrive.cell.config import cell_of, settings
+from ftdrive.cell.emulated import Station
+from ftdrive.cell.units import numbers, rows
+from ftdrive.commands.options import (
     CONFIG,
     JSON,
+    PLAN_FILES,
     SETS,
-    NewFile,
+    Headed,
     ViewOptions,
     check_simulate,
-    numbers,
-    require_viz,
-    rows,
     simulate,
     view_options,
     write_json,
 )
 from ftdrive.errors import ConfigError
+from ftdrive.planning.drawing import draw
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
+from ftdrive.terminal.console import answer, messages, working
+from ftdrive.view.plan_page import PlanPage
 
-if TYPE_CHECKING:
-    from ftdrive.planning.geometry.certify import Certifier
-    from ftdrive.planning.plan import Plan
-    from ftdrive.view.page import Page
+HEADINGS = {
+    "The cell": "--config --model --tool --mass --mounting --plane --box --simulate",
+    "The tour": "--quick --minimal --set --cone --free-box --posture --tip-speed-limit",
+    "Output": "--output --png --all --view --view-address --json --help",
+}
 
-USUAL_POSTURE_DEG = (45, -100, 60)
+
+def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | None:
+    """Return mm/s; infinity for none."""
+    if text is None or text.lower() == "none":
+        return None if text is None else inf
+    with suppress(ValueError):
+        if isfinite(speed := float(text)):
+            return speed
+    raise ConfigError(f"--tip-speed-limit is '{text}': give mm/s, such as 250, or none")
 
 
-@click.command()
+@click.command(cls=Headed, headings=HEADINGS)
 @CONFIG
 @click.option("--model", help="Model of the arm: ur3e, ur5e, ur7e, ur10e, ur12e, ur16e, ur20 or ur30.")
 @click.option(
@@ -55,7 +70,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 )
 @click.option(
     "--posture",
-    default=",".join(map(str, USUAL_POSTURE_DEG)),
+    default=",".join(f"{angle:.0f}" for angle in np.degrees(USUAL_POSTURE_RAD[:3])),
     show_default=True,
     metavar="Q1,Q2,Q3",
     help="Angles of the first three joints, degrees.",
@@ -72,6 +87,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
 @click.option(
     "--tip-speed-limit",
     metavar="MM/S|none",
+    callback=_tip_speed,
     help="Speed of the tool's farthest points.  [default: [robot] tip_speed_mm_s, else 250]",
 )
 @click.option(
@@ -81,8 +97,7 @@ USUAL_POSTURE_DEG = (45, -100, 60)
     type=float,
     help="Mass of the tool, for the prediction.  [default: [tool] mass_kg, else 1]",
 )
-@click.option("--output", type=NewFile(), help="Save the plan as a new JSON file.")
-@click.option("--png", type=NewFile(), help="Save stick figures (needs ftdrive[viz]).")
+@PLAN_FILES
 @click.option("--all", "every", is_flag=True, help="Print each pose and move too.")
 @view_options
 @simulate("Use arm and tool of an emulated cell instead of the configuration.")
@@ -100,7 +115,7 @@ def plan(
     mounting: str | None,
     planes: tuple[str, ...],
     boxes: tuple[str, ...],
-    tip_speed_limit: str | None,
+    tip_speed_limit: float | None,
     mass_kg: float | None,
     output: Path | None,
     png: Path | None,
@@ -114,20 +129,12 @@ def plan(
     Arm, tool and surroundings come from the configuration; options replace its values. Cables, fixtures and people are
     not in the model: look at the space that must be clear before anything moves.
     """
-    import numpy as np
-
-    from ftdrive.cell.config import cell_of, settings
-    from ftdrive.cell.emulated import Station
-    from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
-    from ftdrive.terminal.console import answer, messages, working
-
     for one, other in ((quick, minimal), (cone_deg, box_mm)):
         if one and other:
             raise ConfigError("give --quick or --minimal, and --cone or --free-box, not both")
     if sets is not None and (quick or minimal or cone_deg or box_mm):
         raise ConfigError("--set names the poses: leave out --quick, --minimal, --cone and --free-box")
     check_simulate(simulate, real={"--config": config})
-    require_viz(png)
     page = click.get_current_context().with_resource(view.page("ftdrive plan"))
     emulated = None
     if simulate:
@@ -137,7 +144,7 @@ def plan(
         config,
         {
             "robot.model": ("--model", model),
-            "robot.tip_speed_mm_s": ("--tip-speed-limit", _tip_speed(tip_speed_limit)),
+            "robot.tip_speed_mm_s": ("--tip-speed-limit", None if tip_speed_limit == inf else tip_speed_limit),
             "tool.cylinders_mm": ("--tool", rows("--tool", tool, (3, 5))),
             "tool.mass_kg": ("--mass", mass_kg),
             "workcell.mounting": ("--mounting", mounting),
@@ -158,25 +165,14 @@ def plan(
             f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only."
         )
     certifier = certifier_for(cell, cell.robot.model)
-    messages.print(
-        f"Made for a nominal {certifier.arm.name}, with wider margins: calibrate proves it again with the arm's own "
-        "kinematics."
-    )
+    again = "calibrate proves it again with the arm's own kinematics"
+    messages.print(f"Made for a nominal {certifier.arm.name}, with wider margins: {again}.")
     q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     with working("Planning"):
-        made = plan_for(
-            cell,
-            certifier,
-            q_rad,
-            6 if minimal else 12 if quick else 24,
-            sets=sets,
-            cone_deg=cone_deg,
-            box_mm=box_mm,
-            tip_unlimited=_unlimited(tip_speed_limit),
-        )
+        poses, unlimited = 6 if minimal else 12 if quick else 24, tip_speed_limit == inf
+        chosen: dict[str, Any] = {"sets": sets, "cone_deg": cone_deg, "box_mm": box_mm, "tip_unlimited": unlimited}
+        made = plan_for(cell, certifier, q_rad, poses, **chosen)
     if png is not None:
-        from ftdrive.planning.drawing import draw
-
         with working("Drawing"):
             draw(made, certifier, png)
     if output is not None:
@@ -188,34 +184,10 @@ def plan(
     else:
         answer.print(*filter(None, (made.in_words(table=every), made.stop_in_words(cell.robot))), *saved, sep="\n")
         tour = {"--quick": quick, "--minimal": minimal, f"--set {sets}": sets}
-        messages.print_next(_next_command(tour, output, simulate=simulate))
+        same = {"--simulate": simulate, **(tour if output is None else {f"--plan {quote(str(output))}": True})}
+        command = " ".join(["ftdrive calibrate", *(option for option, given in same.items() if given)])
+        messages.print_next(f"{command}   (asks before anything moves)")
     if page is not None:
-        _show(page, made, certifier)
-
-
-def _next_command(tour: Mapping[str, object], output: Path | None, *, simulate: bool) -> str:
-    same = {"--simulate": simulate, **(tour if output is None else {f"--plan {quote(str(output))}": True})}
-    command = " ".join(["ftdrive calibrate", *(option for option, given in same.items() if given)])
-    return f"{command}   (asks before anything moves)"
-
-
-def _show(page: "Page", plan: "Plan", certifier: "Certifier") -> None:
-    from ftdrive.terminal.console import messages
-    from ftdrive.view.plan_page import PlanPage
-
-    messages.print("Ctrl-C ends.")
-    with suppress(KeyboardInterrupt):
-        PlanPage(page, plan, certifier).play(Event())
-
-
-def _tip_speed(text: str | None) -> float | None:
-    if text is None or _unlimited(text):
-        return None
-    try:
-        return float(text)
-    except ValueError:
-        raise ConfigError(f"--tip-speed-limit is '{text}': give mm/s, such as 250, or none") from None
-
-
-def _unlimited(tip_speed_limit: str | None) -> bool:
-    return tip_speed_limit is not None and tip_speed_limit.lower() == "none"
+        messages.print("Ctrl-C ends.")
+        with suppress(KeyboardInterrupt):
+            PlanPage(page, made, certifier).play(Event())

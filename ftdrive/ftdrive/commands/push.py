@@ -12,35 +12,33 @@ from ftcalib import CalibrationResult
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.devices import build_arm, build_sensor
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import (
+from ftdrive.commands.options import (
     CELL,
     JSON,
+    PATH,
     CellOptions,
     check_simulate,
     declined_aborts,
-    rehearsed_run,
     simulate,
     write_json,
 )
 from ftdrive.errors import ConfigError, SupervisorGone
-from ftdrive.runs.push_receipt import Receipt
-from ftdrive.runs.source import read_calibration
+from ftdrive.runs.calibration import read_calibration
 from ftdrive.session.events import Question
-from ftdrive.session.settings_push import EFFECTS, WORDS, propose, restore, send
+from ftdrive.session.rehearsal import rehearsed_run
+from ftdrive.session.settings_push import EFFECTS, WORDS, Receipt, propose, restore, send
 from ftdrive.terminal.console import answer, beside
 from ftdrive.terminal.screen import open_operator
-from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
 from ftdrive.terminal.text import echo
-
-_PATH = click.Path(exists=True, path_type=Path)
+from ftdrive.words.session import proposal_in_lines, settings_in_words
 
 
 @click.command()
-@click.argument("source", metavar="[RESULT|RUN]", required=False, type=_PATH)
+@click.argument("source", metavar="[RESULT|RUN]", required=False, type=PATH)
 @CELL
 @click.option("--payload", is_flag=True, help="Push mass and centre of mass; the default without --gravity.")
 @click.option("--gravity", is_flag=True, help="Push the direction of gravity in the base.")
-@click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=_PATH, help="Send the values before a push back.")
+@click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=PATH, help="Send the values before a push back.")
 @click.option("--dry-run", is_flag=True, help="Compare only; nothing is sent.")
 @simulate("Push to an emulated cell; it is calibrated first if no result is given.")
 @JSON
@@ -67,7 +65,7 @@ def push(
         raise ConfigError("nothing to push: give a calibration.json or a run folder, --restore or --simulate")
     with ExitStack() as stack:
         operator = stack.enter_context(open_operator(as_json=as_json, live=False))
-        path = source or receipt or stack.enter_context(rehearsed_run(described.sensor))
+        path = source or receipt or stack.enter_context(rehearsed_run(open_operator(), described.sensor))
         folder = path if path.is_dir() else path.parent
         of = read_calibration(path) if receipt is None else Receipt.load(path)
         cell = _emulated_cell(of, described.sensor, stack) if simulate else described.cell()

@@ -9,32 +9,28 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.routine import PoseRecord, take_pose
 from ftcalib.sampling import Sampling
-from ftdrive.commands.common import (
-    EMULATED_SENSOR,
-    JSON,
-    check_simulate,
-    rehearsed_run,
-    simulate,
-    stop_unless_accepted,
-    write_json,
-)
+from ftdrive.commands.options import ALL, EMULATED_SENSOR, JSON, PATH, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.bundle import unpack
+from ftdrive.runs.calibration import require_accepted
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedRun, solve_records
+from ftdrive.session.rehearsal import rehearsed_run
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.report import print_result
+from ftdrive.terminal.screen import open_operator
 
 # Linear algebra rounds differently on different processors.
 _ROUNDING_SIGMA = 1e-6
 
 
 @click.command()
-@click.argument("source", metavar="RUN", required=False, type=click.Path(exists=True, path_type=Path))
+@click.argument("source", metavar="RUN", required=False, type=PATH)
 @simulate("Record a short run of an emulated cell, then repeat it.")
 @EMULATED_SENSOR
+@ALL
 @JSON
-def replay(source: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
+def replay(source: Path | None, simulate: bool, sensor: str | None, every: bool, as_json: bool) -> None:
     """Repeat the recorded RUN and compare the result with the saved one: they must be equal.
 
     On the same kind of processor they are equal to the last digit, on another one to rounding: within 1e-6 sigma.
@@ -43,16 +39,16 @@ def replay(source: Path | None, simulate: bool, sensor: str | None, as_json: boo
     """
     check_simulate(simulate, real={"RUN": source}, emulated={"--sensor": sensor})
     if simulate:
-        with rehearsed_run(sensor) as recorded:
-            _repeat(Run(recorded), recorded, as_json)
+        with rehearsed_run(open_operator(), sensor) as recorded:
+            _repeat(Run(recorded), recorded, every, as_json)
     elif source is not None:
         with unpack(source) as folder:
-            _repeat(Run(folder), source, as_json)
+            _repeat(Run(folder), source, every, as_json)
     else:
         raise ConfigError("no run: give its folder or bundle, or --simulate")
 
 
-def _repeat(run: Run, source: Path, as_json: bool) -> None:
+def _repeat(run: Run, source: Path, every: bool, as_json: bool) -> None:
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
     sampling = Sampling(**run.header()["config"]["sampling"])
@@ -67,8 +63,8 @@ def _repeat(run: Run, source: Path, as_json: bool) -> None:
     if as_json:
         write_json(outcome.result.to_dict())
     else:
-        print_result(outcome.result, drift=outcome.drift, records=records)
-    stop_unless_accepted(outcome.result)
+        print_result(outcome.result, drift=outcome.drift, records=records, every=every)
+    require_accepted(outcome.result)
     if run.calibration_path.exists():
         equal = equality(outcome.result, CalibrationResult.load(run.calibration_path))
         if not as_json:

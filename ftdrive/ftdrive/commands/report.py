@@ -1,50 +1,48 @@
 """`ftdrive report`: one file that says whether a calibration is good, and why."""
 
 import gc
+import json
 import shlex
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import click
-from click.core import ParameterSource
 
-from ftcalib.data.dataset import Orientation
-from ftcalib.files import require_new, write_new
-from ftcalib.likelihood.session import Drift
+from ftcalib.files import unused_path, write_new
 from ftcalib.result import Method
-from ftdrive.commands.common import (
+from ftdrive.commands.options import (
     EMULATED_SENSOR,
     JSON,
+    REPORTED,
+    SOLVED_WITH,
+    TABLE,
     NewFile,
     check_simulate,
-    rehearsed_run,
     require_extra,
     simulate,
-    store_url,
+    typed,
     write_json,
 )
-from ftdrive.commands.solve import known_values, up_direction
-from ftdrive.commands.solve import solve as solve_command
-from ftdrive.commands.tables import TABLE, TABLE_NAMES
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
-from ftdrive.report.report import Format
-from ftdrive.report.report import report as written
-from ftdrive.report.subject import read_subject, trust
+from ftdrive.report.page import page
+from ftdrive.report.subject import MAY_BE_MISSING, read_subject, trust
 from ftdrive.runs.bundle import unpack
-from ftdrive.runs.run import is_run, unused_path
-from ftdrive.runs.source import SolveOptions
+from ftdrive.runs.run import is_run
+from ftdrive.runs.source import SolveOptions, known_values, up_direction
+from ftdrive.store import store_url
 from ftdrive.tables.table import TableOptions
 from ftdrive.terminal.console import beside, hanging, messages, working
 from ftdrive.terminal.text import echo
 
-_SHARED = ("orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up")
-DEFAULT = Path("report.html")
+_FORMATS = ("html", "json")
 
 
-@click.command(params=[one for one in solve_command.params if one.name in _SHARED])
+@click.command()
+@SOLVED_WITH
 @click.option(
     "--method",
     metavar="METHOD",
@@ -58,12 +56,12 @@ DEFAULT = Path("report.html")
     "-o",
     "--output",
     type=NewFile(),
-    help=f"New file. [default: {DEFAULT} in the run or beside SOURCE, or {DEFAULT.stem}-2; stdout for json]",
+    help="New file. [default: report.html in the run or beside SOURCE, or report-2; stdout for json]",
 )
 @click.option(
     "--format",
     "form",
-    type=click.Choice(get_args(Format)),
+    type=click.Choice(_FORMATS),
     help="A page (needs ftdrive[report]), or the facts as JSON.  [default: by the ending of --output, else html]",
 )
 @click.option(
@@ -79,19 +77,14 @@ DEFAULT = Path("report.html")
 def report(
     source: Path | None,
     output: Path | None,
-    form: Format | None,
+    form: str | None,
     parent: Path | None,
     method: Method,
-    orientation: Orientation,
-    drift: Drift,
-    mass_kg: float | None,
-    level_deg: float | None,
-    mounting_deg: str | None,
-    up: str | None,
     table: TableOptions | None,
     simulate: bool,
     sensor: str | None,
     as_json: bool,
+    **shared: Any,
 ) -> None:
     """Report SOURCE: a calibration.json, a run folder, a dataset.json or a table, as `ftdrive solve` takes them.
 
@@ -102,70 +95,50 @@ def report(
     check_simulate(simulate, real={"SOURCE": source}, emulated={"--sensor": sensor})
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
-    chosen = output
-    form = form or _format_of(output)
-    if output is None and form == "html":
-        output = unused_path(_folder_of(source) / DEFAULT)
-        try:
-            require_new(output)
-        except OSError as error:
-            raise ConfigError(f"{error} with --output") from error
+    if (form := form or (output.suffix[1:] if output is not None else "html")) not in _FORMATS:
+        raise ConfigError(f"{output} has no ending of a report: name it .html or .json, or give --format")
     if form == "html":
         require_extra("report", "a report in HTML (not --format json)", "jinja2", "matplotlib")
-    given = known_values(mass_kg, level_deg, mounting_deg), up_direction(up)
-    options = SolveOptions(method, orientation, drift, *given, table=table, words=_typed(click.get_current_context()))
+    orientation, drift, *known, up = (shared[name] for name in REPORTED[1:7])
+    given = SolveOptions(method, orientation, drift, known_values(*known), up_direction(up), table=table)
+    options = replace(given, words=typed(click.get_current_context(), REPORTED))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
-    with unpack(source) if source is not None else rehearsed_run(sensor) as found:
+    with unpack(source) if source is not None else _rehearsed(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
-        known = trust(subject.result, found, store_url, datetime.now(UTC))
-        subject = replace(subject, trust=known)
-        if known["store_error"]:
-            messages.print(hanging(" ! ", f"a later verification may be missing, because {known['store_error']}"))
+        trusted = trust(subject.result, found, store_url, datetime.now(UTC))
+        if trusted["store_error"]:
+            messages.print(hanging(" ! ", MAY_BE_MISSING.format(trusted["store_error"])))
         if source is not None and found != source:  # unpacked
-            reproduce = subject.reproduce.replace(str(found), shlex.quote(str(source)))
-            subject = replace(subject, source=source, reproduce=reproduce)
+            command = subject.reproduce.replace(str(found), shlex.quote(str(source)))
+            subject = replace(subject, source=source, reproduce=command)
         with working("Comparing methods and drawing"):
-            facts = facts_of(subject)
-            text = written(facts, form)
+            facts = facts_of(subject, trusted)
+            text = page(facts) if form == "html" else json.dumps(facts, allow_nan=False) + "\n"
     if output is not None:
-        try:
-            write_new(output, text)
-        # Another report took the name meanwhile.
-        except FileExistsError:
-            if chosen is not None:
-                raise
-            write_new(output := unused_path(_folder_of(source) / DEFAULT), text)
+        write_new(output, text)
+    elif form == "html":
+        output = _saved(text, Path() if source is None else source if is_run(source) else source.parent)
+    if output is not None:
         say = beside(as_json)
         say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
     if as_json:
-        write_json({**facts, "file": None if output is None else str(output)})
+        write_json({**facts, "file": output and str(output)})
     elif output is None:
         echo(text, nl=False, fold=False)
 
 
-def _format_of(output: Path | None) -> Format:
-    """Return the format that the ending of a file names; raises `ConfigError` if none does."""
-    if output is None or output.suffix == ".html":
-        return "html"
-    if output.suffix != ".json":
-        raise ConfigError(f"{output} has no ending of a report: name it .html or .json, or give --format")
-    return "json"
+def _saved(text: str, folder: Path) -> Path:
+    """Save under the first name that is unused, which another report may take meanwhile."""
+    while True:
+        with suppress(FileExistsError):
+            write_new(path := unused_path(folder / "report.html"), text)
+            return path
 
 
-def _folder_of(source: Path | None) -> Path:
-    if source is None:
-        return Path()
-    return source if is_run(source) else source.parent
+def _rehearsed(sensor: str | None) -> AbstractContextManager[Path]:
+    from ftdrive.session.rehearsal import rehearsed_run  # with the drivers and the screen of a session
+    from ftdrive.terminal.screen import open_operator
 
-
-def _typed(context: click.Context) -> tuple[str, ...]:
-    """Return the options of solve that were given, as words for a shell."""
-    return tuple(
-        word
-        for one in context.command.params
-        if one.name in ("method", *_SHARED, *TABLE_NAMES)
-        and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
-        for word in (one.opts[0], shlex.quote(str(context.params[one.name])))
-    )
+    return rehearsed_run(open_operator(), sensor)

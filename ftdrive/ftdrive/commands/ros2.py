@@ -2,14 +2,13 @@
 
 from collections.abc import Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import FRAME, SOURCE, Source, read_frame
-
-if TYPE_CHECKING:
-    from ftdrive.live.samples import Axes
+from ftdrive.commands.options import FRAME, SOURCE, Source
+from ftdrive.stream.samples import WrenchFrame
+from ftdrive.terminal.console import messages
+from ftdrivers.ros2.middleware import ros2_module
 
 _ROS_ARGS = "--ros-args"
 
@@ -33,42 +32,26 @@ class _RosCommand(click.Command):
     metavar="...",
     help="Arguments of ROS until the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
 )
-def ros2(
-    source: Source,
-    axes: "Axes",
-    about: str,
-    ros_args: Sequence[str],
-) -> None:
+def ros2(source: Source, frame: WrenchFrame, ros_args: Sequence[str]) -> None:
     """Publish the raw and the compensated wrench as topics of ROS 2.
 
     The node has ~/wrench_raw, ~/wrench, ~/contact, ~/status, /diagnostics and the services ~/tare and ~/undo_tare.
     `ros2 param describe` explains each parameter. While a device is silent or the calibration does not fit, no wrench
     is published and /diagnostics has the reason. The arm is only read, never moved. Ctrl-C ends.
     """
-    from ftdrivers.ros2.middleware import ros2_module
-
     ros2_module("rclpy")  # before any work
-    from ftdrive.commands.live_source import build_stream, no_calibration
-    from ftdrive.runs.source import read_calibration
-    from ftdrive.servers.ros2 import Ros2Node
-    from ftdrive.session.rehearsal import short_calibration
-    from ftdrive.terminal.console import messages
-    from ftdrive.terminal.screen import open_operator
+    from ftdrive.servers.ros2 import Ros2Node  # imports it
 
-    frame = read_frame(axes, about)
-    calibration = None if source.path is None else read_calibration(source.path, accept_edited=source.force)
+    given = source.path is not None
+    calibration = source.calibration() if given else None
     cell = None if source.simulate else source.described.cell()
     try:
         with closing(Ros2Node(ros_args, frame=frame, tool=source.tool or "")) as node:
-            if source.simulate and calibration is None:
-                with open_operator() as operator:
-                    calibration = short_calibration(operator, source.described.sensor)
-            if calibration is None and not node.parameters.tool:
-                raise no_calibration()
+            calibration = calibration if given else source.calibration()
             messages.print(
                 f"Node {node.name} publishes {node.name}/wrench in {node.parameters.frame}, at most "
                 f"{node.fixed.rate:g} Hz, {'reliable' if node.fixed.reliable else 'best effort'}. Ctrl-C ends."
             )
-            node.serve(lambda: build_stream(source, cell, calibration, node.parameters.tool))
+            node.serve(lambda: source.stream(cell, calibration, node.parameters.tool))
     except KeyboardInterrupt:
         messages.print("The node has ended.")

@@ -2,16 +2,16 @@
 
 from contextlib import ExitStack
 from functools import partial
-from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.commands.common import SOURCE, TRACK, Source, frame_options, read_frame
+from ftdrive.cell.devices import program_registers
+from ftdrive.commands.options import SOURCE, TRACK, Source, frame_options
 from ftdrive.errors import ConfigError
+from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
+from ftdrive.stream.samples import Tracking, WrenchFrame
+from ftdrive.terminal.console import messages
 from ftdrivers.ur.rtde import FIRST_REGISTER, LAST_REGISTER
-
-if TYPE_CHECKING:
-    from ftdrive.live.samples import Axes, Tracking
 
 
 @click.command()
@@ -19,24 +19,13 @@ if TYPE_CHECKING:
 @frame_options("base", "tcp")
 @TRACK
 @click.option("--first", type=int, default=FIRST_REGISTER, show_default=True, help="First register of each kind.")
-def serve_load(
-    source: Source,
-    axes: "Axes",
-    about: str,
-    track: "Tracking",
-    first: int,
-) -> None:
+def serve_load(source: Source, frame: WrenchFrame, track: Tracking, first: int) -> None:
     """Answer the program on the controller: weigh a part, zero, and the contact wrench all the time.
 
     Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive
     export urscript`. Nothing else is sent, and the arm is never moved. With --track the program also gets the bias as
     followed. Ctrl-C ends.
     """
-    from ftdrive.cell.devices import program_registers
-    from ftdrive.commands.live_source import open_log, open_source
-    from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
-    from ftdrive.terminal.console import messages
-
     doubles = len(doubles_of(track))
     last = LAST_REGISTER + 1 - max(len(INTEGERS), doubles)
     if not FIRST_REGISTER <= first <= last:
@@ -44,13 +33,12 @@ def serve_load(
             f"--first is {first}: give {FIRST_REGISTER} to {last}, because fieldbuses and PLCs own the registers below "
             f"{FIRST_REGISTER}, and {LAST_REGISTER} is the last one"
         )
-    frame = read_frame(axes, about)
     with ExitStack() as stack:
-        stream = open_source(source, frame, stack, track)
+        stream = source.open(stack, frame, track)
         if stream.cell.sensor.height_mm is None:
             raise ConfigError("the centre of mass of a part needs [sensor] height_mm: set it, see `ftdrive init`")
         connect = partial(program_registers, stream.cell, first, len(INTEGERS), doubles)
-        service = ProgramService(stream, connect, messages.print, open_log(source, stream, stack, messages.print))
+        service = ProgramService(stream, connect, messages.print, source.open_log(stream, stack, messages.print))
         messages.print(
             f"Serving weight and wrench ({stream.frame}) in the registers from {first}; {stream.info.calibration_name}."
         )

@@ -1,24 +1,25 @@
 """`ftdrive stream`: the compensated wrench for Foxglove, Lichtblick and PlotJuggler."""
 
 import socket
-from collections.abc import Sequence
-from contextlib import ExitStack, closing
-from typing import TYPE_CHECKING
+from contextlib import ExitStack
+from typing import Any
 
 import click
 
-from ftdrive.commands.common import FRAME, SOURCE, TRACK, Source, read_frame
-
-if TYPE_CHECKING:
-    from ftdrive.live.samples import Axes, Sink, Tracking
-    from ftdrive.live.stream import CompensatedStream, ProcessedStream
-    from ftdrive.servers.foxglove import FoxgloveServer
+from ftdrive.commands.options import FRAME, SOURCE, STAGES, TRACK, Source
+from ftdrive.servers.foxglove import FoxgloveServer
+from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
+from ftdrive.servers.udp import UdpSender
+from ftdrive.stream.samples import Tracking, WrenchFrame
+from ftdrive.stream.stream import RECOVER_S, Sink, Stream, pump
+from ftdrive.terminal.console import messages, print_address
 
 
 @click.command()
 @SOURCE
 @TRACK
 @FRAME
+@STAGES
 @click.option(
     "--host",
     default="127.0.0.1",
@@ -33,9 +34,9 @@ if TYPE_CHECKING:
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
     source: Source,
-    track: "Tracking",
-    axes: "Axes",
-    about: str,
+    track: Tracking,
+    frame: WrenchFrame,
+    stages: dict[str, Any],
     host: str,
     port: int,
     origins: tuple[str, ...],
@@ -48,51 +49,18 @@ def stream(
     sensor, poses, joint angles, frames, arrows and events. Programs can tare and change frame and stages. A page in a
     browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
     """
-    from ftdrive.commands.live_source import open_source
-    from ftdrive.http_gate import host_and_port
-    from ftdrive.servers.foxglove import FoxgloveServer
-    from ftdrive.servers.udp import UdpSender
-
-    frame = read_frame(axes, about)
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
-        opened = open_source(source, frame, stack, track)
-        server = stack.enter_context(
-            closing(FoxgloveServer(opened, host, port, origins=origins, allow_control=allow_control))
-        )
-        sinks: list[Sink] = [server]
-        if udp_address is not None:
-            sinks.append(stack.enter_context(closing(UdpSender(opened.info, *udp_address))))
+        opened = source.open(stack, frame, track, stages)
+        sinks: list[Sink] = [] if udp_address is None else [UdpSender(opened.info, *udp_address)]
+        server = FoxgloveServer(opened, host, port, origins=origins, allow_control=allow_control)
         _introduce(opened, server, host, udp_address)
-        serve(opened, sinks)
+        meanwhile = f"Viewers stay connected for {RECOVER_S:g} s."
+        for _ in pump(opened, [server, *sinks], say=messages.print, meanwhile=meanwhile):
+            pass
 
 
-def serve(source: "CompensatedStream", sinks: Sequence["Sink"]) -> None:
-    """Send blocks and events until Ctrl-C is pressed, or a device is silent for `RECOVER_S`."""
-    from ftdrive.live.stream import RECOVER_S, BlockReader
-    from ftdrive.terminal.console import messages
-
-    meanwhile = f"Viewers stay connected for {RECOVER_S:g} s."
-    try:
-        for block in BlockReader(source, say=messages.print, meanwhile=meanwhile):
-            if block is not None:
-                for sink in sinks:
-                    sink.write(block)
-            _send_events(source, sinks)
-    finally:
-        _send_events(source, sinks)
-
-
-def _send_events(source: "CompensatedStream", sinks: Sequence["Sink"]) -> None:
-    for event in source.take_events():
-        for sink in sinks:
-            sink.event(event)
-
-
-def _introduce(source: "ProcessedStream", server: "FoxgloveServer", host: str, udp: tuple[str, int] | None) -> None:
-    from ftdrive.http_gate import is_loopback, with_port
-    from ftdrive.terminal.console import messages, print_address
-
+def _introduce(source: Stream, server: FoxgloveServer, host: str, udp: tuple[str, int] | None) -> None:
     name = socket.gethostname() if host in ("0.0.0.0", "::") else host
     url = f"ws://{with_port(name, server.port)}"
     messages.print(f"Serving the wrench in {source.frame}; {source.info.calibration_name}.")

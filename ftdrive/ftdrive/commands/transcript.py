@@ -1,34 +1,24 @@
 """`ftdrive transcript`: record the bytes on a sensor's wire, and play them to the driver."""
 
-import math
-from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
-import numpy as np
 
 from ftcalib.files import open_file
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import EMULATED, sensor_name, sensor_reached
 from ftdrive.cell.emulated_clock import LocalClock
 from ftdrive.checks.computer import SensorAddress
-from ftdrive.commands.common import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
+from ftdrive.commands.options import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
-from ftdrive.runs.run import versions
+from ftdrive.runs.calibration import versions
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.text import Group
-from ftdrivers.errors import BadTranscript, ConnectError, DeviceTimeout, ProtocolError
-from ftdrivers.interfaces import ForceTorqueSensor
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.transcript import INTERRUPTED, Player, Transcript, Writer, recording
-
-# A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
-_PIECE_S = 60.0
-# Recorded beyond the duration, so that a replay which begins a little later still has enough.
-_TAIL_S = 0.3
+from ftdrivers.transcript import Transcript, Writer
 
 
 @click.group(cls=Group)
@@ -95,23 +85,12 @@ def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) ->
         "versions": versions(),
     }
     writer = Writer(path, header, clock)
-    seen: dict[str, Any] = {"error": INTERRUPTED}
     try:
-        with working(f"Recording for {duration_s:g} s"), recording(writer), device:
-            whole = _watch(device, duration_s)
-            device.collect(_TAIL_S)
-        seen = whole
-    except Exception as error:
-        seen = {"error": f"{type(error).__name__}: {error}"}
-        raise
+        with working(f"Recording for {duration_s:g} s"):
+            seen = writer.record(device, duration_s)
     finally:
-        # A port that does not open is worth a report.
-        if not writer.has_port and seen["error"] in {None, INTERRUPTED}:
-            writer.discard()
-        else:
-            writer.end(**seen)
-            if kept:
-                messages.print(f" Saved {path}")
+        if kept and writer.is_saved:
+            messages.print(f" Saved {path}")
     if not writer.has_port:
         raise ConfigError(f"the driver of {sensor} uses neither pyserial nor python-can: only these can be recorded")
     return url, seen
@@ -139,55 +118,15 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
     # A busy computer makes it slow, never late.
-    clock = LocalClock()
-    player = Player(loaded, clock)
-    with player as port:
-        device = sensor_from_url(loaded.url_at(port), clock=clock)
-        duration_s = float(loaded.header["duration_s"])
-        try:
-            with device:
-                if loaded.is_broken_off:
-                    duration_s = min(duration_s, player.left_s - _TAIL_S)
-                played = _watch(device, duration_s)
-        except Exception as error:
-            if player.divergence:
-                raise ProtocolError(f"{error}; the transcript does not answer: {player.divergence}") from error
-            silent = isinstance(error, ConnectError | DeviceTimeout)
-            if silent and loaded.is_broken_off and player.left_s < _TAIL_S:
-                raise BadTranscript(
-                    f"the recording was interrupted before there was anything to measure ({error}): record it again"
-                ) from error
-            raise
+    played = loaded.play(LocalClock())
     recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
     if as_json:
         write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
         answer.print(hanging(" recorded  ", _words(recorded), answer))
         answer.print(hanging(" played    ", _words(played), answer))
-    if duration_s < loaded.header["duration_s"]:
-        whole_s = loaded.header["duration_s"]
-        messages.print(f" The recording was interrupted: {duration_s:.3g} s of {whole_s:g} s were played.")
-
-
-def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
-    """Collect from an open sensor, in pieces because a `collect` is bounded; with the sensor's own sign."""
-    pieces = math.ceil(duration_s / _PIECE_S)
-    samples, total = 0, np.zeros(6)
-    for _ in range(pieces):
-        wrench = device.collect(duration_s / pieces).wrench
-        samples, total = samples + len(wrench), total + wrench.sum(axis=0)
-    if not samples:
-        raise DeviceTimeout(f"no sample came in {duration_s:g} s: record for longer, with --duration")
-    force_N, torque_Nm = np.split(total / samples, 2)
-    return {
-        "error": None,
-        "identity": asdict(device.identify()),
-        "duration_s": duration_s,
-        "samples": samples,
-        "lost": device.health().lost,
-        "mean_force_N": force_N.tolist(),
-        "mean_torque_Nm": torque_Nm.tolist(),
-    }
+    if (played_s := played["duration_s"]) < (whole_s := loaded.header["duration_s"]):
+        messages.print(f" The recording was interrupted: {played_s:.3g} s of {whole_s:g} s were played.")
 
 
 def _words(seen: dict[str, Any]) -> str:

@@ -1,19 +1,23 @@
 """`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
 
-from contextlib import ExitStack
+from collections.abc import Iterable
+from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import click
 
-from ftdrive.commands.common import JSON, SOURCE, NewFile, Number, Source, ViewOptions, view_options, write_json
+from ftdrive.commands.options import JSON, POSITIVE, SOURCE, NewFile, Source, ViewOptions, view_options, write_json
 from ftdrive.errors import ConfigError
+from ftdrive.recording import Recorder
+from ftdrive.stream.processing import SENSOR_FRAME
+from ftdrive.stream.stream import RECOVER_S, Sink, pump
+from ftdrive.stream.weighing import PATIENCE_S, Weighing, line_of, load_values
+from ftdrive.terminal.console import has_screen, messages
 from ftdrive.terminal.text import echo
-
-if TYPE_CHECKING:
-    from ftdrive.live.samples import StreamInfo
-    from ftdrive.live.weighing import ScaleState, Weighing
+from ftdrive.terminal.weigh_screen import WeighScreen
+from ftdrive.view.live_page import WeighPage
+from ftdrive.view.page import drawing
 
 
 @click.command()
@@ -23,7 +27,7 @@ if TYPE_CHECKING:
 )
 @click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests of one load to join.")
 @click.option("--moving", is_flag=True, help="Weigh what the arm carries, in motion too; begin with an empty gripper.")
-@click.option("--count", "part_kg", type=Number(0, min_open=True), metavar="KG", help="Mass of one part: count parts.")
+@click.option("--count", "part_kg", type=POSITIVE, metavar="KG", help="Mass of one part: count parts.")
 @click.option("--once", is_flag=True, help="Print one weight, then end; with --zero wait for a part.")
 @click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
 @click.option("--allow-control", is_flag=True, help="With --view: the page may tare the empty gripper.")
@@ -48,68 +52,54 @@ def weigh(
     --moving, the load is weighed while the arm carries it, and has its whole centre of mass. The arm is only read,
     never moved. Ctrl-C ends.
     """
-    from ftdrive.commands.live_source import check_view, open_log, open_source
-    from ftdrive.live.processing import SENSOR_FRAME
-    from ftdrive.live.weighing import Weighing
-    from ftdrive.recording import Recorder
-    from ftdrive.terminal.console import has_screen, messages
-
     if moving and (zero or poses > 1):
         raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
-    check_view(view, once=once, allow_control=allow_control)
-    view.require()
+    view.require(once=once, allow_control=allow_control)
     with ExitStack() as stack:
-        stream = open_source(source, SENSOR_FRAME, stack, "show" if moving else "off")
-        recorder = None
+        stream = source.open(stack, SENSOR_FRAME, "show" if moving else "off")
+        keep = source.open_log(stream, stack, messages.print)
+        weighing = Weighing(stream, joins=poses > 1, part_kg=part_kg, moving=moving, keep=keep)
+        sinks: list[Sink] = [weighing]
         if output is not None:
-            recorder = Recorder([output], stream.info, stream.cell.to_dict())
-            stack.callback(recorder.close)
-        log = open_log(source, stream, stack, messages.print)
-        weighing = Weighing(stream, recorder, joins=poses > 1, part_kg=part_kg, moving=moving, log=log)
+            sinks.append(Recorder([output], stream.info, stream.cell.to_dict()))
+        turns = stack.enter_context(closing(pump(stream, sinks, patience_s=0.0 if once else RECOVER_S)))
         if zero:
             messages.print(" Zero: the gripper must be empty.")
-            weighing.zero()
+            weighing.request_zero()
+            while weighing.is_zeroing:
+                next(turns)
+            if weighing.refusal is not None:
+                raise weighing.refusal
+            weighing.note = ""
         on_screen = not (once or as_json) and has_screen()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
-            from ftdrive.view.page import drawing
-            from ftdrive.view.weigh_page import WeighPage
-
             shown = WeighPage(page, weighing, controls=allow_control)
             # the full screen hides what is printed, and has a line for notes
             say = partial(setattr, weighing, "note") if on_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:
-            from ftdrive.terminal.weigh_screen import WeighScreen
-
-            WeighScreen(weighing, "" if page is None else page.url).run()
+            WeighScreen(weighing, turns, "" if page is None else page.url).run()
         else:
-            _print(weighing, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
+            _print(weighing, turns, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
 
 
-def _answer_of(shown: "ScaleState", info: "StreamInfo") -> dict[str, Any]:
-    from ftdrive.live.weighing import load_values
-
-    values: dict[str, Any] = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
-    values |= {} if shown.weight is None else load_values(shown.weight, info)
-    return values | {"count": shown.count, "refused": shown.refusal}
-
-
-def _print(weighing: "Weighing", *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
+def _print(weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
     """Print each new weight or fault as a line; with `once` end with the first weight."""
-    from ftdrive.live.weighing import PATIENCE_S, line_of
-
-    clock = weighing.stream.clock
+    clock, info = weighing.stream.clock, weighing.stream.info
+    head = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
     begin_s = clock.now_s()
-    for shown, is_new in weighing.states(raises=once):
+    for _ in turns:
+        shown = weighing.shown
         if once and not waits and clock.now_s() - begin_s > PATIENCE_S:
             raise weighing.given_up(shown)
         weight = shown.weight
-        if not is_new or (once and (shown.refusal is not None or weight is None or weight.poses < poses)):
+        if not weighing.is_new or (once and (shown.refusal is not None or weight is None or weight.poses < poses)):
             continue
         if once and waits and weight is not None and not weight.is_something:
             continue
         if as_json:
-            write_json(_answer_of(shown, weighing.stream.info))
+            values = {} if weight is None else load_values(weight, info)
+            write_json({**head, **values, "count": shown.count, "refused": shown.refusal})
         else:
             echo(line_of(shown))
         if once:

@@ -6,8 +6,13 @@ from pathlib import Path
 import click
 
 from ftcalib.rounding import counted
-from ftdrive.commands.common import FILE, FOLDER, STORE, open_store
+from ftdrive.commands.options import FILE, FOLDER, STORE
 from ftdrive.errors import ConfigError
+from ftdrive.fleet.cells import Owners, read_cells, refuse_ambiguous
+from ftdrive.fleet.state import list_names
+from ftdrive.store import open_store
+from ftdrive.store.records import record_paths
+from ftdrive.terminal.console import answer, hanging, messages
 
 
 @click.command()
@@ -20,9 +25,6 @@ def add(file: Path, url: str | None) -> None:
     `verify_every_days`. Its runs are found by the serial number of the arm (`arm_serial`, or [robot] serial), else by
     [robot] host.
     """
-    from ftdrive.fleet.cells import read_cells, refuse_ambiguous
-    from ftdrive.terminal.console import answer
-
     found = open_store(url)
     cells = read_cells(file)
     names = {cell.name for cell in cells}
@@ -38,9 +40,6 @@ def add(file: Path, url: str | None) -> None:
 @STORE
 def remove(names: Sequence[str], url: str | None) -> None:
     """Remove cells from the store. Their runs and results stay."""
-    from ftdrive.fleet.state import list_names
-    from ftdrive.terminal.console import answer
-
     found = open_store(url)
     known = [cell.name for cell in found.cells()]
     if unknown := [name for name in names if name not in known]:
@@ -58,11 +57,6 @@ def index(folders: Sequence[Path], url: str | None) -> None:
 
     If cells were added, arms that belong to none of them are listed.
     """
-    from ftdrive.fleet.cells import Owners
-    from ftdrive.fleet.state import list_names
-    from ftdrive.store.records import record_paths
-    from ftdrive.terminal.console import answer, hanging, messages
-
     found = open_store(url)
     indexed = found.index(*folders)
     for words in indexed.unreadable:

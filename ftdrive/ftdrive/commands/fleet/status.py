@@ -6,17 +6,24 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from ftdrive.commands.common import JSON, STORE, NewFile, open_store, require_extra, write_json
+from ftcalib.files import write_new
+from ftdrive.commands.options import JSON, STORE, NewFile, require_extra, write_json
+from ftdrive.fleet.cells import Observed
+from ftdrive.fleet.metrics import MetricsServer
+from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
+from ftdrive.fleet.state import serve as serve_fleet
+from ftdrive.fleet.status import fleet_of, fleet_state
+from ftdrive.runs.verification import age_in_words
+from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
+from ftdrive.store import open_store
+from ftdrive.store.store import Store
+from ftdrive.terminal.console import answer, beside, hanging, messages, print_address
 from ftdrive.terminal.text import print_table
-
-if TYPE_CHECKING:
-    from ftdrive.fleet.state import CellState, Fleet
-    from ftdrive.store.store import Store
-
+from ftdrivers.clock import REAL
 
 _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due", "weighed")
 
@@ -34,11 +41,6 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
 
     `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
     """
-    from ftcalib.files import write_new
-    from ftdrive.fleet.cells import Observed
-    from ftdrive.fleet.status import fleet_of
-    from ftdrive.terminal.console import answer, beside, hanging, messages
-
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
     gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
@@ -46,7 +48,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
     if page_path is not None:
-        from ftdrive.fleet.page import page
+        from ftdrive.fleet.page import page  # needs an extra
 
         write_new(page_path, page(fleet, observed, found.name))
         beside(as_json).print(f" Saved {page_path}")
@@ -55,8 +57,6 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     elif not fleet.cells:
         messages.print("No cells. `ftdrive fleet add cells.toml` adds them.")
     elif page_path is None:
-        from ftdrive.fleet.state import attention, summary
-
         shown = len(_TITLES) if any(one.weighings for one in fleet.cells) else -1
         rows = [_row(one, now)[:shown] for one in fleet.cells]
         print_table(_TITLES[:shown], rows, folding={"cell", "tool"})
@@ -65,10 +65,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
             answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
-    from ftdrive.fleet.state import due_in_words, verified_in_words, weighed_in_words
-    from ftdrive.runs.verification import age_in_words
-
+def _row(one: CellState, now: datetime) -> tuple[str, ...]:
     drift = "-"
     if one.drift is not None:
         drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
@@ -84,7 +81,7 @@ def _row(one: "CellState", now: datetime) -> tuple[str, ...]:
     )
 
 
-def _as_json(fleet: "Fleet", name: str, now: datetime) -> dict[str, Any]:
+def _as_json(fleet: Fleet, name: str, now: datetime) -> dict[str, Any]:
     return {
         "schema_version": 1,
         "store": name,
@@ -115,13 +112,6 @@ def serve(address: str, url: str | None) -> None:
     The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a
     dashboard for Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
     """
-    from ftdrive.fleet.metrics import MetricsServer
-    from ftdrive.fleet.serve import serve as serve_fleet
-    from ftdrive.fleet.status import fleet_state
-    from ftdrive.http_gate import host_and_port, is_loopback, with_port
-    from ftdrive.terminal.console import messages, print_address
-    from ftdrivers.clock import REAL
-
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
     found = open_store(url)
     with closing(MetricsServer(host, port, partial(_page, found))) as metrics:
@@ -136,10 +126,8 @@ def serve(address: str, url: str | None) -> None:
         serve_fleet(partial(fleet_state, found), metrics.update, REAL, say=messages.print)
 
 
-def _page(store: "Store") -> str:
-    from ftdrive.fleet.cells import Observed
-    from ftdrive.fleet.page import page
-    from ftdrive.fleet.status import fleet_of
+def _page(store: Store) -> str:
+    from ftdrive.fleet.page import page  # needs an extra
 
     observed = Observed.read(store, datetime.now(UTC))
     return page(fleet_of(observed, store), observed, store.name)

@@ -5,21 +5,27 @@ from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from ftdrive.cli import in_a_sentence
-from ftdrive.commands.common import STORE, CellOptions, store_url
-from ftdrive.commands.verify import failure_in_words, verify_cell
-from ftdrive.errors import ConfigError, Declined, NotAccepted, exit_code
+from ftdrive.cell.config import CellConfig
+from ftdrive.commands.options import STORE, CellOptions
+from ftdrive.errors import ConfigError, Declined, NotAccepted, exit_code, in_a_sentence
+from ftdrive.fleet.cells import refuse_variables
+from ftdrive.fleet.state import Fleet
+from ftdrive.fleet.status import fleet_state
+from ftdrive.runs.verification import AcceptanceLimits, Verified
+from ftdrive.session.events import Question
+from ftdrive.session.options import SessionOptions
+from ftdrive.session.verifying import POSES, Verifying, save_wanted_update
+from ftdrive.store import index_run, store_url
+from ftdrive.store.records import StoredCell
+from ftdrive.store.store import Store
+from ftdrive.terminal.console import answer, messages
+from ftdrive.terminal.operators import PlainOperator
+from ftdrive.terminal.report import print_verification
+from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
-
-if TYPE_CHECKING:
-    from ftdrive.cell.config import CellConfig
-    from ftdrive.fleet.state import Fleet
-    from ftdrive.store.records import StoredCell
-    from ftdrive.store.store import Store
 
 
 @click.command()
@@ -33,10 +39,6 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
     skips the cell. No option answers these questions, and a terminal is required.
     """
-    from ftdrive.fleet.cells import refuse_variables
-    from ftdrive.fleet.status import fleet_state
-    from ftdrive.store.store import Store
-
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
     refuse_variables()
@@ -45,7 +47,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     url = url or store_url()
     store, now = Store(url), datetime.now(UTC)
     fleet = fleet_state(store, now)
-    chosen = [one for one in _named(store.cells(), names) if not due or _is_due(one, fleet, now)]
+    chosen = [one for one in _named(store.cells(), names) if not due or fleet.is_due(one, now)]
     if not chosen:
         echo("No cell is due.", err=True)
     failed, errors, lines = list[str](), list[Exception](), list[str]()
@@ -75,7 +77,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
         raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its line is printed
 
 
-def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredCell]":
+def _named(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
     """Return the cells with these names in their order; all without names."""
     if not cells:
         raise ConfigError("the store has no cells: add them with `ftdrive fleet add cells.toml`")
@@ -85,31 +87,37 @@ def _named(cells: "Sequence[StoredCell]", names: Sequence[str]) -> "list[StoredC
     return [known[name] for name in dict.fromkeys(names)] if names else list(cells)
 
 
-def _is_due(one: "StoredCell", fleet: "Fleet", now: datetime) -> bool:
-    """Whether the mounted tool is due; without a name of it, whether any tool of the cell is."""
-    states = [state for state in fleet.cells if state.cell == one.name]
-    if one.tool is not None:
-        states = [state for state in states if state.tool in {one.tool, None}]
-    return not states or any(state.is_due(now) for state in states)
-
-
-def _verify(one: "StoredCell", store: "Store", url: str | None, fleet: "Fleet") -> tuple[str, str]:
-    """Ask at a cell and verify it; return the outcome and why. Raises as `verify_cell`."""
-    from ftdrive.runs.verification import AcceptanceLimits
-    from ftdrive.session.options import SessionOptions
-    from ftdrive.session.verifying import POSES
-
+def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tuple[str, str]:
+    """Ask at a cell and verify it; return the outcome and why. Raises as `Verifying.take`."""
     cell = _described(one)
-    path = _calibration(one, cell.tool.name, store, fleet)
+    known = fleet.id_of(one.name, cell.tool.name) or ""
+    paths = [Path(result.path) for result in store.find(known) if result.id == known] if known else []
+    if not paths:
+        tool = cell.tool.name
+        raise ConfigError(f"no accepted calibration of the tool '{tool}' is in the store: calibrate this cell")
+    path = paths[0]
     if not _is_attended(one, cell):
         return "skipped", ""
     options = SessionOptions(path.parent.parent, "verify", poses=POSES)
-    cell = replace(cell, store=replace(cell.store, url=url))
-    verified = verify_cell(cell, path, AcceptanceLimits(), options)
-    return ("passed", "") if verified.passed else ("FAILED", failure_in_words(verified))
+    verified = _session(replace(cell, store=replace(cell.store, url=url)), path, options)
+    return ("passed", "") if verified.passed else ("FAILED", verified.failure)
 
 
-def _described(one: "StoredCell") -> "CellConfig":
+def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
+    """Guide the operator through a verification, as `ftdrive verify` does without options."""
+    task = Verifying.of(cell, path, options)
+    with open_operator(command=task.command) as operator:
+        verified = task.take(operator, AcceptanceLimits(), options)
+    print_verification(verified)
+    saved = save_wanted_update(verified, "ask", PlainOperator(quiet=messages.quiet).ask)
+    if saved is not None:
+        answer.print(f" Saved {saved}: {verified.updated} updated, parent {verified.calibration.id[:6]}")
+    messages.print_next(verified.next_command(saved))
+    index_run(verified.run.folder, messages.print, cell)
+    return verified
+
+
+def _described(one: StoredCell) -> CellConfig:
     """Read the configuration of a cell; raises `ConfigError` if the store does not know its robot."""
     cell = CellOptions(Path(one.config)).cell()
     if one.robot_host not in {None, cell.robot.host}:
@@ -119,20 +127,8 @@ def _described(one: "StoredCell") -> "CellConfig":
     return cell
 
 
-def _calibration(one: "StoredCell", tool: str, store: "Store", fleet: "Fleet") -> Path:
-    for state in fleet.cells:
-        if (state.cell, state.tool) == (one.name, tool) and state.calibration_id is not None:
-            found = [result for result in store.find(state.calibration_id) if result.id == state.calibration_id]
-            if found:
-                return Path(found[0].path)
-    raise ConfigError(f"no accepted calibration of the tool '{tool}' is in the store: calibrate this cell")
-
-
-def _is_attended(one: "StoredCell", cell: "CellConfig") -> bool:
+def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
     """Ask whether an operator stands at the cell; only yes counts, and the end of the input does not."""
-    from ftdrive.session.events import Question
-    from ftdrive.terminal.operators import PlainOperator
-
     text = (
         f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: does an operator stand at this cell, with "
         "the emergency stop in reach? Only yes starts its verification, Enter skips it"

@@ -1,0 +1,108 @@
+"""`ftdrive export`: plans and calibrations as files of other programs."""
+
+from pathlib import Path
+
+import click
+
+from ftcalib.files import write_new
+from ftdrive.cell.emulated import Station
+from ftdrive.commands.export.calibration import Made, calibration
+from ftdrive.commands.options import FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
+from ftdrive.errors import ConfigError
+from ftdrive.exports.formats import FORMATS
+from ftdrive.terminal.console import answer, beside, hanging
+from ftdrive.terminal.text import Group, echo
+
+_OUTPUT = click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
+
+
+@click.group(cls=Group)
+def export() -> None:
+    """Write a plan or a calibration for another program. Files are never overwritten."""
+
+
+@export.result_callback()
+def _deliver(made: Made | None) -> None:
+    """Save or print what a command has made."""
+    if made is None:
+        return
+    text, output, about, facts, as_json = made
+    if output is not None:
+        write_new(output, text)
+        beside(as_json).print(f" Saved {output}")
+    if as_json:
+        write_json({"schema_version": 1, **about, "file": output and str(output), **facts, "text": text})
+    elif output is None:
+        echo(text, nl=False, fold=False)
+
+
+@export.command()
+@click.argument("path", metavar="PLAN.json", required=False, type=FILE)
+@click.option(
+    "--format",
+    "target",
+    required=True,
+    type=click.Choice(["urscript", "csv"]),
+    help="Format: a program for the pendant or a table of joint targets.",
+)
+@_OUTPUT
+@click.option(
+    "--dwell", "dwell_s", type=Number(0, 600), default=4.0, show_default=True, help="Rest at each pose, s (urscript)."
+)
+@simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
+@JSON
+def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, simulate: bool, as_json: bool) -> Made:
+    """Write a plan of `ftdrive plan --output` as a URScript program or as a table.
+
+    The program asks before it moves, and stops unless the arm is near the first pose, because the approach is not
+    planned. Unlike `ftdrive calibrate`, it has no guards.
+    """
+    from ftdrive.exports.urscript import program, table
+    from ftdrive.planning.plan import Plan
+    from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
+
+    check_simulate(simulate, real={"PLAN.json": path})
+    if path is None and not simulate:
+        raise ConfigError("which plan? Give the file that `ftdrive plan --output` has written, or --simulate")
+    if path is not None:
+        made = Plan.load(path)
+    else:
+        with Station.of(None) as station:
+            cell = station.cell
+        made = plan_for(cell, certifier_for(cell, cell.robot.model), USUAL_POSTURE_RAD)
+    text = program(made, dwell_s=dwell_s) if target == "urscript" else table(made)
+    return text, output, {"format": target, "plan": made.sha256}, {}, as_json
+
+
+@export.command()
+@click.option("--first", type=click.IntRange(24, 33), default=24, show_default=True, help="As `serve-load --first`.")
+@click.option("--example", is_flag=True, help="Append a program that weighs a part and sets the payload.")
+@_OUTPUT
+@simulate("Accepted for symmetry: the functions are the same.")
+@JSON
+def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_json: bool) -> Made:  # noqa: ARG001
+    """Write the functions with which a UR program uses `ftdrive serve-load`.
+
+    ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and
+    returns a state, never an old number.
+    """
+    from ftdrive.exports.urscript import functions
+
+    return functions(first, example=example), output, {}, {}, as_json
+
+
+@export.command()
+@JSON
+def formats(as_json: bool) -> None:
+    """List the formats of `ftdrive export calibration`."""
+    if as_json:
+        keys = ("description", "file", "subtracts", "expresses")
+        found = [{"name": name} | {key: getattr(one, key) for key in keys} for name, one in FORMATS.items()]
+        write_json({"schema_version": 1, "formats": found})
+        return
+    width = max(map(len, FORMATS))
+    for name, one in FORMATS.items():
+        answer.print(hanging(f"{name:{width}}  ", one.description, answer))
+
+
+export.add_command(calibration)

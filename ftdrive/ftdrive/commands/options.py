@@ -1,0 +1,635 @@
+"""The options that several commands share, as parameters of `click`, and what they stand for."""
+
+import importlib.util
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import wraps
+from math import isfinite
+from os import fsdecode
+from pathlib import Path
+from shlex import quote
+from socket import gethostname
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast, get_args
+
+import click
+from click.core import ParameterSource
+
+from ftcalib import files
+from ftcalib.files import parsed_json, require_new
+from ftdrive.cell.config import CellConfig, Setting, cell_of, recorded_cell, settings
+from ftdrive.cell.units import numbers, rows
+from ftdrive.errors import ConfigError, Declined
+from ftdrivers.ur.control import CONTROL_SETTINGS
+
+if TYPE_CHECKING:
+    from ftcalib import CalibrationResult
+    from ftdrive.stream.samples import Axes, Tracking, WrenchFrame
+    from ftdrive.stream.stream import Stream
+    from ftdrive.view.page import Page
+
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class Headed(click.Command):
+    """A command whose help has its options under headings: `headings` maps each to the options below it."""
+
+    def __init__(self, *args: Any, headings: Mapping[str, str], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self.headings = headings
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the options."""
+        options = {name: one for one in self.get_params(ctx) for name in one.opts}
+        for heading, names in self.headings.items():
+            with formatter.section(heading):
+                formatter.write_dl([options[name].get_help_record(ctx) or ("", "") for name in names.split()])
+
+
+def _together(*options: Callable[[F], F]) -> Callable[[F], F]:
+    """Make one decorator of several options, the first of which comes first in the help."""
+
+    def added(command: F) -> F:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return added
+
+
+PATH = click.Path(exists=True, path_type=Path)
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
+ALL = click.option(
+    "--all", "every", is_flag=True, help="Print each finding, the residuals and what sigma includes too."
+)
+JSON_LINES = click.option(
+    "--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result."
+)
+MODEL = click.option(
+    "--model", help="Model of the arm, for controllers that do not report it (CB3 before 3.12, e-Series before 5.6)."
+)
+
+
+CONTROL = click.option(
+    "--control",
+    type=click.Choice(CONTROL_SETTINGS),
+    help="What moves the arm.  [default: [robot] control, else auto]",
+)
+
+
+def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
+    """Make the option --runs."""
+    folder = click.Path(file_okay=False, path_type=Path)
+    return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
+
+
+def _known_sets(_context: click.Context, _parameter: click.Parameter, sets: str | None) -> str | None:
+    """Refuse unknown sets before a device is opened."""
+    if sets is not None:
+        from ftcalib.poses.selection import names_of
+
+        try:
+            names_of(sets)
+        except ValueError as error:
+            raise ConfigError(str(error)) from error
+    return sets
+
+
+SETS = click.option(
+    "--set",
+    "sets",
+    metavar="A+E",
+    callback=_known_sets,
+    help="Sets A to H of orientations of Yu's Fig. 6, such as A+E, instead of 24 poses.",
+)
+METHOD = click.option(
+    "--method",
+    metavar="METHOD",
+    default="ml",
+    show_default=True,
+    help="Method that solves the poses, one of `ftdrive solve`; srom takes the 24 poses of its paper.",
+)
+
+YES = click.option(
+    "--yes",
+    is_flag=True,
+    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
+)
+CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
+
+
+@dataclass(frozen=True, slots=True)
+class CellOptions:
+    """Options that describe a cell. A run keeps them, so that it is resumed with the same values."""
+
+    config: Path | None = None
+    robot: str | None = None
+    sensor: str | None = None
+    tool: tuple[str, ...] = ()
+    """Cylinders."""
+    control: str | None = None
+    model: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what run.json keeps of them."""
+        kept = ("config", "robot", "sensor", "tool", "control")
+        return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
+
+    def _or_those(self, begun: Mapping[str, Any]) -> "CellOptions":
+        """Return them with those of a run, from `to_dict`, where none is given; a lost file of the run is left out."""
+        config = Path(begun["config"]) if begun.get("config") else None
+        return CellOptions(
+            self.config or (config if config is not None and config.is_file() else None),
+            self.robot or begun.get("robot"),
+            self.sensor or begun.get("sensor"),
+            self.tool or tuple(begun.get("tool", ())),
+            self.control or begun.get("control"),
+        )
+
+    def settings(self) -> dict[str, Setting]:
+        """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
+        flags = {
+            "robot.host": ("--robot", self.robot),
+            "robot.model": ("--model", self.model),
+            "sensor.url": ("--sensor", self.sensor),
+            "tool.cylinders_mm": ("--tool", rows("--tool", self.tool, (3, 5))),
+            "robot.control": ("--control", self.control),
+        }
+        return settings(self.config, flags)
+
+    def cell(self, *, sensor_alone: bool = False) -> CellConfig:
+        """Return the cell. With `sensor_alone`, a `sensor` needs no robot: its host is empty where none is set."""
+        values = self.settings()
+        needs_robot = not sensor_alone or self.sensor is None or values["robot.host"].value is not None
+        return cell_of(values, devices=needs_robot)
+
+    def sensor_alone(self) -> CellConfig:
+        """Return the cell with a sensor; of the arm nothing is needed, even if it is configured."""
+        cell = cell_of(self.settings(), devices=False)
+        if not cell.sensor.url:
+            raise ConfigError("no sensor: give --sensor URL, or --simulate; `ftdrive devices --probe PLACE` finds one")
+        return cell
+
+    def cell_to_resume(self, folder: Path, header: Mapping[str, Any], say: Callable[[str], object]) -> CellConfig:
+        """Return the cell of a resumed run with this header; options given now replace those of the run.
+
+        Files and environment describe tool and surroundings as they are now; the session refuses to continue if they
+        differ from those of the plan. If no file describes them any more, the run's own record is used. `say` takes a
+        sentence about where they come from.
+        """
+        described = self._or_those(header.get("said", {}))
+        found, before = described.settings(), recorded_cell(header["config"])
+        undescribed = {"default", "not set", "--tool"}
+        origins = {one.origin for key, one in found.items() if key.startswith(("tool.", "workcell."))} - undescribed
+        if origins:
+            say(f"Tool and surroundings are read from {', '.join(sorted(origins))}.")
+            for key, value in (("robot.host", before.robot.host), ("sensor.url", before.sensor.url)):
+                if found[key].value is None:
+                    found[key] = Setting(value, str(folder))
+            return cell_of(found)
+        say("No file describes tool and surroundings: the settings of the run are used.")
+        cylinders_mm = found["tool.cylinders_mm"].value or before.tool.cylinders_mm
+        host, control = described.robot or before.robot.host, described.control or before.robot.control
+        return replace(
+            before,
+            robot=replace(before.robot, host=host, control=control),
+            sensor=replace(before.sensor, url=described.sensor or before.sensor.url),
+            tool=replace(before.tool, cylinders_mm=cylinders_mm),
+        )
+
+
+def CELL(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options --config, --robot and --sensor, and pass them to the command as `CellOptions`."""
+
+    @wraps(command)
+    def with_cell(config: Path | None, robot: str | None, sensor: str | None, **options: Any) -> None:
+        command(described=CellOptions(config, robot, sensor), **options)
+
+    sensor_help = "Address, such as ati-can://can0?bitrate=250000, bota:///dev/ttyUSB0 or robotiq-ft300://HOST."
+    found = click.option("--sensor", metavar="URL", help=sensor_help)(with_cell)
+    return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(found))
+
+
+EDITED = "that was edited by hand; every output then says so"
+FORCE = click.option("--force", is_flag=True, help=f"Apply a calibration {EDITED}.")
+
+CALIBRATION = click.option(
+    "--calibration",
+    "path",
+    metavar="PATH",
+    type=PATH,
+    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+)
+
+
+BAG_TOPICS = _together(
+    click.option("--wrench-topic", metavar="TOPIC", help="Of a bag of ROS: topic of WrenchStamped."),
+    click.option(
+        "--pose-topic",
+        metavar="TOPIC",
+        help="Of a bag of ROS: topic of PoseStamped, tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F.",
+    ),
+)
+
+
+class Number(click.FloatRange):
+    """A finite number within a range; `click` alone accepts nan."""
+
+    name = "number"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number."""
+        number: float = super().convert(value, param, ctx)
+        if not isfinite(number):
+            self.fail(f"'{value}' is not a number.", param, ctx)
+        return number
+
+
+POSITIVE = Number(0, min_open=True)
+
+
+def require_extra(extra: str, what: str, *modules: str) -> None:
+    """Raise `ConfigError` before any work if one of the `modules` that an extra brings is missing for `what`."""
+    from ftdrivers.installation import missing_extra
+
+    if missing := [name for name in modules if importlib.util.find_spec(name) is None]:
+        raise ConfigError(missing_extra(what, missing[0], extra))
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """Whether a command has a page in the browser, and where it is served."""
+
+    view: bool
+    address: str | None
+
+    @property
+    def wanted(self) -> bool:
+        """Whether there is one: an address implies it."""
+        return self.view or self.address is not None
+
+    def require(self, *, once: bool = False, allow_control: bool = False) -> None:
+        """Raise `ConfigError` for options that would be ignored, or if a package of a page is missing."""
+        if once and self.wanted:
+            raise ConfigError("--view does not go with --once: leave one of the two out")
+        if allow_control and not self.wanted:
+            raise ConfigError("--allow-control goes only with --view: add it, or leave --allow-control out")
+        if self.wanted:
+            require_extra("viz", "--view", "uplot", "segno")
+
+    @contextmanager
+    def page(self, title: str) -> Iterator["Page | None"]:
+        """Serve a page while the block runs, and print its address; None where it is not wanted."""
+        from ftdrive.servers.http_gate import host_and_port
+
+        address = None
+        if self.address is not None:
+            address = host_and_port("--view-address", self.address, "0.0.0.0:8080")
+        if not self.wanted:
+            yield None
+            return
+        self.require()
+        from ftdrive.terminal.console import print_page
+        from ftdrive.view.site import announced, serve
+
+        with serve(title, address) as page, announced(page, address, print_page):
+            yield page
+
+
+def view_options(command: F) -> F:
+    """Add the options --view and --view-address, as one argument `view` of type `ViewOptions`."""
+
+    @click.option("--view", is_flag=True, help="Show it in the browser (needs ftdrive[viz]).")
+    @click.option(
+        "--view-address",
+        metavar="HOST:PORT",
+        help="Serve that page to other devices too, such as 0.0.0.0:8080 for a tablet; implies --view.",
+    )
+    @wraps(command)
+    def with_view(view: bool, view_address: str | None, **options: Any) -> None:
+        command(view=ViewOptions(view, view_address), **options)
+
+    return cast("F", with_view)
+
+
+class NewFile(click.Path):
+    """A file that a command creates. It is rejected before any work if it exists or its folder does not."""
+
+    def __init__(self) -> None:
+        super().__init__(dir_okay=False, path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path; raises `ConfigError`."""
+        path = Path(fsdecode(super().convert(value, param, ctx)))
+        try:
+            require_new(path)
+        except OSError as error:
+            raise ConfigError(f"{max(param.opts, key=len) if param else '--output'}: {error}") from error
+        return path
+
+
+def _drawable(_context: click.Context, _parameter: click.Parameter, png: Path | None) -> Path | None:
+    """Refuse a picture before any work if its package is missing."""
+    if png is not None:
+        require_extra("viz", "--png", "matplotlib")
+    return png
+
+
+PLAN_FILES = _together(
+    click.option("--output", type=NewFile(), help="Save the plan as a new JSON file."),
+    click.option("--png", type=NewFile(), callback=_drawable, help="Save stick figures (needs ftdrive[viz])."),
+)
+
+
+def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
+    """Make the option --simulate, which every command accepts."""
+    return click.option("--simulate", is_flag=True, help=words)
+
+
+EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With --simulate: the emulated sensor.")
+
+
+def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
+    """Raise `ConfigError` for an option that would be ignored: one of a real cell, or one that needs --simulate.
+
+    `real` and `emulated` have the values by option. None, False and empty mean not given.
+    """
+    if given := [option for option, value in (real if simulate else emulated).items() if value]:
+        fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
+        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
+
+
+class Source(NamedTuple):
+    """The cell and the calibration of a compensated stream, as the options of `SOURCE` name them."""
+
+    path: Path | None
+    tool: str | None
+    force: bool
+    described: CellOptions
+    simulate: bool
+
+    def calibration(self) -> "CalibrationResult | None":
+        """Read it, or calibrate the emulated cell; None if a tool is named, or nothing."""
+        from ftdrive.runs.calibration import read_calibration
+        from ftdrive.session.rehearsal import short_calibration
+        from ftdrive.terminal.screen import open_operator
+
+        if self.path is not None:
+            return read_calibration(self.path, accept_edited=self.force)
+        return short_calibration(open_operator(), self.described.sensor) if self.simulate else None
+
+    def stream(
+        self, cell: CellConfig | None, calibration: "CalibrationResult | None", tool: str | None, **options: Any
+    ) -> "Stream":
+        """Return the stream of a cell, not open yet, or without a cell that of an emulated one; a tool goes first.
+
+        Raises `ConfigError` without a calibration and without the name of a tool. Other keywords are those of
+        `open_stream`.
+        """
+        from ftdrive.library import open_stream
+        from ftdrive.session.rehearsal import station_of
+
+        # an emulated cell ends with its stream, so each stream has one of its own
+        emulated = station_of(calibration, self.described.sensor) if cell is None and calibration is not None else None
+        if (place := cell or emulated) is None or not (tool or calibration):
+            raise ConfigError(
+                "no calibration: give --calibration PATH or --tool NAME, or --simulate; `ftdrive history` lists "
+                "calibrations, `ftdrive live --raw` needs none"
+            )
+        chosen: dict[str, Any] = {"tool": tool} if tool else {"calibration": calibration}
+        name = "temporary calibration" if self.path is None else str(self.path)
+        return open_stream(place, **chosen, name=name, force=self.force, **options)
+
+    def open(
+        self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
+    ) -> "Stream":
+        """Open the stream, with these settings of the stages, until `stack` closes it.
+
+        The state of the calibration and warnings are printed.
+        """
+        from ftdrive.terminal.console import messages
+
+        calibration = self.calibration()
+        cell = None if self.simulate or (calibration is None and self.tool is None) else self.described.cell()
+        stream = stack.enter_context(self.stream(cell, calibration, self.tool, frame=frame, track=track))
+        stream.stages = replace(stream.stages, **stages)
+        if self.tool is not None:
+            messages.print(f" {self.tool}: {stream.info.calibration_name}")
+        messages.print(f" {stream.info.calibration_state}")
+        for words in stream.warnings:
+            messages.print(f" {words}")
+        return stream
+
+    def require_alone(self, others: Mapping[str, object]) -> None:
+        """Raise `ConfigError` for options that need an arm or a calibration: of these, and `others` by their names."""
+        own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
+        if given := [option for option, value in {**own, **others}.items() if value]:
+            raise ConfigError(
+                f"{given[0]} does not go with --raw, which shows a sensor alone: leave one of the two out"
+            )
+
+    def open_log(
+        self, stream: "Stream", stack: ExitStack, say: Callable[[str], object]
+    ) -> Callable[[Mapping[str, files.JSON]], None]:
+        """Return a function that keeps a weighing of the stream, until `stack` ends; none with a temporary calibration.
+
+        `say` takes a sentence for the operator, from any thread.
+        """
+        from ftdrive.runs.calibration import EMULATED
+        from ftdrive.store import store_url
+        from ftdrive.store.weighing_log import WeighingLog
+
+        if self.simulate and self.path is None:
+            return lambda _: None
+        info, cell = stream.info, stream.cell
+        origin: dict[str, files.JSON] = {
+            "tool": (info.calibration.provenance.get("setup") or {}).get("tool") or info.tool,
+            "calibration_id": info.calibration.id,
+            "arm_serial": info.arm.serial,
+            "sensor_serial": info.sensor.serial,
+            "robot_host": cell.robot.host,
+            "emulated": EMULATED in info.marks,
+            "computer": gethostname(),
+        }
+        log = WeighingLog(origin, store_url() if self.simulate else cell.store.url, say)
+        stack.callback(log.close)
+        return log.keep
+
+
+def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options that name cell and calibration, and pass them to the command as one `Source`."""
+
+    @wraps(command)
+    def with_source(**options: Any) -> None:
+        source = Source(*(options.pop(name) for name in Source._fields))
+        described = source.described
+        real = {"--tool": source.tool, "--config": described.config, "--robot": described.robot}
+        check_simulate(source.simulate, real=real)
+        if source.path is not None and source.tool is not None:
+            raise ConfigError("--calibration and --tool exclude one another: leave one of them out")
+        command(source=source, **options)
+
+    force = f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
+    tool = "Newest accepted calibration of this tool on this cell."
+    words = "Use the emulated cell of the calibration, or one with --sensor emulated://NAME."
+    found: Callable[..., None] = simulate(words)(with_source)
+    found = click.option("--force", is_flag=True, help=force)(CELL(found))
+    return CALIBRATION(click.option("--tool", metavar="NAME", help=tool)(found))
+
+
+TRACK = click.option(
+    "--track",
+    type=click.Choice(["off", "show", "apply"]),
+    default="off",
+    show_default=True,
+    help="Follow bias and held part while the arm works; only apply corrects the wrench.",
+)
+
+
+def frame_options(axes: "Axes", about: str) -> Callable[[F], F]:
+    """Make the options --axes and --about with their defaults, as one argument `frame` of type `WrenchFrame`."""
+    point = "Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes."
+    choice = click.Choice(["sensor", "flange", "base", "tcp"])
+
+    def added(command: F) -> F:
+        @click.option("--axes", type=choice, default=axes, show_default=True, help="Axes of the wrench.")
+        @click.option("--about", default=about, show_default=True, metavar="POINT", help=point)
+        @wraps(command)
+        def with_frame(axes: "Axes", about: str, **options: Any) -> None:
+            command(frame=_frame(axes, about), **options)
+
+        return cast("F", with_frame)
+
+    return added
+
+
+def _frame(axes: "Axes", about: str) -> "WrenchFrame":
+    from ftdrive.stream.samples import Point, WrenchFrame
+
+    if about in get_args(Point):
+        return WrenchFrame(axes, cast("Point", about))
+    x, y, z = numbers("--about", about, ",", [3])
+    return WrenchFrame(axes, (x, y, z))
+
+
+FRAME = frame_options("sensor", "sensor")
+
+
+def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: str) -> dict[str, Any]:
+    """Read settings of stages before a device is opened; raises `ConfigError`."""
+    from ftdrive.servers.parameters import STAGE_TEXTS, checked_value
+
+    found = {}
+    for name, _, value in (part.partition("=") for part in filter(None, text.split(","))):
+        if name not in STAGE_TEXTS:
+            raise ConfigError(f"--stages has no setting '{name}': give NAME=VALUE with one of {', '.join(STAGE_TEXTS)}")
+        try:
+            found[name] = checked_value(name, parsed_json(value))
+        except ValueError:  # a text
+            found[name] = checked_value(name, value)
+    return found
+
+
+STAGES = click.option(
+    "--stages",
+    metavar="NAME=VALUE[,...]",
+    default="",
+    callback=_checked_stages,
+    help="Settings of the stages at the beginning, such as lowpass_Hz=20,bias=false.",
+)
+STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
+
+
+@contextmanager
+def declined_aborts() -> Iterator[None]:
+    """Print why the operator ended a session, and abort the command."""
+    from ftdrive.terminal.console import messages
+
+    try:
+        yield
+    except Declined as error:
+        messages.print(str(error))
+        raise click.Abort from error
+
+
+def write_json(value: Mapping[str, Any]) -> None:
+    """Write one JSON object to stdout, on one line."""
+    click.echo(json.dumps(value))
+
+
+SOLVED_WITH = _together(
+    click.option(
+        "--orientation",
+        type=click.Choice(["R_base_flange", "R_flange_base"]),
+        default="R_base_flange",
+        show_default=True,
+        help="Rotation in a table, also that of --test: flange to base coordinates, or the inverse (as in the papers).",
+    ),
+    click.option(
+        "--drift",
+        type=click.Choice(["auto", "none", "linear", "random-walk"]),
+        default="auto",
+        show_default=True,
+        help="Model of the bias drift; rows without times count as equally spaced.",
+    ),
+    click.option("--mass-kg", metavar="KG", type=POSITIVE, help="Known mass below the sensor."),
+    click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma)."),
+    click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange."),
+    click.option(
+        "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
+    ),
+)
+_OF_TABLE = _together(
+    click.option(
+        "--columns",
+        metavar="NAMES",
+        help='Columns of a table by our names, "t=Time [ms],fx=Force X", or a TOML file with [columns].',
+    ),
+    click.option("--rate", metavar="HZ", type=POSITIVE, help="Samples a second of a table without times."),
+    click.option(
+        "--euler", metavar="ORDER", help="Three angles: rpy, ABC, WPR, OAT, ZYX (axes of the tool), xyz (of the base)."
+    ),
+    click.option(
+        "--tcp", metavar="X,Y,Z,RX,RY,RZ", help="TCP in the flange, m and rad, if the poses are those of the TCP."
+    ),
+    click.option(
+        "--wrench-frame",
+        type=click.Choice(["sensor", "flange", "tcp", "base"]),
+        help="Axes of the wrench; tcp and base are about the TCP.  [default: by the layout, mostly sensor]",
+    ),
+    click.option("--sign", type=click.Choice(["1", "-1"]), help="-1 for a sensor that reports the reaction."),
+    click.option("--model", help="Joint angles of a UR arm: its model, such as UR5e."),
+    click.option("--urdf", metavar="FILE", help="Joint angles of another arm: URDF, FILE?flange=LINK&base=LINK."),
+)
+TABLE_NAMES = ("columns", "rate", "euler", "tcp", "wrench_frame", "sign", "model", "urdf")
+
+
+def TABLE(command: Callable[..., None]) -> Callable[..., None]:
+    """Add the options of a table, and pass them to the command as `TableOptions`; None if none is given."""
+
+    @wraps(command)
+    def with_table(**options: Any) -> None:
+        from ftdrive.runs.source import table_options
+
+        given = {name: options.pop(name) for name in TABLE_NAMES}
+        command(table=table_options(**given) if any(given.values()) else None, **options)
+
+    return _OF_TABLE(with_table)
+
+
+REPORTED = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up", *TABLE_NAMES)
+"""Names of the options of `solve` that `report` takes too."""
+
+
+def typed(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
+    """Return the options that were given, as words for a shell; with `names` only these."""
+    words = list[str]()
+    for one in context.command.params:
+        is_given = one.name is not None and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT
+        if isinstance(one, click.Option) and is_given and (names is None or one.name in names):
+            words += [one.opts[0]] if one.is_flag else [one.opts[0], quote(str(context.params[str(one.name)]))]
+    return tuple(words)
