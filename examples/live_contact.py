@@ -8,7 +8,7 @@ released: list[ftdrive.Contact] = []
 def on_contact(contact: ftdrive.Contact) -> None:
     """Print the beginning of a contact, 60 ms later, and its end."""
     if contact.over:
-        print(f"released after {contact.duration_s:.0f} s, peak {contact.peak_N:.0f} N")
+        print(f"released, peak {contact.peak_N:.0f} N")
         released.append(contact)
     else:
         print("contact")
