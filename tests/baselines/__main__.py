@@ -27,8 +27,8 @@ import numpy as np
 import ftdrive
 import tests.conftest  # the configuration and the terminal of the user do not matter  # noqa: F401
 from ftcalib.published.methods import PUBLISHED
-from ftdrive.commands.live import replayed
-from ftdrive.live.samples import Block, Stages, WrenchFrame
+from ftdrive.recording.replay import replayed
+from ftdrive.stream.samples import Block, Stages, WrenchFrame
 from tests.baselines.pack import unpack
 from tests.system.command_line import CommandLine
 from tests.unit.ftdrive.recorded import dataset

@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, NotObservable, solve
 from ftcalib.judge.cross_validation import standardize
 from ftcalib.likelihood import fit as likelihood
-from ftcalib.likelihood.response import predicted_covariance
-from ftcalib.model import UP_IN_BASE, Array, predict
+from ftcalib.model import UP_IN_BASE, Array, SPECIAL_R_flange_base, predict
 from ftcalib.published.methods import published
-from ftcalib.published.yu import SPECIAL_R_flange_base, lrom, srom
+from ftcalib.published.yu import lrom, srom
+from ftcalib.sensor_matrix import predicted_covariance
 from ftdrive import read_dataset
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run

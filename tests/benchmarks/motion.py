@@ -20,12 +20,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.model import Parameters
 from ftcalib.motion.estimate import fit
 from ftcalib.motion.model import DELAY, INERTIA, Load
 from ftcalib.motion.samples import Means, rows_of
 from ftcalib.motion.solve import solve_motion
+from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 from tests.benchmarks.common import Row, show_rows
 from tests.moving_load import Recorded, Truth, means_of, programme, record, sweep
 

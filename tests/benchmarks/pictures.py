@@ -22,14 +22,14 @@ from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType
-from typing import get_args
+from typing import Any, cast, get_args
 
 import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from ftdrive.fleet.page import page
-from ftdrive.live.weighing import ScaleState
+from ftdrive.stream.weighing import ScaleState
 from ftdrive.terminal.canvas import Canvas
 from tests.benchmarks.common import show
 from tests.unit.ftdrive.fleet.fleet_records import cell, daily, fleet, observed, result
@@ -166,7 +166,7 @@ def draw_live() -> None:
 
 def draw_weigh() -> None:
     weighing = FakeWeighing(ScaleState(PART, None))
-    weighing.stream.info = INFO
+    cast("Any", weighing.stream).info = INFO
     write("weigh.svg", with_dots(picture(Scale(weighing).screen, SCALE_ROWS, "ftdrive weigh")))
 
 

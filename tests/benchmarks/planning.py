@@ -19,7 +19,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_box, _plan_cone, guess_of, plan_tour
 from ftdrive.planning.search.nodes import constant_tour
 from ftdrivers.ur.kinematics import Array
 from tests.benchmarks.common import show
@@ -102,7 +102,7 @@ def searches() -> None:
             row(
                 f"{model:6s} box +-{1e3 * half:3.0f} mm",
                 5,
-                partial(plan_box, certifier, half_size_m=half, centre_m=point, speeds=Speeds(), guess=guess),
+                partial(_plan_box, certifier, half_size_m=half, centre_m=point, speeds=Speeds(), guess=guess),
             )
     for model, tool, deg in [("UR3e", TOOLS["200 x 100"], deg) for deg in (30, 60, 90, 180)] + [
         ("UR5e", TOOLS["200 x 100"], 60),
@@ -115,7 +115,7 @@ def searches() -> None:
         row(
             f"{model:6s} cone {deg:3d} deg{lump}",
             5,
-            partial(plan_cone, certifier, half_angle_rad=np.radians(deg), speeds=Speeds(), guess=guess),
+            partial(_plan_cone, certifier, half_angle_rad=np.radians(deg), speeds=Speeds(), guess=guess),
         )
 
 
@@ -183,9 +183,9 @@ def cells(rng: np.random.Generator) -> Iterator[tuple[Certifier, Array, Callable
         poses, half_angle = int(rng.choice([24, 12, 6])), rng.uniform(0.3, 2.5)
         guess = guess_of(certifier)
         if k % 10 == 0:
-            make = partial(plan_cone, certifier, q, poses, half_angle_rad=half_angle, speeds=Speeds(), guess=guess)
+            make = partial(_plan_cone, certifier, q, poses, half_angle_rad=half_angle, speeds=Speeds(), guess=guess)
         elif k % 10 == 1:
-            make = partial(plan_box, certifier, q, poses, half_size_m=0.15, speeds=Speeds(), guess=guess)
+            make = partial(_plan_box, certifier, q, poses, half_size_m=0.15, speeds=Speeds(), guess=guess)
         else:
             make = partial(plan_tour, certifier, q, poses, speeds=Speeds(), guess=guess)
         yield certifier, q, make

@@ -22,9 +22,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, NotObservable, Setup, solve
-from ftcalib.model import Array
+from ftcalib.model import Array, SPECIAL_R_flange_base
 from ftcalib.published.methods import BASELINES, PUBLISHED
-from ftcalib.published.yu import SPECIAL_R_flange_base
 from ftcalib.result import Method
 from tests.benchmarks.common import restart_with_one_thread, show
 

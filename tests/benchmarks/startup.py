@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ftdrive.recording import Recorder
-from ftdrive.terminal.text import COMMANDS
+from ftdrive.words.text import COMMANDS
 from tests.unit.ftdrive.recorded import block, info
 
 _PEER = ("-c", "import numpy, scipy.optimize, scipy.spatial.transform, click")
@@ -68,8 +68,8 @@ def main() -> int:
         lines = Path(_POSES).read_text("utf-8").splitlines(keepends=True)
         (folder / "17.csv").write_text("".join(lines[:18]), "utf-8")
         recorder = Recorder([folder / "recording.csv"], info(), {})
-        recorder.write(block(2500))
-        recorder.close()
+        recorder.add(block(2500), [])
+        recorder.end()
         run = folder / "runs" / "a"
         run.mkdir(parents=True)
         seconds(("-m", "ftdrive", "solve", _POSES, "--output", str(run / "calibration.json")), folder)

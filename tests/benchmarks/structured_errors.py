@@ -30,7 +30,7 @@ from ftcalib.after.verification import verify
 from ftcalib.after.weighing import drift_since, weigh
 from ftcalib.errors import BadDataset
 from ftcalib.motion.solve import solve_motion
-from ftdrive.live.noise import unexplained_variance
+from ftdrive.stream.noise import unexplained_variance
 from tests.benchmarks.common import Array, Lab, Record, Row, all_within, most, run
 from tests.moving_load import means_of
 from tests.structured_cell import (

@@ -10,7 +10,7 @@ import pytest
 from ftdrive.cell.emulated import Station
 from tests.browser.conftest import address_of
 from tests.system.command_line import CommandLine, say, wait_until
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

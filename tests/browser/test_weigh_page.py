@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ftdrive.cell.emulated import Station
 from tests.browser.conftest import WIDTHS, address_of, nothing_is_cut
 from tests.system.command_line import CommandLine
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 if TYPE_CHECKING:
     from playwright.sync_api import Page

@@ -16,6 +16,9 @@ def is_hit(node: ast.AST) -> bool:
     match node:
         case ast.Call(args=[ast.Call(func=ast.Name(id=name)), *_]) if name in SAFE:
             return False
+        # By default it escapes all but printable ASCII.
+        case ast.Call(args=[ast.Call(func=ast.Attribute(value=ast.Name(id="json"), attr="dumps"), keywords=[]), *_]):
+            return False
         case ast.Call(func=ast.Name(id="print" | "Console")):
             return True
         case ast.Call(func=ast.Attribute(value=ast.Name(id="click"), attr="echo" | "secho" | "prompt" | "confirm")):

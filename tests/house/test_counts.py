@@ -16,25 +16,25 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 72793,
-    "files": 314,
-    "dataclasses": 239,
-    "public functions and classes": 1443,
-    "import statements inside functions": 334,
-    "test lines": 81737,
+    "product lines": 70706,
+    "files": 310,
+    "dataclasses": 236,
+    "public functions and classes": 1430,
+    "import statements inside functions": 113,
+    "test lines": 81533,
 }
 ROOMS = {
-    "a: calibrate, to the first move": 72,
-    "b: live --replay": 42,
-    "c: solve of poses": 41,
-    "d: solve of a recording in motion": 42,
+    "a: calibrate, to the first move": 70,
+    "b: live --replay": 30,
+    "c: solve of poses": 37,
+    "d: solve of a recording in motion": 37,
 }
 """Modules that a command walks through: the definition is that of `rooms.py`."""
 
 LINES_OF_A_MODULE = 700
 LONGER = {
     "calib/ftcalib/motion/estimate.py": 790,
-    "calib/ftcalib/result.py": 744,
+    "calib/ftcalib/result.py": 741,
 }
 """Modules that are longer, until the core has one model of a result and one of an estimate (issue 67)."""
 

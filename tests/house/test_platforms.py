@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder
+from ftdrive.stream.samples import StreamEvent
 from tests.house.uv import run_uv
 from tests.unit.ftdrive.recorded import block, calibration, dataset, info
 from tests.unit.ftdrive.store.run_folders import new_run
@@ -52,9 +52,9 @@ def test_all_dependencies_have_wheels(python: str, system: str) -> None:
 @pytest.mark.slow
 def test_commands_without_devices_need_no_posix(tmp_path: Path) -> None:
     recorder = Recorder([tmp_path / "a.mcap"], info(), {})
-    recorder.write(block(3000))
-    recorder.event(StreamEvent(0, "delay", "…", {"value": 0.0031, "sigma": 0.0002}))
-    recorder.close()
+    recorder.add(block(3000), [])
+    recorder.add(None, [StreamEvent(0, "delay", "…", {"value": 0.0031, "sigma": 0.0002})])
+    recorder.end()
     new_run(tmp_path / "runs", "day-1", calibration())
     dataset().save(tmp_path / "dataset.json")
     commands = [

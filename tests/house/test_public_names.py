@@ -80,8 +80,8 @@ def user_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("user")
     shutil.copy(EXAMPLES / "poses.csv", folder)
     recorder = Recorder([folder / "peg.csv"], info(), {})
-    recorder.write(block(3000))
-    recorder.close()
+    recorder.add(block(3000), [])
+    recorder.end()
     run = Run.create(folder, "gripper", {"config": {"site": {"g_m_s2": 9.80665}}})
     rng = np.random.default_rng(3)
     for stop, R in enumerate(special([1, 5, 9, 14, 18, 22]), 1):

@@ -108,6 +108,8 @@ def test_whatever_is_printed_cannot_command_the_terminal() -> None:
         ("handlers = [logging.StreamHandler()]", True),
         ("self._stderr.write(in_whole_words(text, file))", False),
         ("click.prompt(visible(shown))", False),
+        ("click.echo(json.dumps(found))", False),
+        ("click.echo(json.dumps(found, ensure_ascii=False))", True),
         ("echo(run.tool)", False),
         ("messages.print(run.tool)", False),
         ("file.write(text)", False),

@@ -11,8 +11,8 @@ from typing import Any, cast
 import numpy as np
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Block, LinkStatus, StreamEvent, StreamStatus
 from ftdrive.servers.ros2 import Ros2Node
+from ftdrive.stream.samples import Block, LinkStatus, StreamEvent, StreamStatus
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.servers import fake_stream
 from tests.unit.ftdrive.servers.fake_stream import FakeStream, block
@@ -29,14 +29,15 @@ class Stream(FakeStream):
         super().__init__()
         self.info = replace(
             fake_stream.INFO,
-            calibration=cast(Any, _CALIBRATION),
+            result=cast(Any, _CALIBRATION),
             arm=cast(Any, _DEVICE),
             sensor=cast(Any, _DEVICE),
             sensor_rate_Hz=_RATE_HZ,
             utc_offset_ns=time.time_ns() - time.monotonic_ns(),
         )
         self.warnings: tuple[str, ...] = ()
-        self.silent = False
+        self.devices = self
+        self.silent = self.has_ended = False
         self.blocks: list[Block] = []
         self.replaced: Block | None = None
         """Read next, once."""

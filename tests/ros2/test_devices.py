@@ -15,17 +15,19 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.motion.samples import measured_s
 from ftdrive.cell.emulated import REAL_PACE, Station
-from ftdrive.live.samples import Block
-from ftdrive.live.stream import CompensatedStream
-from ftdrive.runs.motion import MotionRecording, measured_s
+from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import Run
+from ftdrive.stream.samples import Block
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, NoRos2, StreamBroken
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm
 from tests.ros2.seven_joints import TRUTH, URDF
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 CELL = """format = "ftdrive.config/1"
 [robot]
@@ -148,13 +150,13 @@ def test_a_topic_beside_a_driver_of_another_device(stack: ExitStack, by_topic: s
         cell = replace(cell, sensor=replace(cell.sensor, url="ros2:/ft/wrench?recover=1"))
     else:
         cell = replace(cell, robot=replace(cell.robot, host="ros2:/arm/pose", model=None))
-    block = first_block(CompensatedStream(cell, calibrated_from(station.truth), force=True))
+    block = first_block(Stream(CellSource(cell, calibrated_from(station.truth), force=True)))
     assert np.isfinite(block.wrench).all()
     assert np.isnan(block.q_rad).all() == (by_topic == "robot")
     assert (np.linalg.norm(block.raw[:, :3] - TRUTH["force_bias_N"], axis=1) < 20).all() or by_topic == "robot"
 
 
-def first_block(stream: CompensatedStream) -> Block:
+def first_block(stream: Stream) -> Block:
     """Read on, because on a busy computer a device may be silent for too long."""
     for _ in range(20):
         with suppress(DeviceError), stream:

@@ -18,15 +18,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.exports.registry import export
-from ftdrive.exports.shared import Settings
-from ftdrive.live.processing import Processor
-from ftdrive.live.samples import EventKind, Stages, StreamEvent, WrenchFrame
+from ftdrive.exports.registry import Settings, export
+from ftdrive.stream.processing import Processor
+from ftdrive.stream.samples import EventKind, Stages, StreamEvent, WrenchFrame
 from ftdrivers.errors import NoRos2
 from ftdrivers.ros2.middleware import Node, ros2_module
 from tests.ros2.fake_cell import Stream
 from tests.target_formulas import evaluate
-from tests.unit.ftdrive.live import simulated
+from tests.unit.ftdrive.stream import simulated
 
 HASH = "RIHS01_8dc3deaf06b2ab281f9f9a742a8961c328ca7cec16e3fd6586d3a5c83fa78f77"
 """Of geometry_msgs/msg/WrenchStamped, as ROS 2 Jazzy and Kilted announce it."""
@@ -209,7 +208,7 @@ def test_a_tare_in_contact_is_refused_with_a_reason(stack: ExitStack) -> None:
     until(lambda: listener.wrench_s)
     kinds: tuple[EventKind, ...] = ("tool", "gap")
     for kind in kinds:
-        served.node.event(StreamEvent(7, kind, "logged as information, then as a warning"))
+        served.node.add(None, [StreamEvent(7, kind, "logged as information, then as a warning")])
     assert listener.call("tare").success
     assert served.stream.tares == 1
     served.stream.contact = True
@@ -288,7 +287,7 @@ def test_subscribers_go_on_after_a_node_is_killed_and_restarted(stack: ExitStack
 
 def test_the_exported_broadcaster_computes_the_wrench_of_the_node(stack: ExitStack) -> None:
     calibration = simulated.calibrated()
-    processor = Processor(simulated.info(calibration, 500.0), stages=Stages())
+    processor = Processor(simulated.info(calibration, 500.0), settings=Stages())
     R = Rotation.random(200, rng=np.random.default_rng(3)).as_matrix()
     listener, served = Listener(stack), Served(stack, "-p", "reliable:=true")
     processed = processor.process(simulated.paired(R, 500.0), last=True)

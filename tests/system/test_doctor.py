@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import rehearse
+from ftdrive.session.rehearsal import NoOperator, rehearse
 from tests.system.command_line import CommandLine, listen_for
 
 NAMED = {
@@ -97,7 +97,7 @@ def test_a_controller_without_dashboard_server(ftdrive: CommandLine) -> None:
     """It completes, and reports what cannot be known; then a calibration completes."""
     with Station("serial", ["--polyscope", "10.11.0"]) as station:
         checks = checks_of(ftdrive.run("doctor", "--config", ftdrive.connect(station), "--json"))
-        outcome = rehearse(station, ftdrive.folder, "without-dashboard", poses=6)
+        outcome = rehearse(station, ftdrive.folder, "without-dashboard", NoOperator(), poses=6)
     assert [name for name, check in checks.items() if check["state"] == "failed"] == []
     assert checks["robot.remote"]["state"] == "skipped"
     assert "does not report whether it accepts programs" in checks["robot.remote"]["found"]

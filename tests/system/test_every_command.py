@@ -153,8 +153,7 @@ def test_a_command_that_needs_a_run_works_with_simulate_and_json(
     capfd: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    module = importlib.import_module(f"ftdrive.commands.{'common' if ' ' in command else command}")
-    monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
+    rehearse_with(demo, command, monkeypatch)
     works_with_simulate_and_json(command, ftdrive, capfd)
 
 
@@ -168,6 +167,13 @@ def test_an_empty_gripper_is_weighed(
     demo: dict[str, Any], ftdrive: CommandLine, capfd: pytest.CaptureFixture[str]
 ) -> None:
     works_with_simulate_and_json("weigh", ftdrive, capfd, "--calibration", demo["run"])
+
+
+def rehearse_with(demo: dict[str, Any], command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give a command the run of the demo instead of one of its own."""
+    for module in (f"ftdrive.commands.{command.replace(' ', '.')}", "ftdrive.session.rehearsal"):
+        found = importlib.import_module(module)
+        monkeypatch.setattr(found, "rehearsed_run", lambda *_, **__: nullcontext(Path(demo["run"])), raising=False)
 
 
 def works_with_simulate_and_json(
@@ -225,11 +231,10 @@ def test_a_file_gets_the_answer_and_a_reader_that_ends_ends_the_command(
     command: str, demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if command in REHEARSED:
-        module = importlib.import_module(f"ftdrive.commands.{'common' if ' ' in command else command}")
-        monkeypatch.setattr(module, "rehearsed_run", lambda _, **_options: nullcontext(Path(demo["run"])))
+        rehearse_with(demo, command, monkeypatch)
     recorder = Recorder([csv := ftdrive.folder / "peg.csv"], info(), {})
-    recorder.write(block(100))
-    recorder.close()
+    recorder.add(block(100), [])
+    recorder.end()
     calibration().save(ftdrive.folder / "calibration.json")
     press = '[cells.press]\nconfig = "cell.toml"\nverify_every_days = 7\n'
     (ftdrive.folder / "cells.toml").write_text(f'format = "ftdrive.cells/1"\n{press}')

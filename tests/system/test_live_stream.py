@@ -9,16 +9,16 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.cell.emulated import Station
-from ftdrive.live.raw import RawStream
-from ftdrive.live.samples import Axes, Stages, WrenchFrame
-from ftdrive.live.stream import BlockReader, CompensatedStream
+from ftdrive.stream.samples import Axes, Stages, WrenchFrame
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream, pump
 from ftdrivers.errors import DeviceTimeout
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 OPTIONS = ("--time-scale", "1", "--sensor-origin", "0,0,0.03", "--inertia", "0,0,0,0,0,0", "--imperfections", "none")
 
 
-def read(stream: CompensatedStream, seconds: float) -> Array:
+def read(stream: Stream, seconds: float) -> Array:
     end_s = stream.clock.now_s() + seconds
     wrenches = []
     while stream.clock.now_s() < end_s:
@@ -31,7 +31,7 @@ def test_a_push_a_swing_and_an_interruption() -> None:
     with Station("serial", OPTIONS) as station:
         config = replace(station.cell, sensor=replace(station.cell.sensor, height_mm=30.0))
         calibration = calibrated_from(station.truth)
-        with CompensatedStream(config, calibration, frame=WrenchFrame("base", "flange")) as stream:
+        with Stream(CellSource(config, calibration), frame=WrenchFrame("base", "flange")) as stream:
             noise = read(stream, 2.0)[7000:].std(axis=0)
             assert stream.read().sigma == pytest.approx(noise, rel=0.5)
             station.control(do="push", wrench=[10.0, 0, 0, 0, 0, 0], axes="base")
@@ -62,7 +62,8 @@ def test_a_push_a_swing_and_an_interruption() -> None:
             dynamic = read(stream, 2.0).std(axis=0)
             stream.stages = Stages()
             static = read(stream, 2.0).std(axis=0)
-            assert (dynamic[:3] < 0.5 * static[:3]).all()
+            # of all axes, because two seconds need not move each of them
+            assert np.linalg.norm(dynamic[:3]) < 0.5 * np.linalg.norm(static[:3])
 
             station.control(do="sensor-faults", stall=True)
             with pytest.raises(DeviceTimeout):
@@ -81,13 +82,13 @@ def test_a_push_a_swing_and_an_interruption() -> None:
 
 @pytest.mark.slow
 def test_a_sensor_alone_is_read_again_after_an_interruption() -> None:
-    with Station("serial", OPTIONS) as station, RawStream(station.cell) as stream:
+    with Station("serial", OPTIONS) as station, Stream(CellSource(station.cell, None)) as stream:
         before = read(stream, 0.5).mean(axis=0)
         station.control(do="sensor-faults", stall=True)
         with pytest.raises(DeviceTimeout):
             read(stream, 5.0)
         station.control(do="sensor-faults", stall=False)
-        assert any(block is not None for block in islice(BlockReader(stream), 30))
+        assert any(block is not None for block in islice(pump(stream), 30))
         assert read(stream, 0.5).mean(axis=0) == pytest.approx(before, abs=0.05)
         kinds = [event.kind for event in stream.take_events()]
         assert kinds.count("stale") == kinds.count("recovered") == 1

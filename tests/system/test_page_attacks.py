@@ -20,7 +20,7 @@ import pytest
 from ftdrive.cell.emulated import REAL_PACE, Station
 from tests.system.attacked_page import SECRET, Attacked, served
 from tests.system.command_line import CommandLine, exit_code_of, say, wait_until
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
 

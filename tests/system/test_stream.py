@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from ftdrive.live import ros2
+from ftdrive.stream import ros2
 from tests.system.command_line import CommandLine, end_of, listen_for
 from tests.unit.ftdrive.servers.fake_stream import Client
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.accuracy import compensation_error
 from ftdrive.cell.emulated import Station
-from ftdrive.commands.common import rehearse
-from ftdrive.terminal.report import compensation_error
+from ftdrive.session.rehearsal import NoOperator, rehearse
 from tests.system.command_line import CommandLine
 
 pytestmark = pytest.mark.slow
@@ -37,7 +37,7 @@ def test_the_cell_of_a_calibration_passes(demo: dict[str, Any], ftdrive: Command
 
 
 def test_a_bias_step_and_another_payload_are_named(station: Station, ftdrive: CommandLine) -> None:
-    calibrated = rehearse(station, ftdrive.folder / "runs", "calibrate", poses=6)
+    calibrated = rehearse(station, ftdrive.folder / "runs", "calibrate", NoOperator(), poses=6)
     config, parent = ftdrive.connect(station), calibrated.run.calibration_path
     station.control(do="drift", force_N=[0.3, 0.4, 0.0], seconds=0.01)
     outcome = ftdrive.run(

@@ -3,8 +3,8 @@
 import pytest
 
 from ftcalib import CalibrationResult
+from ftcalib.accuracy import errors_in_sigma
 from ftdrive.cell.emulated import Station
-from ftdrive.terminal.report import errors_in_sigma
 from tests.system.command_line import CommandLine, assert_found
 
 WORLDS = {

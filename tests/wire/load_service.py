@@ -2,19 +2,21 @@
 
 import json
 import sys
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import program_registers
 from ftdrive.cell.emulated_clock import EmulatedClock
-from ftdrive.live.samples import WrenchFrame
-from ftdrive.live.stream import CompensatedStream
 from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from ftdrive.stream.samples import Block, StreamEvent, WrenchFrame
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 
-def opened(hello: dict[str, Any]) -> CompensatedStream:
+def opened(hello: dict[str, Any]) -> Stream:
     """Open the stream of a station by its first line."""
     url = next(iter(hello["sensors"].values()))["url"]
     height_mm = 1e3 * hello["truth"]["p_flange_sensor_m"][2]
@@ -23,25 +25,26 @@ def opened(hello: dict[str, Any]) -> CompensatedStream:
         SensorConfig(url, height_mm=height_mm),
         clock=EmulatedClock(hello["clock"]),
     )
-    return CompensatedStream(cell, calibrated_from(hello["truth"]), frame=WrenchFrame("base", "tcp"))
+    return Stream(CellSource(cell, calibrated_from(hello["truth"])), frame=WrenchFrame("base", "tcp"))
 
 
-def service_on(stream: CompensatedStream, first: int = 24) -> ProgramService:
+class Service(ProgramService):
+    """Reports that the first wrench was written."""
+
+    def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
+        super().add(block, events)
+        if self._live == 1:
+            sys.stdout.write("serving\n")
+            sys.stdout.flush()
+
+
+def service_on(stream: Stream, first: int = 24) -> ProgramService:
     """Return the service of an open stream."""
     connect = partial(program_registers, stream.cell, first, len(INTEGERS), len(doubles_of(stream.track)))
-    return ProgramService(stream, connect, sys.stderr.write)
-
-
-def started(service: ProgramService, _block: object) -> None:
-    """Report that the first wrench was written."""
-    service.on_block = None
-    sys.stdout.write("serving\n")
-    sys.stdout.flush()
+    return Service(stream, connect, sys.stderr.write)
 
 
 if __name__ == "__main__":
     with opened(json.loads(sys.argv[1])) as stream:
         stream.track = "show"
-        service = service_on(stream)
-        service.on_block = partial(started, service)
-        service.run()
+        service_on(stream).run()

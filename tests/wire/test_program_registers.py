@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftdrive.exports.program_functions import functions
+from ftdrive.exports.urscript import functions
 from ftdrivers.errors import ConnectError
 from ftdrivers.ur.rtde import ProgramRegisters
 from tests.wire.conftest import Station

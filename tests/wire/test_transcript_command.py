@@ -57,7 +57,15 @@ def recorded(url: str, tmp_path: Path) -> list[str]:
         answer_of(run("record", "--sensor", url, "-o", str(path), "--duration", "1", "--json"))["recorded"]["samples"]
         > 50
     )
-    return path.read_text().splitlines(keepends=True)
+    return on_time(path.read_text().splitlines())
+
+
+def on_time(lines: list[str]) -> list[str]:
+    """Shorten the pauses of a computer that has stalled while it recorded: no driver waits for what is behind them."""
+    entries: list[dict[str, Any]] = [json.loads(line) for line in lines]
+    steps = np.diff([entry["t_ns"] for entry in entries], prepend=entries[0]["t_ns"])
+    times = entries[0]["t_ns"] + np.minimum(steps, 2_000_000_000).cumsum()
+    return [json.dumps(entry | {"t_ns": int(t_ns)}) + "\n" for entry, t_ns in zip(entries, times, strict=True)]
 
 
 def play(lines: list[str], tmp_path: Path) -> Result:

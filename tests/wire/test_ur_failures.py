@@ -52,6 +52,7 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlPath
 from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.opening import Opening
+from ftdrivers.ur.sample import PROGRAM_STOPPED
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
 from tests.wire.moves import STEP_RAD, away, no_guard
@@ -507,6 +508,8 @@ def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Statio
     os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
     station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
     station.ask("dashboard-stop")
+    # A sample on its way can be from before the stop.
+    station.wait_for(lambda _: arm._reader is not None and arm._reader.look().program_state == PROGRAM_STOPPED)
     arm.open()
     another_takes_over(station)
     with pytest.raises(ConnectError, match="stop it at the pendant"):

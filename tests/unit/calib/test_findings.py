@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from ftcalib.findings import CODES, Finding, Severity, folded, ordered, verdict_of
+from tests.finding_examples import examples
 
 PRODUCT = Path(__file__).parents[3]
+UNITS = {"N", "Nm", "mNm", "kg", "m", "s", "mm", "deg", "percent"}
 
 
 def test_words_come_from_the_table_and_the_values() -> None:
     order = [["torque", ["-x", "y", "-z"]], ["force", ["y", "-x", "z"]]]
     finding = Finding.of("axes_disagree", corrections=order, residual_Nm=np.float64(0.301), corrected_Nm=0.0029)
     assert finding.words == (
-        "force and torque axes disagree, because with torque x and z reversed, or force x, y, z taken from (y, -x, z) "
-        "the torque residual is 0.0029 N·m instead of 0.3 N·m: check the columns "
-        "(--columns), the wiring of the axes, or the sensor's matrix"
+        "torque residual 0.3 N·m, but 0.0029 N·m with other axes of force or torque: try torque x and z reversed, or "
+        "force x, y, z taken from (y, -x, z) (--columns), or check the wiring of the axes and the sensor's matrix"
     )
 
 
@@ -29,11 +30,15 @@ def test_words_come_from_the_table_and_the_values() -> None:
         ("cable_pulls", {"poses": ["R03", "R07"]}, "pulls in R03, R07:"),
         ("pose_unsteady", {"pose": 4}, "pose 4 was"),
         ("constant_force", {"force_N": np.array([1.234, -2, 0])}, "(1.2, -2, 0) N"),
-        ("com_too_far", {"distance_m": 1.0, "most_m": 0.5, "units": []}, "than 0.5 m: check"),
+        (
+            "com_too_far",
+            {"distance_m": 1.0, "most_m": 0.5, "units": []},
+            "than 0.5 m: check the units of force and torque, ",
+        ),
         (
             "com_too_far",
             {"distance_m": 1.0, "most_m": 0.5, "units": [("lbf", "N·m"), ("kgf", "kgf·m"), ("N", "N·mm")]},
-            "than 0.5 m, as with forces in lbf, or forces in kgf and torques in kgf·m, or torques in N·mm: check",
+            "torque (perhaps forces in lbf, or forces in kgf and torques in kgf·m, or torques in N·mm), and",
         ),
         (
             "payload_mismatch",
@@ -51,6 +56,14 @@ def test_words_come_from_the_table_and_the_values() -> None:
 def test_forms_and_units(code: str, values: dict[str, object], says: str) -> None:
     severity = CODES[code].severities[0]
     assert says in Finding(code, severity, values).words
+
+
+@pytest.mark.parametrize("finding", [*examples()], ids=lambda one: one.code)
+def test_what_was_found_is_one_line_with_its_number(finding: Finding) -> None:
+    assert len(finding.found) <= 100
+    assert "None" not in finding.words
+    numbers = [place for place in re.findall(r"{(\w+)", CODES[finding.code].found) if place.rpartition("_")[2] in UNITS]
+    assert not numbers or re.search(r"\d", finding.found[:70])
 
 
 def test_a_finding_survives_json_and_infinity_is_not_known() -> None:

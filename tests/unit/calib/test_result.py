@@ -10,10 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Parameters, SensorMatrix, Setup, solve
-from ftcalib.likelihood.response import SIZE, Response
-from ftcalib.model import DriftResult, predict
-from ftcalib.published.yu import weight_and_tilt
+from ftcalib.model import DriftResult, predict, weight_and_tilt
 from ftcalib.result import MotionResult, _weight_and_tilt_sigma, require_positive_definite
+from ftcalib.sensor_matrix import SIZE, Response
 
 RNG = np.random.default_rng(1)
 R = Rotation.random(10, rng=RNG).as_matrix()
@@ -266,6 +265,26 @@ def test_provenance_must_be_writable() -> None:
         solve(DATA, provenance={"x": object()})
 
 
+def test_tilt_angles_reproduce_the_gravity_force() -> None:
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(500, 3))
+    for F_b in [*directions, *np.eye(3), *-np.eye(3)]:
+        weight, alpha, beta = weight_and_tilt(F_b)
+        up = [np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)]
+        np.testing.assert_allclose(-weight * np.array(up), F_b, atol=1e-15)
+        assert abs(alpha) <= np.pi / 2
+        assert -np.pi < beta <= np.pi
+
+
+def test_tilt_of_the_usual_mountings() -> None:
+    assert weight_and_tilt(np.array([0, 0, -20.0])) == (20.0, 0.0, 0.0)
+    np.testing.assert_allclose(weight_and_tilt(np.array([0, 0, 20.0])), [20, 0, np.pi])
+    assert weight_and_tilt(np.array([-20.0, 0, 0]))[2] == pytest.approx(np.pi / 2)
+    np.testing.assert_allclose(weight_and_tilt(np.array([0, 20.0, 0])), [20, np.pi / 2, 0])
+    # Table II of the paper: 20.047 N are 2.044 kg, so eq. 48 cannot mean the square of the norm.
+    assert weight_and_tilt(np.array([0, 0, -20.047]))[0] / 9.80665 == pytest.approx(2.044, abs=5e-4)
+
+
 @pytest.mark.parametrize("F_b", [[0.6, -0.4, -20.0], [12.0, 5.0, -3.0], [-4.0, -9.0, 2.0], [3.0, 10.0, 0.0]])
 def test_sigmas_of_weight_and_tilt_are_those_of_their_derivative(F_b: list[float]) -> None:
     force, h = np.array(F_b), 1e-6
@@ -385,7 +404,7 @@ def test_arrays_of_another_shape_or_without_numbers_are_refused() -> None:
     good = np.zeros(6)
     for bad in (np.zeros(5), np.full(6, np.nan)):
         for change, sigma in ((bad, good), (good, bad)):
-            with pytest.raises(ValueError, match=r"the drift's .* six finite numbers"):
+            with pytest.raises(ValueError, match=r"the drift's .* 6 finite numbers"):
                 DriftResult(change, sigma)
     for inertia, covariance in (
         (np.eye(2), np.eye(23)),

@@ -38,7 +38,7 @@ def test_a_value_with_its_sigma(value: float, sigma: float, words: str) -> None:
 
 def test_no_finding_rounds_a_sigma_to_zero() -> None:
     lean = {"lean_deg": 1.9123, "sigma_deg": 0.00413, "side": "-y"}
-    assert "the base leans 1.9123° (sigma 0.0041°) towards its -y, compared" in Finding.of("base_leans", **lean).words
+    assert "the base leans 1.9123° (sigma 0.0041°) towards its -y from" in Finding.of("base_leans", **lean).words
     assert str(Lean(1.9123, 0.00413, "-y")) == "leans 1.9123° (sigma 0.0041°) towards its -y"
     mass = Finding.of("known_mass", "note", known_kg=1.0, mass_kg=1.18652, sigma_kg=0.00108, units=[])
-    assert re.search(r"which give 1.1865 kg \(sigma 0.0011 kg\)", mass.words)
+    assert re.search(r"^1.1865 kg \(sigma 0.0011 kg\) by the data", mass.words)

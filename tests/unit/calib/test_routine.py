@@ -1,27 +1,17 @@
 """The routine on small fakes: retries, what is steady, what becomes of many poses."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import TooFewSamples
 from ftcalib.model import Array
 from ftcalib.routine import PoseRecord, TourPose, dataset_from, drift_check, take_pose
 from ftcalib.sampling import Sampling
-
-
-@dataclass
-class Samples:
-    wrench: Array
-    t_host_ns: NDArray[np.int64] = field(default_factory=lambda: np.arange(300, dtype=np.int64))
-    t_device_s: Array = field(default_factory=lambda: np.full(300, np.nan))
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.arange(300, dtype=np.int64))
-    counts: NDArray[np.int32] = field(default_factory=lambda: np.zeros((300, 0), np.int32))
-    status: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(300, np.uint32))
+from ftdrivers.interfaces import FtSamples
 
 
 @dataclass
@@ -59,12 +49,12 @@ class Cell:
         guard()
         self._did("still")
 
-    def collect(self, duration_s: float) -> Samples:
+    def collect(self, duration_s: float) -> FtSamples:
         self._did(f"collect {duration_s}")
         n = int(duration_s * self.rate_Hz)
         slope = np.linspace(-1, 1, n)[:, None] if self.drifting else 0.0
         self.drifting -= bool(self.drifting)
-        return Samples(self.rng.normal(0, 0.01, (n, 6)) + slope)
+        return FtSamples.of(np.arange(n), np.arange(n), self.rng.normal(0, 0.01, (n, 6)) + slope)
 
     def check(self) -> None:
         pass

@@ -7,9 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadCalibration, CalibrationDataset, CalibrationResult, Setup, solve
-from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array, Parameters, predict, skew
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SIZE, Response, SensorMatrix
 from tests.loaded_sensor import LEVER_M, TOOL, LoadedSensor
 
 

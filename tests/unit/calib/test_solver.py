@@ -16,24 +16,16 @@ from ftcalib.compare import compare
 from ftcalib.errors import BadDataset
 from ftcalib.known import Known
 from ftcalib.likelihood.fit import fit
-from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, jacobian, predict
+from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, SPECIAL_R_flange_base, jacobian, predict
 from ftcalib.published.methods import BASELINES, CARLSON, PUBLISHED, published
-from ftcalib.published.yu import SPECIAL_R_flange_base, lrom
+from ftcalib.published.yu import lrom
 from ftcalib.result import Method
 from ftdrive import read_dataset
+from tests.known_cells import SIGMA, white
+from tests.known_cells import UPSIDE_DOWN as TRUTH
 
 METHODS: tuple[Method, ...] = ("ml", "srom", "lrom")
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
-
-# Like a real cell: the sensor is mounted nearly upside down and turned, the base leans a little.
-TRUTH = Parameters(
-    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
-    np.array([0.6, -0.4, -20.0]),
-    np.array([3.0, -5.0, 8.0]),
-    np.array([0.01, -0.02, -0.07]),
-    np.array([0.1, 0.2, -0.3]),
-)
 
 
 @pytest.fixture(autouse=True)
@@ -45,10 +37,6 @@ def few_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
 def dataset(R_base_flange: Array, wrench: Array, cov: Array | None = None) -> CalibrationDataset:
     n = len(wrench)
     return CalibrationDataset(R_base_flange, wrench, cov, np.zeros(n, np.int64), np.full(n, np.nan))
-
-
-def white(n: int, sigma: Array = SIGMA) -> Array:
-    return np.tile(np.diag(sigma**2), (n, 1, 1))
 
 
 def uneven(rng: np.random.Generator, n: int) -> Array:

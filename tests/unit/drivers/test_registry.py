@@ -259,7 +259,7 @@ def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(
 ) -> None:
     points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
     install("acme_arm", points, ACME)
-    monkeypatch.setattr(doctor, "_CLOCK_S", 0.1)
+    monkeypatch.setattr("ftdrive.checks.arm._CLOCK_S", 0.1)
     path = tmp_path / "ftdrive.toml"
     path.write_text(
         f'format = "{FORMAT}"\n[robot]\nhost = "127.0.0.1"\ndriver = "acme"\n[sensor]\nurl = "acme-usb:///dev/acme0"\n',

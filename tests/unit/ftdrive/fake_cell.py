@@ -24,15 +24,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import Outcome
 from ftdrive.session import along_plan, session
 from ftdrive.session.along_plan import remember_completed
-from ftdrive.session.events import (
-    Event,
-    Key,
-    Noted,
-    PoseTaken,
-    Question,
-    State,
-    StateChanged,
-)
+from ftdrive.session.events import Event, Key, Noted, PoseTaken, Question, State, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.open_session import Journal, OpenCell
 from ftdrive.session.options import SessionOptions
@@ -41,16 +33,7 @@ from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceFault
 from ftdrivers.follow import Follow
-from ftdrivers.interfaces import (
-    ArmState,
-    ArmStatus,
-    DeviceInfo,
-    ForceTorqueSensor,
-    FtSamples,
-    Guard,
-    Health,
-    RobotArm,
-)
+from ftdrivers.interfaces import ArmState, ArmStatus, DeviceInfo, ForceTorqueSensor, FtSamples, Guard, Health, RobotArm
 from ftdrivers.sweep import Sweep
 from tests.fake_clock import FakeClock
 
@@ -251,14 +234,7 @@ class FakeSensor(ForceTorqueSensor):
         rows = np.array([self._wrench()] * n) if self.stuck else self._wrenches(n)
         now = self.arm.clock.now_ns()
         self._seq += n
-        return FtSamples(
-            now - (np.arange(n)[::-1] * 1_000_000).astype(np.int64),
-            np.full(n, np.nan),
-            np.arange(n, dtype=np.int64),
-            np.zeros((n, 0), np.int32),
-            rows,
-            np.zeros(n, np.uint32),
-        )
+        return FtSamples.of(now - np.arange(n)[::-1] * 1_000_000, np.arange(n), rows)
 
     def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
         return nullcontext(Follow(lambda _: self.collect(0.0)))
@@ -267,14 +243,7 @@ class FakeSensor(ForceTorqueSensor):
         assert timeout_s == 0
         self.check()
         self._seq += 1
-        return FtSamples(
-            np.array([self.arm.clock.now_ns()]),
-            np.array([np.nan]),
-            np.array([self._seq]),
-            np.zeros((1, 0), np.int32),
-            self._wrench()[None],
-            np.zeros(1, np.uint32),
-        )
+        return FtSamples.of(self.arm.clock.now_ns(), self._seq, self._wrench()[None])
 
     def check(self) -> None:
         if self.failure is not None:

@@ -7,20 +7,14 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
-from ftcalib.model import predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
-from ftdrive.live.samples import Block, Stages, StreamInfo, WrenchFrame
+from ftcalib import CalibrationDataset, CalibrationResult, Setup, solve
+from ftcalib.model import SPECIAL_R_flange_base, predict
 from ftdrive.runs.verification import VerificationRecord
+from ftdrive.stream.samples import Block, Stages, StreamInfo, WrenchFrame
 from ftdrivers.interfaces import DeviceInfo, Fact
+from tests.known_cells import TURNED
 
-TRUTH = Parameters(
-    Rotation.from_rotvec([0.02, -0.01, 0.5]).as_matrix(),
-    np.array([0.1, -0.2, -12.0]),
-    np.array([1.0, -2.0, 3.0]),
-    np.array([0.004, -0.002, 0.05]),
-    np.array([0.01, 0.02, -0.03]),
-)
+TRUTH = TURNED
 NOISE = np.repeat([0.05, 0.002], 3)
 BASE_TCP, USUAL = WrenchFrame("base", "tcp"), Stages()
 UTC_OFFSET_NS = 1_700_000_000_123_456_789
@@ -43,7 +37,7 @@ def calibration() -> CalibrationResult:
 @cache
 def info() -> StreamInfo:
     return StreamInfo(
-        calibration=calibration(),
+        result=calibration(),
         calibration_name="cell's calibration.json",
         arm=DeviceInfo("UR5e", "A1", "5.15"),
         sensor=DeviceInfo(

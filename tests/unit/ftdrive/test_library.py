@@ -105,8 +105,8 @@ def test_what_cannot_be_solved_is_an_error_that_names_what_can(source: Any, erro
 def recorded(tmp_path: Any) -> Path:
     """A recording of 30 s in motion."""
     recorder = Recorder([tmp_path / "turn.csv"], info(), {})
-    recorder.write(block(1500, step_ns=2 * 10**7))
-    recorder.close()
+    recorder.add(block(1500, step_ns=2 * 10**7), [])
+    recorder.end()
     return Path(tmp_path / "turn.csv")
 
 

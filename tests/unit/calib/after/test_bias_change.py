@@ -7,20 +7,14 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, Parameters, solve
+from ftcalib import CalibrationDataset, solve
 from ftcalib.after.expected_readings import BiasChange, Expected, bias_change
 from ftcalib.after.state import Update
 from ftcalib.after.verification import verify
 from ftcalib.model import Array, predict
+from tests.known_cells import UPRIGHT as TRUTH
 
 SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
-TRUTH = Parameters(
-    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
-    np.array([0.2, -0.1, -11.76]),
-    np.array([3.0, -2.0, 5.0]),
-    np.array([0.01, -0.005, 0.07]),
-    np.array([0.1, 0.2, -0.1]),
-)
 CHANGE = np.array([0.1, -0.02, 0.0, 0.001, 0.0, -0.003])
 CHANGED = replace(TRUTH, force_bias_N=TRUTH.force_bias_N + CHANGE[:3], torque_bias_Nm=TRUTH.torque_bias_Nm + CHANGE[3:])
 

@@ -9,14 +9,8 @@ from scipy.stats import kstest
 
 from ftcalib.after.series import difference
 from ftcalib.model import Array, Parameters, rotation_of
+from tests.known_cells import UPRIGHT as TRUTH
 
-TRUTH = Parameters(
-    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
-    np.array([0.2, -0.1, -14.7]),
-    np.array([3.0, -2.0, 5.0]),
-    np.array([0.01, -0.005, 0.06]),
-    np.array([0.1, 0.2, -0.1]),
-)
 SIGMA = np.repeat([1e-3, 0.02, 0.02, 2e-4, 1e-3], 3)
 
 

@@ -9,14 +9,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
 from ftcalib import CalibrationResult
-from ftcalib.after.expected_readings import (
-    Expected,
-    expected_as_found,
-)
+from ftcalib.after.expected_readings import Expected, expected_as_found
 from ftcalib.after.state import Update
 from ftcalib.model import BIASES, Array, DriftResult, gravity_wrench, predict
 from tests.first_order import propagated
-from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
+from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated
 
 SIGMA = NOISE / 20
 NEW = Rotation.random(4, rng=np.random.default_rng(1)).as_matrix()

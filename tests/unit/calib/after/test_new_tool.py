@@ -8,14 +8,15 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
-from ftcalib.after.cell_errors import known_response, sensor_error_columns
+from ftcalib.after.expected_readings import sensor_error_columns
 from ftcalib.after.new_tool import _beyond, new_tool, together
+from ftcalib.after.state import known_response
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.response import Response, response_columns
 from ftcalib.model import Array, Parameters, predict
+from ftcalib.sensor_matrix import Response, response_columns
 from tests.first_order import assert_same, propagated
-from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated
+from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated
 
 OTHER = replace(
     TRUTH,

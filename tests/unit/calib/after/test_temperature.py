@@ -10,9 +10,9 @@ from scipy.stats import f, multivariate_normal
 
 from ftcalib.after.series import _SHARES, BiasTemperature, bias_temperature
 from ftcalib.after.state import with_bias_change
-from ftcalib.likelihood.response import Response
 from ftcalib.model import BIASES, Array
-from tests.unit.ftdrive.live.simulated import calibrated
+from ftcalib.sensor_matrix import Response
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 ONES = np.repeat([1.0, 0.03], 3)
 SLOPE = 0.1 * ONES

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
 from ftcalib.after.state import BLOCKS, Update, apply_update, reestimate, tare
-from ftcalib.likelihood.response import Response, response_columns
 from ftcalib.model import Array, jacobian, predict
+from ftcalib.sensor_matrix import Response, response_columns
 from tests.first_order import assert_same, propagated
 
 NOISE = np.diag(np.repeat([0.05**2, (0.025 * 0.05) ** 2], 3))

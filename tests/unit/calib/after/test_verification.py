@@ -12,18 +12,12 @@ from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameter
 from ftcalib.after.expected_readings import expected_with_smooth_errors
 from ftcalib.after.state import apply_update
 from ftcalib.after.verification import Verification, verify
-from ftcalib.likelihood.response import response_columns
 from ftcalib.model import Array, DriftResult, predict
 from ftcalib.poses.information import SUBSET_6, special
+from ftcalib.sensor_matrix import response_columns
+from tests.known_cells import UPRIGHT as TRUTH
 
 SIGMA = np.repeat([0.05, 0.002], 3) / np.sqrt(200)
-TRUTH = Parameters(
-    Rotation.from_euler("zx", [20, 3], degrees=True).as_matrix(),
-    np.array([0.2, -0.1, -11.76]),
-    np.array([3.0, -2.0, 5.0]),
-    np.array([0.01, -0.005, 0.07]),
-    np.array([0.1, 0.2, -0.1]),
-)
 COEFFICIENTS = 0.01 * np.random.default_rng(0).normal(size=11)
 TURN = Rotation.from_rotvec(np.deg2rad(1.0) * np.array([0.6, 0.0, 0.8]))
 CHANGED = {

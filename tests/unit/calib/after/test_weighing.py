@@ -8,18 +8,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import solve
-from ftcalib.after.cell_errors import sensor_error_columns
+from ftcalib.after.expected_readings import sensor_error_columns
 from ftcalib.after.state import Calibrated, tare
-from ftcalib.after.weighing import Weight, drift_since, holding, known_contact, true_tool, weigh
+from ftcalib.after.weighing import Weight, drift_since, holding, true_tool, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
-from ftcalib.likelihood.response import Response, predicted_covariance, ranges
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import Response, SensorMatrix, predicted_covariance, ranges
 from tests.first_order import assert_same, propagated
 from tests.loaded_sensor import LEVER_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor
 from tests.loaded_sensor import NOISE as LOAD_NOISE
-from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, G, calibrated
+from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, G, calibrated
 
 NEAR = 2 * TRUTH.p_sensor_com_m
 NEVER = float("inf")
@@ -304,7 +303,7 @@ def test_a_sensor_known_by_loads_weighs_without_its_error() -> None:
     noise = np.tile(np.diag((0.1 * LOAD_NOISE) ** 2), (4, 1, 1))
     known = {"drift": drift_since(0.0), "g_m_s2": tool.g_m_s2, "p_sensor_near_m": tool.R_flange_sensor.T @ p}
     as_read = weigh(result, R, held, noise, **known)
-    decoded = weigh(result, R, held, noise, **known, contact=known_contact(result))
+    decoded = weigh(result, R, held, noise, **known, contact=result.known_contact)
     sigma_kg = np.hypot(decoded.mass_sigma_kg, decoded.scale_sigma * decoded.mass_kg)
     assert abs(decoded.mass_kg - 2.0) < 3 * sigma_kg < 0.01 * 2.0 < abs(as_read.mass_kg - 2.0)
     # A force at the tip has the errors of the lever too: more than the gain alone.

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
 from ftcalib.findings import Finding
 from ftcalib.judge.described_cell import _OTHER_ORDERS, LEAN_DEG, contradictions, directions, lean_from, payload, tool
-from ftcalib.model import STANDARD_GRAVITY_M_S2, predict
+from ftcalib.model import STANDARD_GRAVITY_M_S2, SPECIAL_R_flange_base, predict
 from ftcalib.poses.information import special
-from ftcalib.published.yu import SPECIAL_R_flange_base
 
 Array = NDArray[np.float64]
 
@@ -333,7 +332,7 @@ def test_a_weighed_tool_is_compared_within_the_gain_of_the_sensor(load_kg: float
 
 def test_only_quaternions_can_have_been_read_in_another_order() -> None:
     on_wall = replace(NO_LEAN, gravity_force_base_N=np.array([-20.0, 0, 0]))
-    said = {form: directions(on_wall, CERTAIN, Setup(), form)[0].found for form in ("quaternion", "", "matrix", "xyz")}
+    said = {form: directions(on_wall, CERTAIN, Setup(), form)[0].fix for form in ("quaternion", "", "matrix", "xyz")}
     assert [form for form, words in said.items() if "quaternions" in words] == ["quaternion", ""]
 
 

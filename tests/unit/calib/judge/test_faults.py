@@ -8,16 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib import (
-    BadDataset,
-    CalibrationDataset,
-    CalibrationResult,
-    Finding,
-    NotObservable,
-    Parameters,
-    Setup,
-    solve,
-)
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Finding, NotObservable, Parameters, Setup, solve
 from ftcalib.judge.faults import (
     CHANNELS,
     EULER_ORDERS,
@@ -30,8 +21,7 @@ from ftcalib.judge.faults import (
     rough_fit,
 )
 from ftcalib.known import Known
-from ftcalib.model import Array, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array, SPECIAL_R_flange_base, predict
 from ftcalib.result import Method
 from ftdrive import read_dataset
 

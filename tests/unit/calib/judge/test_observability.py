@@ -21,8 +21,7 @@ from ftcalib.judge.observability import (
     second_minimum,
     wrong_basin_probability,
 )
-from ftcalib.model import Array, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array, SPECIAL_R_flange_base, predict
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 T12 = R24[np.array([1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22]) - 1]

@@ -20,10 +20,9 @@ from ftcalib.judge.session_change import (
     session_change,
 )
 from ftcalib.likelihood.fit import fit
-from ftcalib.likelihood.response import SIZE, response_columns
 from ftcalib.likelihood.session import LEVER_M
-from ftcalib.model import Parameters, jacobian, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Parameters, SPECIAL_R_flange_base, jacobian, predict
+from ftcalib.sensor_matrix import SIZE, response_columns
 from tests.structured_cell import CELLS, Cell, flange, tour
 
 Array = NDArray[np.float64]

@@ -99,7 +99,7 @@ def test_a_bias_of_no_sensor_is_named(weight_N: float, force_N: float, torque_Nm
     )
     found = implausible(biased, 0.01, described=False, unit_N=(0.82, 0.01))
     assert [one.severity for one in found if one.code == "bias_implausible"] == [severity] * (severity is not None)
-    assert all("1 unit = 0.820 N (sigma 0.010 N)" in one.found for one in found)
+    assert all("1 unit = 0.820 N (sigma 0.010 N)" in one.fix for one in found)
     confirmed = implausible(biased, 0.01, described=False, unit_N=(1.002, 0.001))
     assert any(one.code == "bias_implausible" for one in confirmed) == (severity is not None and torque_Nm > 100)
     free = implausible(biased, 0.01, described=False, any_bias=True)

@@ -25,30 +25,18 @@ from ftcalib.judge.verdict import (
     _some_runs,
     _structure,
     _weight,
-    expected_error,
     judge,
     out_of_line,
     strong_correlations,
     successive_correlation,
 )
-from ftcalib.likelihood.response import SIZE, Response, predicted_covariance
-from ftcalib.model import Array, DriftResult, jacobian, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array, DriftResult, SPECIAL_R_flange_base, jacobian, predict
+from ftcalib.sensor_matrix import SIZE, Response, expected_error, predicted_covariance
 from ftdrive import read_dataset
+from tests.known_cells import SIGMA, white
+from tests.known_cells import UPSIDE_DOWN as TRUTH
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-SIGMA = np.repeat([0.05, 0.05 * 0.025], 3)
-TRUTH = Parameters(
-    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
-    np.array([0.6, -0.4, -20.0]),
-    np.array([3.0, -5.0, 8.0]),
-    np.array([0.01, -0.02, -0.07]),
-    np.array([0.1, 0.2, -0.3]),
-)
-
-
-def white(n: int, sigma: Array = SIGMA) -> Array:
-    return np.tile(np.diag(sigma**2), (n, 1, 1))
 
 
 def gauss_newton(R: Array, wrench: Array, cov: Array, start: Parameters = TRUTH) -> Parameters:

@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import Parameters
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.session import Drift, Session, white
-from ftcalib.model import Array, predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib.model import Array, SPECIAL_R_flange_base, predict
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
 TOOL = Parameters(

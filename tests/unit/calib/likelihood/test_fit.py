@@ -11,14 +11,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import Parameters
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.descent import (
-    Descent,
-    Statistics,
-    coefficients,
-    coefficients_derivative,
-    features,
-    wrench_gram,
-)
+from ftcalib.likelihood.descent import Descent, Statistics, coefficients, coefficients_derivative, features, wrench_gram
 from ftcalib.likelihood.fit import Fit, fit
 from ftcalib.likelihood.session import Drift
 from ftcalib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products

@@ -10,21 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.judge.verdict import _response
-from ftcalib.known import Constraints, Known
+from ftcalib.known import RANGE_LEVER_M, Constraints, Known
 from ftcalib.likelihood.explanation import with_walks_instead
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.response import (
-    CROSS_TALK_M,
-    GAIN,
-    LEVER_M,
-    Response,
-    predicted_covariance,
-    response_columns,
-)
 from ftcalib.likelihood.session import Session
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
 from ftcalib.result import require_positive_definite
+from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN, Response, predicted_covariance, response_columns
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 WHITE = np.diag(SIGMA**2)
@@ -47,7 +40,7 @@ def session(
 ) -> tuple[Parameters, Array, Array, Array, Array]:
     """Simulate n poses read by a sensor with errors of that size in every entry of its matrix."""
     p, R = truth(rng), np.asarray(Rotation.random(n, rng=rng).as_matrix())
-    M, L = gain * rng.normal(size=(3, 3)), cross_talk * LEVER_M * rng.normal(size=(3, 3))
+    M, L = gain * rng.normal(size=(3, 3)), cross_talk * RANGE_LEVER_M * rng.normal(size=(3, 3))
     return p, R, read(p, R, M, L) + SIGMA * rng.normal(size=(n, 6)), M, L
 
 
@@ -136,7 +129,7 @@ def test_a_far_centre_of_mass_is_no_reason_against_gain_and_cross_talk() -> None
     rng = np.random.default_rng(3)
     p, R = truth(rng), np.asarray(Rotation.random(24, rng=rng).as_matrix())
     p = replace(p, p_sensor_com_m=np.array([0.0, 0.0, 0.2]))
-    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * LEVER_M * rng.normal(size=(3, 3))
+    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * RANGE_LEVER_M * rng.normal(size=(3, 3))
     best = fit(R, read(p, R, M, L) + SIGMA * rng.normal(size=(24, 6)), WHITE)
     assert {"gain", "cross_talk"} <= best.components.keys()
     elsewhere = Rotation.random(50, rng=rng).as_matrix()
@@ -237,7 +230,7 @@ def test_forces_are_not_called_noisy_where_the_torques_alone_determine_the_mount
     rng = np.random.default_rng(seed)
     p = replace(truth(rng), p_sensor_com_m=np.array([0.03, 0.03, 0.15]))
     R = Rotation.from_euler("xyz", 60 * rng.uniform(-1, 1, (12, 3)), degrees=True).as_matrix()
-    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * LEVER_M * rng.normal(size=(3, 3))
+    M, L = 0.03 * rng.normal(size=(3, 3)), 0.01 * RANGE_LEVER_M * rng.normal(size=(3, 3))
     best = fit(R, read(p, R, M, L) + 0.2 * SIGMA * rng.normal(size=(12, 6)), None)
     assert best.components["white_force_N"] < SIGMA[0]
 

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, solve
 from ftcalib.likelihood.fit import fit
-from ftcalib.likelihood.response import FEW, hysteresis_columns
+from ftcalib.likelihood.structure import FEW, hysteresis_columns
 from ftcalib.model import Array, gravity_wrench, predict
 
 SIGMA = np.repeat([0.01, 0.4e-3], 3)

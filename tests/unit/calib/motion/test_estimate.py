@@ -8,7 +8,7 @@ from scipy.linalg import block_diag
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
-from ftcalib.likelihood.response import LEVER_M
+from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, skew
 from ftcalib.motion.estimate import (
     _SIZES,
@@ -105,7 +105,7 @@ class Dense:
         variance[GAINS], variance[CROSS_TALK] = sizes["gain"] ** 2, sizes["cross_talk"] ** 2
         walk = np.diag(np.repeat([sizes["walk_N"] ** 2, sizes["walk_Nm"] ** 2], 3))
         root = self.since_end @ self.steps
-        lever = sizes["cross_talk"] ** 2 * LEVER_M**2 / 2 * np.eye(3)
+        lever = sizes["cross_talk"] ** 2 * RANGE_LEVER_M**2 / 2 * np.eye(3)
         return np.asarray(block_diag(np.diag(variance[15:]), np.kron(root @ root.T, walk), lever))
 
     def solution(self, sizes: dict[str, float]) -> tuple[Array, Array, float, float]:

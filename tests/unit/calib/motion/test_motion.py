@@ -9,15 +9,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult, Known, NotObservable
 from ftcalib.errors import BadDataset
 from ftcalib.model import Parameters
-from ftcalib.motion.model import (
-    SIZE,
-    Load,
-    SmoothFunctions,
-    jacobian,
-    lever_columns,
-    turn_columns,
-    wrench_of,
-)
+from ftcalib.motion.model import SIZE, Load, SmoothFunctions, jacobian, lever_columns, turn_columns, wrench_of
 from ftcalib.motion.samples import Means, Motion, rows_of
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import HOME, Array, Recorded, Truth, means_of, programme, record, sweep

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.response import CROSS_TALK_M, GAIN
 from ftcalib.model import Parameters, predict
 from ftcalib.motion.solve import solve_motion
+from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 from tests.moving_load import Truth, means_of, record, sweep
 
 SECONDS = 6.0

@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, Setup, solve
 from ftcalib.errors import NotObservable
-from ftcalib.likelihood.response import response_columns
 from ftcalib.likelihood.structure import hidden_columns
 from ftcalib.model import Array, angle_between, jacobian, predict
 from ftcalib.poses.information import (
@@ -31,7 +30,7 @@ from ftcalib.poses.selection import (
     greedy_and_exchange,
     next_pose,
 )
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SensorMatrix, response_columns
 from tests.pose_sets import AMBIGUOUS_6, SUBSET_8, SUBSET_12, efficiency, optimised
 
 ALL = special(range(1, 25))

@@ -8,10 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
-from ftcalib.model import UP_IN_BASE, Array, predict
+from ftcalib.model import UP_IN_BASE, Array, SPECIAL_R_flange_base, predict
 from ftcalib.published import carlson
 from ftcalib.published.methods import BASELINES, CARLSON, PUBLISHED, published, vougioukas, wang, yang
-from ftcalib.published.yu import SPECIAL_R_flange_base
 
 TRUTH = Parameters(
     Rotation.from_euler("zyx", [70, 15, 13], degrees=True).as_matrix(),

@@ -1,4 +1,4 @@
-"""Yu's closed forms: the 24 orientations, their recognition, the tilt angles."""
+"""Yu's closed forms: the 24 orientations and their recognition."""
 
 import re
 
@@ -8,27 +8,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib import NotObservable, Parameters
-from ftcalib.model import Array, predict
-from ftcalib.published.yu import (
-    _SUMS,
-    SPECIAL_R_flange_base,
-    lrom,
-    mixed,
-    special_deviation_rad,
-    special_numbers,
-    srom,
-    srom_gravity_force,
-    weight_and_tilt,
-)
+from ftcalib.model import Array, SPECIAL_R_flange_base, predict
+from ftcalib.published.yu import _SUMS, lrom, mixed, special_deviation_rad, special_numbers, srom, srom_gravity_force
+from tests.known_cells import UPSIDE_DOWN as TRUTH
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
-TRUTH = Parameters(
-    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
-    np.array([0.6, -0.4, -20.0]),
-    np.array([3.0, -5.0, 8.0]),
-    np.array([0.01, -0.02, 0.07]),
-    np.array([0.1, 0.2, -0.3]),
-)
 
 
 def turned(axis: str, angle_deg: float | list[float]) -> Array:
@@ -226,23 +210,3 @@ def test_lrom_rejects_four_poses_and_poses_with_several_solutions() -> None:
     spin = Rotation.from_euler("x", np.arange(8)[:, None] * 40.0, degrees=True).as_matrix()
     with pytest.raises(NotObservable, match="several solutions"):
         lrom(spin, predict(TRUTH, spin))
-
-
-def test_tilt_angles_reproduce_the_gravity_force() -> None:
-    rng = np.random.default_rng(0)
-    directions = rng.normal(size=(500, 3))
-    for F_b in [*directions, *np.eye(3), *-np.eye(3)]:
-        weight, alpha, beta = weight_and_tilt(F_b)
-        up = [np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)]
-        np.testing.assert_allclose(-weight * np.array(up), F_b, atol=1e-15)
-        assert abs(alpha) <= np.pi / 2
-        assert -np.pi < beta <= np.pi
-
-
-def test_tilt_of_the_usual_mountings() -> None:
-    assert weight_and_tilt(np.array([0, 0, -20.0])) == (20.0, 0.0, 0.0)
-    np.testing.assert_allclose(weight_and_tilt(np.array([0, 0, 20.0])), [20, 0, np.pi])
-    assert weight_and_tilt(np.array([-20.0, 0, 0]))[2] == pytest.approx(np.pi / 2)
-    np.testing.assert_allclose(weight_and_tilt(np.array([0, 20.0, 0])), [20, np.pi / 2, 0])
-    # Table II of the paper: 20.047 N are 2.044 kg, so eq. 48 cannot mean the square of the norm.
-    assert weight_and_tilt(np.array([0, 0, -20.047]))[0] / 9.80665 == pytest.approx(2.044, abs=5e-4)

@@ -58,14 +58,7 @@ class Fed(StreamingSensor):
             return item
         seq = self.seq + np.arange(item)
         self.seq += item
-        return FtSamples(
-            t_host_ns=np.full(item, self._clock.now_ns()),
-            t_device_s=np.full(item, np.nan),
-            seq=seq,
-            counts=np.ones((item, 6), np.int32),
-            wrench=self.wrench(seq),
-            status=np.zeros(item, np.uint32),
-        )
+        return FtSamples.of(self._clock.now_ns(), seq, self.wrench(seq), counts=np.ones((item, 6)))
 
     def wrench(self, seq: NDArray[np.int64]) -> Array:
         return np.arange(1.0, 7.0) + 1e-3 * seq[:, np.newaxis]
@@ -119,14 +112,7 @@ def block(seq: list[int], *, wrench: float | None = None, t_device_s: float = np
     """A wrench that is not given is another one in each row."""
     n = len(seq)
     rows = np.arange(6.0) + np.array(seq)[:, np.newaxis] if wrench is None else np.full((n, 6), wrench)
-    return FtSamples(
-        t_host_ns=np.zeros(n, np.int64),
-        t_device_s=np.full(n, t_device_s),
-        seq=np.array(seq),
-        counts=np.zeros((n, 0), np.int32),
-        wrench=rows,
-        status=np.zeros(n, np.uint32),
-    )
+    return FtSamples.of(0, seq, rows, t_device_s=t_device_s)
 
 
 @pytest.fixture

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.exports.program_functions import functions
-from ftdrive.exports.urscript import program
+from ftdrive.exports.urscript import functions, program
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene

@@ -14,7 +14,7 @@ from ftdrive.cell.config import (
     load,
     orientation_accuracy_deg,
     settings,
-    user_file,
+    user_folder,
     variable,
 )
 from ftdrive.cell.rules import Rule
@@ -32,8 +32,8 @@ def _no_other_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def write_user_file(text: str) -> None:
-    user_file().parent.mkdir(parents=True)
-    user_file().write_text(text)
+    user_folder("config").mkdir(parents=True)
+    (user_folder("config") / "ftdrive.toml").write_text(text)
 
 
 def test_defaults_fill_what_is_not_said(tmp_path: Path) -> None:
@@ -90,7 +90,7 @@ def test_the_first_that_says_it_counts(said: tuple[str, ...], monkeypatch: pytes
         "option": "--robot",
         "variable": "FTDRIVE_ROBOT_HOST",
         "project": "ftdrive.toml",
-        "user": str(user_file()),
+        "user": str(user_folder("config") / "ftdrive.toml"),
     }
     found = settings(None, flags)
     assert (found["robot.host"].value, found["robot.host"].origin) == (hosts[said[0]], origins[said[0]])
@@ -291,7 +291,7 @@ def test_a_plan_needs_no_addresses() -> None:
 def test_a_relative_folder_of_the_user_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("XDG_CONFIG_HOME", "relative")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert user_file() == tmp_path / ".config" / "ftdrive" / "ftdrive.toml"
+    assert user_folder("config") / "ftdrive.toml" == tmp_path / ".config" / "ftdrive" / "ftdrive.toml"
 
 
 def test_a_password_of_the_store_reaches_no_file() -> None:

@@ -117,27 +117,6 @@ def test_the_name_by_id_of_a_port(computer: Path) -> None:
     assert checks.name_by_id(computer / "dev/ttyUSB0", dev=computer) is None
 
 
-@pytest.mark.parametrize(
-    ("url", "place"),
-    [
-        ("bota:///dev/ttyUSB0?sinc=512", "/dev/ttyUSB0"),
-        ("ati-can://can0?bitrate=250000", "can0"),
-        ("ati-can://can0?base=0x7F", "socketcan://can0?base=0x7F"),
-        ("ati-can:///dev/ttyACM0?interface=slcan&bitrate=500000", "slcan:///dev/ttyACM0?bitrate=500000"),
-        ("robotous-can:///dev/ttyACM0?interface=slcan", "slcan:///dev/ttyACM0?bitrate=1000000"),
-        ("robotous-can:///dev/my%20port?interface=slcan", "slcan:///dev/my%20port?bitrate=1000000"),
-        ("ati-can://PCAN_USBBUS1?interface=pcan", None),
-        ("ati-can:///dev/ttyUSB0?interface=robotell", None),
-        ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port"),
-        ("ati-netft://192.168.1.1", None),
-        ("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1", None),
-        ("robotiq-ft300://192.168.1.10", None),
-    ],
-)
-def test_an_address_names_the_place_that_can_be_probed(url: str, place: str | None) -> None:
-    assert SensorAddress.of(url).place == place
-
-
 @pytest.fixture
 def can0(tmp_path: Path) -> Path:
     for name, kind in (("can0", "280"), ("eth0", "1")):
@@ -193,25 +172,34 @@ def test_can_details_are_taken_from_what_ip_says(tmp_path: Path, monkeypatch: py
 
 
 @pytest.mark.parametrize(
-    ("url", "port", "interface"),
+    ("url", "place", "port", "interface"),
     [
-        ("ati-can://can0?bitrate=500000", None, "can0"),
-        ("ati-can:///dev/ttyACM0@1000000?interface=slcan", "/dev/ttyACM0", None),
-        ("ati-serial:///dev/serial/by-id/X", "/dev/serial/by-id/X", None),
-        ("robotous-can://can1?rate=500", None, "can1"),
-        ("bota:///dev/ttyUSB1?sinc=512", "/dev/ttyUSB1", None),
-        ("ur-ft://10.0.0.1?counts_per_N=1&counts_per_Nm=1", None, None),
-        ("ati-netft://192.168.1.1", None, None),
-        ("robotiq-ft300://192.168.1.10", None, None),
-        ("robotiq-ft300://192.168.1.10:63351", None, None),
-        ("robotiq-ft300:///dev/ttyUSB0", "/dev/ttyUSB0", None),
-        ("ati-can://PCAN_USBBUS1?interface=pcan", None, None),
-        ("bota://COM3", "COM3", None),
-        ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port", None),
+        ("ati-can://can0?bitrate=500000", "can0", None, "can0"),
+        ("ati-can://can0?base=0x7F", "socketcan://can0?base=0x7F", None, "can0"),
+        ("robotous-can://can1?rate=500", "can1", None, "can1"),
+        *(
+            (f"{name}:///dev/{written}?interface=slcan{more}", f"slcan:///dev/{written}?bitrate={rate}", port, None)
+            for name, written, more, rate, port in (
+                ("ati-can", "ttyACM0", "&bitrate=500000", 500_000, "/dev/ttyACM0"),
+                ("ati-can", "ttyACM0@1000000", "", 250_000, "/dev/ttyACM0"),
+                ("robotous-can", "my%20port", "", 1_000_000, "/dev/my port"),
+            )
+        ),
+        ("ati-can:///dev/ttyUSB0?interface=robotell", None, "/dev/ttyUSB0", None),
+        ("ati-can://PCAN_USBBUS1?interface=pcan", None, None, None),
+        ("bota:///dev/ttyUSB1?sinc=512", "/dev/ttyUSB1", "/dev/ttyUSB1", None),
+        ("bota:///dev/serial/by-id/my%20port", "/dev/serial/by-id/my port", "/dev/serial/by-id/my port", None),
+        ("bota://COM3", "COM3", "COM3", None),
+        ("robotiq-ft300:///dev/ttyUSB0", "/dev/ttyUSB0", "/dev/ttyUSB0", None),
+        ("robotiq-ft300://192.168.1.10", None, None, None),
+        ("robotiq-ft300://192.168.1.10:63351", None, None, None),
+        ("ur-ft://10.0.0.1?counts_per_N=1&counts_per_Nm=1", None, None, None),
+        ("ati-netft://192.168.1.1", None, None, None),
     ],
 )
-def test_what_an_address_says(url: str, port: str | None, interface: str | None) -> None:
+def test_what_an_address_says(url: str, place: str | None, port: str | None, interface: str | None) -> None:
     address = SensorAddress.of(url)
+    assert address.place == place
     assert address.serial_port == (None if port is None else Path(port))
     assert address.can_interface == interface
     assert address.host == next((host for host in ("10.0.0.1", "192.168.1.10", "192.168.1.1") if host in url), None)

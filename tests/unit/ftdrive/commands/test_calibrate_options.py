@@ -7,14 +7,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import click
 import pytest
 from click.testing import CliRunner
 
-from ftcalib.errors import BadDataset, NotObservable
+from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.cli import cli
-from ftdrive.errors import ConfigError, exit_code
+from ftdrive.commands.options import Headed
+from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.session import session
 from ftdrive.session.options import SessionOptions
@@ -51,7 +53,7 @@ def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellCon
         raise Opened
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(session, "calibrate", guide)
+    monkeypatch.setattr("ftdrive.commands.calibrate.guide", guide)
     return found
 
 
@@ -207,7 +209,7 @@ def stations(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, Sequence[str]]]
 
         def __exit__(self, *_: object) -> None: ...
 
-    monkeypatch.setattr("ftdrive.cell.emulated.Station", Emulated)
+    monkeypatch.setattr("ftdrive.commands.calibrate.Station", Emulated)
     return found
 
 
@@ -246,5 +248,9 @@ def test_a_run_with_a_field_of_the_wrong_type_is_refused_in_one_sentence(
     assert cells == stations == []
 
 
-def test_every_error_of_the_solver_has_an_exit_code() -> None:
-    assert exit_code(NotObservable("the run contains no pose")) == 7
+@pytest.mark.parametrize("name", ["calibrate", "solve", "live", "plan"])
+def test_each_option_is_below_one_heading_of_the_help(name: str) -> None:
+    command = cli.get_command(click.Context(cli), name)
+    assert isinstance(command, Headed)
+    options = [one for one in command.get_params(click.Context(command)) if isinstance(one, click.Option)]
+    assert sorted(" ".join(command.headings.values()).split()) == sorted(max(one.opts, key=len) for one in options)

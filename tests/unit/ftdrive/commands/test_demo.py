@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive.commands.demo import contact_errors
+from ftdrive.session.rehearsal import contact_errors
 from ftmocks.sensor_errors import SensorErrors
 from ftmocks.world import Truth
-from tests.unit.ftdrive.live.simulated import calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 
 def test_a_gain_of_two_percent_is_two_newtons_until_it_is_known() -> None:

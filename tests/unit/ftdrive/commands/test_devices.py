@@ -9,7 +9,6 @@ from serial.tools import list_ports
 from serial.tools.list_ports_common import ListPortInfo
 
 from ftdrive import cli
-from ftdrive.checks import discovery
 from ftdrive.commands import devices
 from ftdrivers.errors import DeviceTimeout
 
@@ -64,7 +63,7 @@ def test_ports_and_interfaces_are_listed_with_what_is_wrong(capsys: pytest.Captu
 def test_places_are_probed_and_an_error_is_an_answer(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(discovery, "ask", ask)
+    monkeypatch.setattr(devices, "ask", ask)
     places = ["--probe", "can0", "--probe", "silent", "--probe", "busy"]
     assert cli.run(["devices", *places]) == 4
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(" probed")]

@@ -1,7 +1,6 @@
 """The events of an emulated calibration name no folder that is gone afterwards, and commands that can be typed."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,11 +8,10 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.commands import common, demo
+from ftdrive.commands import demo
 from ftdrive.runs.run import Run
 from ftdrive.session import rehearsal
 from ftdrive.session.events import Event, Noted, RunOpened
-from ftdrive.terminal import screen
 
 STATION: Any = SimpleNamespace(description={}, truth={"mass_kg": 0.5}, cell=None)
 
@@ -32,10 +30,6 @@ def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
 ) -> None:
     folder, person = str(tmp_path / "2026-simulated"), Listener()
 
-    @contextmanager
-    def open_operator() -> Iterator[Listener]:
-        yield person
-
     def calibrate(_: object, operator: Any, options: Any) -> SimpleNamespace:
         assert options.runs == tmp_path
         operator.show(RunOpened(folder=folder, resume=f"ftdrive calibrate --resume {folder}"))
@@ -43,9 +37,8 @@ def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
         operator.show(Noted(words=f"3 poses are kept in {folder}"))
         return SimpleNamespace()
 
-    monkeypatch.setattr(screen, "open_operator", open_operator)
     monkeypatch.setattr(rehearsal, "calibrate", calibrate)
-    common.rehearse(STATION, tmp_path, "simulated", kept=kept)
+    rehearsal.rehearse(STATION, tmp_path, "simulated", person, kept=kept)  # type: ignore[arg-type]
     assert [type(event) for event in person.events] == expected
 
 

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import nullcontext
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import yaml
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli
-from ftdrive.commands import common
 from ftdrive.errors import ConfigError, exit_code
 from ftdrive.exports.formats import FORMATS
 from ftdrive.runs.run import Run
@@ -57,11 +57,12 @@ def test_text_goes_to_stdout_and_notes_to_stderr(saved: Path) -> None:
 
 
 def test_the_mass_of_an_emulated_sensor_is_that_of_its_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder = Run.create(
-        tmp_path, "simulated", {"config": {"sensor": {"url": "x", "height_mm": 0.0, "mass_kg": 0.25}}}
-    ).folder
+    config = {"sensor": {"url": "x", "height_mm": 0.0, "mass_kg": 0.25}}
+    folder = Run.create(tmp_path, "simulated", {"config": config}).folder
     calibration().save(folder / "calibration.json")
-    monkeypatch.setattr(common, "rehearsed_run", lambda _: nullcontext(folder))
+    monkeypatch.setattr(
+        import_module("ftdrive.commands.export.calibration"), "rehearsed_run", lambda *_: nullcontext(folder)
+    )
     outcome = export("calibration", "--simulate", "--format", "franka")
     assert yaml.safe_load(outcome.stdout)["mass"] == pytest.approx(2.25)
 

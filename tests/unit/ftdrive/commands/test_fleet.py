@@ -4,6 +4,7 @@ import json
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,6 @@ import pytest
 from rich.cells import cell_len
 
 from ftcalib import CalibrationResult
-from ftdrive import cli
 from ftdrive.runs.run import RUN_FORMAT
 from tests.unit.ftdrive.fleet.fleet_records import SIGMA
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -23,17 +23,8 @@ DAY = (NOW - FIRST).total_seconds() / 86400
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run a command in an empty folder; return its exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-
-    def call(*arguments: str | Path) -> Ran:
-        code = cli.run(["fleet", *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
-    return call
+def run(run: Callable[..., Ran]) -> Callable[..., Ran]:
+    return partial(run, "fleet")
 
 
 @pytest.fixture

@@ -3,11 +3,11 @@
 import urllib.request
 from collections.abc import Callable
 from datetime import datetime
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from ftdrive import cli
 from ftdrive.fleet.state import Fleet
 from ftdrive.store.store import Store
 from tests.fake_clock import FakeClock
@@ -16,20 +16,18 @@ from tests.unit.ftdrive.fleet.fleets import cell, fleet
 pytestmark = pytest.mark.usefixtures("quick_shutdown")
 
 Ran = tuple[int, str]
+STATUS = import_module("ftdrive.commands.fleet.status")  # the package has a command of this name
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run the command in an empty folder on a fake clock; return its exit code and what it prints for people."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    monkeypatch.setattr("ftdrivers.clock.REAL", FakeClock())
+def run(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ran]:
+    """Run the command on a fake clock; return its exit code and what it prints for people."""
+    monkeypatch.setattr(STATUS, "REAL", FakeClock())
 
     def call(*arguments: str | Path) -> Ran:
-        code = cli.run(["fleet", "serve", *map(str, arguments)])
-        out, err = capsys.readouterr()
+        code, out, err = run("fleet", "serve", *arguments)
         assert out == ""
-        return code, " ".join(err.split())
+        return code, err
 
     return call
 
@@ -44,7 +42,7 @@ def answer_with(monkeypatch: pytest.MonkeyPatch, *answers: Fleet | BaseException
             raise answer
         return answer
 
-    monkeypatch.setattr("ftdrive.fleet.status.fleet_state", fleet_state)
+    monkeypatch.setattr(STATUS, "fleet_state", fleet_state)
 
 
 def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -67,8 +65,8 @@ def test_the_page_has_the_cells_as_long_as_it_serves(run: Callable[..., Ran], mo
             super().__init__(host, port, page)
             opened.append(self)
 
-    monkeypatch.setattr(metrics, "MetricsServer", Server)
-    monkeypatch.setattr("ftdrive.fleet.status.fleet_state", look)
+    monkeypatch.setattr(STATUS, "MetricsServer", Server)
+    monkeypatch.setattr(STATUS, "fleet_state", look)
     assert run("--metrics", "127.0.0.1:0")[0] == 130
     assert 'ftdrive_bias_drift_found{cell="press-4",tool="gripper"} 0.0' in pages[0]
     with pytest.raises(OSError, match="refused"):

@@ -4,13 +4,14 @@ import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from ftcalib import Finding
-from ftdrive import __version__, cli
+from ftdrive import __version__
 from ftdrive.fleet import workers
 from ftdrive.fleet.workers import Workers
 from ftdrive.store.store import Store
@@ -21,24 +22,16 @@ Ran = tuple[int, str, str]
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run the command in an empty folder, its workers in this process; return exit code, stdout and stderr."""
+def run(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ran]:
+    """Run the command with its workers in this process."""
 
     @contextmanager
     def here(_: int | None) -> Iterator[Workers]:
         with ThreadPoolExecutor(1) as thread:
             yield Workers(1, thread.submit, BrokenExecutor)
 
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     monkeypatch.setattr(workers, "local_workers", here)
-
-    def call(*arguments: str | Path) -> Ran:
-        code = cli.run(["fleet", "solve", *map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
-    return call
+    return partial(run, "fleet", "solve")
 
 
 def test_the_runs_of_the_store_are_solved_and_the_report_names_what_differs(

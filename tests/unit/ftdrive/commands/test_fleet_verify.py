@@ -14,7 +14,6 @@ import pytest
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import Declined
-from ftdrive.runs.verification import AcceptanceLimits
 from ftdrive.session.events import Question
 from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
@@ -42,8 +41,8 @@ class Lab:
         """Of the sessions: empty for one that passes, the reason of one that fails, or what it raises."""
         self.sessions: list[tuple[CellConfig, Path, Any]] = []
         self._monkeypatch = monkeypatch
-        monkeypatch.setattr(command, "verify_cell", self._session)
-        monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator", lambda: self)
+        monkeypatch.setattr(command, "_session", self._session)
+        monkeypatch.setattr(command, "PlainOperator", lambda: self)
         self.store = Store(url)
         self.put(*map(self.cell, NAMES))
 
@@ -77,15 +76,12 @@ class Lab:
             raise answer
         return answer
 
-    def _session(self, cell: CellConfig, path: Path, limits: AcceptanceLimits, options: Any) -> Any:
-        assert not limits.given
+    def _session(self, cell: CellConfig, path: Path, options: Any) -> Any:
         self.sessions.append((cell, path, options))
         outcome = self.outcomes.pop(0) if self.outcomes else ""
         if isinstance(outcome, BaseException):
             raise outcome
-        return SimpleNamespace(
-            passed=not outcome, limits=AcceptanceLimits(), verification=SimpleNamespace(reason=outcome)
-        )
+        return SimpleNamespace(passed=not outcome, failure=outcome)
 
     @property
     def verified(self) -> list[str]:
@@ -245,6 +241,6 @@ def test_a_store_without_cells_says_how_to_add_them(lab: Lab) -> None:
 
 
 def test_nothing_due_is_success(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(command, "_is_due", lambda *_: False)
+    monkeypatch.setattr("ftdrive.fleet.state.Fleet.is_due", lambda *_: False)
     code, out, err = lab.run("--due")
     assert (code, out, err) == (0, [], "No cell is due.")

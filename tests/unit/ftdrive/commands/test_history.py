@@ -15,34 +15,17 @@ import pytest
 
 from ftcalib import CalibrationResult
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive import cli
-from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
-from ftdrive.commands.common import CellOptions, Source, index_run
-from ftdrive.commands.live_source import open_log
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_folder
+from ftdrive.commands.options import CellOptions, Source
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, WeighingsFile
-from ftdrive.session import session
+from ftdrive.store import index_run
 from ftdrive.store.database import SCHEMA, default_file
-from ftdrive.store.records import user_folder
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.live.simulated import calibrated, info
 from tests.unit.ftdrive.store.run_folders import new_run, result, verified
+from tests.unit.ftdrive.stream.simulated import calibrated, info
 
 Ran = tuple[int, str, str]
-
-
-@pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Ran]:
-    """Run a command in an empty folder; return its exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-
-    def call(*arguments: str | Path) -> Ran:
-        code = cli.run([*map(str, arguments)])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
-    return call
 
 
 @pytest.fixture
@@ -100,10 +83,10 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
     run("history", "--index", runs)
     days = [(datetime.now(UTC) - timedelta(days=27 - n)).date().isoformat() for n in range(28)]
     for n, day in enumerate(days):
-        file = WeighingsFile.of(user_folder() / FOLDER, {"tool": "gripper", "arm_serial": "arm-1"}, day)
+        file = WeighingsFile.of(user_folder("data") / FOLDER, {"tool": "gripper", "arm_serial": "arm-1"}, day)
         part = {"t_utc": f"{day}T10:15:00+00:00", "is_something": True, "mass_sigma_kg": 1e-3, "mass_kg": 0.2 + n / 1e3}
         file.append([part, {"refused": "cable"}, {"refused": "cable"}])
-    run("history", "--index", user_folder() / FOLDER)
+    run("history", "--index", user_folder("data") / FOLDER)
     (line,) = [one for one in run("history")[1].splitlines() if one.startswith("last weighing: ")]
     assert line == f"last weighing: gripper, {days[-1]} 10:15: 0.2270 ± 0.0010 kg; 1 part, 2 refused on this day"
     assert "last weighing" not in run("history", "--tool", "drill")[1]
@@ -120,8 +103,9 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
 def test_a_day_without_a_weighing_has_no_line(run: Callable[..., Ran], runs: Path) -> None:
     run("history", "--index", runs)
     day = datetime.now(UTC).date().isoformat()
-    WeighingsFile.of(user_folder() / FOLDER, {"tool": "welder", "arm_serial": "1"}, day).append([{"refused": "cable"}])
-    run("history", "--index", user_folder() / FOLDER)
+    file = WeighingsFile.of(user_folder("data") / FOLDER, {"tool": "welder", "arm_serial": "1"}, day)
+    file.append([{"refused": "cable"}])
+    run("history", "--index", user_folder("data") / FOLDER)
     assert len(json.loads(run("history", "--json")[1])["last_weighings"]) == 1
     assert "last weighing" not in run("history")[1]
 
@@ -131,10 +115,8 @@ def test_rebuilt_a_deleted_run_is_gone_and_a_damaged_one_is_named(run: Callable[
     (runs / "gripper-0" / "calibration.json").write_text("{")
     (runs / "drill" / "calibration.json").unlink()
     code, out, err = run("history", "--rebuild")
-    assert (code, len(out.splitlines())) == (
-        0,
-        5 + 4 + 1,
-    )  # the damaged one is still there, and no reason to forget its result
+    # the damaged one is still there, and no reason to forget its result
+    assert (code, len(out.splitlines())) == (0, 5 + 4 + 1)
     assert "left out: " in err
     assert "gripper-0/calibration.json" in err
     assert run("history", runs, "--rebuild")[0] == 2
@@ -224,7 +206,7 @@ def calibrate_with(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """Have `ftdrive calibrate` end with this run."""
     loaded = CalibrationResult.load(folder / "calibration.json")
     outcome = SimpleNamespace(run=Run(folder), result=loaded, drift=None)
-    monkeypatch.setattr(session, "calibrate", lambda *_: outcome)
+    monkeypatch.setattr("ftdrive.commands.calibrate.guide", lambda *_: outcome)
 
 
 def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
@@ -252,12 +234,11 @@ def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
 
 
 @pytest.mark.parametrize("url", ["mysql://host/db", "sqlite:////dev/null/store.sqlite", "store"])
-def test_a_bad_address_is_a_warning_after_a_calibration(
-    url: str, runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_address_is_a_warning_after_a_calibration(url: str, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FTDRIVE_STORE_URL", url)
-    index_run(runs / "gripper-0")
-    assert capsys.readouterr().err.startswith(" The run is saved but not in the history yet, because ")
+    said = list[str]()
+    index_run(runs / "gripper-0", said.append)
+    assert said[0].startswith(" The run is saved but not in the history yet, because ")
 
 
 def test_a_result_that_solve_saves_in_its_run_is_indexed(
@@ -295,7 +276,7 @@ def test_a_tool_reaches_the_stream(run: Callable[..., Ran], monkeypatch: pytest.
         opened.append((wanted, options["force"]))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", stream)
+    monkeypatch.setattr("ftdrive.library.CellSource", stream)
     for more in ([], ["--force"]):
         run("live", "--tool", "gripper", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", *more)
     assert opened == [("gripper", False), ("gripper", True)]
@@ -321,10 +302,9 @@ def test_weighings_are_kept_with_a_calibration_of_a_file(
     stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
     source = Source(None, None, False, CellOptions(), emulated)
     with ExitStack() as stack:
-        assert (open_log(source, stream, stack, print) is None) == emulated
-        log = open_log(source._replace(path=tmp_path), stream, stack, print)
-        assert log is not None
-        log.refused("cable")
+        if emulated:
+            source.open_log(stream, stack, print)({"refused": "cable"})
+        source._replace(path=tmp_path).open_log(stream, stack, print)({"refused": "cable"})
     (day,) = Store().weighings(9)
     assert (day.tool, day.calibration_id, day.robot_host) == ("gripper", calibration.id, "10.0.0.7")
     assert (day.emulated, day.refusals["cable"], day.last_utc) == (emulated, 1, None)

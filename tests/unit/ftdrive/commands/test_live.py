@@ -3,6 +3,7 @@
 import io
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -13,27 +14,27 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from ftcalib import CalibrationDataset, CalibrationResult, Known, Parameters, Setup, solve
-from ftcalib.model import predict
-from ftcalib.published.yu import SPECIAL_R_flange_base
+from ftcalib import CalibrationDataset, Known, Parameters, Setup, solve
+from ftcalib.model import SPECIAL_R_flange_base, predict
 from ftdrive.checks.check import Check
 from ftdrive.commands import live
-from ftdrive.live.processing import Processor
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Block, Stages, WrenchFrame
-from ftdrive.terminal import live_feed
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.terminal.live_panels import plain
+from ftdrive.stream.feed import Feed
+from ftdrive.stream.processing import Processor
+from ftdrive.stream.samples import Links, Stages, WrenchFrame
+from ftdrive.stream.sources import Read, RecordingSource
+from ftdrive.stream.stream import Stream
+from ftdrive.terminal import live_panels
+from ftdrive.words.stream import Summary, View
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import NOISE, calibrated, dwells, info, paired
+from tests.unit.ftdrive.stream.simulated import NOISE, calibrated, dwells, info, paired
 
 PUSH = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
 
 
-def replayed(seconds: float = 1.2, **options: Any) -> ReplayedStream:
+def pushed(seconds: float = 1.2, kind: type[RecordingSource] = RecordingSource, **options: Any) -> Stream:
     rows = paired(dwells(1, round(seconds * 1000), seed=1), push=PUSH)
-    return ReplayedStream(info(calibrated()), rows, clock=FakeClock(), **options)
+    return Stream(kind(info(calibrated()), rows, clock=FakeClock(), speed=options.pop("speed", 1.0)), **options).open()
 
 
 @pytest.fixture
@@ -42,10 +43,11 @@ def arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     path = tmp_path / "calibration.json"
     calibrated().save(path)
 
-    def stream(_run: Any, _calibration: CalibrationResult, _name: str, **options: Any) -> ReplayedStream:
-        return replayed(**options)
+    def stream(_path: Path, _calibration: Path, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
+        assert not force
+        return pushed(speed=speed, frame=frame)
 
-    monkeypatch.setattr(live, "replay_run", stream)
+    monkeypatch.setattr(live, "replayed", stream)
     return ["--calibration", str(path), "--replay", str(tmp_path)]
 
 
@@ -77,6 +79,8 @@ def test_axes_and_point_are_chosen_separately(arguments: list[str]) -> None:
         moved = np.array(sensor[key]["torque_Nm"]) + np.cross(lever, sensor[key]["force_N"])
         np.testing.assert_allclose(point[key]["torque_Nm"], moved, atol=1e-9)
     assert (base["axes"], base["about"], point["about"]) == ("base", "sensor origin", [0.0, 0.0, 0.13])
+    as_measured = json.loads(run(arguments, "--json", "--once", "--stages", "bias=false,gravity=false").stdout)
+    np.testing.assert_allclose(as_measured["compensated"]["force_N"], sensor["raw"]["force_N"], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -91,11 +95,6 @@ def test_options_are_checked(arguments: list[str], more: list[str], why: str | N
     result = CliRunner().invoke(live.live, [*arguments, *more, "--once"])
     assert (str(result.exception) if result.exception else "").startswith(why or "")
     assert (result.exception is None) == (why is None)
-
-
-def test_speed_needs_a_recording() -> None:
-    result = CliRunner().invoke(live.live, ["--speed", "2"])
-    assert "--replay" in str(result.exception)
 
 
 def test_once_prints_one_line(arguments: list[str]) -> None:
@@ -132,17 +131,18 @@ class Quiet:
         self.used.append("as before")
 
 
-def shown_table(monkeypatch: pytest.MonkeyPatch, stream: Any, width: int = 80) -> str:
-    console = Console(width=width, file=io.StringIO(), color_system=None, force_terminal=False)
-    monkeypatch.setattr(live, "answer", console)
-    live._show_table(Feed(stream), [Check("robot.payload", "ok", "robot 1.44 kg")])
+def shown_table(monkeypatch: pytest.MonkeyPatch, views: Iterable[View]) -> str:
+    console = Console(width=80, file=io.StringIO(), color_system=None, force_terminal=False)
+    monkeypatch.setattr(live_panels, "answer", console)
+    live_panels.show_table(views)
     assert isinstance(console.file, io.StringIO)
     return console.file.getvalue()
 
 
 def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "Keyboard", Quiet)
-    shown = shown_table(monkeypatch, replayed())
+    monkeypatch.setattr(live_panels, "Keyboard", Quiet)
+    checks = [Check("robot.payload", "ok", "robot 1.44 kg")]
+    shown = shown_table(monkeypatch, Summary(Feed(pushed()), checks).views())
     assert shown.rstrip().endswith("The recording has ended.")
     assert "Ctrl-C" not in shown
     lines = shown.splitlines()
@@ -154,48 +154,44 @@ def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytes
     assert Quiet.used == ["echo off", "as before"]
 
 
-class Interrupted:
-    """A stream that fails for some reads."""
+class Interrupted(RecordingSource):
+    """It fails for some reads."""
 
-    def __init__(self, failures: int) -> None:
-        self.stream = replayed(10.0)
-        self.clock, self.info, self.frame = self.stream.clock, self.stream.info, self.stream.frame
-        self.status, self.sigma_of_mean = self.stream.status, self.stream.sigma_of_mean
-        self.take_events = self.stream.take_events
-        self.reads, self.failures = 0, failures
+    reads, failures, error = 0, 2, ""
 
-    def read(self) -> Block:
-        self.reads += 1
+    def links(self) -> Links:
+        links = super().links()
+        return links._replace(sensor=replace(links.sensor, error=self.error))
+
+    def read(self, timeout_s: float = 0.1) -> Read:
+        self.reads, self.error = self.reads + 1, ""
         if 50 < self.reads <= 50 + self.failures:
-            self.clock.sleep(0.3)
-            raise DeviceTimeout("sensor: no new sample for 0.300 s", "check cable and supply")
-        return self.stream.step()
+            self.clock.sleep(3 * timeout_s)
+            self.error = "no new sample for 0.300 s"
+            raise DeviceTimeout(self.error, "check cable and supply")
+        return super().read(timeout_s)
 
 
-def test_a_silent_device_is_shown_and_no_old_number() -> None:
-    stream: Any = Interrupted(2)
-    views = list(islice(live._views(Feed(stream)), 12))
-    readings = [live._reading(view) for view in views]
-    stale = [reading for reading in readings if reading["stale"]]
-    assert len(stale) == 2
-    for reading in stale:
-        assert reading["stale"].startswith("sensor: no new sample for 0.300 s")
+def test_a_silent_device_is_shown_and_no_old_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    views = list(islice(Summary(Feed(pushed(10.0, Interrupted))).views(), 12))
+    first, second = (view for view in views if view.silent)
+    for reading in (first.to_dict(), second.to_dict()):
+        assert reading["stale"].endswith(": no new sample for 0.300 s")
         assert reading["compensated"] is reading["raw"] is reading["sigma"] is reading["contact"] is None
-        assert live._line(reading, stream.frame).startswith("stale: sensor")
-    assert readings[-1]["stale"] is None
-    (view, *_) = [view for view in views if view.silent]
-    shown = "\n".join(map(str, plain(view, 80)))
+    assert not views[-1].silent
+    assert first.in_line(timed=False).startswith("stale: ")
+    shown = shown_table(monkeypatch, [first])
     assert "no new sample for 0.300 s" in shown
     assert "--.--" in shown
     assert not re.search(r" Fx +[+-]?\d", shown)
 
 
-def test_a_failure_that_lasts_ends_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_feed, "_RETRY_S", 0.0)
+def test_a_failure_that_lasts_ends_the_command() -> None:
     for failures, raises in ((1000, False), (1, True)):
-        stream: Any = Interrupted(failures)
+        stream = pushed(10.0, Interrupted)
+        stream.source.failures = failures  # type: ignore[attr-defined]
         with pytest.raises(DeviceTimeout):
-            list(live._views(Feed(stream), raises=raises))
+            list(Summary(Feed(stream)).views(raises=raises))
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
@@ -213,7 +209,7 @@ def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:
     assert (headline > 1.1 * np.array(calibration.predicted_error())).all()
     shown = []
     for one in R:
-        processor = Processor(replace(info(calibration), calibration=calibration), WrenchFrame("base"), Stages())
+        processor = Processor(replace(info(calibration), result=calibration), WrenchFrame("base"), Stages())
         rows = paired(np.tile(one, (1000, 1, 1)), noise=1e-3)
         processor.process(rows)
         shown.append(processor.sigma_of_mean(one, 0.1, loaded=False))

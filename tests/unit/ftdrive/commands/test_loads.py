@@ -12,15 +12,14 @@ from ftcalib import CalibrationResult, solve
 from ftcalib.loads.model import LoadRun
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
-from ftdrive.commands import live, live_source
+from ftdrive.commands.options import Source
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Paired
-from ftdrive.runs.sensor_file import next_sensor_file, sensor_files
-from ftdrive.runs.source import read_calibration
+from ftdrive.runs.calibration import next_sensor_file, read_calibration, sensor_files
+from ftdrive.stream.samples import Paired
+from ftdrive.stream.stream import Stream
 from tests.loaded_sensor import PROTOCOLS, LoadedSensor, with_load
-from tests.unit.ftdrive.live.simulated import calibrated, info
-from tests.unit.ftdrive.live.test_weighing import POSE, part, rests, stream
+from tests.unit.ftdrive.stream.simulated import calibrated, info, replayed
+from tests.unit.ftdrive.stream.test_weighing import POSE, part, rests, stream
 
 
 def run(*arguments: str) -> Result:
@@ -111,7 +110,7 @@ def test_a_recording_is_tared_where_the_tool_is_free_before_the_load(
     rows = Paired.concatenate([*free, rests((POSE, load), (POSE, drift), seconds=1.5)])
     rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
     known = info(replace(calibrated(), sensor=SensorMatrix.usual(0.02)))
-    monkeypatch.setattr(live, "replayed", lambda *_, **__: ReplayedStream(known, rows, speed=float("inf")))
+    monkeypatch.setattr("ftdrive.commands.loads.replayed", lambda *_, **__: replayed(known, rows, speed=float("inf")))
     found = run("check", "1.000", "--replay", str(tmp_path), "--json")
     answer = json.loads(found.stdout)
     assert answer["scale_error"] == pytest.approx(0.09, abs=4 * answer["scale_sigma"])
@@ -124,8 +123,9 @@ def test_a_recording_is_tared_where_the_tool_is_free_before_the_load(
 
 def test_an_emulated_cell_hangs_the_load_itself_also_without_a_place(monkeypatch: pytest.MonkeyPatch) -> None:
     cell, hung = stream(rests((POSE, part(POSE, 1.0)), seconds=2.0)), list[dict[str, object]]()
-    cell.station = SimpleNamespace(control=lambda **request: hung.append(request))  # type: ignore[attr-defined]
-    monkeypatch.setattr(live_source, "open_source", lambda *_: cell)
+    station = SimpleNamespace(control=lambda **request: hung.append(request))
+    monkeypatch.setattr(Stream, "station", station)
+    monkeypatch.setattr(Source, "open", lambda *_: cell)
     found = run("check", "1.000", "--simulate", "--json")
     assert found.exception is None, found.output
     assert [(one["do"], one["mass_kg"], one["at_mm"]) for one in hung] == [("hang", 1.0, (0.0, 0.0, 200.0))]
@@ -136,7 +136,7 @@ def test_a_load_that_hangs_nowhere_is_named_after_an_unsteady_second(monkeypatch
     touched = [(POSE, sign * part(POSE, 0.2)) for sign in (1, -1)]
     rows = Paired.concatenate([rests(*touched, seconds=0.1), rests((POSE, nothing), seconds=4.0)])
     rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
-    monkeypatch.setattr(live_source, "open_source", lambda *_: stream(rows))
+    monkeypatch.setattr(Source, "open", lambda *_: stream(rows))
     found = run("check", "1.000", "--tool", "gripper", "--wait", "3")
     assert isinstance(found.exception, ConfigError)
     assert "no load of about 1 kg" in str(found.exception)

@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 from ftcalib import CalibrationResult
-from ftdrive import cli
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.bundle import write_bundle
@@ -27,25 +26,16 @@ SEED = 77
 def peg(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("recorded") / "peg.csv"
     recorder = Recorder([path], info(), {})
-    recorder.write(block(1200))
-    recorder.close()
+    recorder.add(block(1200), [])
+    recorder.end()
     return path
 
 
 @pytest.fixture
-def run(
-    peg: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., Ran]:
-    """Run a command line beside `c.json` and a recording `peg.csv`; return exit code, stdout and stderr as one line."""
-    monkeypatch.chdir(tmp_path)
+def run(run: Callable[..., Ran], peg: Path) -> Callable[..., Ran]:
+    """Run a command line beside `c.json` and a recording `peg.csv`."""
     calibration().save(Path("c.json"))
     shutil.copy(peg, "peg.csv")
-
-    def run(*words: str) -> Ran:
-        code = cli.run(list(words))
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
-
     return run
 
 
@@ -112,7 +102,7 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResu
 def test_every_output_of_an_emulated_calibration_says_so(
     run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.report.report.draw", lambda *_: "")  # figures take most of the time
+    monkeypatch.setattr("ftdrive.report.figures.draw", lambda *_: "")  # figures take most of the time
     run("report", "e.json", "-o", "report.html")
     assert "The cell was EMULATED: these are not the values of a real tool." in Path("report.html").read_text("utf-8")
     assert list(json.loads(run("report", "e.json", "--format", "json")[1])["marks"]) == ["EMULATED"]
@@ -142,8 +132,8 @@ def test_a_real_calibration_is_not_marked(run: Callable[..., Ran]) -> None:
 def test_a_recording_of_an_emulated_cell_says_so_whatever_its_calibration(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     recorder = Recorder([path], replace(info(), emulated=True), {})
-    recorder.write(block(3))
-    recorder.close()
+    recorder.add(block(3), [])
+    recorder.end()
     found = read_recording(path)
     assert found.header.info.marks == ("EMULATED",)
     assert with_calibration(found.header, calibration(), "c.json").info.marks == ("EMULATED",)

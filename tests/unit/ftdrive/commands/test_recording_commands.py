@@ -21,11 +21,12 @@ import pytest
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.commands.record import Duration
-from ftdrive.live.samples import Block, StreamEvent
 from ftdrive.recording import Recorder, read_recording
 from ftdrive.recording import recorder as recorder_module
 from ftdrive.recording.growing_file import GrowingFile
+from ftdrive.stream.samples import Block, Stages, StreamEvent
 from ftdrivers.errors import DeviceTimeout
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.recorded import UTC_OFFSET_NS, block, calibration, info
 
 END = KeyboardInterrupt()
@@ -41,7 +42,7 @@ class FakeStream:
     ) -> None:
         self.info, self.frame, self.warnings = info(), block(1).frame, ("the serial number is unknown",)
         self._blocks, self._end, self._events = blocks, end, events or {}
-        self._read = 0
+        self._read, self.clock, self.stages = 0, FakeClock(), Stages()
 
     def __enter__(self) -> "FakeStream":
         return self
@@ -72,11 +73,11 @@ def run_record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.C
     calibration().save(tmp_path / "c.json")
 
     def run(stream: FakeStream, *options: str) -> tuple[int, dict[str, Any] | None, str]:
-        def opened(cell: CellConfig, *_: Any, **__: Any) -> FakeStream:
+        def opened(cell: Any, *_: Any, **__: Any) -> FakeStream:
             stream.cell = cell
             return stream
 
-        monkeypatch.setattr("ftdrive.commands.live_source.CompensatedStream", opened)
+        monkeypatch.setattr("ftdrive.library.open_stream", opened)
         given = ["--calibration", "c.json", "--robot", "10.0.0.2", "--sensor", "ati-can://can0", "--json", *options]
         code = cli.run(["record", *given])
         out, err = capsys.readouterr()
@@ -91,8 +92,9 @@ def blocks(n: int, size: int = 100) -> list[Block]:
 
 def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
     stream = FakeStream(blocks(30))
-    code, answer, err = run_record(stream, "-o", "a.mcap", "-o", "a.csv", "--count", "1234")
-    assert code == 0
+    options = ["--count", "1234", "--stages", "lowpass_Hz=20,bias=false"]
+    code, answer, err = run_record(stream, "-o", "a.mcap", "-o", "a.csv", *options)
+    assert (code, stream.stages) == (0, Stages(bias=False, lowpass_Hz=20.0))
     assert answer is not None
     assert (answer["files"], answer["samples"], answer["gaps"], answer["lost"]) == (["a.mcap", "a.csv"], 1234, 0, 0)
     assert (answer["axes"], answer["about"]) == ("sensor", "sensor")
@@ -189,6 +191,11 @@ def test_a_gap_after_the_end_does_not_count(run_record: Run) -> None:
         (["-o", "a.csv", "--simulate"], "--robot does not go with --simulate"),
         (["-o", "a.csv", "--duration", "soon"], "not a duration"),
         (["-o", "c.json"], "never overwritten"),
+        (
+            ["-o", "a.csv", "--stages", "smoothing=3"],
+            "--stages has no setting 'smoothing': give NAME=VALUE with one of",
+        ),
+        (["-o", "a.csv", "--stages", "lowpass_Hz=fast"], "lowpass_Hz cannot be 'fast': set a frequency"),
     ],
 )
 def test_what_cannot_be_done_is_refused_before_any_work(run_record: Run, options: list[str], words: str) -> None:
@@ -213,12 +220,12 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     recorder = Recorder([Path("a.csv")], info(), {})
-    recorder.write(block(1500))
-    recorder.write(block(100, 1500))
-    recorder.write(block(100, 1600))
-    recorder.write(block(100, 1700))
+    recorder.add(block(1500), [])
+    recorder.add(block(100, 1500), [])
+    recorder.add(block(100, 1600), [])
+    recorder.add(block(100, 1700), [])
     Path("b.csv.partial").write_bytes(Path("a.csv.partial").read_bytes()[:-30])
-    recorder.close()
+    recorder.end()
     assert cli.run(["convert", "a.csv", "b.mcap", "--json"]) == 0
     out, err = capsys.readouterr()
     answer = json.loads(out)
@@ -241,9 +248,9 @@ def three_seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording of 1 kHz."""
     path = tmp_path_factory.mktemp("recorded") / "a.mcap"
     recorder = Recorder([path], info(), {})
-    recorder.write(block(3000))
-    recorder.event(StreamEvent(0, "delay", "…", {"value": 0.0031, "sigma": 0.0002}))
-    recorder.close()
+    recorder.add(block(3000), [])
+    recorder.add(None, [StreamEvent(0, "delay", "…", {"value": 0.0031, "sigma": 0.0002})])
+    recorder.end()
     return path
 
 
@@ -303,8 +310,8 @@ def test_damage_and_control_c_keep_what_was_before(
     path, target = Path(f"a{ending}"), Path(f"b{ending}")
     recorder = Recorder([path], info(), {})
     for start in (0, 8200, 16_400):
-        recorder.write(block(8200 if start < 16_400 else 1000, start, step_ns=2_000_000))
-    recorder.close()
+        recorder.add(block(8200 if start < 16_400 else 1000, start, step_ns=2_000_000), [])
+    recorder.end()
     call = [command, str(path), *(["-o"] if command == "compensate" else []), str(target), "--json"]
     append = recorder_module.RecordingFiles.append
     written, pressed = [0], [False]
@@ -365,8 +372,8 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
     path, target = Path("a.parquet"), f"b{ending}"
     recorder = Recorder([path], info(), {})
     for start in range(0, 24_600, 8200):
-        recorder.write(block(8200, start, step_ns=2_000_000))
-    recorder.close()
+        recorder.add(block(8200, start, step_ns=2_000_000), [])
+    recorder.end()
     command = ["compensate", str(path), "-o", target]
     killed = [sys.executable, "-c", KILLED, "-q", *command]  # without the line of a command that takes over 2 s
     outcome = subprocess.run(killed, capture_output=True, text=True, check=False)

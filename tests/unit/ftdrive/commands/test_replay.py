@@ -7,7 +7,7 @@ import pytest
 from ftcalib import CalibrationResult, Finding
 from ftdrive.commands.replay import equality
 from ftdrive.errors import NotAccepted
-from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 
 def moved(result: CalibrationResult, sigmas: float) -> CalibrationResult:

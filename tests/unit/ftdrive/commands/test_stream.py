@@ -1,111 +1,36 @@
-"""What `stream` prints, what it passes on, and when it ends."""
+"""What `stream` prints."""
 
-from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Self, cast
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.commands import live_source, stream
-from ftdrive.commands.common import CellOptions
-from ftdrive.errors import ConfigError, exit_code
-from ftdrive.live.samples import Block, StreamEvent, WrenchFrame
-from ftdrive.live.stream import RECOVER_S
-from ftdrivers.errors import DeviceTimeout
-from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.servers.fake_stream import FakeStream, block
-
-
-class Source(FakeStream):
-    """Takes 50 ms for each block, and notes a stale event when it fails first."""
-
-    def __init__(self, *fails: tuple[float, float], ends_s: float = 1.0) -> None:
-        super().__init__()
-        self.clock = FakeClock()
-        self._begin_s = self.clock.now_s()
-        self._fails = fails
-        self._ends_s = ends_s
-        self.warnings = ["the arm reports no serial number"]
-        self.events: list[StreamEvent] = []
-        self.reads = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-    def read(self) -> Block:
-        self.clock.advance(0.05)
-        t_s = self.clock.now_s() - self._begin_s
-        if t_s > self._ends_s:
-            self.events.append(StreamEvent(0, "mark", "the last"))
-            raise KeyboardInterrupt
-        if any(start < t_s < end for start, end in self._fails):
-            self.events.append(StreamEvent(0, "stale", f"sensor: silent at {t_s:.0f} s"))
-            raise DeviceTimeout("no sample for 0.3 s", "check cable and supply")
-        self.reads += 1
-        return block(1, self.reads)
-
-    def take_events(self) -> list[StreamEvent]:
-        events, self.events = self.events, []
-        return events
-
-
-class Sink:
-    def __init__(self) -> None:
-        self.blocks: list[Block] = []
-        self.events: list[StreamEvent] = []
-        self.write: Callable[[Block], None] = self.blocks.append
-        self.event: Callable[[StreamEvent], None] = self.events.append
-
-
-def serve(source: Source, *sinks: Sink) -> None:
-    stream.serve(cast(Any, source), cast(Any, sinks))
-
-
-def test_every_sink_gets_every_block_and_event() -> None:
-    source, sinks = Source(), [Sink(), Sink()]
-    with pytest.raises(KeyboardInterrupt):
-        serve(source, *sinks)
-    for sink in sinks:
-        assert [int(one.seq[0]) for one in sink.blocks] == list(range(1, source.reads + 1))
-        assert [event.text for event in sink.events] == ["the last"]
-
-
-def test_viewers_stay_connected_while_a_device_is_silent(capsys: pytest.CaptureFixture[str]) -> None:
-    source, sink = Source((1.0, 10.9), (11.0, 20.9), ends_s=30.0), Sink()
-    with pytest.raises(KeyboardInterrupt):
-        serve(source, sink)
-    assert len(sink.blocks) == source.reads > 180
-    assert sink.events[0].kind == "stale"
-    printed = capsys.readouterr().err
-    assert printed.count("no sample for 0.3 s; check cable and supply. Viewers stay connected for 10 s.") == 2
-    assert printed.count("Samples arrive again.") == 2
-
-
-def test_a_device_that_stays_silent_ends_the_stream() -> None:
-    source, sink = Source((1.0, 60.0), ends_s=60.0), Sink()
-    with pytest.raises(DeviceTimeout) as failure:
-        serve(source, sink)
-    assert exit_code(failure.value) == 4
-    assert source.clock.now_s() - 1001.0 == pytest.approx(RECOVER_S, abs=0.11)
-    assert "silent at 11 s" in sink.events[-1].text
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
+from ftdrive.commands import stream
+from ftdrive.commands.options import CellOptions
+from ftdrive.commands.options import Source as Chosen
+from ftdrive.errors import ConfigError
+from ftdrive.stream.samples import WrenchFrame
+from ftdrive.stream.sources import CellSource
+from tests.unit.ftdrive.stream.simulated import calibrated
+from tests.unit.ftdrive.stream.test_pump import Source
 
 
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, *arguments: str) -> tuple[dict[str, Any], str]:
     """Run the command on a fake stream; return how it opened it, and what it printed."""
     opened: dict[str, Any] = {}
 
-    def open_(_cell: object, _calibration: object, **options: Any) -> Source:
-        opened.update(options)
-        return Source()
+    def open_(cell: CellSource, **options: Any) -> Any:
+        opened.update(options, name=cell._name)
+        source: Any = Source("a")
+        source.warnings = ["the arm reports no serial number"]
+        return nullcontext(source)
 
-    monkeypatch.setattr(live_source, "CompensatedStream", open_)
-    monkeypatch.setattr(live_source, "read_calibration", lambda *_, **__: SimpleNamespace())
-    monkeypatch.setattr(CellOptions, "cell", lambda _: SimpleNamespace())
+    monkeypatch.setattr("ftdrive.library.Stream", open_)
+    monkeypatch.setattr(Chosen, "calibration", lambda _: calibrated())
+    monkeypatch.setattr(CellOptions, "cell", lambda _: CellConfig(RobotConfig("a"), SensorConfig("b")))
     calibration = tmp_path / "calibration.json"
     calibration.touch()
     outcome = CliRunner().invoke(stream.stream, ["--calibration", str(calibration), "--port", "0", *arguments])

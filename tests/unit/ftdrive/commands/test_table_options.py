@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftdrive import cli
-from ftdrive.commands.tables import _forward
+from ftdrive.runs.source import _forward
 from tests.ros2.seven_joints import URDF
 from tests.unit.ftdrive.tables.test_layouts import POSES, columns, quaternion, t, text, wrench
 
@@ -18,15 +18,12 @@ TCP = "0.02,-0.01,0.15,0.1,0.2,0.3"
 
 
 @pytest.fixture
-def solved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Solved:
+def solved(run: Callable[..., tuple[int, str, str]]) -> Solved:
     """Solve a table in an empty folder; return exit code, stdout and stderr."""
-    monkeypatch.chdir(tmp_path)
 
     def call(table: dict[str, np.ndarray], *options: str) -> tuple[int, str, str]:
         Path("poses.csv").write_text(text(table))
-        code = cli.run(["solve", "poses.csv", "--json", *options])
-        out, err = capsys.readouterr()
-        return code, out, " ".join(err.split())
+        return run("solve", "poses.csv", "--json", *options)
 
     return call
 

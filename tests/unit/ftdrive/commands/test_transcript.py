@@ -9,10 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
-from ftdrive.commands.transcript import _watch, _words
+from ftdrive.commands.transcript import _words
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo
+from ftdrivers.transcript import _watch
 
 
 class Sensor:

@@ -17,7 +17,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import AcceptanceLimits, Verified
 from ftdrive.session.options import SessionOptions
-from ftdrive.terminal.report import verdict_in_words
+from ftdrive.session.verifying import Verifying, save_wanted_update
+from ftdrive.words.result import _verdict_in_words
 from tests.unit.ftdrive.recorded import calibration
 
 
@@ -48,11 +49,11 @@ def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: 
 
 def test_a_resumed_verification_keeps_its_options(begun: Path) -> None:
     options = SessionOptions(begun.parent, resume=begun)
-    path, limits, options = command._with_poses(options, None, None, AcceptanceLimits())
+    path, limits, options = Verifying.chosen(options, None, None, AcceptanceLimits())
     assert (path, options.poses, limits) == (Path("cell/calibration.json"), 3, AcceptanceLimits(force_N=0.5))
     calibrate = Run.create(begun.parent, "calibrate", {"mode": "auto"}).folder
     with pytest.raises(ConfigError, match="ftdrive calibrate --resume"):
-        command._with_poses(replace(options, resume=calibrate), None, None, AcceptanceLimits())
+        Verifying.chosen(replace(options, resume=calibrate), None, None, AcceptanceLimits())
 
 
 def failed(folder: Path, limits: AcceptanceLimits) -> Any:
@@ -69,11 +70,11 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
 
 
 def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
-    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in verdict_in_words(
+    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in _verdict_in_words(
         failed(tmp_path, AcceptanceLimits())
     )
     given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))
-    assert verdict_in_words(given) == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
+    assert _verdict_in_words(given) == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
     assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
 
 
@@ -81,11 +82,15 @@ def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
     ("update", "typed", "wanted"),
     [("no", "yes\n", False), ("yes", "", True), ("ask", "yes\n", True), ("ask", "no\n", False), ("ask", "", False)],
 )
-def test_an_update_is_saved_only_if_it_is_wanted(update: Any, typed: str, wanted: bool, tmp_path: Path) -> None:
+def test_an_update_is_saved_only_if_it_is_wanted(
+    update: Any, typed: str, wanted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftdrive.session.verifying.save_update", lambda _: tmp_path)
+    ask: Any = lambda question: command._ask(None, True, question)  # noqa: E731
     with CliRunner().isolation(typed) as (out, *_):
-        found = command._wants_update(failed(tmp_path, AcceptanceLimits()), update, as_json=True)
+        found = save_wanted_update(failed(tmp_path, AcceptanceLimits()), update, ask)
         printed = out.getvalue().decode()
-    assert found is wanted
+    assert (found is not None) is wanted
     if update == "ask":
         assert json.loads(printed.splitlines()[0])["text"].startswith("An update of the bias is sufficient.")
-    assert not command._wants_update(failed(tmp_path, AcceptanceLimits(force_N=1.0)), "yes", as_json=True)
+    assert save_wanted_update(failed(tmp_path, AcceptanceLimits(force_N=1.0)), "yes", ask) is None

@@ -10,9 +10,10 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
+from ftdrive.commands.options import Source
 from ftdrive.commands.weigh import _print
 from ftdrive.errors import ConfigError
-from ftdrive.live.weighing import CannotWeigh, ScaleState
+from ftdrive.stream.weighing import CannotWeigh, ScaleState
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import INFO
 from tests.unit.ftdrive.terminal.test_weigh_screen import PART
@@ -28,17 +29,16 @@ class Scale:
     def __init__(self, *states: tuple[ScaleState, bool]) -> None:
         self.stream = SimpleNamespace(clock=FakeClock(), info=replace(INFO, emulated=True))
         self._states: Sequence[tuple[ScaleState, bool]] = states
-        self.raises: bool | None = None
-        self.zeros = 0
+        self.zeros, self.is_zeroing, self.refusal = 0, False, None
 
-    def zero(self) -> None:
+    def request_zero(self) -> None:
         self.zeros += 1
 
-    def states(self, *, raises: bool = False) -> Iterator[tuple[ScaleState, bool]]:
-        self.raises = raises
-        for one in self._states:
+    def turns(self) -> Iterator[None]:
+        for shown, is_new in self._states:
             self.stream.clock.sleep(1.0)
-            yield one
+            self.shown, self.is_new = shown, is_new
+            yield
 
     def given_up(self, shown: ScaleState) -> CannotWeigh:
         return CannotWeigh(shown.refusal or "samples")
@@ -53,7 +53,7 @@ def printed(
     poses: int = 1,
     as_json: bool = False,
 ) -> list[str]:
-    _print(cast("Any", scale), once=once, waits=waits, poses=poses, as_json=as_json)
+    _print(cast("Any", scale), scale.turns(), once=once, waits=waits, poses=poses, as_json=as_json)
     return capsys.readouterr().out.splitlines()
 
 
@@ -61,14 +61,11 @@ def test_each_new_weight_and_fault_is_a_line(capsys: pytest.CaptureFixture[str])
     scale = Scale((MOVING, False), (EMPTY, True), (EMPTY, False), (CABLE, True), (ONE, True))
     lines = printed(scale, capsys)
     assert [line.split()[0] for line in lines] == ["nothing:", "not", "0.8123"]
-    assert scale.raises is False
 
 
 def test_once_ends_with_the_first_weight(capsys: pytest.CaptureFixture[str]) -> None:
     states = (CABLE, True), (EMPTY, True), (ONE, True), (TWO, True), (ONE, True)
-    scale = Scale(*states)
-    assert printed(scale, capsys, once=True)[0].startswith("nothing:")
-    assert scale.raises is True
+    assert printed(Scale(*states), capsys, once=True)[0].startswith("nothing:")
     assert printed(Scale(*states), capsys, once=True, poses=2)[0].startswith("0.3000 ")
     (line,) = printed(Scale(*states), capsys, once=True, waits=True)  # after a zero it waits for a part
     assert line.startswith("0.8123 ")
@@ -97,17 +94,22 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
     """Run the command on a scale; return how it was opened, and stdout."""
     opened: dict[str, Any] = {}
 
-    def open_source(_source: object, _frame: object, _stack: object, track: str) -> Any:
+    def open_(_source: object, _stack: object, _frame: object, track: str) -> Any:
         opened["track"] = track
         return scale.stream
 
-    def weighing(_stream: object, _recorder: object, **named: Any) -> Any:
+    def weighing(_stream: object, **named: Any) -> Any:
         opened.update(named)
         return scale
 
-    monkeypatch.setattr("ftdrive.commands.live_source.open_source", open_source)
-    monkeypatch.setattr("ftdrive.commands.live_source.open_log", lambda *_: None)
-    monkeypatch.setattr("ftdrive.live.weighing.Weighing", weighing)
+    def pump(*_: object, patience_s: float) -> Any:
+        assert (patience_s == 0.0) == ("--once" in options)
+        return scale.turns()
+
+    monkeypatch.setattr(Source, "open", open_)
+    monkeypatch.setattr(Source, "open_log", lambda *_: None)
+    monkeypatch.setattr("ftdrive.commands.weigh.Weighing", weighing)
+    monkeypatch.setattr("ftdrive.commands.weigh.pump", pump)
     outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])
     assert outcome.exit_code == 0, outcome.output
     return opened, outcome.stdout

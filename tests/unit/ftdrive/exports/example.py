@@ -6,9 +6,9 @@ from math import cos, radians, sin
 import numpy as np
 
 from ftcalib import CalibrationResult, Finding, Parameters
-from ftcalib.likelihood.response import SIZE, Response
 from ftcalib.model import Array
-from ftdrive.exports.shared import Settings
+from ftcalib.sensor_matrix import SIZE, Response
+from ftdrive.exports.registry import Settings
 
 G_M_S2 = 9.80665
 WEIGHT_N = 2 * G_M_S2

@@ -15,13 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Parameters
 from ftcalib.compensation import Compensator
-from ftcalib.likelihood.response import SIZE, Response, ranges
 from ftcalib.model import Array
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SIZE, Response, SensorMatrix, ranges
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.formats import FORMATS, Property
-from ftdrive.exports.registry import export
-from ftdrive.exports.shared import Exported, Settings
+from ftdrive.exports.registry import Exported, Settings, export
 from tests.target_formulas import evaluate, mujoco_plugin, tool0_from, world_from_base
 
 ALL: tuple[Property, ...] = ("tilt", "rotation", "response")
@@ -102,7 +100,7 @@ def compensated(
     assert settings.sensor_com_mm is not None
     context: dict[str, Any] = {
         "R_flange_sensor": np.eye(3) if name in AXES_OF_THE_FLANGE else given.R_flange_sensor,
-        "p_flange_sensor_m": settings.p_flange_sensor_m(name),
+        "p_flange_sensor_m": np.array([0.0, 0.0, settings.height_mm or 0.0]) / 1e3,
         "R_flange_parent": tool0_from(settings.flange_frame),
         "sensor_mass_kg": settings.sensor_mass_kg,
         "p_flange_sensor_com_m": np.array(settings.sensor_com_mm) / 1e3,

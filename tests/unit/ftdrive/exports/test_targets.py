@@ -15,13 +15,8 @@ from ftcalib import CalibrationResult
 from ftcalib.result import MotionResult
 from ftdrive import __version__
 from ftdrive.exports.formats import FORMATS
-from ftdrive.exports.registry import export
-from ftdrive.exports.shared import Exported, Settings
-from tests.unit.ftdrive.exports.example import (
-    MEASURED,
-    calibration,
-    responding,
-)
+from ftdrive.exports.registry import Exported, Settings, export
+from tests.unit.ftdrive.exports.example import MEASURED, calibration, responding
 
 IN_YAML = [name for name, one in FORMATS.items() if one.file.endswith(".yaml")]
 
@@ -128,7 +123,7 @@ def test_notes_have_all_digits() -> None:
     assert bias == [*(np.array([1, -2, 3]) / 7), *odd.parameters.torque_bias_Nm]
     raised = replace(MEASURED, height_mm=100 / 3)
     notes = export(odd, "mc-rtc", raised, max_force_error_N=1e3).notes
-    assert numbers_after("with the sensor at ", notes)[2] == raised.p_frame_sensor_m("mc-rtc")[2]
+    assert numbers_after("with the sensor at ", notes)[2] == pytest.approx(0.1 / 3, rel=1e-15)
 
 
 def in_motion() -> CalibrationResult:

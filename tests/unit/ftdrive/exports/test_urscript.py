@@ -1,5 +1,9 @@
-"""A plan as a program for the pendant, run here by the interpreter of the emulated controller."""
+"""A plan as a program for the pendant, run here by the interpreter of the emulated controller, and functions for one.
 
+tests/wire runs the functions.
+"""
+
+import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -13,8 +17,9 @@ import pytest
 from click.testing import CliRunner, Result
 
 from ftdrive.cli import cli
-from ftdrive.errors import ConfigError, PlanRefused, exit_code
+from ftdrive.errors import PlanRefused, exit_code
 from ftdrive.exports import urscript
+from ftdrive.exports.urscript import functions
 from ftdrive.planning.plan import Plan
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.ur.urscript.program import Program
@@ -121,15 +126,9 @@ def test_a_person_is_asked_before_the_first_move(plan: Plan) -> None:
 
 def test_header_says_what_it_is_for(plan: Plan) -> None:
     comments = "\n".join(re.findall(r"^ *#.*$", urscript.program(plan, dwell_s=1.0), re.MULTILINE))
-    for word in (
-        plan.to_dict()["sha256"],
-        "UR5e",
-        "from 33.0 to 200.0, diameter 100.0, axis at x 0.0, y 5.0",
-        "WARNINGS",
-    ):
+    words = ("from 33.0 to 200.0, diameter 100.0, axis at x 0.0, y 5.0", "no safety function", "within 30 degrees")
+    for word in (plan.to_dict()["sha256"], "UR5e", "WARNINGS", *words):
         assert word in comments
-    assert "no safety function" in comments
-    assert "within 30 degrees" in comments
 
 
 def test_header_names_the_surroundings(plan: Plan) -> None:
@@ -203,10 +202,8 @@ def test_golden_lines_and_the_same_each_time(path: Path, plan: Plan) -> None:
     assert text.isascii()
     assert text.startswith("def ftdrive_tour():\n")
     assert [line for line in text.splitlines() if line.rstrip() != line] == []
-    assert re.findall(r"^\S.*$", text, re.MULTILINE) == [
-        "def ftdrive_tour():",
-        "end",
-    ]  # the controller ends at this end
+    # The controller ends at this end.
+    assert re.findall(r"^\S.*$", text, re.MULTILINE) == ["def ftdrive_tour():", "end"]
 
 
 @pytest.mark.parametrize("model", ['"\nend\nmovej([9,0,0,0,0,0])\n#', "a\r\nhalt", 'x")\u2028movej([0])', "\\", "\0"])
@@ -250,14 +247,7 @@ def test_table_of_targets(path: Path, plan: Plan) -> None:
     assert values[:, 1].tolist() == [step.number for step in plan.steps]
 
 
-def test_files_are_new_and_plans_unchanged(path: Path, tmp_path: Path) -> None:
-    out = tmp_path / "tour.script"
-    assert export(path, "--format", "urscript", "-o", str(out)).exit_code == 0
-    written = out.read_text()
-    again = export(path, "--format", "csv", "-o", str(out))
-    assert isinstance(again.exception, ConfigError)
-    assert "never overwritten" in str(again.exception)
-    assert out.read_text() == written
+def test_a_file_of_another_kind_and_an_edited_plan_are_refused(path: Path, tmp_path: Path) -> None:
     (other := tmp_path / "other.json").write_text('{"format": "ftdrive.dataset/1"}')
     refused = export(other, "--format", "urscript").exception
     assert refused is not None
@@ -269,3 +259,27 @@ def test_files_are_new_and_plans_unchanged(path: Path, tmp_path: Path) -> None:
     assert refused is not None
     assert exit_code(refused) == 7
     assert "changed" in str(refused)
+
+
+@pytest.mark.parametrize(("first", "doubles"), [(24, 22), (26, 22), (27, 15), (33, 15)])
+def test_every_name_has_its_register(first: int, doubles: int) -> None:
+    text = functions(first, example=True)
+    assert "<" not in text.replace("<=", "").replace(" < ", "")
+    assert f"read_input_integer_register({first + 4})" in text
+    assert ("def ftd_bias" in text) == (doubles == 22), "the tracked bias has no room behind a later register"
+    assert f"read_input_float_register({first + doubles - 1})" in text
+    assert f"read_input_float_register({first + doubles})" not in text
+    assert "read_input_integer_register(23)" not in text
+
+
+def test_the_command_prints_or_saves(tmp_path: Path) -> None:
+    def printed(*arguments: str) -> str:
+        return CliRunner().invoke(cli, ["export", "urscript", *arguments]).stdout
+
+    assert printed("--first", "26") == functions(26)
+    answer = json.loads(printed("--json", "--example"))
+    assert (answer["text"], answer["file"]) == (functions(24, example=True), None)
+    path, other = (str(tmp_path / name) for name in ("ftd.script", "two.script"))
+    assert "".join(printed("-o", path).split()) == f"Saved{path}"
+    assert Path(path).read_text() == functions(24)
+    assert json.loads(printed("--json", "-o", other))["file"] == other

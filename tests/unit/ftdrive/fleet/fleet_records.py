@@ -15,15 +15,9 @@ from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.verification import VerificationRecord, newest
 from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import (
-    BriefVerification,
-    StoredCell,
-    StoredResult,
-    StoredWeighings,
-    sum_up,
-)
+from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings, sum_up
 from ftdrive.store.store import Store
-from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 SIGMA = np.repeat([0.01, 0.0005], 3)

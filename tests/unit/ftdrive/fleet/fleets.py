@@ -3,8 +3,7 @@
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from ftdrive.fleet.serve import FleetReading
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, FleetReading
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 CALM = BiasDrift(0.8, found=False, words="")

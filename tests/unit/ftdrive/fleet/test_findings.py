@@ -10,7 +10,7 @@ from ftcalib.model import Array
 from ftdrive.fleet.state import FleetFinding
 from ftdrive.store.records import StoredResult
 from tests.unit.ftdrive.fleet.fleet_records import cell, check, daily, fleet, result, weighed
-from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 MASS_KG = result("a", 1).mass_kg
 OFF_AXIS_M = (calibrated().parameters.R_flange_sensor @ calibrated().parameters.p_sensor_com_m)[:2]

@@ -5,8 +5,7 @@ from datetime import datetime, timedelta
 import pytest
 
 from ftdrive.errors import BadStore
-from ftdrive.fleet.serve import EVERY_S, FleetReading, serve
-from ftdrive.fleet.state import Fleet
+from ftdrive.fleet.state import EVERY_S, Fleet, FleetReading, serve
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
 

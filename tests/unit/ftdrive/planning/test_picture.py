@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ftdrive.planning.drawing import draw, title_of
+from ftdrive.planning.drawing import _title_of, draw
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
@@ -34,11 +34,11 @@ def plan() -> Plan:
 def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
     first, second, *others = plan.steps
     moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
-    title = title_of(plan, certifier_of(), on_its_way=False)
+    title = _title_of(plan, certifier_of(), on_its_way=False)
     assert "stays in this sphere" in title
     assert "WHOLE ARM" not in title
     assert "grey: arm, orange: tool" in title
-    title = title_of(moving, certifier_of(), on_its_way=True)
+    title = _title_of(moving, certifier_of(), on_its_way=True)
     assert "all that moves" not in title
     assert "WHOLE ARM moves" in title
     assert "green" in title
@@ -46,9 +46,9 @@ def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
 
 def test_what_cannot_be_drawn_is_named(plan: Plan) -> None:
     shown = certifier_of(scene=Scene((BASE_PLANE, WALL)))
-    assert "not drawn" not in title_of(plan, shown, on_its_way=False)
+    assert "not drawn" not in _title_of(plan, shown, on_its_way=False)
     slanting = certifier_of(scene=Scene((BASE_PLANE, WALL, SLANTING)))
-    assert "slanting planes (1)" in title_of(plan, slanting, on_its_way=False)
+    assert "slanting planes (1)" in _title_of(plan, slanting, on_its_way=False)
 
 
 def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,7 +17,7 @@ from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
-from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_tool, plan_tour
+from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, _plan_tool, guess_of, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
 from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
@@ -96,7 +96,7 @@ def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> Non
 
 def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pytest.MonkeyPatch) -> None:
     certifier = certifier_of()
-    plan = plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
+    plan = _plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
     assert (plan.kind, len(plan.steps), plan.certified) == ("tool", TOOL_POSES, True)
     u = -np.array([step.R_base_flange for step in plan.steps])[:, 2]
     X = np.column_stack([u.ravel(), np.tile(np.eye(3), (len(u), 1))])  # force of a weight of 1, and its bias
@@ -105,7 +105,7 @@ def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pyte
     assert not any("times that of all 24" in sentence for sentence in plan.why)
     monkeypatch.setattr("ftdrive.planning.planner.chosen_tour", lambda *_: None)  # as without room
     with pytest.raises(PlanRefused, match="new tool"):
-        plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
+        _plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
 
 
 @pytest.mark.parametrize("pan_deg", [-120.0, 33.0])

@@ -11,7 +11,7 @@ from syrupy.assertion import SnapshotAssertion
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.cell.rules import Rows
 from ftdrive.errors import ConfigError
-from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, height_above, separation_from_box
+from ftdrive.planning.geometry.arm_model import SHAPES, ArmModel, Cylinder, separation_from_box
 from ftdrive.planning.geometry.certify import Margins
 from ftdrive.planning.planner import box_from_mm, certifier_for, plane_from_mm, require_possible
 
@@ -76,7 +76,7 @@ def test_refused_is_just_what_the_shoulder_is_never_clear_of(
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (40, 6))
     shoulder = arm.bodies(q).at(np.arange(40), np.full(40, SHOULDER))
     plane, block = plane_from_mm((*normal, place)), box_from_mm(box)
-    to_plane = height_above(shoulder, np.array(plane.normal), plane.offset_m).max()
+    to_plane = shoulder.height_above(np.array(plane.normal), plane.offset_m).max()
     to_box = separation_from_box(shoulder, np.array(block.low_m), np.array(block.high_m), np.full(40, np.inf)).max()
     for described, distance_m in ((cell(planes=[(*normal, place)]), to_plane), (cell(boxes=[box]), to_box)):
         try:

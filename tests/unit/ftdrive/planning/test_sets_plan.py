@@ -12,14 +12,14 @@ from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_sets, plan_verification
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_sets, guess_of, plan_verification
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
 HOW: dict[str, Any] = {"speeds": Speeds(), "guess": guess_of(CERTIFIER)}
 
 
 def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
-    made = plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "A+E", **HOW)
+    made = _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "A+E", **HOW)
     assert made.certified
     assert made.arm_rests
     assert sorted(step.number for step in made.steps) == [*range(1, 25), *numbers_of("E").tolist()]
@@ -30,7 +30,7 @@ def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
 
 def test_each_number_has_an_orientation_of_its_set() -> None:
     pan = 0.3
-    made = plan_sets(CERTIFIER, [pan, *USUAL_POSTURE_RAD[1:]], "A+H", **HOW)
+    made = _plan_sets(CERTIFIER, [pan, *USUAL_POSTURE_RAD[1:]], "A+H", **HOW)
     kinds = {
         "A": Rotation.from_euler("z", pan - np.pi / 4).as_matrix() @ paper_set("A"),
         "H": paper_set("H", spare=100),
@@ -44,31 +44,31 @@ def test_each_number_has_an_orientation_of_its_set() -> None:
 
 def test_a_set_hangs_with_the_robot_under_a_ceiling() -> None:
     hanging = Certifier(CERTIFIER.arm, Scene((BASE_PLANE,), lean_rad=np.pi))
-    made = plan_sets(hanging, USUAL_POSTURE_RAD, "H", **HOW)
+    made = _plan_sets(hanging, USUAL_POSTURE_RAD, "H", **HOW)
     tool_axis = np.array([step.R_base_flange for step in made.steps])[:, :, 2]
     assert (tool_axis @ [1, 0, 1] / np.sqrt(2)).min() > 0.49
 
 
 def test_another_posture_for_a_set_is_found_and_named() -> None:
     ceiling = Plane((0.0, 0.0, -1.0), -0.75)
-    made = plan_sets(Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, "H", **HOW)
+    made = _plan_sets(Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, "H", **HOW)
     assert made.certified
     assert "A tour exists with joints 1 to 3 at" in made.why[1]
 
 
 def test_wrong_sets_are_refused() -> None:
     with pytest.raises(ConfigError, match="no set 'X'"):
-        plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "X", **HOW)
+        _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "X", **HOW)
     low = Certifier(CERTIFIER.arm, Scene((BASE_PLANE, Plane((0.0, 0.0, -1.0), -0.45))))
     with pytest.raises(PlanRefused, match="no tour of the sets A"):
-        plan_sets(low, USUAL_POSTURE_RAD, "A", **HOW)
+        _plan_sets(low, USUAL_POSTURE_RAD, "A", **HOW)
     with pytest.raises(PlanRefused, match=r"no tour of the sets A\+H"):  # enough poses, but too few of A
-        plan_sets(low, USUAL_POSTURE_RAD, "A+H", **HOW)
+        _plan_sets(low, USUAL_POSTURE_RAD, "A+H", **HOW)
 
 
 @pytest.mark.slow
 def test_the_sets_of_the_table_are_one_tour() -> None:
-    made = plan_sets(CERTIFIER, USUAL_POSTURE_RAD, EVERY_SET, **HOW)
+    made = _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, EVERY_SET, **HOW)
     assert made.certified
     assert len(made.steps) == 294
     assert made.motion_time_s < 400

@@ -14,9 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import BadDataset, FtdriveError
-from ftdrive.recording.files import is_bag
-from ftdrive.recording.foreign import read_bag
-from ftdrive.recording.in_motion import solve_recording
+from ftdrive.recording.foreign import is_bag, read_bag
+from ftdrive.recording.solve import solve_recording
 from ftdrive.tables.table import Table
 from tests.ros2.seven_joints import JOINTS, TRUTH, URDF, flange, sway, wrench
 
@@ -292,8 +291,8 @@ def test_a_recording_of_ours_is_no_bag(tmp_path: Path) -> None:
     from tests.unit.ftdrive.recorded import block, info
 
     recorder = Recorder([tmp_path / "a.mcap"], info(), {})
-    recorder.write(block(100))
-    recorder.close()
+    recorder.add(block(100), [])
+    recorder.end()
     assert not is_bag(tmp_path / "a.mcap")
     assert not is_bag(tmp_path)
 

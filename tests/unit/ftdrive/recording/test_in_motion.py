@@ -13,12 +13,12 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult
 from ftcalib.errors import FtdriveError
 from ftdrive.commands.solve import solve
-from ftdrive.live.samples import Stages, WrenchFrame
 from ftdrive.recording.files import write_recording
 from ftdrive.recording.recording import ROW, Header, Recording
+from ftdrive.stream.samples import Stages, WrenchFrame
 from tests.moving_load import Recorded, Truth, record, sweep
-from tests.unit.ftdrive.live.simulated import calibrated_from
 from tests.unit.ftdrive.recorded import info
+from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 SECONDS = 7.0
 TRUTH = Truth(height_m=0.04)

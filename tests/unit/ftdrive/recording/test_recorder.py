@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.live.samples import StreamEvent
 from ftdrive.recording import Recorder, read_recording, write_recording
-from ftdrive.recording.csv_file import CsvFile
 from ftdrive.recording.files import grown_as, require_new_recordings
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.parquet_file import ParquetFile
 from ftdrive.recording.recording import Header
+from ftdrive.recording.table_files import CsvFile, ParquetFile
+from ftdrive.stream.samples import StreamEvent
 from tests.unit.ftdrive.recorded import BASE_TCP, USUAL, block, info
 
 ENDINGS = (".mcap", ".csv", ".parquet")
@@ -69,8 +68,8 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
     recorder = Recorder([first, other], info(), {})
     with pytest.raises(OSError, match="No space left") as failure:  # noqa: PT012  # some write fails
         for start in range(0, 5000, 100):
-            recorder.write(block(100, start))
-    recorder.close()
+            recorder.add(block(100, start), [])
+    recorder.end()
     assert not first.exists()
     assert not other.exists()
     assert recorder.saved == []
@@ -89,14 +88,14 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
 ) -> None:
     path = tmp_path / f"a{ending}"
     whole = Recorder([tmp_path / f"b{ending}"], info(), {})
-    whole.write(block(1100))
+    whole.add(block(1100), [])
     size = (tmp_path / f"b{ending}.partial").stat().st_size
-    whole.close()
+    whole.end()
     fill_disk(size)
     recorder = Recorder([path], info(), {})
-    recorder.write(block(1100))
+    recorder.add(block(1100), [])
     with pytest.raises(OSError, match=r"No space left .*\.partial keeps 1100 samples"):
-        recorder.close()
+        recorder.end()
     assert not path.exists()
     partial = tmp_path / f"a{ending}.partial"
     found = read_recording(partial)
@@ -117,7 +116,7 @@ def test_control_c_amid_a_write_waits_for_its_end(ending: str, tmp_path: Path, m
     """Without, the files of one recording would hold different samples, or half a line."""
     paths = [tmp_path / f"a{ending}", tmp_path / "b.csv"]
     recorder = Recorder(paths, info(), {})
-    recorder.write(block(100))
+    recorder.add(block(100), [])
     append = CsvFile.append
 
     def interrupted(*given: Any) -> None:
@@ -126,9 +125,9 @@ def test_control_c_amid_a_write_waits_for_its_end(ending: str, tmp_path: Path, m
 
     monkeypatch.setattr(CsvFile, "append", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        recorder.write(block(200, 100))
+        recorder.add(block(200, 100), [])
     monkeypatch.undo()
-    recorder.close()
+    recorder.end()
     assert [len(read_recording(path).rows) for path in recorder.saved] == [300, 300]
     assert recorder.saved == paths
 
@@ -139,14 +138,14 @@ def test_after_a_power_failure_the_partial_file_is_readable(ending: str, tmp_pat
     recorder = Recorder([path], info(), {})
     mark = StreamEvent(5_000_000_000, "mark", "begin")
     for start in range(26):
-        recorder.write(block(1, start, step_ns=1_000_000_000))
-        recorder.event(mark if start == 1 else StreamEvent(0, "frame", "the recorder notices it itself"))
+        recorder.add(block(1, start, step_ns=1_000_000_000), [])
+        recorder.add(None, [mark if start == 1 else StreamEvent(0, "frame", "the recorder notices it itself")])
     found = read_recording(partial_of(path))
     np.testing.assert_array_equal(found.rows["seq"], block(len(found.rows)).seq)
     assert len(found.rows) > 15
     assert list(found.events) == [mark]
     assert found.cut
-    recorder.close()
+    recorder.end()
     assert len(read_recording(path).rows) == 26
 
 
@@ -154,10 +153,10 @@ def test_after_a_power_failure_the_partial_file_is_readable(ending: str, tmp_pat
 def test_nothing_is_overwritten(ending: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{ending}"
     recorder = Recorder([path], info(), {})
-    recorder.write(block(3))
+    recorder.add(block(3), [])
     path.write_text("another program's")
     with pytest.raises(FileExistsError, match="never overwritten"):
-        recorder.close()
+        recorder.end()
     assert path.read_text() == "another program's"
     kept, samples = next(iter(recorder.partial.items()))
     assert len(read_recording(kept).rows) == samples == 3
@@ -171,13 +170,13 @@ def test_what_cannot_be_converted_to_parquet_stays_in_mcap(
 ) -> None:
     path, kept = tmp_path / "a.parquet", tmp_path / "a.parquet.mcap"
     recorder = Recorder([path, tmp_path / "b.csv"], info(), {})
-    recorder.write(block(1100))
+    recorder.add(block(1100), [])
     if isinstance(failure, OSError):
         fill_disk(100_000)
     else:
         monkeypatch.setattr(ParquetFile, "append", Mock(side_effect=failure))
     with pytest.raises(OSError, match=rf"a\.parquet was not written .*`ftdrive convert {kept} {path}` saves"):
-        recorder.close()
+        recorder.end()
     assert (recorder.saved, recorder.partial) == ([tmp_path / "b.csv"], {kept: 1100})
     assert sorted(tmp_path.iterdir()) == [kept, tmp_path / "b.csv"]
     monkeypatch.undo()
@@ -189,17 +188,17 @@ def test_what_cannot_be_converted_to_parquet_stays_in_mcap(
 
 def test_without_a_sample_there_is_no_file(tmp_path: Path) -> None:
     recorder = Recorder([tmp_path / f"a{ending}" for ending in ENDINGS], info(), {})
-    recorder.event(StreamEvent(0, "mark", "x"))
-    recorder.close()
+    recorder.add(None, [StreamEvent(0, "mark", "x")])
+    recorder.end()
     assert list(tmp_path.iterdir()) == []
 
 
 def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
     recorder = Recorder([tmp_path / "a.csv", tmp_path / "b.csv"], info(), {})
-    recorder.write(block(3))
+    recorder.add(block(3), [])
     (tmp_path / "a.csv").touch()
     with pytest.raises(FileExistsError, match=r"a\.csv\.partial keeps 3 samples"):
-        recorder.close()
+        recorder.end()
     assert recorder.saved == [tmp_path / "b.csv"]
     assert len(read_recording(tmp_path / "b.csv").rows) == 3
 
@@ -232,11 +231,6 @@ def test_a_file_of_another_kind_is_named_with_its_fault(content: str, words: str
         read_recording(path)
 
 
-def test_a_header_of_an_earlier_version_has_no_mark_of_another_cell() -> None:
-    document = {name: value for name, value in Header(info(), BASE_TCP, USUAL).to_dict().items() if name != "foreign"}
-    assert Header.from_dict(document).info.foreign is False
-
-
 def test_a_newer_version_is_refused() -> None:
     document = Header(info(), BASE_TCP, USUAL).to_dict() | {"format": "ftdrive.recording/2"}
     with pytest.raises(BadRecording, match="use a newer program"):
@@ -246,10 +240,10 @@ def test_a_newer_version_is_refused() -> None:
 def test_a_file_that_still_grows_is_not_to_be_deleted(tmp_path: Path) -> None:
     path = tmp_path / "peg.csv"
     recorder = Recorder([path], info(), {})
-    recorder.write(block(500))
+    recorder.add(block(500), [])
     with pytest.raises(FileExistsError, match=f"process {os.getpid()} still records to .*: choose another name"):
         require_new_recordings([path])
-    recorder.close()
+    recorder.end()
     path.rename(tmp_path / "peg.csv.partial")  # as a process leaves it that ends at once
     with pytest.raises(FileExistsError, match="an earlier recording was interrupted"):
         require_new_recordings([path])

@@ -41,7 +41,7 @@ def drawn() -> Iterator[Draw]:
         return figures.pop()
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(matplotlib.figure, "Figure", Unsaved)
+        patch.setattr("ftdrive.report.figures.Figure", Unsaved)
         yield figure
 
 

@@ -82,10 +82,11 @@ def test_the_error_is_listed_with_its_worst_direction() -> None:
     other = {"map": [[0.001, 0.002]], "rms": 0.00125, "largest": 0.00231, "axes": "-x", "words": "along -x"}
     facts: dict[str, Any] = {
         "error_map": {"force_N": one, "torque_Nm": other},
-        "error": {"words": "0.02 N rms", "cross_validated": True},
+        "error": {"words": "0.02 N rms", "source": "predicted by the noise: 0.01 N", "cross_validated": True},
     }
     section = error(facts)
     assert section.text[1:] == [
+        "Its source: predicted by the noise: 0.01 N.",
         "Worst direction of the tool axis for the force: up, 0.0231 N.",
         "Worst direction for the torque: along -x, 0.00231 N·m.",
     ]
@@ -138,15 +139,14 @@ POSES: list[dict[str, Any]] = [
 
 
 def left(poses: Any = POSES, motion: Any = None, **more: Any) -> Any:
-    sums = {"force_rms_N": 0.21, "force_max_N": 2.0, "torque_rms_Nm": 0.002, "torque_max_Nm": 0.0035}
-    result = {"residual": sums, "noise_factor": 1.234, "p_value": 0.042, "rejected_poses": [2]} | more
-    return residuals({"result": result, "poses": poses, "motion": motion})
+    result = {"noise_factor": 1.234, "p_value": 0.042, "rejected_poses": [2]} | more
+    return residuals({"result": result, "poses": poses, "motion": motion, "residuals": "force 0.2100 N rms"})
 
 
 def test_each_residual_is_in_the_table_and_the_worst_is_named() -> None:
     section = left()
     assert section.text == [
-        "Residuals: force 0.210 N rms, 2.00 N at most; torque 0.00200 N·m rms, 0.00350 N·m at most.",
+        "Residuals: force 0.2100 N rms.",
         "They are 1.23 times the measured noise (p = 0.042).",
         "Rejected, because they do not fit the others: pose R12.",
     ]

@@ -36,4 +36,4 @@ def test_what_only_motion_gives_is_listed() -> None:
 def test_no_contact_and_no_sweep_are_said_or_left_out() -> None:
     section = motion({"motion": {**FOUND, "contacts": [], "sweep": None}})
     assert section.text[-1] == "No contact was found."
-    assert (len(section.tables), section.figures) == (1, [])
+    assert (len(section.tables), section.figures) == (1, ())

@@ -26,8 +26,8 @@ from ftdrive.cli import run as run_command
 from ftdrive.errors import BadBundle
 from ftdrive.runs import bundle
 from ftdrive.runs.bundle import Bundled, unpack, write_bundle
+from ftdrive.runs.calibration import sensor_files
 from ftdrive.runs.run import Reading, Run
-from ftdrive.runs.sensor_file import sensor_files
 from ftdrive.runs.source import solve_and_save
 from ftdrivers.interfaces import FtSamples
 
@@ -53,9 +53,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
         reading = Reading(stop * 10**9, np.full(6, 0.1 * stop), R)
         wrench = predict(TRUTH, R[None]) + rng.normal(0, 0.01, (n, 6))
         t_ns = stop * 10**9 + np.arange(n) * 10**6
-        samples = FtSamples(
-            t_ns, np.full(n, np.nan), np.arange(n), np.zeros((n, 0), np.int32), wrench, np.zeros(n, "u4")
-        )
+        samples = FtSamples.of(t_ns, np.arange(n), wrench)
         run.commit(PoseRecord(stop, TourPose(stop, reading.q_rad), reading, reading, samples, steady=True))
     run.append_event({"event": "noted", "words": f"alice@ur5e-hall3 lost 10.9.8.7, by {SERIAL_PORT}"})
     run.append_event({"event": "noted", "words": "fe80::a00:27ff on 08:00:27:12:34:56, 127.0.0.1, 12:30:45"})

@@ -6,9 +6,10 @@ import pytest
 
 from ftcalib.errors import BadCalibration
 from ftdrive.errors import ConfigError
+from ftdrive.runs.calibration import read_calibration
 from ftdrive.runs.load import Load, mass_of, place_of
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import SolveOptions, circumstances_of, read_calibration, read_source, solve_and_save
+from ftdrive.runs.source import SolveOptions, circumstances_of, read_source, solve_and_save
 from tests.unit.ftdrive.fake_cell import Lab
 
 

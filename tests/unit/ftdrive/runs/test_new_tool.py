@@ -16,7 +16,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import require_same_cell
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
-from tests.unit.ftdrive.live.simulated import calibrated, calibrated_from
+from tests.unit.ftdrive.stream.simulated import calibrated, calibrated_from
 
 TRUTH = Truth()
 

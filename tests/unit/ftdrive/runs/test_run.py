@@ -34,15 +34,7 @@ def run(tmp_path: Path) -> Run:
     """One of one pose."""
     run = Run.create(tmp_path, "calibrate", {"mode": "auto", "config": CONFIG, "devices": {"arm": {"serial": "1"}}})
     reading = Reading(0, np.zeros(6), np.eye(3))
-    n = 20
-    samples = FtSamples(
-        np.arange(n),
-        np.full(n, np.nan),
-        np.arange(n),
-        np.zeros((n, 0), np.int32),
-        np.zeros((n, 6)),
-        np.zeros(n, np.uint32),
-    )
+    samples = FtSamples.of(np.arange(20), np.arange(20), np.zeros((20, 6)))
     run.commit(PoseRecord(1, TourPose(1, np.zeros(6)), reading, reading, samples, steady=True))
     return run
 

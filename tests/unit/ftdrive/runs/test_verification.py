@@ -17,7 +17,7 @@ from ftdrive.runs.verification import (
     age_in_words,
     calibration_in_words,
     fitted_dataset,
-    last_verification,
+    verification_near,
 )
 from tests.unit.ftdrive.recorded import calibration
 
@@ -56,16 +56,16 @@ def test_the_newest_verification_of_this_calibration_counts(tmp_path: Path, besi
     verify(tmp_path / "runs/d-verify", 0.5, calibration=other)
     newest = verify(tmp_path / beside, 2.0, passed=False, change="bias")
     for place in (path, path.parent):
-        found = last_verification(place)
+        found = verification_near(place, calibration().id)
         assert found is not None
         assert (found.path, found.passed, found.change) == (newest, False, "bias")
 
 
 def test_a_calibration_outside_of_a_run_folder_has_its_runs_beside_it(tmp_path: Path) -> None:
     path = saved(tmp_path / "cell")
-    assert last_verification(path) is None
+    assert verification_near(path, calibration().id) is None
     verify(tmp_path / "cell/runs/b-verify", 1.0)
-    assert last_verification(path) is not None
+    assert verification_near(path, calibration().id) is not None
 
 
 def test_damaged_and_newer_files_are_ignored(tmp_path: Path) -> None:
@@ -75,7 +75,7 @@ def test_damaged_and_newer_files_are_ignored(tmp_path: Path) -> None:
         (tmp_path / "runs" / name / "verification.json").write_text(text)
     verify(tmp_path / "runs/e", 1.0, format="ftdrive.verification/2")
     verify(tmp_path / "runs/f", 1.0, force_max_N="much")
-    assert last_verification(path) is None
+    assert verification_near(path, calibration().id) is None
     with pytest.raises(BadCalibration, match=r"f/verification\.json"):
         VerificationRecord.load(tmp_path / "runs/f/verification.json")
 

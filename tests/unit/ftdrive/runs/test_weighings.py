@@ -9,8 +9,8 @@ import pytest
 
 from ftcalib import files
 from ftcalib.errors import BadDataset
-from ftdrive.live.weighing import WORDS
 from ftdrive.runs.weighings import FORMAT, REFUSALS, WeighingsFile
+from ftdrive.stream.weighing import WORDS
 
 ORIGIN = {"tool": "gripper", "arm_serial": "arm-1", "emulated": False}
 DAY = "2026-11-26"

@@ -16,14 +16,14 @@ from websockets.sync.client import connect
 from websockets.sync.connection import Connection
 
 from ftdrive.errors import ConfigError
-from ftdrive.live.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
+from ftdrive.stream.samples import Block, LinkStatus, Stages, StreamEvent, StreamInfo, StreamStatus, WrenchFrame
 from ftdrivers.clock import REAL
 
 UTC_OFFSET_NS = 1_700_000_000_000_000_000
 RATE_HZ = 7000.0
 
 INFO = StreamInfo(
-    calibration=cast(
+    result=cast(
         Any,
         SimpleNamespace(
             R_flange_sensor=Rotation.from_euler("z", 30, True).as_matrix(),
@@ -75,20 +75,15 @@ class FakeStream:
     def __init__(self) -> None:
         self.info = INFO
         self.clock: Any = REAL
-        self._frame = WrenchFrame()
+        self.frame = WrenchFrame()
         self.stages = Stages()
         self.contact = False
         self.tares = 0
 
-    @property
-    def frame(self) -> WrenchFrame:
-        return self._frame
-
-    @frame.setter
-    def frame(self, frame: WrenchFrame) -> None:
-        if frame.about == "tcp":
+    def __setattr__(self, name: str, value: Any) -> None:
+        if (name == "frame" and value.about == "tcp") or (name == "stages" and value.inertia):
             raise ConfigError("the height of the sensor is not configured: set it")
-        self._frame = frame
+        super().__setattr__(name, value)
 
     def tare(self) -> StreamEvent:
         if self.contact:
@@ -104,6 +99,16 @@ class FakeStream:
         link = LinkStatus(RATE_HZ, RATE_HZ, 0, 0.001)
         tare = np.arange(6.0) if self.tares else None
         return StreamStatus(link, replace(link, lost=3), 0.003, 0.0002, tare, None, float("nan"), 0.1, 22.5, 0.001)
+
+
+@contextmanager
+def serving(stream: FakeStream, **options: Any) -> Iterator[Any]:
+    """A server of a stream, at a free port."""
+    from ftdrive.servers.foxglove import FoxgloveServer
+
+    server = FoxgloveServer(cast(Any, stream), port=0, **options)
+    yield server
+    server.end()
 
 
 class Client:

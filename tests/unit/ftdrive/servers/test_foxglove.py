@@ -6,8 +6,7 @@ import json
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import closing
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, cast
 
 import numpy as np
@@ -17,12 +16,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.live import ros2
-from ftdrive.live.samples import Stages, StreamEvent, WrenchFrame
 from ftdrive.servers import foxglove
-from ftdrive.servers.foxglove import ARROWS, EVENTS, STATUS, TRANSFORMS, FoxgloveServer
+from ftdrive.servers.foxglove import ARROWS, EVENTS, STATUS, FoxgloveServer
+from ftdrive.stream import ros2
+from ftdrive.stream.samples import Stages, StreamEvent, WrenchFrame
 from ftdrivers.interfaces import Array
-from tests.unit.ftdrive.servers.fake_stream import INFO, UTC_OFFSET_NS, Client, FakeStream, block
+from tests.unit.ftdrive.servers.fake_stream import INFO, UTC_OFFSET_NS, Client, FakeStream, block, serving
 
 
 @pytest.fixture
@@ -32,9 +31,8 @@ def stream() -> FakeStream:
 
 @pytest.fixture
 def server(stream: FakeStream) -> Iterator[FoxgloveServer]:
-    server = FoxgloveServer(cast(Any, stream), port=0)
-    yield server
-    server.close()
+    with serving(stream) as server:
+        yield server
 
 
 @pytest.fixture
@@ -79,7 +77,7 @@ def test_the_server_is_what_viewers_expect(client: Client) -> None:
         ros2.COMPENSATED: "geometry_msgs/msg/WrenchStamped",
         ros2.POSE: "geometry_msgs/msg/PoseStamped",
         ros2.JOINTS: "sensor_msgs/msg/JointState",
-        TRANSFORMS: "foxglove.FrameTransforms",
+        ros2.TRANSFORMS: "tf2_msgs/msg/TFMessage",
         ARROWS: "foxglove.SceneUpdate",
         EVENTS: "foxglove.Log",
     }
@@ -89,7 +87,7 @@ def test_the_server_is_what_viewers_expect(client: Client) -> None:
 def test_every_wrench_is_sent(server: FoxgloveServer, client: Client, topic: str, sign: int, frame: str) -> None:
     client.subscribe(topic)
     sent = block(start=5, frame=WrenchFrame("base", "tcp"))
-    server.write(sent)
+    server.add(sent, [])
     for i in range(len(sent)):
         received, log_time_ns, payload = client.message()
         message = read_cdr(client, topic, payload) if i in (0, 69) else None
@@ -104,7 +102,7 @@ def test_every_wrench_is_sent(server: FoxgloveServer, client: Client, topic: str
 def test_poses_and_joints_come_at_the_rate_of_the_arm(server: FoxgloveServer, client: Client) -> None:
     client.subscribe(ros2.POSE, ros2.JOINTS)
     sent = block(700)
-    server.write(sent)
+    server.add(sent, [])
     received = [client.message() for _ in range(2 * 50)]
     by_time = {int(t_ns): i for i, t_ns in enumerate(sent.t_host_ns + UTC_OFFSET_NS)}
     assert {topic for topic, _, _ in received} == {ros2.POSE, ros2.JOINTS}
@@ -121,17 +119,17 @@ def test_poses_and_joints_come_at_the_rate_of_the_arm(server: FoxgloveServer, cl
 
 
 def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer, client: Client) -> None:
-    client.subscribe(TRANSFORMS)
+    client.subscribe(ros2.TRANSFORMS)
     sent = block(start=9, frame=WrenchFrame("base", (0.01, 0.02, 0.03)))
-    server.write(sent)
+    server.add(sent, [])
     _, t_ns, payload = client.message()
     poses = {"base": (np.eye(3), np.zeros(3))}
-    for item in read_protobuf(client, TRANSFORMS, payload).transforms:
-        R_base_parent, p_base_parent = poses[item.parent_frame_id]
-        q, p = item.rotation, item.translation
+    for item in read_cdr(client, ros2.TRANSFORMS, payload).transforms:
+        R_base_parent, p_base_parent = poses[item.header.frame_id]
+        q, p = item.transform.rotation, item.transform.translation
         R = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
         poses[item.child_frame_id] = (R_base_parent @ R, p_base_parent + R_base_parent @ [p.x, p.y, p.z])
-        assert item.timestamp.seconds * 1_000_000_000 + item.timestamp.nanos == t_ns
+        assert stamp_ns(item.header.stamp) == t_ns
     R_base_flange, p_base_flange_m = sent.R_base_flange[-1], sent.p_base_flange_m[-1]
     expected = {
         "base": (np.eye(3), np.zeros(3)),
@@ -149,20 +147,20 @@ def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer
 def test_frames_that_are_not_configured_are_left_out_and_never_nan(stream: FakeStream) -> None:
     unknown = np.full(3, np.nan)
     stream.info = replace(INFO, p_flange_sensor_m=unknown, p_flange_tcp_m=unknown)
-    with closing(FoxgloveServer(cast(Any, stream), port=0)) as server, Client.to(server.port) as client:
-        client.subscribe(TRANSFORMS)
-        server.write(block())
+    with serving(stream) as server, Client.to(server.port) as client:
+        client.subscribe(ros2.TRANSFORMS)
+        server.add(block(), [])
         found = {
-            item.child_frame_id: item for item in read_protobuf(client, TRANSFORMS, client.message()[2]).transforms
+            item.child_frame_id: item for item in read_cdr(client, ros2.TRANSFORMS, client.message()[2]).transforms
         }
     assert found.keys() == {"flange", "sensor"}
-    assert numbers(found["sensor"].translation) == [0, 0, 0]
+    assert numbers(found["sensor"].transform.translation) == [0, 0, 0]
 
 
 def test_a_block_without_samples_sends_nothing(server: FoxgloveServer, client: Client) -> None:
     client.subscribe(*client.channels)
-    server.write(block(0))
-    server.event(StreamEvent(0, "mark", ""))
+    server.add(block(0), [])
+    server.add(None, [StreamEvent(0, "mark", "")])
     assert client.message()[0] == EVENTS
 
 
@@ -171,7 +169,7 @@ def test_arrows_show_force_and_torque(server: FoxgloveServer, client: Client, fo
     client.subscribe(ARROWS)
     sent = block(1, frame=WrenchFrame("base", "tcp"))
     sent.wrench[-1] = [*force_N, 0.0, 0.6, 0.8]
-    server.write(sent)
+    server.add(sent, [])
     (entity,) = read_protobuf(client, ARROWS, client.message()[2]).entities
     assert entity.frame_id == "base_at_tcp"
     vectors: list[Array] = []
@@ -183,18 +181,18 @@ def test_arrows_show_force_and_torque(server: FoxgloveServer, client: Client, fo
 
 
 def test_arrows_and_frames_come_at_most_60_times_a_second(server: FoxgloveServer, client: Client) -> None:
-    client.subscribe(ARROWS, TRANSFORMS, STATUS)
+    client.subscribe(ARROWS, ros2.TRANSFORMS, STATUS)
     for start in range(0, 7000, 35):
-        server.write(block(35, start))
-    server.event(StreamEvent(0, "mark", ""))
+        server.add(block(35, start), [])
+    server.add(None, [StreamEvent(0, "mark", "")])
     topics = [client.message()[0] for _ in range(122)]
-    assert (topics.count(ARROWS), topics.count(TRANSFORMS), topics.count(STATUS)) == (60, 60, 2)
+    assert (topics.count(ARROWS), topics.count(ros2.TRANSFORMS), topics.count(STATUS)) == (60, 60, 2)
 
 
 @pytest.mark.parametrize(("kind", "level"), [("mark", 2), ("tare-refused", 3)])
 def test_events_are_log_messages(server: FoxgloveServer, client: Client, kind: Any, level: int) -> None:
     client.subscribe(EVENTS)
-    server.event(StreamEvent(5, kind, "peg in"))
+    server.add(None, [StreamEvent(5, kind, "peg in")])
     _, t_ns, payload = client.message()
     log = read_protobuf(client, EVENTS, payload)
     assert (log.name, log.message, log.level, t_ns) == (kind, "peg in", level, 5 + UTC_OFFSET_NS)
@@ -202,7 +200,7 @@ def test_events_are_log_messages(server: FoxgloveServer, client: Client, kind: A
 
 def test_the_status_says_what_is_shown_and_is_valid_json(server: FoxgloveServer, client: Client) -> None:
     client.subscribe(STATUS)
-    server.write(block())
+    server.add(block(), [])
 
     def refuse(word: str) -> None:
         raise AssertionError(word)
@@ -229,17 +227,8 @@ def test_tare_is_a_service(stream: FakeStream, client: Client) -> None:
 
 
 def test_parameters_are_the_frame_and_the_stages(stream: FakeStream, client: Client) -> None:
-    at_first = {
-        "axes": "sensor",
-        "about": "sensor",
-        "bias": True,
-        "gravity": True,
-        "inertia": False,
-        "notch_Hz": 0.0,
-        "lowpass_Hz": 0.0,
-        "deadband_N": 0.0,
-        "deadband_Nm": 0.0,
-    }
+    stages = {name: 0.0 if value is None else value for name, value in asdict(Stages()).items()}
+    at_first = {"axes": "sensor", "about": "sensor", **stages}
     assert client.parameters() == at_first
     assert client.parameters("axes", "gravity") == {"axes": "sensor", "gravity": True}
     wanted = {"axes": "base", "about": [0, 0.5, 1], "gravity": False, "lowpass_Hz": 40, "deadband_N": 0.5}
@@ -268,6 +257,7 @@ def test_other_clients_see_a_changed_parameter(server: FoxgloveServer, client: C
         ({"axes": "base", "gravity": 1}, "gravity cannot be 1: set true or false"),
         ({"gain": 1}, "gain cannot be 1: there is no such parameter"),
         ({"bias": False, "about": "tcp"}, "the height of the sensor is not configured"),
+        ({"axes": "base", "inertia": True}, "the height of the sensor is not configured"),
     ],
 )
 def test_a_wrong_parameter_changes_nothing(
@@ -286,7 +276,7 @@ def test_a_client_that_never_reads_delays_no_other(
     """Every message reaches a client that reads, until the queue of another one overflows and beyond."""
     monkeypatch.setattr(foxglove, "BACKLOG", 128)
     with (
-        closing(FoxgloveServer(cast(Any, stream), port=0)) as server,
+        serving(stream) as server,
         Client.to(server.port, reads=False) as slow,
         Client.to(server.port) as client,
     ):
@@ -294,8 +284,8 @@ def test_a_client_that_never_reads_delays_no_other(
         client.subscribe(ros2.RAW, EVENTS)
         times_full = 0
         while times_full < 10:
-            server.event(StreamEvent(0, "mark", "long" * 50_000))  # fills the buffers of the system
-            server.write(block(100))
+            server.add(None, [StreamEvent(0, "mark", "long" * 50_000)])  # fills the buffers of the system
+            server.add(block(100), [])
             assert [client.message()[0] for _ in range(101)] == [EVENTS, *[ros2.RAW] * 100]
             times_full += "reads too slowly" in caplog.text
         host, port = slow.socket.local_address[:2]
@@ -305,14 +295,14 @@ def test_a_client_that_never_reads_delays_no_other(
 def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foxglove, "BACKLOG", 128)
     with (
-        closing(FoxgloveServer(cast(Any, stream), port=0)) as server,
+        serving(stream) as server,
         Client.to(server.port, reads=False) as slow,
     ):
         slow.subscribe(ros2.RAW, STATUS, EVENTS)
         for i in range(100):
-            server.write(block(100, 100 * i))
-            server.event(StreamEvent(0, "mark", "long" * 50_000))  # fills the buffers of the system
-        server.write(block(100, 20_000))
+            server.add(block(100, 100 * i), [])
+            server.add(None, [StreamEvent(0, "mark", "long" * 50_000)])  # fills the buffers of the system
+        server.add(block(100, 20_000), [])
         received, sent = [0], [0]
         while sent[-1] < 101 * 100:
             topic, _, payload = slow.message()
@@ -331,7 +321,7 @@ def test_without_a_client_nothing_is_packed(server: FoxgloveServer, monkeypatch:
 
     for name in ("pack_wrenches", "pack_poses", "pack_joints"):
         monkeypatch.setattr(ros2, name, fail)
-    server.write(block())
+    server.add(block(), [])
 
 
 def test_a_port_in_use_is_named(server: FoxgloveServer, stream: FakeStream) -> None:

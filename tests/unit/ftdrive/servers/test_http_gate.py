@@ -6,15 +6,14 @@ from contextlib import closing
 from http.client import HTTPConnection, HTTPResponse
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from threading import Thread
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from websockets import InvalidStatus, Origin, Subprotocol
 from websockets.sync.client import connect
 
-from ftdrive.http_gate import PassingGate, refusal
-from ftdrive.servers.foxglove import FoxgloveServer
-from tests.unit.ftdrive.servers.fake_stream import Client, FakeStream
+from ftdrive.servers.http_gate import PassingGate, refusal
+from tests.unit.ftdrive.servers.fake_stream import Client, FakeStream, serving
 
 PAGE = "https://evil.example"
 VIEWER = "https://app.foxglove.dev"
@@ -130,7 +129,7 @@ def handshake(port: int, origin: str | None, host: str = "127.0.0.1", **options:
 @pytest.mark.parametrize("allow_control", [False, True])
 def test_a_viewer_in_a_browser_reads_and_controls_only_if_that_is_allowed(allow_control: bool) -> None:
     stream = FakeStream()
-    with closing(FoxgloveServer(cast(Any, stream), port=0, origins=[PAGE], allow_control=allow_control)) as server:
+    with serving(stream, origins=[PAGE], allow_control=allow_control) as server:
         for origin in (VIEWER, PAGE):
             with handshake(server.port, origin) as viewer:
                 info = viewer.recv(timeout=10)
@@ -144,7 +143,7 @@ def test_a_viewer_in_a_browser_reads_and_controls_only_if_that_is_allowed(allow_
 @pytest.mark.parametrize(("origin", "host"), [(PAGE, "127.0.0.1"), (None, "evil.example")])
 def test_any_other_page_is_refused_by_the_stream(origin: str | None, host: str) -> None:
     with (
-        closing(FoxgloveServer(cast(Any, FakeStream()), port=0)) as server,
+        serving(FakeStream()) as server,
         socket.create_connection(("127.0.0.1", server.port)) as raw,
         pytest.raises(InvalidStatus, match="403"),
         handshake(server.port, origin, host=host, sock=raw),

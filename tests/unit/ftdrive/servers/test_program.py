@@ -1,19 +1,18 @@
 """The service for a program: which registers it writes, and how it answers."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import WrenchFrame
 from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
+from ftdrive.stream.samples import WrenchFrame
 from ftdrivers.errors import StreamBroken
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import calibrated, info
-from tests.unit.ftdrive.live.test_weighing import NOTHING, POSE, part, rests
+from tests.unit.ftdrive.stream.simulated import calibrated, info, replayed
+from tests.unit.ftdrive.stream.test_weighing import NOTHING, POSE, part, rests
 
 WEIGH, ZERO, STATUS = 1, 2, 3
 
@@ -39,34 +38,29 @@ class FakeLog:
     def __init__(self) -> None:
         self.kept: list[float | str] = []
 
-    def weighed(self, values: dict[str, Any]) -> None:
-        self.kept.append(round(values["mass_kg"], 2))
-
-    def refused(self, code: str) -> None:
-        self.kept.append(code)
+    def keep(self, values: Mapping[str, Any]) -> None:
+        self.kept.append(values["refused"] if "refused" in values else round(values["mass_kg"], 2))
 
 
 class Cell:
     """A service on a recording."""
 
     def __init__(self, *each: Any, seconds: float = 1.0) -> None:
-        self.stream = ReplayedStream(
+        self.stream = replayed(
             info(calibrated()), rests(*each, seconds=seconds), frame=WrenchFrame("base", "tcp"), speed=float("inf")
         )
-        self.registers = FakeRegisters()
+        self.registers: Any = FakeRegisters()
         self.said: list[str] = []
         self.log = FakeLog()
-        self.service = ProgramService(
-            cast("Any", self.stream), lambda: self.registers, self.said.append, cast("Any", self.log)
-        )
+        self.service = ProgramService(self.stream, lambda: self.registers, self.said.append, self.log.keep)
 
     def run(self, seconds: float) -> dict[str, float]:
         n = 0
         while n < round(1000 * seconds) and not self.stream.has_ended:
             block = self.stream.read()
             n += len(block)
-            self.service.take(block)
-        return self.registers.written[-1]
+            self.service.add(block, [])
+        return cast("dict[str, float]", self.registers.written[-1])
 
     def ask(self, number: int, command: int, seconds: float = 0.7) -> dict[str, float]:
         self.registers.request = number, command
@@ -110,10 +104,10 @@ def test_a_cycle_weighs_the_part_and_takes_it_out_of_the_wrench() -> None:
 
 
 def test_a_push_is_a_contact_and_its_weight_is_refused() -> None:
-    cell = Cell((POSE, NOTHING), (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
+    cell = Cell(*[(POSE, NOTHING)] * 3, (POSE, np.array([5.0, 8.0, 0, 0, 0, 0])))
     cell.run(0.2)
     cell.ask(6, ZERO)
-    cell.run(0.2)
+    cell.run(2.2)
     pushed = cell.ask(7, WEIGH, 0.8)
     assert (pushed["condition"], pushed["state"], pushed["code"], pushed["mass"]) == (1, 3, 4, 0)
 
@@ -171,27 +165,28 @@ class Unsteady:
         return []
 
 
-def test_a_silent_stream_is_reported_once_and_its_return_too() -> None:
+def test_a_silent_stream_is_reported_once_and_its_return_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ftdrive.servers.program.WEIGH_S", 0.0)
     cell = Cell((POSE, NOTHING))
     blocks = [cell.stream.read() for _ in range(3)]
     broken = StreamBroken("no sample for 0.3 s")
     unsteady = Unsteady(cell.stream, broken, broken, *blocks[:2], broken, blocks[2])
     cell.service._stream = cast("Any", unsteady)
-    heard: list[Any] = []
-    cell.service.on_block = heard.append
     with pytest.raises(KeyboardInterrupt):
-        cell.service._serve()
+        cell.service.run()
     lost, again = "no sample for 0.3 s. The program sees a stale wrench.", "Samples arrive again."
     assert cell.said == [lost, again, lost, again]
-    assert (heard, unsteady.taken, len(cell.registers.written)) == (blocks, 3, 3)
+    assert unsteady.taken == 7, "else they would pile up"
+    live = [one["live"] for one in cell.registers.written if one["condition"] != 3]
+    assert (live, cell.registers.written[-1]["state"]) == ([1, 2, 3], 0)
 
 
 def test_a_program_sees_that_the_service_has_ended() -> None:
     cell = Cell((POSE, NOTHING))
     cell.run(0.1)
     closed: list[bool] = []
-    cell.registers.close = lambda: closed.append(True)  # type: ignore[method-assign]
-    cell.service.stop()
+    cell.registers.close = lambda: closed.append(True)
+    cell.service.end()
     last = cell.registers.written[-1]
     assert (last["state"], last["condition"], closed) == (0, 3, [True])
 
@@ -200,7 +195,7 @@ def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_a
     cell = Cell((POSE, NOTHING))
     cell.run(0.1)
     service, clock = cell.service, FakeClock()
-    cell.stream.clock = clock
+    cell.stream.source.clock = clock
     written = len(cell.registers.written)
 
     def no_sample_for(seconds: float) -> None:

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ftdrive.live.samples import Picked, WrenchFrame
 from ftdrive.servers.ros2 import Averaged
+from ftdrive.stream.samples import Picked, WrenchFrame
 from tests.unit.ftdrive.servers.fake_stream import block
 
 

@@ -8,10 +8,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ftdrive.live.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
 from ftdrive.servers import ros2
 from ftdrive.servers.parameters import Fixed
 from ftdrive.servers.ros2 import Level, PartState, Transforms, reports_of
+from ftdrive.stream.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
 from ftdrivers.errors import NoRos2
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, FakeStream
 
@@ -31,7 +31,8 @@ def reports(
     links = {"sensor": LINK, "arm": replace(LINK, rate_Hz=500.0, lost=2)} | status
     rest = (0.00312, 0.0002, None, None, 0.12, 0.05, 22.5, 0.001)
     stream.status = lambda: StreamStatus(links["sensor"], links["arm"], *rest)  # type: ignore[method-assign]
-    return reports_of(cast("Any", stream), warnings, lost_before, 42)
+    stream.warnings = warnings
+    return reports_of(cast("Any", stream), lost_before, 42)
 
 
 def test_a_healthy_stream_reports_its_state() -> None:
@@ -89,13 +90,14 @@ class FakeNode:
 
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch) -> FakeNode:
-    def kept(found: Sequence[tuple[str, str, Any, Any]], t_ns: int) -> Any:
-        return t_ns, {(parent, child): (R, p) for parent, child, R, p in found}
+    def kept(t_ns: Any, found: Sequence[tuple[str, str, Any, Any]]) -> Any:
+        made = t_ns[0], {(parent, child): (R, p) for parent, child, p, R in found}
+        return SimpleNamespace(tobytes=lambda: made)
 
     policy = SimpleNamespace(TRANSIENT_LOCAL=1)
     fake = SimpleNamespace(TFMessage=object, DurabilityPolicy=policy, QoSProfile=SimpleNamespace)
     monkeypatch.setattr(ros2, "ros2_module", lambda _: fake)
-    monkeypatch.setattr(ros2, "pack", kept)
+    monkeypatch.setattr(ros2, "pack_transforms", kept)
     return FakeNode()
 
 
@@ -111,7 +113,7 @@ def test_the_names_of_frames_are_those_of_the_parameters(node: FakeNode) -> None
         WrenchFrame("tcp", "tcp"): "tcp",
         WrenchFrame("flange", (0.0, 0.0, 0.15)): "ur_tool0_at_0_0_0.15_m",
     }
-    assert {frame: found.frame_id(frame) for frame in names} == names
+    assert {frame: found.named(frame.id) for frame in names} == names
 
 
 def test_sensor_and_tcp_are_published_once_where_the_height_is_known(node: FakeNode) -> None:

@@ -147,14 +147,8 @@ class Cell(ForceTorqueSensor):
             load = np.concatenate([force, cross(COM_M, force)])
             wrench.append(load + self.dwells[k].wrench(some - self.starts[k]))
         n = len(t)
-        return FtSamples(
-            t_host_ns=np.round(t * 1e9).astype(np.int64),
-            t_device_s=np.full(n, np.nan),
-            seq=np.arange(n),
-            counts=np.zeros((n, 0), np.int32),
-            wrench=np.concatenate(wrench) + BIAS + self.rng.normal(size=(n, 6)) * NOISE,
-            status=np.zeros(n, np.uint32),
-        )
+        rows = np.concatenate(wrench) + BIAS + self.rng.normal(size=(n, 6)) * NOISE
+        return FtSamples.of(np.round(t * 1e9), np.arange(n), rows)
 
     def check(self) -> None:
         if self.now_s < self.back_s:

@@ -1,7 +1,7 @@
 """The fit while poses come in, what is said about what is missing, and what is said at the end about odd poses."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -23,6 +23,8 @@ from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
 from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit, _hint, _light, _motions, faces
 from ftdrive.terminal.report import print_result
+from ftdrivers.interfaces import FtSamples
+from tests.known_cells import UPSIDE_DOWN
 from tests.pose_sets import AMBIGUOUS_6
 
 Array = NDArray[np.float64]
@@ -30,24 +32,8 @@ Array = NDArray[np.float64]
 SAMPLES = 200
 SIGMA = np.repeat([0.3, 0.3 * 0.025], 3)
 """Of one sample."""
-TRUTH = Parameters(
-    Rotation.from_euler("ZYX", [105, 2, 179], degrees=True).as_matrix(),
-    np.array([0.3, -0.2, -11.0]),
-    np.array([3.0, -5.0, 8.0]),
-    np.array([0.01, -0.02, -0.07]),
-    np.array([0.1, 0.2, -0.3]),
-)
+TRUTH = replace(UPSIDE_DOWN, gravity_force_base_N=np.array([0.3, -0.2, -11.0]))
 TOUR = NUMBERS
-
-
-@dataclass
-class Samples:
-    wrench: Array
-    t_host_ns: NDArray[np.int64]
-    t_device_s: Array = field(default_factory=lambda: np.full(SAMPLES, np.nan))
-    seq: NDArray[np.int64] = field(default_factory=lambda: np.arange(SAMPLES, dtype=np.int64))
-    counts: NDArray[np.int32] = field(default_factory=lambda: np.zeros((SAMPLES, 0), np.int32))
-    status: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(SAMPLES, np.uint32))
 
 
 @dataclass
@@ -65,7 +51,7 @@ def record(
     wrench[:, 0] += bump_N
     start_ns = stop * 4_000_000_000
     reading = Reading(start_ns, np.zeros(6), R_base_flange)
-    samples = Samples(wrench, start_ns + np.arange(SAMPLES) * 10_000_000)
+    samples = FtSamples.of(start_ns + np.arange(SAMPLES) * 10_000_000, np.arange(SAMPLES), wrench)
     return PoseRecord(stop, TourPose(number, np.zeros(6)), reading, reading, samples, steady=True)
 
 
@@ -266,7 +252,7 @@ def disturbed(wrench_of: Disturbed) -> list[PoseRecord]:
     for one in tour():
         noise = one.samples.wrench - one.samples.wrench.mean(axis=0) + rng.normal(size=6) * SIGMA / np.sqrt(SAMPLES)
         wrench = wrench_of(one.stop, one.before.R_base_flange, rng) + noise
-        taken.append(replace(one, samples=Samples(wrench, one.samples.t_host_ns)))
+        taken.append(replace(one, samples=FtSamples.of(one.samples.t_host_ns, one.samples.seq, wrench)))
     return taken
 
 
@@ -382,7 +368,7 @@ def test_the_report_names_poses_says_the_drift_and_ends_with_the_file(capsys: py
     taken = disturbed(lambda stop, R, _: predict(TRUTH, R) + (stop == 8) * pull + stop / 25 * np.eye(6)[1])
     result = solve(dataset_from(taken, {}))
     path = Path("runs") / "x [1]" / "calibration.json"
-    print_result(result, drift=drift_check(taken), records=taken, saved=path)
+    print_result(result, drift=drift_check(taken), records=taken, saved=path, every=True)
     lines = capsys.readouterr().out.rstrip().splitlines()
     assert lines[-1] == f" Saved {path}"
     text = "\n".join(lines)

@@ -29,7 +29,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.live_fit import faces
-from ftdrive.terminal.report import drift_in_words
+from ftdrive.words.result import drift_in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.edited_files import edit

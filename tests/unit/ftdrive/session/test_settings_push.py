@@ -12,9 +12,8 @@ from ftcalib import CalibrationResult, Finding, Parameters
 from ftcalib.errors import BadDataset
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, SupervisorGone
-from ftdrive.runs.push_receipt import Receipt
-from ftdrive.session.settings_push import Push, propose, restore, send
-from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
+from ftdrive.session.settings_push import Push, Receipt, propose, restore, send
+from ftdrive.words.session import proposal_in_lines, settings_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceFault, DeviceTimeout
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, Guard
@@ -197,7 +196,7 @@ def test_a_calibration_of_other_devices_is_refused(cell: Cell, devices: Any, say
 
 def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
     rejected = Finding.of("second_solution", probability_percent=40.0)
-    with pytest.raises(NotAccepted, match=r"rejected \(a very different mounting .* 40 %"):
+    with pytest.raises(NotAccepted, match=r"rejected \(40 % probability of a very different mounting"):
         cell.propose(cell.result(findings=(rejected,)))
 
 

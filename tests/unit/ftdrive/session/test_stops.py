@@ -17,16 +17,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
 from ftdrive.session import tour
-from ftdrive.session.events import (
-    Checked,
-    Event,
-    GuardTripped,
-    Key,
-    Noted,
-    PoseTaken,
-    State,
-    StateChanged,
-)
+from ftdrive.session.events import Checked, Event, GuardTripped, Key, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.preflight import Before
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import FtSamples

@@ -18,7 +18,7 @@ from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
-from ftdrive.runs.verification import AcceptanceLimits, Verified, last_verification, save_update, verify_run
+from ftdrive.runs.verification import AcceptanceLimits, Verified, save_update, verification_near, verify_run
 from ftdrive.session.along_plan import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
 from ftdrive.session.options import SessionOptions
@@ -107,7 +107,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
         range(6), change["value"], change["sigma"], change["calibration_sigma"], strict=True
     ):
         assert abs(bias) < 6 * np.hypot(sigma, common), one
-    last = last_verification(run.folder.parent / str(calibration.provenance["run"]))
+    last = verification_near(run.folder.parent / str(calibration.provenance["run"]), calibration.id)
     assert last is not None
     assert (last.passed, last.path) == (True, found.path.absolute())
     with pytest.raises(NotObservable):
@@ -140,7 +140,7 @@ def test_a_step_of_the_bias_is_named_and_the_update_names_its_parent(
     step = saved.force_bias_N - calibration.force_bias_N
     assert step == pytest.approx([0.3, 0.4, 0.0], abs=6 * float(np.max(saved.sigma["force_bias_N"])))
     assert save_update(found).name == "calibration-2.json"
-    last = last_verification(Path(saved.provenance["parent"]["path"]))
+    last = verification_near(Path(saved.provenance["parent"]["path"]), calibration.id)
     assert last is not None
     assert not last.passed
 

@@ -12,7 +12,7 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftdrive.runs.run import RUN_FORMAT
-from tests.unit.ftdrive.live.simulated import calibrated
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 FIRST = datetime(2026, 3, 1, tzinfo=UTC)
 

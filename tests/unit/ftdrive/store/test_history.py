@@ -12,8 +12,8 @@ from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.trends import QuantityTrend, hour_changes, temperatures
-from tests.unit.ftdrive.live.simulated import calibrated
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
+from tests.unit.ftdrive.stream.simulated import calibrated
 
 
 def records(folder: Path) -> tuple[list[StoredResult], list[VerificationRecord]]:

@@ -254,7 +254,7 @@ def test_a_csv_is_solved_without_the_database(tmp_path: Path) -> None:
     rows = "".join(f"0.{k},0.{k}{7 * k % 10},-0.{9 - k},{k},{-k},9.8,0.1,0.{k},0\n" for k in range(1, 10))
     (tmp_path / "poses.csv").write_text("rx,ry,rz,fx,fy,fz,tx,ty,tz\n" + rows)
     code = (
-        "import sys, ftdrive.live.stream, ftdrive.commands.live, ftdrive.commands.history\n"
+        "import sys, ftdrive.stream.stream, ftdrive.commands.live, ftdrive.commands.history\n"
         "from ftdrive.cli import run\n"
         "code = run(['solve', 'poses.csv'])\n"
         "sys.exit('sqlalchemy is imported' if 'sqlalchemy' in sys.modules else code not in (0, 7))\n"

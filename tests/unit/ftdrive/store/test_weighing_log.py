@@ -41,7 +41,7 @@ class Logs:
         clock = times or (NOON + timedelta(seconds=5 * n) for n in range(100))
         log = WeighingLog({**ORIGIN, **origin}, self.url, self.said.append, folder=self.folder, now=lambda: next(clock))
         for one in entries:
-            log.refused(one) if isinstance(one, str) else log.weighed(part(one))
+            log.keep({"refused": one} if isinstance(one, str) else part(one))
         log.close()
 
 
@@ -105,7 +105,7 @@ def test_a_store_that_cannot_be_written_is_reported_once_and_caught_up(tmp_path:
     down = Logs(tmp_path / "weighings", f"sqlite:///{tmp_path}/file/store.sqlite")
     log = WeighingLog(ORIGIN, down.url, down.said.append, folder=down.folder, every_s=0, now=lambda: NOON)
     for mass in range(5):
-        log.weighed(part(mass))
+        log.keep(part(mass))
     log.close()
     assert len(down.said) == 1
     assert down.said[0].startswith(" Weighings are kept but not in the history yet, because the store")
@@ -134,8 +134,8 @@ def test_lines_wait_for_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.Mo
     shutil.rmtree(logs.folder)
     reported = Event()
     log = WeighingLog(ORIGIN, logs.url, lambda _: reported.set(), folder=logs.folder, now=lambda: NOON)
-    log.weighed(part(0.4))
+    log.keep(part(0.4))
     assert reported.wait(30)
-    log.weighed(part(0.5))
+    log.keep(part(0.5))
     log.close()
     assert [one.weighings for one in Store(logs.url).weighings(9)] == [2]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, Known, solve
 from ftcalib.data.dataset import Orientation
-from ftdrive.commands.tables import _forward
+from ftdrive.runs.source import _forward
 from ftdrive.tables.table import Table, TableOptions
 from tests.unit.ftdrive.tables.test_layouts import POSES, RECORDING, columns, position, quaternion, t, wrench
 

@@ -1,8 +1,11 @@
 """A stream without devices, in the states that the live screen must show."""
 
 import math
+from collections import deque
+from collections.abc import Iterator
 from datetime import UTC, datetime
-from functools import cache
+from functools import cache, cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -10,7 +13,9 @@ import numpy as np
 
 from ftcalib import CalibrationResult, Parameters
 from ftcalib.model import predict
-from ftdrive.live.samples import (
+from ftdrive.runs.verification import VerificationRecord
+from ftdrive.stream.feed import Feed
+from ftdrive.stream.samples import (
     Block,
     EventKind,
     FrameTransform,
@@ -21,7 +26,6 @@ from ftdrive.live.samples import (
     StreamStatus,
     WrenchFrame,
 )
-from ftdrive.runs.verification import VerificationRecord
 from ftdrivers.clock import REAL
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import Array, DeviceInfo, Fact
@@ -78,7 +82,7 @@ def calibration() -> CalibrationResult:
 
 
 INFO = StreamInfo(
-    calibration=calibration(),
+    result=calibration(),
     calibration_name="runs/2026-11-14T080000Z-gripper_a/calibration.json",
     arm=DeviceInfo("UR5e", "20225500001", "5.12.0"),
     sensor=DeviceInfo(
@@ -137,6 +141,7 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
         block_s: float = 0.01,
     ) -> None:
         self.info = INFO
+        self.processor = self.source = self
         self.clock = REAL
         self.frame = WrenchFrame("base", "tcp")
         self.stages = Stages(lowpass_Hz=40.0)
@@ -252,3 +257,14 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
         event = StreamEvent(self.now_ns, kind, text)
         self._events.append(event)
         return event
+
+
+class SteppedFeed(Feed):
+    """A feed that reads block by block, without a thread."""
+
+    @cached_property
+    def _turns(self) -> Iterator[Block | None]:
+        return self.turns(until=lambda: False)
+
+    def step(self, turns: int = 1) -> None:
+        deque(islice(self._turns, turns), 0)

@@ -2,19 +2,18 @@
 
 import numpy as np
 
-from ftdrive.terminal.lines import characters, envelope, level, row_text
+from ftdrive.terminal.lines import characters, envelope
 
 
 def drawn(low: list[float], high: list[float], rows: int, full: float) -> list[str]:
-    codes = characters(envelope(np.array(low), np.array(high), rows, full))
-    return [row_text(row) for row in codes]
+    return ["".join(row) for row in characters(envelope(np.array(low), np.array(high), rows, full))]
 
 
 def test_the_bits_are_those_of_unicode() -> None:
     for dot, code in enumerate((0x01, 0x02, 0x04, 0x40, 0x08, 0x10, 0x20, 0x80)):  # dots 1, 2, 3, 7, 4, 5, 6, 8
         dots = np.zeros((4, 2), np.bool_)
         dots[dot % 4, dot // 4] = True
-        assert characters(dots)[0, 0] == code
+        assert characters(dots)[0, 0] == chr(0x2800 + code)
 
 
 def test_noise_about_zero_is_one_line() -> None:
@@ -30,8 +29,3 @@ def test_the_edges_hold_what_is_larger() -> None:
 def test_a_step_is_joined_and_a_gap_is_not() -> None:
     assert drawn([-1.0, 1.0], [-1.0, 1.0], 1, 1.0) == ["⣸"]
     assert drawn([0.0, np.nan, 0.0, 0.0], [0.0, np.nan, 0.0, 0.0], 1, 1.0) == ["⠄⠤"]
-
-
-def test_a_level_outside_is_not_drawn() -> None:
-    assert level(0.0, 3, 1.0) == 6
-    assert level(1.5, 3, 1.0) is None

@@ -6,8 +6,9 @@ import signal
 import sys
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 
 import pytest
 
@@ -38,13 +39,12 @@ class Counting(Canvas):
     def act(self, key: str) -> None:
         self.heard.append(key)
 
-    @contextmanager
-    def reading(self) -> Iterator[None]:
+    def turns(self) -> Iterator[None]:
         self.is_reading = True
-        try:
+        while not self.is_over:
+            time.sleep(0.001)
             yield
-        finally:
-            self.is_reading = False
+        self.is_reading = False
 
 
 def run(canvas: Canvas, does: Callable[[int, int], Shown], size: tuple[int, int] = (4, 80)) -> str:

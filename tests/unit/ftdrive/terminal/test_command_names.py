@@ -4,7 +4,7 @@ import pytest
 
 from ftdrive import cli
 from ftdrive.terminal.console import hanging
-from ftdrive.terminal.text import as_typed
+from ftdrive.words.text import as_typed
 
 
 @pytest.fixture

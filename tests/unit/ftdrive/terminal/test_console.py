@@ -20,20 +20,20 @@ from syrupy.assertion import SnapshotAssertion
 
 import ftdrive.cli as cli_module
 from ftdrive.checks.check import Check
-from ftdrive.cli import cli, in_a_sentence
+from ftdrive.cli import cli
 from ftdrive.cli import run as cli_run
 from ftdrive.commands.doctor import _print
-from ftdrive.errors import Declined
+from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
-from ftdrive.session import session
 from ftdrive.session.events import Noted, Question
 from ftdrive.terminal import console
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.lines import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
-from ftdrive.terminal.text import echo, in_whole_words, print_table, visible
+from ftdrive.terminal.text import echo, in_whole_words, print_table
+from ftdrive.words.text import visible
 
 PLAN = ["plan", "--model", "ur5e", "--tool", "0:200:100", "--minimal"]
 HELD = ["calibrate", "--robot", "10.0.0.1", "--sensor", "ati-can://can0"]
@@ -55,7 +55,7 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
     def guide(*_: object) -> None:
         raise Declined(text)
 
-    monkeypatch.setattr(session, "calibrate", guide)
+    monkeypatch.setattr("ftdrive.commands.calibrate.guide", guide)
     assert text in run(*HELD).stderr
 
 
@@ -264,7 +264,7 @@ def test_a_broken_pipe_of_a_device_is_no_closed_output(
     def lose(*_: object) -> None:
         raise BrokenPipeError(EPIPE, "Broken pipe")
 
-    monkeypatch.setattr(session, "calibrate", lose)
+    monkeypatch.setattr("ftdrive.commands.calibrate.guide", lose)
     assert cli_run(HELD) == 4
     assert "closed its connection" in capsys.readouterr().err
 

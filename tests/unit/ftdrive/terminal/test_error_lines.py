@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ftdrive import cli
-from ftdrive.terminal.text import in_one_line
+from ftdrive.words.text import in_one_line
 
 
 def test_a_name_cannot_begin_a_second_error(

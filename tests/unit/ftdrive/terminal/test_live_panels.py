@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.runs.verification import FOREIGN
+from ftdrive.runs.calibration import FOREIGN
+from ftdrive.stream.feed import Note
+from ftdrive.stream.samples import Stages, WrenchFrame
 from ftdrive.terminal import live_panels
-from ftdrive.terminal.lines import BAD, GOOD, WARNING, Line
-from ftdrive.terminal.live_feed import Note
-from ftdrive.terminal.live_panels import _range, line_of_force, others, sphere
+from ftdrive.terminal.lines import GOOD, WARNING, Line
+from ftdrive.terminal.live_panels import others, sphere
 from ftdrive.terminal.live_screen import frame
-from ftdrive.terminal.live_view import View
+from ftdrive.words.stream import View, line_of_force
 from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
-from tests.unit.ftdrive.terminal.test_live_summary import Rig, reading_of
+from tests.unit.ftdrive.words.test_stream import Rig, reading_of
 
 SENSOR = WrenchFrame("sensor", "sensor")
 
@@ -46,8 +46,8 @@ def test_the_line_of_force_passes_where_the_torque_says(
 ) -> None:
     wrench = np.concatenate([force_N, np.cross(at_m, force_N)])
     reading = replace(reading_of(view), wrench=wrench, in_contact=True, sigma=SIGMA)
-    assert text(line_of_force(reading)) == words
-    assert text(line_of_force(replace(reading, in_contact=False))) == ""
+    assert line_of_force(reading) == words
+    assert line_of_force(replace(reading, in_contact=False)) == ""
 
 
 def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> None:
@@ -55,16 +55,16 @@ def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> No
     facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured")}
     reading = replace(reading_of(view), raw=bias + np.array([0, 0, 20, 0, 0, 0]))
     sensor = replace(view.info.sensor, facts=facts | {"zero": Fact("arbitrary", "assumed")})
-    line = text(_range(replace(view, reading=reading, info=replace(view.info, sensor=sensor))))
-    assert line.endswith("40 % used, most by Fz")
+    share, axis = replace(view, reading=reading, info=replace(view.info, sensor=sensor)).used_range or (0.0, "")
+    assert (round(share, 3), axis) == (0.4, "Fz")
     plain = replace(view.info.sensor, facts=facts)
-    assert text(_range(replace(view, reading=reading, info=replace(view.info, sensor=plain)))) != line
+    assert replace(view, reading=reading, info=replace(view.info, sensor=plain)).used_range != (share, axis)
 
 
 def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -> None:
     push = np.array([1.0, -2.0, -5.0, 0.1, 0.2, -0.3])
     reading = replace(reading_of(view), raw=FREE + TARE + push, R_base_flange=R_BASE_FLANGE, frame=SENSOR)
-    lines = [text(line) for line in others(replace(view, reading=reading), 100)]
+    lines = [text(line) for line in others(replace(view, reading=reading))]
     found = {line[:21].strip(): [float(one) for one in line[21:].split()] for line in lines[1:]}
     assert lines[0].split() == ["in", "sensor", "@", "sensor", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz"]
     rounded = {"as measured": FREE + TARE + push, "without bias": FREE + push - BIAS, "and without gravity": push}
@@ -75,7 +75,7 @@ def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -
     below = np.cross([0, 0, 0.035], R_flange_sensor @ push[:3])  # the sensor is 35 mm below the flange
     np.testing.assert_allclose(found["flange @ flange"][3:], R_flange_sensor @ push[3:] + below, atol=0.00051)
     np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
-    silent = [text(line) for line in others(replace(view, reading=reading, silent="the arm"), 100)]
+    silent = [text(line) for line in others(replace(view, reading=reading, silent="the arm"))]
     assert all(line.count("--.--") == 6 for line in silent[1:])
 
 
@@ -90,7 +90,7 @@ def directions(*angles_deg: float) -> Array:
 
 def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) -> None:
     reading = replace(reading_of(view), R_base_flange=R_BASE_FLANGE)
-    lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)), 80)
+    lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)))
     words = [text(line)[2 * live_panels._DISC + 6 :].strip() for line in lines]
     covariance = view.info.calibration.wrench_covariance(R_BASE_FLANGE)
     variances = np.diag(covariance)
@@ -105,7 +105,7 @@ def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) ->
         f"{np.sqrt(variances[:3].sum()):.3f} N, {1e3 * np.sqrt(variances[3:].sum()):.2f} mN·m",
     ]
     assert sum(text(line).count("●") for line in lines) == 2  # one is in the words
-    unknown = sphere(replace(view, reading=reading, calibrated=None), 80)
+    unknown = sphere(replace(view, reading=reading, calibrated=None))
     assert "calibrated:" not in "".join(map(text, unknown))
 
 
@@ -136,6 +136,6 @@ def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(vie
 def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:
     words = "tare refused: the reading differs from a free tool by 1.52 N, more than noise, calibration and a usual "
     words += "drift explain (test value 31, limit 22.5); take hand or contact away, or calibrate again"
-    refused = replace(view, notes=[Note(None, words, BAD), *view.notes])
+    refused = replace(view, notes=[Note(None, words, "tare-refused"), *view.notes])
     shown = " ".join(text(line).strip() for line in frame(refused, 80, 24))
     assert words in " ".join(shown.split())

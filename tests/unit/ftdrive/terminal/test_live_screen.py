@@ -15,16 +15,15 @@ from syrupy.assertion import SnapshotAssertion
 
 from ftdrive.checks.check import Check
 from ftdrive.errors import ConfigError
-from ftdrive.live.replay import STEP_S, ReplayedStream
-from ftdrive.live.samples import Block, Stages, WrenchFrame
+from ftdrive.stream.samples import Block, Stages, WrenchFrame
+from ftdrive.stream.sources import STEP_S
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.live_feed import Feed
 from ftdrive.terminal.live_screen import LiveScreen, frame, run_live
-from ftdrive.terminal.live_view import Summary
+from ftdrive.words.stream import Summary
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import calibrated, dwells, info, paired
-from tests.unit.ftdrive.terminal.fake_stream import INFO, SIGMA, FakeStream, Scenario
+from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
+from tests.unit.ftdrive.terminal.fake_stream import INFO, SIGMA, FakeStream, Scenario, SteppedFeed
 from tests.wire.waiting import wait_until
 
 CHECKS = (
@@ -52,17 +51,16 @@ class Screen:
         self.show(self.stream)
         self.step(blocks)
         if scenario == "tare-refused":
-            self.feed.request("t")
+            self.screen.press("t")
         self.step(1)
 
     def show(self, stream: Any) -> None:
-        self.stream, self.feed = stream, Feed(stream)
+        self.stream, self.feed = stream, SteppedFeed(stream)
         self.summary = Summary(self.feed, CHECKS)
         self.screen = LiveScreen(self.feed, self.summary)
 
     def step(self, blocks: int) -> None:
-        for _ in range(blocks):
-            self.feed.step()
+        self.feed.step(blocks)
 
     def lines(self) -> list[str]:
         return [str(line) for line in self.screen.lines(*self.size)]
@@ -98,23 +96,16 @@ def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
 def test_the_low_pass_fits_the_rate_of_the_sensor(rate_Hz: float, lowpass_Hz: float) -> None:
     stream = FakeStream()
     stream.info, stream.stages = replace(INFO, sensor_rate_Hz=rate_Hz), Stages()
-    feed = Feed(stream)
+    screen = Screen(blocks=0)
+    screen.show(stream)
+    screen.step(1)
     for stages in (Stages(lowpass_Hz=lowpass_Hz), Stages()):
-        feed.request("4")
-        feed.step()
+        screen.press("4")
         assert stream.stages == stages
 
 
-def test_a_stale_screen_shows_no_number_that_looks_live() -> None:
-    lines = Screen("stale").lines()
-    assert lines[3].startswith(" ATI Mini45: no sample for 0.31 s")
-    for line in lines[5:14]:
-        now = line[4:12].strip()
-        assert now in {"--.--", ""}
-
-
 def test_before_the_first_sample_the_screen_waits_and_the_page_has_its_place() -> None:
-    screen = LiveScreen(feed := Feed(FakeStream()), Summary(feed), "http://127.0.0.1:8080/?token=abc")
+    screen = LiveScreen(feed := SteppedFeed(FakeStream()), Summary(feed), "http://127.0.0.1:8080/?token=abc")
     lines = [str(line) for line in screen.lines(80, 24)]
     assert "waiting for the first sample" in lines[1]
     assert lines[3].strip(" ─") == "http://127.0.0.1:8080/?token=abc  v QR code"
@@ -133,7 +124,7 @@ def test_keys_change_frame_and_stages_and_the_screen_says_what_the_numbers_are()
 
 def test_a_frame_that_is_not_configured_is_left_out_and_named() -> None:
     screen, rows = Screen(blocks=0), paired(dwells(1, 2000, seed=1), rate_Hz=100.0)
-    screen.show(ReplayedStream(info(calibrated(), height=False), rows, clock=FakeClock()))
+    screen.show(replayed(info(calibrated(), height=False), rows, clock=FakeClock()))
     screen.step(3)
     screen.press("a")
     assert any("set [sensor] height_mm" in note.text for note in screen.summary.view().notes)
@@ -190,18 +181,19 @@ def test_freeze_span_and_peaks() -> None:
 
 def test_a_replay_pauses_steps_seeks_and_says_where_it_is() -> None:
     rows = paired(dwells(1, 2000, seed=1), rate_Hz=100.0)
-    screen, replayed = Screen(blocks=0), ReplayedStream(info(calibrated()), rows, clock=FakeClock())
-    screen.show(replayed)
+    screen, stream = Screen(blocks=0), replayed(info(calibrated()), rows)
+    replay: Any = stream.source
+    screen.show(stream)
     screen.step(3)
     screen.press(" ")
-    assert replayed.is_paused
-    begin_s = replayed.at_s
+    assert replay.is_paused
+    begin_s = replay.at_s
     lines = screen.press(".", ".")
-    assert begin_s + STEP_S < replayed.at_s < begin_s + 5 * STEP_S
+    assert begin_s + STEP_S < replay.at_s < begin_s + 5 * STEP_S
     assert "of 00:20.0, paused" in lines[0]
     screen.press("right", "right", "left", "right", "+", " ")
     screen.step(40)
-    assert replayed.at_s > 10
+    assert replay.at_s > 10
     lines = screen.lines()
     assert ", x 2" in lines[0]
     assert "space pause" in lines[-1]
@@ -220,6 +212,8 @@ def test_help_covers_the_screen_until_a_key() -> None:
 
 class Other(FakeStream):
     def read(self) -> Block:
+        if self.blocks < 3:
+            return super().read()
         raise ConfigError("another device answers: start again")
 
 
@@ -239,17 +233,17 @@ def test_a_failure_is_the_end_of_the_command_and_recordings_are_named(
         is_well = isinstance(ends, nullcontext)
         screen.press("r")
         with screen.reading():
-            wait_until(lambda: feed.reader.failure or feed.crash or (feed.recorded and is_well))
-            screen.draw(80, 24)
+            wait_until(lambda: feed.status.failure or screen.failure or (feed.recorded and is_well))
+            screen.lines(80, 24)
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(LiveScreen, "run", run)
     tape = MagicMock()
-    feed = Feed(stream, lambda _: tape)
+    feed = SteppedFeed(stream, lambda _: tape)
     with messages.capture() as said, ends:
         run_live(feed)
     assert f"Recorded: {tmp_path}/live-" in said.get().replace("\n", "")
-    tape.close.assert_called_once()
+    tape.end.assert_called_once()
 
 
 def test_colours_are_those_of_the_terminal_so_that_light_and_dark_ones_do() -> None:

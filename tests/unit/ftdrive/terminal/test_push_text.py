@@ -7,7 +7,7 @@ import pytest
 
 from ftdrive.checks.arm import FlangeLoad
 from ftdrive.session.settings_push import Push
-from ftdrive.terminal.session_text import proposal_in_lines, settings_in_words
+from ftdrive.words.session import proposal_in_lines, settings_in_words
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo
 
 OLD = ControllerSettings(0.6, (0.0, 0.0, 0.03), (0.0,) * 6, (0.0, 0.0, 9.82))

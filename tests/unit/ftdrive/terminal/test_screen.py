@@ -36,8 +36,8 @@ from ftdrive.session.events import (
 )
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
-from ftdrive.terminal.screen import Screen, SessionView, _drift, frame, open_operator
-from ftdrive.terminal.session_text import SessionText
+from ftdrive.terminal.screen import Screen, frame, open_operator
+from ftdrive.words.session import SessionText, SessionView, drift_so_far
 from tests.wire.waiting import wait_until
 
 RESUME = "ftdrive calibrate --resume runs/2026-11-20T211503Z-gripper_a"
@@ -185,7 +185,7 @@ def test_a_first_pose_shows_its_coverage_and_no_numbers() -> None:
 def test_a_pose_out_of_line_says_which_key_helps() -> None:
     text = "\n".join(drawn(view(*MIDDLE, pose(7, 5, steady=False, attempts=3), estimated(residual_sigma=31.0))))
     assert "OUT OF LINE: press r" in text
-    assert "3 tries, NOT STEADY" in text
+    assert "NOT STEADY, 3 attempts" in text
 
 
 def test_the_first_pose_seen_again_shows_the_drift() -> None:
@@ -199,11 +199,11 @@ def test_the_first_pose_seen_again_shows_the_drift() -> None:
 
 def test_only_a_drift_beyond_the_noise_is_yellow() -> None:
     for again, style in ((0.0, ""), (0.5, "bold yellow")):
-        assert _drift(view(pose(1, 19), pose(2, 19, mean=np.array([again, 0, 0, 0, 0, 0])))).style == style
+        assert drift_so_far(view(pose(1, 19), pose(2, 19, mean=np.array([again, 0, 0, 0, 0, 0])))).style == style
     for sigma, style, words in ((0.07, "yellow", "pose"), (0.08, "", "pose, perhaps")):
         fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, sigma)})
-        found = _drift(view(*MIDDLE, fitted))
-        assert (found.style, found.plain.endswith(words)) == (style, True)
+        found = drift_so_far(view(*MIDDLE, fitted))
+        assert (found.style, found.words.endswith(words)) == (style, True)
 
 
 def test_a_drift_of_the_force_alone_is_shown_without_torque() -> None:
@@ -299,7 +299,8 @@ class Shown:
 
     def __init__(self, person: int) -> None:
         self.text = ""
-        self._person = person
+        # its own descriptor: another test could get the number of a closed one
+        self._person = os.dup(person)
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self) -> None:
@@ -307,7 +308,7 @@ class Shown:
             while more := os.read(self._person, 65536):
                 self.text += more.decode(errors="replace")
         except OSError:
-            pass  # the terminal was closed
+            os.close(self._person)  # the terminal was closed
 
 
 def test_keys_arrive_without_enter_and_all_others_as_another_key(
@@ -362,6 +363,14 @@ def test_letters_of_a_word_are_no_keys_but_those_that_stop(
         os.write(person, b"q")  # heard in a word too
         wait_until(lambda: Key.STOP in keyboard.waiting)
         assert list(keyboard.waiting) == [*heard, Key.STOP]
+
+
+def test_no_read_waits_for_a_key_that_the_terminal_discards(monkeypatch: pytest.MonkeyPatch) -> None:
+    reading = list[str]()
+    monkeypatch.setattr(termios, "tcflush", lambda *_: reading.extend(one.name for one in threading.enumerate()))
+    with terminal() as (_, program), Keyboard(program):
+        pass
+    assert "keyboard" not in reading
 
 
 def test_the_terminal_is_restored_after_success_failure_and_while_suspended() -> None:
@@ -592,7 +601,7 @@ def test_the_frame_is_erased_after_success_and_stays_after_an_error(error: type[
     assert ("\x1b[1A\x1b[2K" in last) == (error is None)  # up, and clear the line
     assert ("✔ 6 averages kept in runs/2026" in last) == (error is None)
     assert "SETTLE" in file.getvalue()
-    assert "settled 0.9 s, 2000 samples in" not in file.getvalue(), "the frame shows the poses"
+    assert "/25 R14: settled" not in file.getvalue(), "the frame shows the poses"
 
 
 @pytest.mark.parametrize("width", [80, 60])

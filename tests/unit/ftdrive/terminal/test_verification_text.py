@@ -49,8 +49,9 @@ def verified(found: Verification = FOUND, *, passed: bool = True, drift: Any = N
 
 @pytest.fixture
 def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Any:
-    monkeypatch.setattr(report, "find_moved", lambda _: [SimpleNamespace(words="R03 was not steady")])
-    monkeypatch.setattr(report, "drift_in_words", lambda drift: ("0.1 N since the first pose", drift == "bad"))
+    monkeypatch.setattr("ftdrive.words.result.find_moved", lambda _: [SimpleNamespace(words="R03 was not steady")])
+    drift_words = "ftdrive.words.result.drift_in_words"
+    monkeypatch.setattr(drift_words, lambda drift: ("0.1 N since the first pose", drift == "bad"))
 
     def run(one: Any) -> list[str]:
         print_verification(cast("Any", one))

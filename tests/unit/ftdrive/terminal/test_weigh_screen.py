@@ -1,6 +1,6 @@
 """The scale as a user sees it: which number, with what beside it, and what its keys do."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ftcalib.after.weighing import Weight
-from ftdrive.errors import NotAccepted
-from ftdrive.live.weighing import WORDS, ScaleState, Weighing
+from ftdrive.stream.weighing import WORDS, CannotWeigh, ScaleState, Weighing
 from ftdrive.terminal.weigh_screen import WeighScreen, large
 from ftdrivers.errors import StreamBroken
+from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import INFO
 from tests.wire.waiting import wait_until
 
@@ -33,46 +33,56 @@ NOTHING = replace(PART, mass_kg=-0.00021, mass_sigma_kg=0.1, least_kg=0.4)
 
 
 class FakeWeighing(Weighing):
-    """A scale that stays in the state it is given."""
+    """A scale that stays in the state it is given, on a fake clock."""
 
     def __init__(self, shown: ScaleState, *, moving: bool = False, fails: Exception | None = None) -> None:
-        self.stream = cast("Any", SimpleNamespace(info=replace(INFO, emulated=True)))
-        self.given, self.moving, self.joins, self.fails = shown, moving, False, fails
-        self.zeros = 0
-        self.refuses = False
-        self.in_zero: Callable[[], object] = lambda: None
+        self.refuses, self.zeroed_s = False, float("inf")
+        processor = SimpleNamespace(monitor=SimpleNamespace(reference=lambda: (None, self.zeroed_s)))
+        stream: Any = SimpleNamespace(info=replace(INFO, emulated=True), clock=FakeClock(), processor=processor)
+        super().__init__(stream, joins=False, part_kg=None, moving=moving)
+        self.given, self.fails = shown, fails
+        self._scale = cast("Any", SimpleNamespace(zero=self._rest))
 
-    def _states(self, *, raises: bool) -> Iterator[tuple[ScaleState, bool]]:
-        assert not raises
+    def turns(self) -> Iterator[None]:
+        """Read 0.1 s each time."""
         while True:
-            yield self.given, False
+            self.stream.clock.sleep(0.11)
+            self.add(cast("Any", "a block"), ())
+            yield
             if self.fails is not None:
                 raise self.fails
 
-    def zero(self) -> None:
-        self.zeros += 1
-        self.in_zero()
+    def _weighed(self) -> ScaleState:
+        return self.given
+
+    def _is_new(self, *_: object) -> bool:
+        return False
+
+    def _rest(self, since_ns: int) -> None:
+        if self.stream.clock.now_ns() < since_ns + 0.5e9:
+            raise CannotWeigh("samples")
         if self.refuses:
-            raise NotAccepted("no zero: the arm moves")
+            raise CannotWeigh("not-empty")
 
 
 class Scale:
     """The screen of a fake scale, without a thread and a terminal; with `keys` pressed, one after the other."""
 
     def __init__(self, weighing: FakeWeighing, *keys: str) -> None:
-        self.screen, self.states = WeighScreen(weighing), weighing.states()
-        next(self.states)
+        self.turns = weighing.turns()
+        self.screen = WeighScreen(weighing, self.turns)
+        next(self.turns)
         self.press(*keys)
 
     def press(self, *keys: str) -> None:
         for key in keys:
             self.screen.press(key)
-            next(self.states)
+            next(self.turns)
         self.read()
 
     def read(self) -> list[str]:
-        *rows, self.keys = (str(line).strip() for line in self.screen.lines(110, 20))
-        self.title, _, _, *self.mass, _, self.sigma, self.line, self.note = rows[:10]
+        *self.rows, self.keys = (str(line).strip() for line in self.screen.lines(110, 20))
+        self.title, _, _, *self.mass, _, self.sigma, self.line, self.note = self.rows[:10]
         return self.mass
 
 
@@ -90,7 +100,7 @@ def test_figures_are_three_rows_high_and_letters_one() -> None:
 
 def test_the_number_ends_where_its_sigma_does() -> None:
     scale = Scale(FakeWeighing(ScaleState(PART, None, 3)))
-    assert scale.title == "ftdrive weigh   tool gripper_a   EMULATED"
+    assert scale.title == "ftdrive weigh   UR5e · ATI Mini45 FT12345 · gripper_a   EMULATED"
     assert scale.mass == mass("0.8123 kg")
     assert scale.sigma == "3 parts   sigma 1.2 g, smallest mass 4.8 g"
     assert scale.line == "3 parts, 0.8123 ± 0.0012 kg at (10.0 ± 2.0, -20.0 ± 3.0, 150 ± 100) mm from the sensor origin"
@@ -101,11 +111,9 @@ def test_the_number_ends_where_its_sigma_does() -> None:
 def test_a_scale_without_a_zero_asks_for_one() -> None:
     scale = Scale(FakeWeighing(ScaleState(NOTHING, None)))
     assert scale.mass == mass("0.00 kg")  # neither -0 nor another place of the digits
-    hint = "   not zeroed: press z with an empty gripper"
+    hint = "   not zeroed: zero the empty gripper"
     assert scale.sigma == f"sigma 100 g, smallest mass 400 g{hint}"
     assert scale.line == "nothing: -0.00 ± 0.10 kg, less than 0.4 kg"
-    assert hint in Scale(FakeWeighing(ScaleState(replace(NOTHING, least_kg=0.101), None))).sigma
-    assert hint not in Scale(FakeWeighing(ScaleState(replace(NOTHING, least_kg=0.099), None))).sigma
 
 
 @pytest.mark.parametrize(
@@ -134,24 +142,25 @@ def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("refuses", "note"), [(False, "zero: the empty gripper was tared"), (True, "no zero: the arm moves")]
+    ("refuses", "note"), [(False, "zero: the empty gripper was tared"), (True, f"no zero: {WORDS['not-empty']}")]
 )
 def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
     weighing = FakeWeighing(ScaleState(PART, None))
     weighing.refuses = refuses
-    during = list[str]()
-    scale = Scale(weighing)
-    weighing.in_zero = lambda: during.extend(scale.read())
-    scale.press("z")
-    assert weighing.zeros == 1
-    assert during == mass("- - -")
-    assert scale.note == note
+    scale = Scale(weighing, "z")
+    for _ in range(4):
+        assert (scale.mass, scale.note) == (mass("- - -"), "zero: waits for half a second at rest …")
+        scale.press("")
+    assert not weighing.is_zeroing
+    assert str(weighing.refusal or weighing.note) == note
+    scale.press("")
+    assert (scale.mass, " ".join(scale.rows[9:]).strip()) == (mass("0.8123 kg"), note)
 
 
 def test_in_motion_neither_zero_nor_poses_are_offered() -> None:
     weighing = FakeWeighing(ScaleState(replace(NOTHING, poses=0, in_motion=True), None), moving=True)
     scale = Scale(weighing, "z", "p")
-    assert (weighing.zeros, weighing.joins) == (0, False)
+    assert (weighing.is_zeroing, weighing.joins) == (False, False)
     assert (scale.keys, scale.note) == ("q quit", "")
     assert scale.sigma == "sigma 100 g, smallest mass 400 g"
 
@@ -159,7 +168,7 @@ def test_in_motion_neither_zero_nor_poses_are_offered() -> None:
 @pytest.mark.parametrize("error", [StreamBroken("the cable is cut"), OSError(28, "No space left on device")])
 def test_what_ends_the_reading_ends_the_screen(error: Exception) -> None:
     """Else the last number would stay, as if it were live."""
-    screen = WeighScreen(FakeWeighing(ScaleState(PART, None), fails=error))
+    screen = Scale(FakeWeighing(ScaleState(PART, None), fails=error)).screen
     with pytest.raises(type(error)) as raised, screen.reading():
-        wait_until(lambda: screen.draw(80, 24) == [])
+        wait_until(lambda: screen.lines(80, 24) == [])
     assert raised.value is error

@@ -5,33 +5,27 @@ import re
 import time
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
-from ftdrive.commands.common import ViewOptions
-from ftdrive.commands.live import _certifier, _recorded_cell
-from ftdrive.commands.live_source import check_view
+from ftdrive.commands.options import ViewOptions
 from ftdrive.errors import ConfigError
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import FrameTransform, WrenchFrame
-from ftdrive.live.weighing import WORDS, ScaleState
+from ftdrive.library import certifier_of
 from ftdrive.planning.geometry.certify import Certifier
-from ftdrive.planning.planner import certifier_as_described
+from ftdrive.planning.planner import certifier_for
 from ftdrive.recording import Recorder
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.view.live_page import LivePage, in_base, is_significant, words
+from ftdrive.stream.samples import FrameTransform, WrenchFrame
+from ftdrive.stream.weighing import WORDS, ScaleState
+from ftdrive.view.live_page import LivePage, WeighPage, _in_base, texts
 from ftdrive.view.page import Page, drawing
-from ftdrive.view.scene import turned
-from ftdrive.view.weigh_page import WeighPage
-from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import calibrated, dwells, info, paired
-from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, SIGMA, FakeStream
-from tests.unit.ftdrive.terminal.test_live_summary import Rig, reading_of
+from ftdrive.words.stream import NOISE_UNKNOWN, state
+from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
+from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, R_FLANGE_SENSOR, SIGMA, FakeStream, SteppedFeed
 from tests.unit.ftdrive.terminal.test_weigh_screen import NOTHING, PART, FakeWeighing
+from tests.unit.ftdrive.words.test_stream import Rig, reading_of
 
 PUSHED = np.array([1.0, -2.0, -7.0, 0.1, 0.2, -0.05])
 FRAMES = [
@@ -55,14 +49,13 @@ class Shown:
     """A page of a stream that runs block by block; without a server."""
 
     def __init__(self, stream: Any, *, certifier: Certifier | None = None, controls: bool = False) -> None:
-        self.stream, self.page, self.feed = stream, Page("ftdrive live"), Feed(stream)
+        self.stream, self.page, self.feed = stream, Page("ftdrive live"), SteppedFeed(stream)
         self.page.viewers = 1
         self.live = LivePage(self.page, self.feed, [], certifier, controls=controls)
 
     def run(self, blocks: int = 1) -> dict[str, Any]:
         """Read, draw until the plots are drawn too, and return the parts."""
-        for _ in range(blocks):
-            self.feed.step()
+        self.feed.step(blocks)
         for _ in range(5):
             self.live.draw()
         return parts_of(self.page)
@@ -94,7 +87,7 @@ def test_arrow_and_line_of_action_do_not_depend_on_the_frame(frame: WrenchFrame)
     reading = reading_of(Rig(FakeStream("contact")).run(3))
     p_base_flange_m = reading.p_base_flange_m
     wrench = FrameTransform(frame, INFO).matrix(R_BASE_FLANGE) @ PUSHED
-    p_m, wrench_base = in_base(replace(reading, frame=frame, wrench=wrench), INFO, p_base_flange_m)
+    p_m, wrench_base = _in_base(replace(reading, frame=frame, wrench=wrench), INFO, p_base_flange_m)
     R = R_BASE_FLANGE @ R_FLANGE_SENSOR
     sensor_m = p_base_flange_m + R_BASE_FLANGE @ INFO.p_flange_sensor_m
     force = R @ PUSHED[:3]
@@ -104,19 +97,19 @@ def test_arrow_and_line_of_action_do_not_depend_on_the_frame(frame: WrenchFrame)
 
 
 def test_the_flange_is_turned_as_the_arm_says() -> None:
-    w, x, y, z = turned(R_BASE_FLANGE)
+    w, x, y, z = Shown(FakeStream()).run(3)["scene/flange"]["turn"]
     axis = np.array([x, y, z])
     rotated = [v + 2 * np.cross(axis, np.cross(axis, v) + w * v) for v in np.eye(3)]
-    np.testing.assert_allclose(np.transpose(rotated), R_BASE_FLANGE, atol=1e-12)
+    np.testing.assert_allclose(np.transpose(rotated), R_BASE_FLANGE, atol=1e-4)
 
 
 def test_less_than_four_sigmas_has_no_arrow() -> None:
     reading = reading_of(Rig(FakeStream("contact")).run(3))
     reading = replace(reading, wrench=np.array([0.0, 8.1, 0.0, 0.0, 0.0, 0.13]), sigma=np.repeat([2.0, 0.03], 3))
-    assert [is_significant(reading, first) for first in (0, 3)] == [True, True]
+    assert [reading.is_significant(first) for first in (0, 3)] == [True, True]
     weaker = replace(reading, wrench=np.array([0.0, 7.9, 0.0, 0.0, 0.0, 0.11]))
-    assert [is_significant(weaker, first) for first in (0, 3)] == [False, False]
-    assert not is_significant(replace(reading, sigma=np.full(6, np.nan)), 0)  # the noise is not known yet
+    assert [weaker.is_significant(first) for first in (0, 3)] == [False, False]
+    assert not replace(reading, sigma=np.full(6, np.nan)).is_significant(0)  # the noise is not known yet
 
 
 def test_a_push_has_size_sigma_direction_and_arrows() -> None:
@@ -142,7 +135,7 @@ def test_a_push_has_size_sigma_direction_and_arrows() -> None:
 def test_numbers_end_where_their_sigmas_do() -> None:
     view = Rig(FakeStream("contact")).run(3)
     wrench, sigma = np.array([0.0, 98.04, 0.0, 0.0, 0.0, 1.234]), np.repeat([2.1, 0.03], 3)
-    parts = words(view, replace(reading_of(view), wrench=wrench, sigma=sigma))
+    parts = texts(view, replace(reading_of(view), wrench=wrench, sigma=sigma))
     _, force, torque = numbers_of(cast("Any", parts))
     assert (force["value"], force["sigma"], force["note"]) == ("98.0", "± 2.1 (1 sigma)", "towards +y of base axes")
     assert (torque["value"], torque["sigma"]) == ("1.234", "± 0.030 (1 sigma)")
@@ -167,10 +160,13 @@ def test_before_the_noise_is_known_a_tool_is_not_called_free() -> None:
             return np.full(6, np.nan)
 
     parts = Shown(Fresh()).run(3)
-    state, force, _ = numbers_of(parts)
-    assert (state["value"], state["tone"]) == ("noise not known yet", "quiet")
+    shown, force, _ = numbers_of(parts)
+    assert (shown["value"], shown["tone"]) == (NOISE_UNKNOWN, "quiet")
     assert (force["sigma"], force["note"]) == ("", "\u00a0")
     assert "nan" not in json.dumps(parts).lower()
+    view = Rig(FakeStream()).run(3)
+    status = replace(view.status, contact_limit=8e10)  # the first estimates have hardly a degree of freedom
+    assert state(replace(view, status=status)) == (NOISE_UNKNOWN, "")
 
 
 def test_contact_is_marked_in_the_plots() -> None:
@@ -192,7 +188,7 @@ def test_contact_is_marked_in_the_plots() -> None:
 
 
 def test_no_old_value_of_a_silent_device() -> None:
-    certifier = certifier_as_described(CELL, "ur5e")
+    certifier = certifier_for(CELL, "ur5e")
     stream = FakeStream("contact", silent_after=240, block_s=0.05)
     shown = Shown(stream, certifier=certifier)
     before = shown.run(240)
@@ -217,9 +213,9 @@ def _still(certifier: Certifier) -> set[str]:
 
 def test_what_the_numbers_are_is_in_words() -> None:
     shown = Shown(FakeStream())
-    assert shown.run(0)["table/what"]["lines"] == ["waiting for samples"]
+    assert shown.run(0)["table/what"]["lines"] == ["waiting for the first sample"]
     parts = shown.run(3)
-    assert parts["table"]["lines"] == ["UR5e · ATI Mini45 · gripper_a"]
+    assert parts["table"]["lines"] == ["UR5e · ATI Mini45 FT12345 · gripper_a"]
     assert parts["table/what"]["lines"][0] == "contact wrench, base axes, about the tcp origin; stages: " + (
         "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
     )
@@ -230,7 +226,7 @@ def test_what_the_numbers_are_is_in_words() -> None:
 
 
 def test_the_legend_names_each_colour_of_the_scene() -> None:
-    parts = Shown(FakeStream("contact", block_s=0.05), certifier=certifier_as_described(CELL, "ur5e")).run(240)
+    parts = Shown(FakeStream("contact", block_s=0.05), certifier=certifier_for(CELL, "ur5e")).run(240)
     named = {colour for colour, *_ in parts["scene/legend"]["rows"]}
     drawn = {part["colour"] for name, part in parts.items() if name.startswith("scene/") and "colour" in part}
     assert drawn <= named
@@ -245,7 +241,7 @@ def test_an_arm_at_rest_is_not_sent_again() -> None:
             block = super().read()
             return replace(block, q_rad=block.q_rad + 5e-5 * (-1) ** self.blocks)
 
-    shown = Shown(Trembling(), certifier=certifier_as_described(CELL, "ur5e"))
+    shown = Shown(Trembling(), certifier=certifier_for(CELL, "ur5e"))
     shown.run(3)
     version = shown.page.since(0)[0]
     shown.run(1)
@@ -269,7 +265,7 @@ def test_without_a_viewer_nothing_is_shown_and_nothing_piles_up() -> None:
     shown = Shown(FakeStream())
     shown.page.viewers = 0
     assert "numbers" not in shown.run(5)
-    assert not shown.feed._news[0].blocks
+    assert not shown.feed._readers[0][0]
     shown.page.viewers = 1
     shown.live.draw()
     assert {"numbers", "plots"} <= parts_of(shown.page).keys()
@@ -299,7 +295,7 @@ def test_viewers_tare_and_choose_the_frame_only_if_that_is_allowed() -> None:
 
 def test_a_frame_that_is_not_configured_is_explained() -> None:
     rows = paired(dwells(1, 3000, seed=1))
-    replay = ReplayedStream(info(calibrated(), height=False), rows, clock=cast("Any", FakeClock()))
+    replay = replayed(info(calibrated(), height=False), rows)
     shown = Shown(replay, controls=True)
     shown.run()
     with pytest.raises(ValueError, match=r"set \[sensor\] height_mm"):
@@ -318,8 +314,8 @@ def test_the_span_of_the_plots_is_chosen() -> None:
 
 def test_a_viewer_of_a_replay_pauses_and_goes_elsewhere() -> None:
     rows = paired(dwells(1, 3000, seed=1))
-    replay = ReplayedStream(info(calibrated()), rows, clock=cast("Any", FakeClock()), speed=3.0)
-    shown = Shown(replay)
+    stream = replayed(info(calibrated()), rows, speed=3.0)
+    replay, shown = cast("Any", stream.source), Shown(stream)
     parts = shown.run()
     assert (control(parts, "play")["label"], control(parts, "speed")["value"]) == ("Pause", "3")
     shown.act("play")
@@ -335,7 +331,7 @@ def test_a_viewer_of_a_replay_pauses_and_goes_elsewhere() -> None:
     shown.act("play")
     assert not replay.is_paused
     replay.seek(replay.duration_s)
-    replay.step()
+    stream.read()
     assert control(shown.run(0), "play")["label"] == "Play"
     shown.act("play")
     assert replay.at_s == pytest.approx(0.0, abs=0.02)
@@ -360,10 +356,10 @@ def test_a_failed_drawing_is_said_once_and_ends_nothing_else(monkeypatch: pytest
 
 def test_options_that_would_be_ignored_are_refused() -> None:
     with pytest.raises(ConfigError, match="--allow-control goes only with --view"):
-        check_view(ViewOptions(False, None), once=False, allow_control=True)
+        ViewOptions(False, None).require(once=False, allow_control=True)
     with pytest.raises(ConfigError, match="--view does not go with --once"):
-        check_view(ViewOptions(False, "0.0.0.0:8080"), once=True, allow_control=False)
-    check_view(ViewOptions(True, None), once=False, allow_control=True)
+        ViewOptions(False, "0.0.0.0:8080").require(once=True, allow_control=False)
+    ViewOptions(False, None).require(once=True, allow_control=False)
 
 
 def weighed(
@@ -372,7 +368,7 @@ def weighed(
     """The parts of the page of a scale, the page, and the scale."""
     weighing = FakeWeighing(shown, moving=moving)
     weighing.shown, weighing.note, weighing.part_kg = shown, note, None if shown.count is None else 0.27
-    weighing.stream = cast("Any", SimpleNamespace(info=INFO, reference=lambda: (None, zeroed_s)))
+    weighing.zeroed_s = zeroed_s
     page = Page("ftdrive weigh")
     page.viewers = 1
     WeighPage(page, weighing, controls=controls).draw()
@@ -392,26 +388,21 @@ def test_the_scale_shows_a_mass_with_unit_and_sigma() -> None:
     assert mass["value"] == "0.00"
 
 
-@pytest.mark.parametrize("shown", [ScaleState(PART, "contact"), ScaleState(None, "moving")], ids=str)
-def test_what_is_not_weighed_has_no_number_but_a_reason(shown: ScaleState) -> None:
+@pytest.mark.parametrize(
+    ("shown", "value", "place", "line", "tone"),
+    [
+        (ScaleState(PART, "contact"), "- - -", "table/line", f"not weighed: {WORDS['contact']}", "warn"),
+        (ScaleState(None, "moving"), "- - -", "table/line", f"not weighed: {WORDS['moving']}", "warn"),
+        (ScaleState(PART, "count"), "0.8123", "table/line", f"not weighed: {WORDS['count']}", "warn"),
+        (ScaleState(None, None, stale="no sample for 0.3 s"), "- - -", "alert", "stale: no sample for 0.3 s", "bad"),
+    ],
+)
+def test_what_is_not_weighed_has_a_reason(shown: ScaleState, value: str, place: str, line: str, tone: str) -> None:
     parts, *_ = weighed(shown)
     (mass,) = parts["numbers"]["rows"]
-    assert (mass["value"], mass["unit"], mass["sigma"]) == ("- - -", "", "")
-    assert WORDS[cast("Any", shown.refusal)] in parts["table/line"]["lines"][0]
-    assert parts["table/line"]["tone"] == "warn"
-
-
-def test_what_cannot_be_counted_has_a_mass() -> None:
-    parts, *_ = weighed(ScaleState(PART, "count"))
-    assert parts["numbers"]["rows"][0]["value"] == "0.8123"
-    assert parts["table/line"]["lines"] == [f"not weighed: {WORDS['count']}"]
-
-
-def test_a_silent_device_is_red_and_has_no_mass() -> None:
-    parts, *_ = weighed(ScaleState(None, None, stale="the sensor sent nothing for 0.3 s"))
-    assert parts["alert"]["lines"] == ["stale: the sensor sent nothing for 0.3 s"]
-    assert parts["numbers"]["rows"][0]["value"] == "- - -"
-    assert "table/line" not in parts
+    assert (mass["value"], mass["unit"] == mass["sigma"] == "") == (value, value == "- - -")
+    assert (parts[place]["lines"], parts[place]["tone"]) == ([line], tone)
+    assert {"alert", "table/line"} & parts.keys() == {place}
 
 
 @pytest.mark.parametrize(("least_kg", "moving"), [(0.099, False), (0.101, False), (0.101, True)])
@@ -428,21 +419,22 @@ def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
         _, page, weighing = weighed(ScaleState(PART, None), controls=controls, moving=moving)
         with pytest.raises(ValueError, match="no such control"):
             page.act("viewer 2", "zero", None)
-        assert not weighing._zero_requested
+        assert not weighing.is_zeroing
     _, page, weighing = weighed(ScaleState(PART, None), controls=True)
     page.act("viewer 2", "zero", None)
-    assert weighing._zero_requested
+    assert weighing.is_zeroing
 
 
 def test_a_recording_brings_its_arm_and_tool(tmp_path: Path) -> None:
     recorder = Recorder([path := tmp_path / "peg.mcap"], INFO, CELL.to_dict())
-    recorder.write(FakeStream().read())
-    recorder.close()
-    found = _recorded_cell(path)
-    assert found is not None
-    certifier = _certifier(found, INFO.arm.model)
-    assert certifier is not None
+    recorder.add(FakeStream().read(), [])
+    recorder.end()
+    stream, said = FakeStream(), list[str]()
+    assert (certifier := certifier_of(stream, path, said.append)) is not None
     assert [part.to_m for part in certifier.arm.tool] == [0.2]
-    assert _certifier(replace(found, tool=ToolConfig()), INFO.arm.model) is None
     (table := tmp_path / "table.csv").write_text("t,fx\n0,1\n")
-    assert _recorded_cell(table) is None
+    assert certifier_of(stream, table, said.append) is None
+    assert not said
+    stream.cell = replace(CELL, tool=ToolConfig())
+    assert certifier_of(stream, None, said.append) is None
+    assert "what is mounted?" in said[0]

@@ -6,17 +6,15 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from ftdrive.commands import calibrate, verify
-from ftdrive.commands.common import on_page
 from ftdrive.errors import Declined
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import certifier_as_described
+from ftdrive.planning.planner import certifier_for
 from ftdrive.runs.source import Outcome
 from ftdrive.runs.verification import AcceptanceLimits, verify_run
 from ftdrive.session import session
@@ -35,11 +33,12 @@ from ftdrive.session.guards import ExpectedMotion, Limits, RangeGuard, Seen
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrive.session.verifying import Verifying
-from ftdrive.terminal.text import as_typed
 from ftdrive.view import session_page
+from ftdrive.view.outcome import on_page
 from ftdrive.view.page import Page
 from ftdrive.view.scene import arm_parts
 from ftdrive.view.session_page import SessionPage
+from ftdrive.words.text import as_typed
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import MODEL, STATUS, Lab, Scripted
@@ -269,7 +268,7 @@ def test_the_arm_and_its_next_pose_are_drawn(lab: Lab, page: Page) -> None:
 
 def test_force_and_torque_stand_beside_the_limits_of_their_guard(watched: SessionPage, lab: Lab) -> None:
     load = RangeGuard(Limits(saturation=0.5), np.array([100.0] * 3 + [10.0] * 3))
-    onlooker = watched.watch(certifier_as_described(lab.cell, "ur5e"), load)
+    onlooker = watched.watch(certifier_for(lab.cell, "ur5e"), load)
     onlooker.look(seen([25.0, -49.0, 0.0, 0.0, 0.0, 1.0], t_s=1.0))
     onlooker.look(seen([25.0, -49.0, 0.0, 0.0, 0.0, 1.0], t_s=1.02))
     parts = shown(watched)
@@ -286,7 +285,7 @@ def test_force_and_torque_stand_beside_the_limits_of_their_guard(watched: Sessio
 
 
 def test_an_arbitrary_zero_does_not_count_and_an_unknown_range_has_no_bars(watched: SessionPage, lab: Lab) -> None:
-    certifier = certifier_as_described(lab.cell, "ur5e")
+    certifier = certifier_for(lab.cell, "ur5e")
     load = RangeGuard(Limits(saturation=0.5), np.full(6, 100.0), np.full(6, 20.0))
     onlooker = watched.watch(certifier, load)
     onlooker.look(seen([45.0, 20, 20, 20, 20, 20]))
@@ -539,7 +538,7 @@ def test_a_calibration_ends_with_verdict_estimates_and_next_command(
     outcome = lab.calibrate()
     assert isinstance(outcome, Outcome)
     capsys.readouterr()
-    calibrate._report(outcome, page, simulate=False, as_json=False)
+    calibrate._report(outcome, page, simulate=False, every=False, as_json=False)
     terminal, parts = printed(capsys), parts_of(page)
     verdict = parts["result"]
     tones = {"GOOD": "good", "USABLE": "warn"}
@@ -560,7 +559,7 @@ def test_a_calibration_ends_with_verdict_estimates_and_next_command(
 def test_the_result_of_json_is_shown_too(lab: Lab, page: Page, capsys: pytest.CaptureFixture[str]) -> None:
     outcome = lab.calibrate()
     assert isinstance(outcome, Outcome)
-    calibrate._report(outcome, page, simulate=False, as_json=True)
+    calibrate._report(outcome, page, simulate=False, every=False, as_json=True)
     assert json.loads(capsys.readouterr().out)["verdict"].upper() == parts_of(page)["result"]["head"]
 
 
@@ -577,7 +576,7 @@ def test_a_verification_ends_with_its_verdict(
     assert run is not None
     verified = verify_run(run, result, path, AcceptanceLimits(limit_N))
     capsys.readouterr()
-    verify._report(verified, "no", page, simulated=False, as_json=False)
+    verify._report(verified, "no", page, again="", as_json=False)
     terminal, parts = printed(capsys), parts_of(page)
     assert (parts["result"]["head"], parts["result"]["tone"]) == (head, tone)
     assert f"{head} {parts['result/words']['lines'][0]}" in terminal
@@ -596,7 +595,6 @@ def test_the_question_of_a_verification_is_shown_while_it_waits(page: Page, monk
         return "yes"
 
     monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator.ask", answer)
-    failed: Any = SimpleNamespace(passed=False, update=object(), update_name="bias")
-    assert verify._wants_update(failed, "ask", page, as_json=False)
-    assert waiting[0].startswith("Answer in the terminal\nAn update of the bias is sufficient.")
+    assert verify._ask(page, False, Question("Save it?")) == "yes"
+    assert waiting == ["Answer in the terminal\nSave it?"]
     assert "question" not in parts_of(page)

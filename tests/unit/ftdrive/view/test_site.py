@@ -13,6 +13,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from ftdrive.terminal.console import print_page
 from ftdrive.view.page import Page, drawing
 from ftdrive.view.parts import button, check, controls, lines, select, slider, text_field
 from ftdrive.view.site import announced, serve
@@ -227,7 +228,7 @@ def test_the_browser_is_given_a_file_that_only_its_owner_can_read(
     opened: list[str] = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("webbrowser.open", opened.append)
-    with announced(page):
+    with announced(page, None, print_page):
         (address,) = opened
         file = Path(urlsplit(address).path)
         assert "token" not in address

@@ -14,7 +14,6 @@ from ftdrive.planning.geometry.arm_model import (
     ArmModel,
     Bodies,
     Cylinder,
-    height_above,
     separation,
     separation_from_box,
 )
@@ -91,7 +90,7 @@ def test_separation_from_a_box_and_a_plane_is_below_the_distance_of_the_surface(
     assert found <= to_box + 1e-9
     if to_box > 0.1:
         assert found > to_box - 0.03
-    height = float(height_above(body, np.array([0.0, 0.6, 0.8]), -0.3)[0])
+    height = float(body.height_above(np.array([0.0, 0.6, 0.8]), -0.3)[0])
     sampled = float((points @ [0.0, 0.6, 0.8]).min()) + 0.3 - 0.02
     assert sampled - 0.01 < height <= sampled + 1e-9
 

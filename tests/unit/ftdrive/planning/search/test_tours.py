@@ -14,7 +14,7 @@ from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_box, plan_cone, plan_tour
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_box, _plan_cone, guess_of, plan_tour
 from ftdrive.planning.search.nodes import DIFFERENT_SHAPES, NUMBERS, WINDOW_RAD, constant_tour
 from ftdrivers.ur.kinematics import MODELS
 
@@ -86,7 +86,7 @@ def test_cone_tour_stays_in_its_cone_clear_and_says_what_the_cone_allows(
     model: str, tool: tuple[Cylinder, ...], half_angle_deg: float, most_cond9: float, least_gap: float
 ) -> None:
     certifier = certifier_of(model, tool)
-    plan = plan_cone(certifier, half_angle_rad=np.radians(half_angle_deg), speeds=Speeds(), guess=guess_of(certifier))
+    plan = _plan_cone(certifier, half_angle_rad=np.radians(half_angle_deg), speeds=Speeds(), guess=guess_of(certifier))
     assert plan.kind == "cone"
     assert plan.why[1].startswith("Their predicted error is")  # not "of that": nothing was said before
     assert plan.certified
@@ -109,14 +109,14 @@ def test_a_tour_in_a_cone_has_an_approach(half_angle_deg: float) -> None:
     """The same orientations with wrist 2 at 270 degrees have none: between, the tool folds against the forearm."""
     certifier = certifier_of()
     half_angle_rad = np.radians(half_angle_deg)
-    plan = plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
+    plan = _plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
     assert plan_approach(certifier, USUAL_POSTURE_RAD, plan.nodes_rad[0], Speeds()).certified
 
 
 @pytest.mark.parametrize("lean_rad", [np.pi / 2, pytest.param(np.radians(26.6), marks=pytest.mark.slow)])
 def test_the_cone_is_about_straight_down_however_the_arm_is_mounted(lean_rad: float) -> None:
     certifier = certifier_of(scene=Scene(lean_rad=lean_rad))
-    plan = plan_cone(certifier, poses=6, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
+    plan = _plan_cone(certifier, poses=6, half_angle_rad=np.radians(40), speeds=Speeds(), guess=guess_of(certifier))
     tool_axis = np.array([step.R_base_flange for step in plan.steps])[:, :, 2]
     assert (tool_axis @ certifier.scene.down_base).min() >= np.cos(np.radians(40)) - 1e-9
 
@@ -125,14 +125,14 @@ def test_the_cone_is_about_straight_down_however_the_arm_is_mounted(lean_rad: fl
 def test_cone_that_cannot_be_is_refused(half_angle_rad: float, words: str) -> None:
     certifier = certifier_of()
     with pytest.raises(ConfigError, match=words):
-        plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
+        _plan_cone(certifier, half_angle_rad=half_angle_rad, speeds=Speeds(), guess=guess_of(certifier))
 
 
 @pytest.mark.slow
 def test_poses_that_leave_a_parameter_unobservable_are_refused() -> None:
     certifier = certifier_of()
     with pytest.raises(PlanRefused, match="informative enough"):
-        plan_cone(certifier, poses=6, half_angle_rad=1e-6, speeds=Speeds(), guess=guess_of(certifier))
+        _plan_cone(certifier, poses=6, half_angle_rad=1e-6, speeds=Speeds(), guess=guess_of(certifier))
 
 
 @pytest.mark.slow
@@ -140,7 +140,7 @@ def test_free_box_tour_keeps_the_flange_in_its_box_and_the_moves_clear() -> None
     certifier = certifier_of("UR3e")
     centre = np.array([0.283, 0.283, 0.3])
     guess = guess_of(certifier)
-    plan = plan_box(certifier, half_size_m=0.1, centre_m=centre, speeds=Speeds(), guess=guess)
+    plan = _plan_box(certifier, half_size_m=0.1, centre_m=centre, speeds=Speeds(), guess=guess)
     assert plan.kind == "box"
     assert plan.certified
     assert not plan.arm_rests
@@ -149,7 +149,7 @@ def test_free_box_tour_keeps_the_flange_in_its_box_and_the_moves_clear() -> None
     assert np.abs(at.flange_m - centre).max() <= 0.1 + 1e-9
     assert np.allclose(at.R_base_flange, special([step.number for step in plan.steps]), atol=1e-9)
     assert len({step.number for step in plan.steps}) == 24
-    assert plan_box(certifier, half_size_m=0.1, centre_m=centre, speeds=Speeds(), guess=guess) == plan
+    assert _plan_box(certifier, half_size_m=0.1, centre_m=centre, speeds=Speeds(), guess=guess) == plan
     # All of wrist and tool stays in the ball, also where the arm moves.
     q = np.array([step.q_rad for step in plan.steps])
     share = np.linspace(0, 1, 200)[:, None, None]
@@ -161,7 +161,7 @@ def test_free_box_tour_keeps_the_flange_in_its_box_and_the_moves_clear() -> None
 def test_free_box_out_of_reach_is_refused() -> None:
     certifier = certifier_of("UR3e")
     with pytest.raises(PlanRefused, match="larger box"):
-        plan_box(certifier, centre_m=(0.9, 0.0, 0.3), speeds=Speeds(), guess=guess_of(certifier))
+        _plan_box(certifier, centre_m=(0.9, 0.0, 0.3), speeds=Speeds(), guess=guess_of(certifier))
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.live.pairing import PERIOD_S, DelayEstimator
-from ftdrive.live.samples import Paired
-from tests.unit.ftdrive.live.simulated import NOISE, P_FLANGE_SENSOR_M, TRUTH, Motion, calibrated, paired
+from ftdrive.stream.pairing import PERIOD_S, DelayEstimator
+from ftdrive.stream.samples import Paired
+from tests.unit.ftdrive.stream.simulated import NOISE, P_FLANGE_SENSOR_M, TRUTH, Motion, calibrated, paired
 
 MOTION = Motion()
 T_S = np.arange(0.0, 2.4, 1e-3)
@@ -79,7 +79,7 @@ def test_the_error_of_the_delay_is_as_its_sigma_says() -> None:
     left = []
     for seed in range(8):
         estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
-        estimator.learn([moved(0.004, 2.01, seed)])
+        estimator.add(moved(0.004, 2.01, seed))
         assert 5e-5 < estimator.sigma_s < 1.5e-4  # 6,000 numbers of 0.05 N, of a force that changes by 10 N/s
         left.append((estimator.delay_s - 0.004) / estimator.sigma_s)
     assert 0.4 < np.sqrt(np.mean(np.square(left))) < 1.6
@@ -89,8 +89,16 @@ def test_every_second_is_one_piece_whatever_the_blocks() -> None:
     rows = paired(np.tile(np.eye(3), (3500, 1, 1)))
     for block in (3500, 700, 90):
         estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
-        pieces = [
-            piece for i in range(0, 3500, block) for piece in estimator._whole_seconds(rows.rows(slice(i, i + block)))
-        ]
+        blocks = (rows.rows(slice(i, i + block)) for i in range(0, 3500, block))
+        pieces = [piece for one in blocks for piece in estimator._whole_seconds(one)]
         assert [(piece.seq[0], len(piece)) for piece in pieces] == [(0, 1000), (1000, 1000), (2000, 1000)]
         assert sum(map(len, estimator._pending)) == 500
+
+
+def test_a_second_whose_push_looks_like_a_delay_does_not_count() -> None:
+    for seconds, found in ((5.01, True), (2.01, False)):
+        rows, estimator = moved(0.004, seconds, 0), DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
+        rows.raw[950:1950, 2] += 6.0
+        estimator.add(rows)
+        assert abs(estimator.delay_s - 0.004) < 3 * estimator.sigma_s
+        assert (estimator.sigma_s < 3e-4) == found  # of two seconds, which one is right?

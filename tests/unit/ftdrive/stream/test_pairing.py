@@ -10,18 +10,11 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ftcalib.errors import BadDataset
 from ftcalib.model import angle_between
-from ftdrive.live.pairing import (
-    RATE_TOLERANCE,
-    DelayEstimator,
-    Pairing,
-    PoseTrack,
-    Timeline,
-    estimate_delay,
-    pair_blocks,
-)
+from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
+from ftdrive.stream.pairing import DelayEstimator, Pairing, PoseTrack, pair_blocks
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated, calibrated_from
+from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, T0_NS, Motion, calibrated, calibrated_from
 
 
 def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -176,7 +169,7 @@ def test_the_delay_between_the_links_is_found_from_motion(
     estimator = DelayEstimator(calibrated(poses), p_flange_sensor_m, window=60)
     samples, states = recording(delay_s)
     pushed = FtSamples.of(samples.t_host_ns, samples.seq, samples.wrench + added)
-    estimate_delay([pushed], [states], estimator)
+    estimator.learn([pushed], lambda: [states])
     assert estimator.delay_s == pytest.approx(delay_s, abs=max(6 * estimator.sigma_s, most_s))
     assert estimator.sigma_s < 2e-4
 
@@ -189,14 +182,14 @@ def test_vibration_and_noisy_poses_are_not_taken_for_a_delay() -> None:
     t_ns, unknown = T0_NS + np.rint(1e9 * one.t_pose_s).astype(np.int64), np.full((len(one.t_pose_s), 6), np.nan)
     states = ArmStates(t_ns, one.t_pose_s, unknown, unknown, one.R_base_flange, one.p_base_flange_m)
     estimator = DelayEstimator(calibration, np.array([0, 0, truth.height_m]), window=60)
-    estimate_delay([samples], [states], estimator)
+    estimator.learn([samples], lambda: [states])
     assert abs(estimator.delay_s - truth.delay_s) < 3 * estimator.sigma_s < 3e-3
 
 
 def test_an_arm_at_rest_shows_no_delay() -> None:
     estimator = DelayEstimator(calibrated(), P_FLANGE_SENSOR_M)
     samples, states = recording(0.02, scale=0.0)
-    estimate_delay([samples], [states], estimator)
+    estimator.learn([samples], lambda: [states])
     assert (estimator.delay_s, estimator.sigma_s) == (0.0, 0.05)
 
 
@@ -208,9 +201,8 @@ def test_recordings_of_different_times_are_rejected() -> None:
 
 def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
     count = np.arange(7000)
-    late_s = np.where(
-        count < 3500, count * 4e-5, 0.14 * np.exp(-(count - 3500) / 300)
-    )  # more and more, then it catches up
+    # more and more, then it catches up
+    late_s = np.where(count < 3500, count * 4e-5, 0.14 * np.exp(-(count - 3500) / 300))
     t_ns = T0_NS + np.maximum.accumulate((count * 1e-3 + late_s) * 1e9).astype(np.int64)
     line = Timeline(1e-3, RATE_TOLERANCE)
     stamps = stamped(line, count, t_ns)

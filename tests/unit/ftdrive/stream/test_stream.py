@@ -17,20 +17,20 @@ from ftcalib.display import MOST_LINES
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
 from ftdrive.errors import ConfigError
 from ftdrive.library import open_stream
-from ftdrive.live import stream as module
-from ftdrive.live.contact import Contact
-from ftdrive.live.samples import Stages, WrenchFrame
-from ftdrive.live.stream import CompensatedStream
-from ftdrive.runs.source import read_calibration
-from ftdrive.runs.verification import FOREIGN
+from ftdrive.runs.calibration import FOREIGN, read_calibration
 from ftdrive.store import tools as named_tools
 from ftdrive.store.tools import Tool
+from ftdrive.stream import sources as module
+from ftdrive.stream.contact import Contact
+from ftdrive.stream.samples import Stages, WrenchFrame
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream
 from ftdrivers.errors import DeviceError, DeviceTimeout
 from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples, Health
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import STATUS
-from tests.unit.ftdrive.live.simulated import DEVICE, NOISE, Motion, calibrated
+from tests.unit.ftdrive.stream.simulated import DEVICE, NOISE, Motion, calibrated
 
 RATE_HZ, ARM_HZ = 1000.0, 500.0
 
@@ -130,8 +130,9 @@ class Cell:
         )
         self.calibration: CalibrationResult = calibrated()
 
-    def stream(self, **options: Any) -> CompensatedStream:
-        return CompensatedStream(self.config, self.calibration, **options)
+    def stream(self, **options: Any) -> Stream:
+        given = {name: options.pop(name) for name in ("name", "force", "devices") if name in options}
+        return Stream(CellSource(self.config, self.calibration, **given), **options)
 
 
 @pytest.fixture
@@ -139,7 +140,7 @@ def cell(monkeypatch: pytest.MonkeyPatch) -> Cell:
     return Cell(monkeypatch)
 
 
-def until(stream: CompensatedStream, done: Callable[[], bool]) -> None:
+def until(stream: Stream, done: Callable[[], bool]) -> None:
     for _ in range(2000):
         stream.read()
         if done():
@@ -211,7 +212,7 @@ def test_a_silent_device_raises_and_recovers_with_events(cell: Cell, device: str
             stream.read()
         link.silent = False
         after = stream.read()
-        stale, gap, recovered = stream.take_events()
+        stale, recovered, gap = stream.take_events()
         status = stream.status()
     assert (stale.kind, stale.values["device"]) == ("stale", device)
     assert (gap.kind, recovered.kind) == ("gap", "recovered")
@@ -404,7 +405,7 @@ def test_the_bias_follows_the_temperature_of_the_sensor(cell: Cell, monkeypatch:
         end_s = cell.clock.now_s() + seconds
         until(stream, lambda: cell.clock.now_s() > end_s)
 
-    with CompensatedStream(cell.config, "gripper") as stream:
+    with Stream(CellSource(cell.config, "gripper")) as stream:
         wait(1.2)
         cell.sensor.now_C = 31.0
         cell.sensor.push = 6 * slope

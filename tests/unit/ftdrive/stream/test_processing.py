@@ -13,17 +13,16 @@ from scipy.signal import butter, lfilter
 from scipy.spatial.transform import Rotation
 
 from ftcalib.after.series import BiasTemperature
-from ftcalib.likelihood.response import ranges
 from ftcalib.model import Array, predict
 from ftcalib.result import MotionResult
-from ftcalib.sensor_matrix import SensorMatrix
+from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftdrive.errors import ConfigError
-from ftdrive.live.processing import Processor
-from ftdrive.live.samples import Axes, Block, FrameTransform, Paired, Point, Stages, WrenchFrame
-from ftdrive.live.stages import stages_in_words
-from ftdrive.live.stream import ProcessedStream
+from ftdrive.stream import processing
+from ftdrive.stream.processing import Processor
+from ftdrive.stream.samples import Axes, Block, FrameTransform, Links, LinkStatus, Paired, Point, Stages, WrenchFrame
+from ftdrive.stream.stages import stages_in_words
 from tests.moving_load import HOME, flange
-from tests.unit.ftdrive.live.simulated import (
+from tests.unit.ftdrive.stream.simulated import (
     NOISE,
     P_FLANGE_SENSOR_M,
     P_FLANGE_TCP_M,
@@ -40,37 +39,28 @@ from tests.unit.ftdrive.live.simulated import (
 
 AXES: tuple[Axes, ...] = ("sensor", "flange", "base", "tcp")
 POINTS: tuple[Point | tuple[float, float, float], ...] = ("sensor", "flange", "tcp", (0.1, -0.2, 0.3))
+LINKS = Links(LinkStatus(1000.0, 1000.0, 0, 0.0), LinkStatus(500.0, 500.0, 0, 0.0), 0.0, 0.0)
 UPSIDE_DOWN = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
-
-
-class Fed(ProcessedStream):
-    """A stream whose samples the test brings."""
-
-    def read(self) -> Any:
-        raise NotImplementedError
-
-    def status(self) -> Any:
-        raise NotImplementedError
 
 
 def still(seconds: float, rate_Hz: float = 1000.0) -> Array:
     return np.tile(UPSIDE_DOWN, (round(seconds * rate_Hz), 1, 1))
 
 
-def processed(rows: Paired, *, block: int = 50, rate_Hz: float = 1000.0, **options: Any) -> tuple[Fed, Block]:
+def processed(rows: Paired, *, block: int = 50, rate_Hz: float = 1000.0, **options: Any) -> tuple[Processor, Block]:
     """Process in blocks; the block returned has all rows."""
-    processor = Fed(info(calibrated(), rate_Hz), **options)
+    processor = Processor(info(calibrated(), rate_Hz), **options)
     return processor, run(processor, rows, block)
 
 
-def run(processor: Fed, rows: Paired, block: int = 50) -> Block:
+def run(processor: Processor, rows: Paired, block: int = 50) -> Block:
     blocks = [processor.process(rows.rows(slice(i, i + block))) for i in range(0, len(rows), block)]
     columns = ("t_host_ns", "wrench", "chi2", "in_contact", "seq")
     joined: dict[str, Any] = {name: np.concatenate([getattr(b, name) for b in blocks]) for name in columns}
     return replace(blocks[-1], **joined)
 
 
-def kinds(processor: Fed) -> list[str]:
+def kinds(processor: Processor) -> list[str]:
     return [event.kind for event in processor.take_events()]
 
 
@@ -136,11 +126,11 @@ def test_a_frame_needs_the_height_of_the_sensor() -> None:
     for about in ("flange", "tcp", (0.0, 0.0, 0.1)):
         with pytest.raises(ConfigError, match=r"\[sensor\] height_mm"):
             FrameTransform(WrenchFrame("sensor", about), without)
-    processor = Fed(without)
+    processor = Processor(without)
     with pytest.raises(ConfigError, match="height_mm"):
         processor.frame = WrenchFrame("base", "tcp")
     with pytest.raises(ConfigError, match="height_mm"):
-        processor.stages = Stages(inertia=True)
+        processor.settings = Stages(inertia=True)
     assert processor.frame == WrenchFrame()
     assert kinds(processor) == []
 
@@ -166,15 +156,15 @@ def test_each_stage_is_what_it_says() -> None:
         (Stages(deadband_N=1.0, deadband_Nm=10.0), np.r_[push[:3] * (1 - 1 / np.sqrt(14)), 0, 0, 0]),
         (Stages(lowpass_Hz=10.0, notch_Hz=50.0), push),  # no transient at the beginning
     ):
-        _, block = processed(rows, block=50, stages=stages)
+        _, block = processed(rows, block=50, settings=stages)
         np.testing.assert_allclose(block.wrench, np.tile(expected, (200, 1)), atol=0.02)
 
 
 def test_blocks_of_any_size_give_the_same() -> None:
     rows = moving(0.6)
     stages = Stages(lowpass_Hz=30.0, notch_Hz=100.0, inertia=True)
-    _, small = processed(rows, block=7, stages=stages)
-    processor = Fed(info(calibrated()), stages=stages)
+    _, small = processed(rows, block=7, settings=stages)
+    processor = Processor(info(calibrated()), settings=stages)
     large = processor.process(rows, last=True)
     n = len(small.t_host_ns)
     assert n > 550  # the last rows wait for poses after them
@@ -185,19 +175,19 @@ def test_blocks_of_any_size_give_the_same() -> None:
 
 def test_a_lowpass_reduces_the_noise_as_its_sigma_says() -> None:
     rows = paired(still(8.0))
-    processor, block = processed(rows, block=400, stages=Stages(lowpass_Hz=40.0))
+    processor, block = processed(rows, block=400, settings=Stages(lowpass_Hz=40.0))
     assert block.wrench[2000:].std(axis=0) == pytest.approx(block.sigma, rel=0.1)
     assert block.sigma[0] < 0.4 * NOISE[0]
     _, plain = processed(rows, block=400)
     assert plain.sigma == pytest.approx(NOISE, rel=0.05)
-    assert stages_in_words(processor.stages) == "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
+    assert stages_in_words(processor.settings) == "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
 
 
 def test_a_switch_of_stages_has_no_transient() -> None:
     push = np.array([0, 0, 20.0, 0, 0, 0])
-    processor = Fed(info(calibrated()), stages=Stages(lowpass_Hz=5.0))
+    processor = Processor(info(calibrated()), settings=Stages(lowpass_Hz=5.0))
     run(processor, paired(still(0.3), push=push, noise=0.01))
-    processor.stages = Stages(gravity=False, lowpass_Hz=5.0)
+    processor.settings = Stages(gravity=False, lowpass_Hz=5.0)
     weight = predict(TRUTH, UPSIDE_DOWN)[:3] - TRUTH.force_bias_N
     block = run(processor, paired(still(0.3), push=push, noise=0.01))
     np.testing.assert_allclose(block.wrench[:, :3] - weight, np.tile(push[:3], (300, 1)), atol=0.02)
@@ -206,13 +196,13 @@ def test_a_switch_of_stages_has_no_transient() -> None:
 
 def test_an_impossible_filter_is_rejected() -> None:
     with pytest.raises(ConfigError, match="less than 500 Hz"):
-        Fed(info(calibrated()), stages=Stages(lowpass_Hz=600.0))
+        Processor(info(calibrated()), settings=Stages(lowpass_Hz=600.0))
 
 
 def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
     rows = moving(3.0)
     _, static = processed(rows)
-    _, dynamic = processed(rows, stages=Stages(inertia=True))
+    _, dynamic = processed(rows, settings=Stages(inertia=True))
     assert (static.wrench.std(axis=0) > 4 * NOISE).all()
     assert dynamic.wrench.std(axis=0) == pytest.approx(NOISE, rel=0.1)
     assert len(static.seq) - len(dynamic.seq) <= 18  # milliseconds
@@ -221,7 +211,7 @@ def test_inertia_leaves_only_noise_of_a_moving_tool() -> None:
 def test_repeated_times_delay_the_inertia_stage_only() -> None:
     rows = moving(0.4)
     coarse = replace(rows, t_host_ns=rows.t_host_ns // 20_000_000 * 20_000_000)
-    _, block = processed(coarse, stages=Stages(inertia=True))
+    _, block = processed(coarse, settings=Stages(inertia=True))
     assert len(block.seq) > 100
     assert np.isfinite(block.wrench).all()
 
@@ -229,10 +219,10 @@ def test_repeated_times_delay_the_inertia_stage_only() -> None:
 def test_a_known_inertia_tensor_is_subtracted_too() -> None:
     tensor = np.diag([0.01, 0.02, 0.03])
     rows = moving(3.0)
-    _, point = processed(rows, block=500, stages=Stages(inertia=True))
+    _, point = processed(rows, block=500, settings=Stages(inertia=True))
     in_motion = replace(calibrated(), motion=MotionResult(tensor, 0.0, 0.03, np.eye(23), 1.0))
-    processor = Fed(info(in_motion))
-    assert processor.stages.inertia, "a stage that is on where the calibration has what it needs"
+    processor = Processor(info(in_motion))
+    assert processor.settings.inertia, "a stage that is on where the calibration has what it needs"
     body = run(processor, rows, 500)
     difference = body.wrench - point.wrench
     assert np.abs(difference[:, :3]).max() < 1e-9
@@ -259,13 +249,14 @@ def test_a_free_tool_is_noise_and_no_contact() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("poses", [24, 6])
-def test_false_alarms_are_as_rare_as_stated(poses: int) -> None:
+def test_false_alarms_are_as_rare_as_stated(poses: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(processing, "FALSE_ALARM_RATE", 0.01)
     alarms = readings = 0
     for seed in range(8):
         R = np.concatenate([np.repeat(dwells(1, 1, seed), 20_000, axis=0), dwells(100, 740, seed + 1000)])
-        processor = Fed(info(calibrated(poses, seed)), false_alarm_rate=0.01)
+        processor = Processor(info(calibrated(poses, seed)))
         chi2 = processor.process(paired(R, seed=seed)).chi2[20_000:].reshape(100, 740)[:, 559::20].ravel()  # at rest
-        alarms, readings = alarms + int((chi2 > processor.contact_limit).sum()), readings + len(chi2)
+        alarms, readings = alarms + int((chi2 > processor.status(LINKS).contact_limit).sum()), readings + len(chi2)
     assert readings == 8 * 1000
     assert 0.003 < alarms / readings < 0.012
 
@@ -299,7 +290,7 @@ def test_a_contact_is_reported_after_40_ms_and_at_its_end_and_a_shorter_touch_is
     push = np.zeros((2800, 6))
     for start, stop in ((1500, 2100), (2600, 2615)):
         push[start:stop, 2] = 8.0
-    rows, processor = paired(still(2.8), push=push), Fed(info(calibrated()))
+    rows, processor = paired(still(2.8), push=push), Processor(info(calibrated()))
     processor.process(rows.rows(slice(0, 1400)))
     changes = []
     for i in range(1400, len(rows), 10):
@@ -443,7 +434,7 @@ def test_a_tare_is_refused_while_the_arm_moves() -> None:
 
 
 def test_a_tare_without_samples_is_refused() -> None:
-    assert Fed(info(calibrated())).tare().kind == "tare-refused"
+    assert Processor(info(calibrated())).tare().kind == "tare-refused"
     processor, _ = processed(paired(still(0.1)))
     assert "only 100 samples" in processor.tare().text
 
@@ -454,7 +445,8 @@ def test_drift_is_found_with_its_sigma_and_warned_of_once(per_h: float) -> None:
     drift = np.outer(per_h * np.arange(n) / 100 / 3600, np.eye(6)[0])
     rows = paired(np.tile(UPSIDE_DOWN, (n, 1, 1)), 100.0, push=drift)
     processor, _ = processed(rows, block=2000, rate_Hz=100.0)
-    rate, sigma = processor._drift.force_rate_N_h
+    status = processor.status(LINKS)
+    rate, sigma = status.drift_N_h, status.drift_sigma_N_h
     assert sigma < 2.0
     assert rate == pytest.approx(per_h, abs=6 * sigma)
     assert kinds(processor).count("drift") == (per_h > 0)
@@ -467,22 +459,22 @@ def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_one
     warmth = BiasTemperature(slope, np.full(6, 1e-3), 12, 15.0, 40.0, *errors, np.zeros(2))
     made = calibrated()
     known = replace(made, provenance={**made.provenance, "temperature_C": 20.0})
-    processor = Fed(info(known), temperature=warmth)
+    processor = Processor(info(known), temperature=warmth)
     for temperature_C, bias_C in ((20.04, 20.0), (20.06, 20.06), (20.95, 20.95)):
-        processor.warm(temperature_C)
-        change = processor.reference()[0].parameters.bias - made.parameters.bias
+        processor.monitor.warm(temperature_C)
+        change = processor.monitor.reference()[0].parameters.bias - made.parameters.bias
         np.testing.assert_allclose(change, slope * (bias_C - 20.0), atol=1e-12)
         assert not kinds(processor)
-    processor.warm(21.04)
+    processor.monitor.warm(21.04)
     (event,) = processor.take_events()
     assert (event.kind, event.text) == ("temperature", "sensor at 21.0 °C: bias corrected by 0.52 N")
     assert event.values["change"] == pytest.approx((slope * 1.04).tolist())
-    processor.warm(22.0)  # less than 1 °C after the last event
-    processor.warm(20.02)
+    processor.monitor.warm(22.0)  # less than 1 °C after the last event
+    processor.monitor.warm(20.02)
     assert kinds(processor) == ["temperature"]
-    for unknown in (Fed(info(made), temperature=warmth), Fed(info(known))):
-        unknown.warm(35.0)
-        assert unknown.reference()[0].parameters.bias.tolist() == made.parameters.bias.tolist()
+    for unknown in (Processor(info(made), temperature=warmth), Processor(info(known))):
+        unknown.monitor.warm(35.0)
+        assert unknown.monitor.reference()[0].parameters.bias.tolist() == made.parameters.bias.tolist()
         assert not kinds(unknown)
 
 
@@ -490,7 +482,7 @@ def test_sigma_grows_with_the_age_of_the_bias_until_a_tare() -> None:
     moves = np.repeat([0.3, 0.01], 3)
     made = {"created_utc": datetime.fromtimestamp(T0_NS * 1e-9 - 4 * 3600, UTC).isoformat()}
     calibration = replace(calibrated(), provenance=made)
-    known, unknown = (Fed(replace(info(calibration), hour_change=change)) for change in (moves, None))
+    known, unknown = (Processor(replace(info(calibration), hour_change=change)) for change in (moves, None))
 
     def added() -> Array:
         """What the history adds to the variance."""

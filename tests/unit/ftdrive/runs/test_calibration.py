@@ -12,7 +12,7 @@ import pytest
 from ftcalib import CalibrationResult, solve
 from ftcalib.errors import BadCalibration
 from ftcalib.sensor_matrix import SensorMatrix
-from ftdrive.runs.sensor_file import sensor_identity, with_sensor
+from ftdrive.runs.calibration import sensor_identity, with_sensor
 from ftdrivers.interfaces import NOT_REPORTED
 from tests.loaded_sensor import PROTOCOLS, LoadedSensor
 

@@ -1,4 +1,4 @@
-"""What the screen keeps: means, extremes, contact; cleared when they would mean something else."""
+"""What the model of a stream keeps: means, extremes, contact, and the recent past in memory of fixed size."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,10 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
-from ftdrive.live.samples import Block, WrenchFrame
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.terminal.live_view import ShownWrench, Summary, View
-from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream
+from ftdrive.stream.feed import History
+from ftdrive.stream.samples import Block, WrenchFrame
+from ftdrive.words.stream import ShownWrench, Summary, View
+from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream, SteppedFeed
+
+MS = 1_000_000
+BEGIN_NS = 5_000_000_000_000
 
 
 class Rig:
@@ -20,12 +23,11 @@ class Rig:
 
     def __init__(self, stream: FakeStream, dataset: CalibrationDataset | None = None, *checks: Check) -> None:
         self.stream = stream
-        self.feed = Feed(stream)
+        self.feed = SteppedFeed(stream)
         self.summary = Summary(self.feed, checks, dataset)
 
     def run(self, blocks: int) -> View:
-        for _ in range(blocks):
-            self.feed.step()
+        self.feed.step(blocks)
         return self.summary.view()
 
 
@@ -37,13 +39,20 @@ def reading_of(view: View) -> ShownWrench:
 def test_numbers_are_the_mean_of_the_last_tenth_of_a_second() -> None:
     rig = Rig(FakeStream("contact"))
     rig.run(23)
-    news = rig.feed.subscribe()
-    for _ in range(10):
-        rig.feed.step()
-    last = list(news.blocks)
+    last, _ = rig.feed.subscribe()
+    rig.feed.step(10)
     view = rig.summary.view()
     np.testing.assert_allclose(reading_of(view).wrench, np.concatenate([block.wrench for block in last]).mean(axis=0))
     np.testing.assert_allclose(reading_of(view).raw, np.concatenate([block.raw for block in last]).mean(axis=0))
+
+
+def test_a_recording_that_goes_back_between_two_drawings_leaves_nothing_in_the_mean() -> None:
+    rig = Rig(FakeStream("contact", block_s=0.05))
+    rig.feed.step(240)  # in contact, with 5 N
+    rig.stream.blocks = 20
+    reading = reading_of(rig.run(1))
+    assert not reading.in_contact
+    assert np.abs(reading.wrench).max() < SIGMA[0]
 
 
 def test_the_result_does_not_depend_on_when_it_is_drawn() -> None:
@@ -61,7 +70,7 @@ def test_peaks_are_of_single_samples_until_they_are_reset() -> None:
     rig = Rig(FakeStream(block_s=0.05))
     view = rig.run(124)  # a push of 8 N
     assert view.peaks.high[2] == pytest.approx(7.8, abs=0.3)
-    assert view.peaks.force_N == pytest.approx(8.1, abs=0.2)
+    assert view.peaks.sizes[0] == pytest.approx(8.1, abs=0.2)
     rig.summary.reset_peaks()
     assert rig.run(10).peaks.high[2] < 7 * SIGMA[0]
 
@@ -106,6 +115,13 @@ def test_old_numbers_are_named_silent_with_their_device() -> None:
     assert view.silent == "ATI Mini45: no sample for 0.31 s"
 
 
+def test_numbers_are_not_live_while_nothing_reads_the_stream() -> None:
+    rig = Rig(FakeStream())
+    assert not rig.run(1).silent
+    rig.feed.turned_ns -= 3_000_000_000
+    assert "nothing was read for 3 s" in rig.summary.view().silent
+
+
 def dataset(noise: float) -> CalibrationDataset:
     """Twelve poses of 1000 samples with white noise of this factor of `SIGMA`."""
     cov = np.tile(np.diag((noise * SIGMA) ** 2 / 1000), (12, 1, 1))
@@ -147,3 +163,65 @@ def test_a_failed_check_is_among_the_events() -> None:
     check = Check("calibration.devices", "failed", "the calibration was made with the sensor A", "ftdrive calibrate")
     view = Rig(FakeStream(), None, check).run(1)
     assert view.notes[0].text == "the calibration was made with the sensor A. Fix: ftdrive calibrate"
+
+
+def filled(span_s: float, duration_s: float, rate_Hz: int, block: int = 7) -> tuple[History, np.ndarray, np.ndarray]:
+    """A history fed in blocks, with the samples themselves."""
+    n = round(duration_s * rate_Hz)
+    t_ns = BEGIN_NS + np.arange(n) * (1_000_000_000 // rate_Hz)
+    wrench = np.random.default_rng(1).normal(size=(n, 6))
+    history = History(span_s)
+    for i in range(0, n, block):
+        rows = slice(i, i + block)
+        history.add(t_ns[rows], wrench[rows], wrench[rows, 0] > 2.5)
+    return history, t_ns, wrench
+
+
+@pytest.mark.parametrize("n", [28, 146, 200])
+def test_each_column_has_the_extremes_of_its_own_time(n: int) -> None:
+    history, t_ns, wrench = filled(2.0, 5.0, 1000)
+    columns = history.columns(int(t_ns[-1]), n, (int(t_ns[-1]), 0))
+    assert columns.span_s == pytest.approx(2.0, rel=0.2)
+    for column in range(n):
+        start_ns = columns.start_ns + column * columns.column_ns
+        inside = wrench[(t_ns >= start_ns) & (t_ns < start_ns + columns.column_ns)]
+        np.testing.assert_array_equal(columns.low[:, column], inside.min(axis=0))
+        np.testing.assert_array_equal(columns.high[:, column], inside.max(axis=0))
+        assert columns.in_contact[column] == (inside[:, 0] > 2.5).any()
+    assert columns.marks == {n - 1}
+
+
+def test_a_column_does_not_change_when_time_goes_on() -> None:
+    history, t_ns, _ = filled(2.0, 3.0, 1000)
+    before = history.columns(int(t_ns[-1]), 100)
+    later_ns = int(t_ns[-1]) + 3 * before.column_ns
+    history.add(np.array([later_ns]), np.full((1, 6), 50.0), np.array([False]))
+    after = history.columns(later_ns, 100)
+    assert after.start_ns == before.start_ns + 3 * before.column_ns
+    np.testing.assert_array_equal(after.low[:, :96], before.low[:, 3:99])
+
+
+def test_what_was_not_sampled_stays_empty() -> None:
+    history, t_ns, _ = filled(10.0, 1.0, 1000)
+    columns = history.columns(int(t_ns[-1]), 100)
+    assert np.isnan(columns.low[:, :85]).all()
+    assert np.isfinite(columns.high[:, -8:]).all()
+    history.clear()
+    assert np.isnan(history.columns(int(t_ns[-1]), 100).low).all()
+
+
+def test_a_recording_that_goes_back_shows_what_was_there() -> None:
+    history, t_ns, wrench = filled(2.0, 3.0, 1000)
+    then = history.columns(int(t_ns[2500]), 100)
+    rows = slice(2384, 2501)
+    history.add(t_ns[rows], wrench[rows], wrench[rows, 0] > 2.5)
+    again = history.columns(int(t_ns[2500]), 100)
+    np.testing.assert_array_equal(then.high[:, :-1], again.high[:, :-1])
+
+
+def test_memory_is_flat() -> None:
+    history, t_ns, _ = filled(2.0, 1.0, 1000)
+    size = sum(value.nbytes for value in vars(history).values() if isinstance(value, np.ndarray))
+    for k in range(1, 50):
+        history.add(t_ns + k * 1000 * MS, np.zeros((len(t_ns), 6)), np.zeros(len(t_ns), np.bool_))
+    assert size == sum(value.nbytes for value in vars(history).values() if isinstance(value, np.ndarray)) < 250_000

@@ -6,13 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array, skew
-from ftdrive.live.motion import REST
-from ftdrive.live.noise import SensorNoise
-from ftdrive.live.samples import Paired
-from ftdrive.live.tracking import Window, Windows
-from tests.unit.ftdrive.live.simulated import (
+from ftdrive.stream.motion import REST
+from ftdrive.stream.noise import SensorNoise, Window, Windows
+from ftdrive.stream.samples import Paired
+from tests.unit.ftdrive.stream.simulated import (
     P_FLANGE_SENSOR_M,
     T0_NS,
     TRUTH,
@@ -25,16 +23,17 @@ from tests.unit.ftdrive.live.simulated import (
 )
 
 NOISE = SensorNoise(np.eye(6), np.diag(np.arange(1.0, 7.0)), np.zeros((6, 6)), 100.0)
+SYSTEMATIC = np.diag(np.arange(7.0, 13.0))
 MASS_KG = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
 H_S = 1e-3
 
 
 def windows(rows: Paired, state: int) -> list[Window]:
     noise: Any = KnownNoise(NOISE)
-    collected, found = Windows(info(calibrated())), []
+    collected, found = Windows(info(calibrated())), list[Window]()
     for i in range(0, len(rows), 70):
         part = rows.rows(slice(i, i + 70))
-        found += list(collected.add(part, np.full(len(part), state, np.int8), noise))
+        found += collected.add(part, np.full(len(part), state, np.int8), noise, SYSTEMATIC)
     return found
 
 
@@ -57,12 +56,8 @@ def rates(motion: Motion, t_s: Array) -> tuple[Array, Array, Array]:
 
 
 def test_a_window_has_the_motion_of_the_sensor() -> None:
-    motion, calibration = Motion(), calibrated()
+    motion = Motion()
     found = windows(moving(1.0, motion, noise=0.0), 3)
-    covariance = calibration.covariance.copy()
-    covariance[[6, 7, 8, 12, 13, 14]] = 0.0  # the bias is what is tracked
-    covariance[:, [6, 7, 8, 12, 13, 14]] = 0.0
-    beyond = (np.square(calibration.likely_error()) - np.square(calibration.predicted_error())).clip(0) / 3
     times_s = np.array([one.t_s for one in found]) - T0_NS * 1e-9
     np.testing.assert_allclose(np.diff(times_s), 0.15, atol=1e-9)
     assert times_s[0] == pytest.approx(0.02 + 0.15)  # after five knots of 4 ms
@@ -84,9 +79,8 @@ def test_a_window_has_the_motion_of_the_sensor() -> None:
         np.testing.assert_allclose(window.p_base_flange_m, motion.pose(t_s[150:151])[1][0])
         np.testing.assert_allclose(window.noise, 1.5 * 0.02 / 0.3 * NOISE.reading)
         assert window.state == 3
-        R_base_flange = motion.pose(t_s[150:151])[0][0]
-        error = predicted_covariance(calibration.parameters, covariance, calibration.response, R_base_flange)
-        np.testing.assert_allclose(window.systematic, error + np.diag(np.repeat(beyond, 3)))
+        np.testing.assert_allclose(window.R_base_flange, motion.pose(t_s[150:151])[0][0])
+        assert window.systematic is SYSTEMATIC
 
 
 def test_inertia_counts_in_motion_only_and_a_window_without_all_samples_is_left_out() -> None:

@@ -10,9 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.model import Array, predict
-from ftdrive.live.noise import SensorNoise
-from ftdrive.live.samples import Paired, StreamInfo
+from ftdrive.stream.noise import SensorNoise
+from ftdrive.stream.samples import Paired, StreamInfo
+from ftdrive.stream.sources import RecordingSource
+from ftdrive.stream.stream import Stream
 from ftdrivers.interfaces import ArmStates, DeviceInfo, FtSamples
+from tests.fake_clock import FakeClock
 
 G = 9.80665
 NOISE = np.repeat([0.05, 0.002], 3)
@@ -58,7 +61,7 @@ def calibrated_from(truth: Mapping[str, Any], seed: int = 1) -> CalibrationResul
 
 def info(calibration: CalibrationResult, rate_Hz: float = 1000.0, *, height: bool = True) -> StreamInfo:
     return StreamInfo(
-        calibration=calibration,
+        result=calibration,
         calibration_name="calibration.json",
         arm=DEVICE,
         sensor=DEVICE,
@@ -71,6 +74,11 @@ def info(calibration: CalibrationResult, rate_Hz: float = 1000.0, *, height: boo
         p_flange_tcp_m=P_FLANGE_TCP_M,
         versions={},
     )
+
+
+def replayed(known: StreamInfo, rows: Paired, *, speed: float = 1.0, **options: Any) -> Stream:
+    """Open a recording in place of a cell, on a clock that only the stream advances."""
+    return Stream(RecordingSource(known, rows, speed=speed, clock=options.pop("clock", FakeClock())), **options).open()
 
 
 def paired(

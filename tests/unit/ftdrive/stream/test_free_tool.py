@@ -1,6 +1,7 @@
-"""Bias and part of a program that picks, carries, places and touches, while the bias drifts."""
+"""Bias, drift and part of a program that picks, carries, places and touches, while the bias drifts."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,21 +9,30 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from ftcalib.model import Array
-from ftdrive.live.motion import REST
-from ftdrive.live.samples import StreamEvent, Tracked
-from ftdrive.live.tracking import Tracker, Window, _corrected, _less, _log_likelihood, _observed, _place
+from ftdrive.stream.free_tool import ANY_BIAS, FreeToolFilter, _corrected, _less, _observed, _place, _State
+from ftdrive.stream.motion import REST
+from ftdrive.stream.noise import Window
+from ftdrive.stream.samples import StreamEvent, Tracked
 
 NOISE = np.repeat([0.08, 0.004], 3)
 G_M_S2, WINDOW_S = 9.81, 0.15
+UNIT = np.repeat([1.0, 0.03], 3)
 DRIFT = np.array([0.8, -0.5, 0.33, 0.02, 0.01, -0.02]) / 3600
 """1 N an hour."""
+
+
+def free_tool(mass_kg: float = 1.2, height_m: float = 0.06, *, is_known: bool = True, **options: Any) -> FreeToolFilter:
+    found = FreeToolFilter(mass_kg, np.array([0.0, 0.0, height_m]), np.zeros(6), **options)
+    if not is_known:
+        found.expect(ANY_BIAS)
+    return found
 
 
 class Program:
     """A tool that turns, and what the tracker says of each window."""
 
     def __init__(self, seed: int) -> None:
-        self.rng, self.tracker = np.random.default_rng(seed), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+        self.rng, self.tracker = np.random.default_rng(seed), free_tool(is_known=False)
         self.R, self.t_s, self.part_kg, self.p_m = Rotation.identity(), 0.0, 0.0, np.array([0, 0.01, 0.12])
         self.events: list[StreamEvent] = []
         self.off = list[float]()
@@ -57,7 +67,9 @@ class Program:
                     systematic=np.zeros((6, 6)),
                     turning_rad_s2=0.0,
                     tensor_Nm=0.0,
+                    R_base_flange=self.R.as_matrix(),
                     p_base_flange_m=np.zeros(3),
+                    as_read=np.eye(6),
                 )
             )
             self.events += self.last.events
@@ -145,7 +157,9 @@ WINDOW = Window(
     systematic=np.zeros((6, 6)),
     turning_rad_s2=2.0,
     tensor_Nm=0.05,
+    R_base_flange=np.eye(3),
     p_base_flange_m=np.zeros(3),
+    as_read=np.eye(6),
 )
 
 
@@ -154,33 +168,37 @@ def covariances(rng: np.random.Generator, n: int, size: int) -> Array:
     return roots @ np.swapaxes(roots, 1, 2) + np.eye(size)
 
 
+def state(x: Array, P: Array) -> _State:
+    return _State(x, P, 0.0, np.eye(3))
+
+
 @pytest.mark.parametrize("p_m", [None, np.array([0.03, 0.01, 0.2])])
 def test_a_part_is_a_point_mass(p_m: Array | None) -> None:
     at_m = WINDOW.p_sensor_near_m if p_m is None else p_m
     force_N = 1.5 * (WINDOW.felt_m_s2 - WINDOW.lever_s2 @ at_m)
     bias = np.arange(6.0)
-    wrench = _observed(WINDOW, p_m) @ np.r_[bias, 1.5, 1.5 * at_m]
-    np.testing.assert_allclose(wrench, bias + np.r_[force_N, np.cross(at_m, force_N)])
+    local, as_read = np.arange(6.0) ** 2, np.eye(6) + 0.01 * np.arange(36.0).reshape(6, 6)
+    wrench = _observed(replace(WINDOW, as_read=as_read), p_m) @ np.r_[bias, np.ones(6), local, 1.5, 1.5 * at_m]
+    np.testing.assert_allclose(wrench, bias + local + as_read @ np.r_[force_N, np.cross(at_m, force_N)])
 
 
 def test_a_place_is_known_from_3_cm_on_and_of_a_part_only() -> None:
-    x, P = np.r_[np.zeros(6), 2.0, 0.2, 0.4, 0.6], np.zeros((10, 10))
+    x, P = np.r_[np.zeros(18), 2.0, 0.2, 0.4, 0.6], np.zeros((22, 22))
     for at, known in ((0.0599, True), (0.0601, False)):
-        P[range(7, 10), range(7, 10)] = at**2 / 3
-        place = _place(x, P)
+        P[range(19, 22), range(19, 22)] = at**2 / 3
+        place = _place(state(x, P))
         assert (place is not None) == known
         if place is not None:
             np.testing.assert_allclose(place, [0.1, 0.2, 0.3])
-    assert _place(np.r_[np.zeros(6), 0.0199, np.zeros(3)], 0 * P) is None
-    assert _place(np.r_[np.zeros(6), 0.0201, np.zeros(3)], 0 * P) is not None
+    assert _place(state(np.r_[np.zeros(18), 0.0199, np.zeros(3)], 0 * P)) is None
+    assert _place(state(np.r_[np.zeros(18), 0.0201, np.zeros(3)], 0 * P)) is not None
 
 
 def test_a_correction_is_that_of_the_information_form() -> None:
     rng = np.random.default_rng(4)
     x, P, C = rng.standard_normal((2, 10)), covariances(rng, 2, 10), covariances(rng, 1, 6)[0]
     H, y = rng.standard_normal((6, 10)), rng.standard_normal(6)
-    found, found_P = _corrected(x, P, y, C, H)
-    likelihood = _log_likelihood(x, P, y, C, H)
+    (found, found_P, *_), likelihood = _corrected(state(x, P), y, C, H)
     expected = []
     for k in range(2):
         information = np.linalg.inv(P[k]) + H.T @ np.linalg.inv(C) @ H
@@ -193,24 +211,23 @@ def test_a_correction_is_that_of_the_information_form() -> None:
 
 
 def test_states_are_mixed_by_the_likelihood_of_their_walks() -> None:
-    tracker, rng = Tracker(1.0, np.zeros(3)), np.random.default_rng(5)
-    tracker._likelihood = np.log([1.0, 2.0, 3.0, 4.0]) - 700.0
+    tracker, rng = free_tool(walks_N=(0.1, 0.3, 1.0, 3.0)), np.random.default_rng(5)
     x, P = rng.standard_normal((4, 10)), covariances(rng, 4, 10)
-    mean, covariance = tracker._mixed(x, P)
-    weights = np.array([0.1, 0.2, 0.3, 0.4])
+    tracker._weights = weights = np.array([0.1, 0.2, 0.3, 0.4])
+    mean, covariance, *_ = tracker._mixed(state(x, P))
     np.testing.assert_allclose(mean, weights @ x)
     second = sum(w * (one + np.outer(at, at)) for w, at, one in zip(weights, x, P, strict=True))
     np.testing.assert_allclose(covariance, second - np.outer(mean, mean), atol=1e-9)
 
 
 def test_vibration_shakes_a_part_as_it_shakes_the_tool() -> None:
-    tracker = Tracker(2.0, np.array([0.0, 0.0, 0.1]))
+    tracker = free_tool(2.0, 0.1)
     still = replace(WINDOW, turning_rad_s2=0.0, tensor_Nm=0.0)
-    moment = np.array([0.0, 0.03, 0.04])  # a quarter of that of the tool
+    part = np.array([1.0, 0.0, 0.03, 0.04])  # a quarter of that of the tool
     scale = np.repeat([1.5, 1.25], 3)  # half the mass of the tool
-    np.testing.assert_allclose(tracker._covariance(still, 1.0, moment), np.diag(np.diag(WINDOW.noise) * scale**2))
-    np.testing.assert_allclose(tracker._covariance(replace(still, state=REST), 1.0, moment), WINDOW.noise)
-    turning = tracker._covariance(WINDOW, 1.0, moment) - tracker._covariance(still, 1.0, moment)
+    np.testing.assert_allclose(tracker._covariance(still, part), np.diag(np.diag(WINDOW.noise) * scale**2))
+    np.testing.assert_allclose(tracker._covariance(replace(still, state=REST), part), WINDOW.noise)
+    turning = tracker._covariance(WINDOW, part) - tracker._covariance(still, part)
     inertia_kg_m2 = 1.0 * 0.08**2  # of a part whose radius of gyration is 8 cm
     np.testing.assert_allclose(turning, np.diag([0, 0, 0, *[(inertia_kg_m2 * 2.0) ** 2 + 0.05**2] * 3]), atol=1e-12)
 
@@ -227,16 +244,16 @@ def test_a_part_is_new_once_gravity_has_turned_or_the_arm_has_gone() -> None:
     def gone(*p_m: float) -> Window:
         return replace(turned(0.0), p_base_flange_m=np.array(p_m))
 
-    assert not Tracker._moved([turned(0.0), turned(0.249), turned(0.0)])
-    assert Tracker._moved([turned(0.0), turned(0.251), turned(0.0)])
-    assert not Tracker._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.04), gone(1, 2, 3)])
-    assert Tracker._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.06), gone(1, 2, 3)])
-    assert not Tracker._moved([gone(np.nan, np.nan, np.nan)] * 2)
+    assert not FreeToolFilter._moved([turned(0.0), turned(0.249), turned(0.0)])
+    assert FreeToolFilter._moved([turned(0.0), turned(0.251), turned(0.0)])
+    assert not FreeToolFilter._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.04), gone(1, 2, 3)])
+    assert FreeToolFilter._moved([gone(1, 2, 3), gone(1.1, 2.1, 3.06), gone(1, 2, 3)])
+    assert not FreeToolFilter._moved([gone(np.nan, np.nan, np.nan)] * 2)
 
 
 @pytest.mark.parametrize("walk_N", [0.0, 3.0])
 def test_noise_and_walk_are_learnt(walk_N: float) -> None:
-    rng, tracker = np.random.default_rng(6), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    rng, tracker = np.random.default_rng(6), free_tool(is_known=False)
     noise, bias = NOISE * [1, 2, 1, 1, 0.5, 1], np.zeros(6)
     step = walk_N * np.repeat([1.0, 0.03], 3) / 60  # in a second, of what it is in an hour
     squares = list[float]()
@@ -256,10 +273,10 @@ def test_noise_and_walk_are_learnt(walk_N: float) -> None:
         )
         tracked = tracker.update(still)
         squares.append(float(np.square((tracked.bias - bias) / tracked.sigma).mean()))
-    assert 0.5 < np.mean(squares[50:]) < 2.0
-    assert abs(np.log(tracked.walk_N / max(walk_N, 0.2))) < np.log(2)
+    assert 0.3 < np.mean(squares[50:]) < 2.0  # a drift is not excluded
+    assert abs(np.log(tracked.walk_N / max(walk_N, 0.1))) < np.log(2)
     if not walk_N:
-        learnt = np.sqrt(np.diag(tracker._covariance(still, 0.0, np.zeros(3))))
+        learnt = np.sqrt(np.diag(tracker._covariance(still, np.zeros(4))))
         np.testing.assert_allclose(learnt, noise, rtol=0.2)
 
 
@@ -277,7 +294,7 @@ def at_rest(t_s: float, residual: Array) -> Window:
 
 
 def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma() -> None:
-    rng, tracker = np.random.default_rng(9), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    rng, tracker = np.random.default_rng(9), free_tool()
     contact, events = 3.0 * np.array([0.6, 0.0, -0.8, 0.005, 0.01, 0.0]), list[StreamEvent]()
     for t_s in np.arange(0.0, 400.0):
         held = contact * np.clip((t_s - 30) / 300, 0, 1) * (t_s < 360)
@@ -293,7 +310,7 @@ def test_a_contact_that_grows_slowly_is_reported_once_and_covered_by_the_sigma()
 
 
 def test_a_sensor_that_warms_up_is_followed_without_an_event() -> None:
-    rng, tracker = np.random.default_rng(10), Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    rng, tracker = np.random.default_rng(10), free_tool()
     for t_s in np.arange(0.0, 900.0, 3.0):
         warmed = np.array([2.0, -1.0, 0.5, 0.03, 0.02, -0.04]) * -np.expm1(-t_s / 900)
         tracked = tracker.update(at_rest(t_s, warmed + NOISE / 4 * rng.standard_normal(6)))
@@ -303,29 +320,67 @@ def test_a_sensor_that_warms_up_is_followed_without_an_event() -> None:
 
 
 def test_a_tare_ends_the_doubt() -> None:
-    tracker = Tracker(1.2, np.array([0.0, 0.0, 0.06]))
+    tracker = free_tool()
     for t_s in np.arange(0.0, 200.0):
         tracked = tracker.update(at_rest(t_s, np.array([1.5, 0, 0, 0, 0, 0]) * np.clip((t_s - 30) / 150, 0, 1)))
     assert tracked.sigma[0] > 0.8
-    tracker.trust()
+    tracker.tare(np.array([1.5, 0, 0, 0, 0, 0]), np.diag(NOISE**2 / 100), np.zeros((6, 6)), np.eye(3))
     assert tracker.update(at_rest(200.0, np.array([1.5, 0, 0, 0, 0, 0]))).sigma[0] < 0.1
 
 
-def test_the_error_of_the_calibration_is_in_the_sigma() -> None:
-    variance = np.array([0.1, 0.2, 0.3, 0.004, 0.005, 0.006])
-    pairs = [(Tracker(1.0, np.zeros(3)), systematic) for systematic in (np.diag(variance), np.zeros((6, 6)))]
-    with_it, without = (tracker.update(replace(WINDOW, systematic=one)).sigma for tracker, one in pairs)
-    np.testing.assert_allclose(np.square(with_it) - np.square(without), variance)
-    np.testing.assert_allclose(without, np.repeat([1.0, 0.03], 3), rtol=1e-3)  # of a sensor that was not seen yet
+def test_the_offset_of_a_free_tool_is_another_one_after_a_turn_and_a_tare_can_be_undone() -> None:
+    error, systematic = np.array([0.3, -0.1, 0.2, 0.004, 0.003, -0.002]), np.diag(np.square(0.2 * UNIT))
+    tracker, rng = free_tool(), np.random.default_rng(11)
+    for k in range(60):
+        residual = error + NOISE / 4 * rng.standard_normal(6)
+        tracker.update(replace(at_rest(0.15 * k, residual), systematic=systematic))
+    turned = Rotation.from_rotvec([0, 0.25, 0]).as_matrix()
+    here, C_here = tracker.offset(systematic, np.eye(3))
+    there, C_there = tracker.offset(systematic, turned)
+    away, C_away = tracker.offset(systematic, Rotation.from_rotvec([0, 3.1, 0]).as_matrix())
+    np.testing.assert_allclose(here, error, atol=0.02)
+    np.testing.assert_allclose(there, np.exp(-0.5) * error, atol=0.05)
+    assert (np.abs(away) < 0.15 * np.abs(error) + 0.01).all()
+    assert (np.diag(C_here) < 0.02 * np.diag(systematic)).all()
+    np.testing.assert_allclose(np.diag(C_there), (1 - np.exp(-1.0)) * np.diag(systematic), rtol=0.2)
+    np.testing.assert_allclose(np.diag(C_away), np.diag(systematic), rtol=0.1)
+    tracker.tare(error + UNIT, np.diag(NOISE**2), systematic, np.eye(3))
+    np.testing.assert_allclose(tracker.offset(systematic, np.eye(3))[0], 0.0, atol=0.05)
+    tracker.undo_tare(-error - UNIT)
+    np.testing.assert_allclose(tracker.offset(systematic, np.eye(3))[0], here)
 
 
-def test_the_bias_walks_and_the_likelihood_of_walks_is_forgotten() -> None:
-    tracker = Tracker(1.0, np.zeros(3))
+@pytest.mark.parametrize("rate_N_h", [0.0, 6.0, 20.0])
+def test_the_rate_of_a_drift_has_an_honest_sigma_and_is_reported_once(rate_N_h: float) -> None:
+    squares, reported = [], 0
+    for seed in range(4):
+        rng, tracker = np.random.default_rng(seed), free_tool()
+        for t_s in np.arange(0.0, 240.0):
+            drift = rate_N_h * t_s / 3600 * np.array([0.6, 0, -0.8, 0, 0, 0])
+            tracker.update(at_rest(t_s, drift + NOISE / 4 * rng.standard_normal(6)))
+            reported += tracker.warning(1.0) is not None
+        found, sigma_N_h = tracker.force_rate_N_h
+        squares.append(((found - rate_N_h) / sigma_N_h) ** 2)
+    assert np.mean(squares) < (3.0 if rate_N_h else 6.0)  # without a drift three axes count
+    assert reported == (4 if rate_N_h else 0)
+
+
+def test_the_temperature_moves_the_bias_and_is_no_drift() -> None:
+    rng, tracker = np.random.default_rng(12), free_tool()
+    for t_s in np.arange(0.0, 60.0, 0.15):
+        if warmed := t_s > 30:
+            tracker.warm(0.02 * UNIT)
+        bias = 0.02 * UNIT * (np.floor((t_s - 30) / 0.15) + 1 if warmed else 0)
+        tracked = tracker.update(at_rest(t_s, bias + NOISE / 4 * rng.standard_normal(6)))
+    np.testing.assert_allclose(tracked.bias, bias, atol=0.1)
+    assert tracker.force_rate_N_h[0] < 30.0 < 0.02 / 0.15 * 3600
+
+
+@pytest.mark.parametrize("walk_N", [0.1, 3.0])
+def test_the_bias_walks_and_drifts_between_looks(walk_N: float) -> None:
+    tracker = free_tool(walks_N=(walk_N,))
     tracker.update(replace(WINDOW, t_s=100.0))
-    tracker._likelihood = np.arange(4.0)
     tracked = tracker.update(replace(WINDOW, t_s=1900.0))
-    np.testing.assert_allclose(tracker._likelihood, np.arange(4.0) * np.exp(-0.5))  # half an hour
-    weights = np.exp(tracker._likelihood) / np.exp(tracker._likelihood).sum()
-    assert tracked.walk_N == pytest.approx(weights @ [0.1, 0.3, 1.0, 3.0])
-    variance = 1.0 + weights @ np.square([0.1, 0.3, 1.0, 3.0]) / 2
-    np.testing.assert_allclose(tracked.sigma, np.sqrt(variance) * np.repeat([1.0, 0.03], 3))
+    variance = walk_N**2 / 2 + 5.0**2 / 4
+    np.testing.assert_allclose(tracked.sigma, np.sqrt(variance) * UNIT, rtol=1e-3)
+    assert tracked.walk_N == pytest.approx(walk_N)

@@ -1,16 +1,17 @@
 """The distance of a reading from a free tool, its limit, and what joins readings to contacts."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from ftcalib.likelihood.response import predicted_covariance
 from ftcalib.model import Array
-from ftdrive.live.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
-from ftdrive.live.noise import SensorNoise
-from tests.unit.ftdrive.live.simulated import KnownNoise, calibrated
+from ftcalib.sensor_matrix import predicted_covariance
+from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
+from ftdrive.stream.noise import SensorNoise
+from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
 RATE_HZ, SIZE = 1000.0, 20
 """A reading is 0.02 s."""
@@ -20,6 +21,7 @@ RNG = np.random.default_rng(3)
 ROOT = RNG.standard_normal((6, 6)) * np.repeat([0.05, 0.002], 3)[:, None]
 NOISE = SensorNoise(np.eye(6), ROOT @ ROOT.T, np.diag(np.repeat([1e-3, 1e-5], 3)), 300.0)
 R = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
+OFFSET = np.repeat([0.03, 0.001], 3)
 FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 
 
@@ -30,8 +32,13 @@ def judged(
     n = len(residual)
     motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
     noise: Any = KnownNoise(NOISE)
-    poses = np.tile(R, (n, 1, 1))
-    return test.judge(residual, predicted, poses, motion, noise, delay_sigma_s=0.003, inertia=inertia)
+    free: Any = SimpleNamespace(
+        windows=SimpleNamespace(steps=lambda n: np.zeros(n, int)),
+        add=lambda *_: None,
+        filter=SimpleNamespace(changes=0, offset=lambda uncertainty, _: (OFFSET, uncertainty)),
+    )
+    rows = paired(np.tile(R, (n, 1, 1)))
+    return test.judge(residual, predicted, rows, motion, noise, free, delay_sigma_s=0.003, inertia=inertia)
 
 
 def test_the_limit_is_that_of_an_estimated_covariance() -> None:
@@ -74,36 +81,12 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
     else:
         inexact = felt
     covariance += np.outer(inexact, inexact)
-    assert chi2[-1] == pytest.approx(reading @ np.linalg.solve(covariance, reading))
+    assert chi2[-1] == pytest.approx((reading - OFFSET) @ np.linalg.solve(covariance, reading - OFFSET))
     assert test.limit == _hotelling(1e-4, NOISE.dof)
     np.testing.assert_array_equal(beyond, chi2 > test.limit)
     np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
     restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)
     assert [len(one) for one in restarted] == [0, 0, 0]
-
-
-def test_at_rest_a_small_load_becomes_the_offset_of_the_free_tool() -> None:
-    test, load = ContactTest(RATE_HZ, 1e-4, BEYOND), np.array([0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
-    nothing, step = np.zeros(6), 10 * SIZE
-    for k in range(1, 31):
-        _, _, beyond = judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
-        assert not beyond.any()
-        np.testing.assert_allclose(test._offset, (1 - 0.9**k) * load, atol=1e-12)
-        assert test._share == pytest.approx(0.9 ** (2 * k))
-
-
-def test_the_offset_follows_no_farther_than_drift_and_the_error_of_the_calibration() -> None:
-    test, load = ContactTest(RATE_HZ, 1e-40, BEYOND), np.array([0.8, 0.0, 0.0, 0.03, 0.0, 0.0])
-    nothing, step = np.zeros(6), 10 * SIZE
-    for k in range(1, 21):
-        judged(test, np.tile(k / 20 * load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
-    for _ in range(30):
-        judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 0, nothing, Inertia.EXACT)
-    sigma = np.sqrt(np.diag(test.uncertainty))
-    np.testing.assert_allclose(test._offset[[0, 3]], [0.5 + 3 * sigma[0], 0.015 + 3 * sigma[3]])
-    before = test._offset.copy()
-    judged(test, np.tile(load, (step, 1)), np.zeros((step, 6)), 1, nothing, Inertia.EXACT)
-    np.testing.assert_array_equal(test._offset, before)  # not in motion
 
 
 def test_a_contact_has_a_line_of_force() -> None:

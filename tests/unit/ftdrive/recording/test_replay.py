@@ -9,21 +9,24 @@ import numpy as np
 import pytest
 
 from ftcalib.errors import BadDataset
-from ftdrive.live.processing import Processor
-from ftdrive.live.replay import ReplayedStream, replay_run
-from ftdrive.live.samples import Stages, WrenchFrame
+from ftdrive.recording.replay import source_of_run
+from ftdrive.stream.processing import Processor
+from ftdrive.stream.samples import Stages, WrenchFrame
+from ftdrive.stream.sources import RecordingSource
+from ftdrive.stream.stream import Stream
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import NOISE, TRUTH, calibrated, dwells, info, paired
+from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated, dwells, info, paired
 
 
-def replayed(seconds: float = 4.0, **options: Any) -> tuple[ReplayedStream, FakeClock]:
+def replayed(seconds: float = 4.0, **options: Any) -> tuple[Stream, RecordingSource, FakeClock]:
     clock = FakeClock()
     rows = paired(dwells(1, round(seconds * 1000), seed=1))
-    return ReplayedStream(info(calibrated()), rows, clock=clock, **options), clock
+    source = RecordingSource(info(calibrated()), rows, clock=clock, speed=options.pop("speed", 1.0))
+    return Stream(source, **options).open(), source, clock
 
 
 def test_it_lasts_as_long_as_the_recording() -> None:
-    stream, clock = replayed(1.5)
+    stream, _, clock = replayed(1.5)
     begin_s, samples = clock.now_s(), list(stream)
     assert len(samples) == 1500
     assert clock.now_s() - begin_s == pytest.approx(1.5, abs=0.02)
@@ -34,15 +37,15 @@ def test_it_lasts_as_long_as_the_recording() -> None:
 
 @pytest.mark.parametrize("speed", [0.5, 8.0])
 def test_speed_scales_the_time(speed: float) -> None:
-    stream, clock = replayed(0.8)
-    stream.speed = speed
+    stream, source, clock = replayed(0.8)
+    source.speed = speed
     begin_s = clock.now_s()
     assert sum(1 for _ in stream) == 800
     assert clock.now_s() - begin_s == pytest.approx(0.8 / speed, rel=0.05)
 
 
 def test_it_can_run_as_fast_as_it_is_read() -> None:
-    stream, clock = replayed(1.0, speed=math.inf, frame=WrenchFrame("base"), stages=Stages(lowpass_Hz=50.0))
+    stream, _, clock = replayed(1.0, speed=math.inf, frame=WrenchFrame("base"), stages=Stages(lowpass_Hz=50.0))
     begin_s, blocks = clock.now_s(), []
     while not stream.has_ended:
         blocks.append(stream.read())
@@ -53,34 +56,36 @@ def test_it_can_run_as_fast_as_it_is_read() -> None:
 
 
 def test_pause_step_seek_and_resume() -> None:
-    stream, clock = replayed()
+    stream, source, clock = replayed()
     for _ in range(10):
         stream.read()
-    stream.pause()
-    at_s = stream.at_s
+    source.toggle()
+    at_s = source.at_s
     clock.advance(5.0)
     assert len(stream.read()) == 0
-    assert stream.at_s == at_s
-    assert len(stream.step()) == pytest.approx(10, abs=1)
-    assert stream.at_s == pytest.approx(at_s + 0.01, abs=2e-3)
-    stream.seek(3.0)
-    assert len(stream.step()) == pytest.approx(10, abs=1)
-    stream.seek(1.0)
-    stream.resume()
+    assert source.at_s == at_s
+    source.step()
+    assert len(stream.read()) == pytest.approx(10, abs=1)
+    assert source.at_s == pytest.approx(at_s + 0.01, abs=2e-3)
+    source.seek(3.0)
+    source.step()
+    assert len(stream.read()) == pytest.approx(10, abs=1)
+    source.seek(1.0)
+    source.toggle()
     block = stream.read()
     assert block.seq[0] == 1000
     assert len(block) <= 20
-    assert stream.at_s == pytest.approx(1.01, abs=0.02)
+    assert source.at_s == pytest.approx(1.01, abs=0.02)
     assert [event.kind for event in stream.take_events()] == []  # a jump is no gap
-    assert stream.duration_s == pytest.approx(4.0, abs=0.01)
+    assert source.duration_s == pytest.approx(4.0, abs=0.01)
     assert stream.status().sensor.rate_Hz == pytest.approx(1000, rel=0.05)
     with pytest.raises(ValueError, match="positive"):
-        stream.speed = 0.0
+        source.speed = 0.0
 
 
 def test_an_empty_recording_is_refused() -> None:
     with pytest.raises(BadDataset, match="no samples"):
-        ReplayedStream(info(calibrated()), paired(np.empty((0, 3, 3))))
+        RecordingSource(info(calibrated()), paired(np.empty((0, 3, 3))))
 
 
 def run_of(poses: int, n: int = 300) -> Any:
@@ -106,14 +111,14 @@ def run_of(poses: int, n: int = 300) -> Any:
 
 
 def test_the_poses_of_a_run_are_replayed_one_after_the_other() -> None:
-    stream = replay_run(
-        run_of(3), calibrated(), "calibration.json", clock=FakeClock(), frame=WrenchFrame("base", "flange")
-    )
+    source = source_of_run(run_of(3), calibrated(), "calibration.json")
+    source.speed = math.inf
+    stream = Stream(source, frame=WrenchFrame("base", "flange")).open()
     blocks = []
     while not stream.has_ended:
         blocks.append(stream.read())
     assert sum(map(len, blocks)) == 900
-    assert stream.duration_s == pytest.approx(900 / 500, rel=0.02)  # without the moves between
+    assert np.ptp(np.concatenate([block.t_host_ns for block in blocks])) == pytest.approx(1.8e9, rel=0.02)  # no moves
     wrench = np.concatenate([block.wrench for block in blocks])
     assert np.sqrt(np.square(wrench[:, :3]).mean()) == pytest.approx(NOISE[0], rel=0.1)
     assert [(event.kind, event.values["lost"]) for event in stream.take_events() if event.kind == "gap"] == [("gap", 1)]
@@ -123,4 +128,4 @@ def test_the_poses_of_a_run_are_replayed_one_after_the_other() -> None:
 
 def test_a_run_without_poses_is_refused() -> None:
     with pytest.raises(BadDataset, match="no pose"):
-        replay_run(run_of(0), calibrated())
+        source_of_run(run_of(0), calibrated())

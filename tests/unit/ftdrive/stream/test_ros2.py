@@ -9,8 +9,8 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 from scipy.spatial.transform import Rotation
 
-from ftdrive.live import ros2
-from ftdrive.live.samples import Axes, Point, WrenchFrame
+from ftdrive.stream import ros2
+from ftdrive.stream.samples import Axes, Point, WrenchFrame, quaternions
 
 N = 5
 T_NS = 1_700_000_000_999_999_999 + 142_857 * np.arange(N)
@@ -20,7 +20,7 @@ ORIENTATIONS = Rotation.random(N, random_state=1)
 PACKED = {
     ros2.RAW: ros2.pack_wrenches(T_NS, NUMBERS, "sensor").tolist(),
     ros2.COMPENSATED: ros2.pack_wrenches(T_NS, NUMBERS, "base_at_tcp").tolist(),
-    ros2.POSE: ros2.pack_poses(T_NS, ORIENTATIONS.as_matrix(), NUMBERS[:, :3]).tolist(),
+    ros2.POSE: ros2.pack_poses(T_NS, NUMBERS[:, :3], quaternions(ORIENTATIONS.as_matrix())).tolist(),
     ros2.JOINTS: ros2.pack_joints(T_NS, NUMBERS).tolist(),
 }
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ftdrive.live.processing import Processor
-from ftdrive.live.samples import Tracking
-from tests.unit.ftdrive.live.simulated import calibrated, dwells, info, paired
+from ftdrive.stream.processing import Processor
+from ftdrive.stream.samples import Tracking
+from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired
 
 DRIFTED = np.array([0.2, -0.1, 0.15, 0.004, -0.003, 0.002])
 
@@ -13,12 +13,12 @@ DRIFTED = np.array([0.2, -0.1, 0.15, 0.004, -0.003, 0.002])
 @pytest.mark.parametrize(("track", "left"), [("show", DRIFTED), ("apply", np.zeros(6)), ("off", DRIFTED)])
 def test_only_apply_corrects_the_wrench(track: Tracking, left: np.ndarray) -> None:
     processor = Processor(info(calibrated()))
-    processor.track = track
+    processor.monitor.track = track
     rows = paired(dwells(1, 6000, seed=2), push=DRIFTED)
     blocks = [processor.process(rows.rows(slice(i, i + 100))) for i in range(0, len(rows), 100)]
     wrench = np.concatenate([block.wrench for block in blocks[-10:]]).mean(axis=0)
     assert wrench == pytest.approx(left, abs=0.02)
-    tracked = processor._following.tracked
+    tracked = processor.monitor.tracked
     events = [event for event in processor.take_events() if event.kind == "tracked"]
     if track == "off":
         assert tracked is None
@@ -34,7 +34,7 @@ def test_only_apply_corrects_the_wrench(track: Tracking, left: np.ndarray) -> No
 @pytest.mark.parametrize("seed", [2, 3])
 def test_a_contact_without_a_part_is_reported_once(seed: int) -> None:
     processor = Processor(info(calibrated()))
-    processor.track = "show"
+    processor.monitor.track = "show"
     motion = dwells(1, 6000, seed=seed)
     rows = paired(motion)
     rows.raw[3000:3600] += [0, 0, -5.0, 0, 0, 0]

@@ -14,20 +14,12 @@ from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
-from ftdrive.live.noise import unexplained_variance
-from ftdrive.live.replay import ReplayedStream
-from ftdrive.live.samples import Paired
-from ftdrive.live.weighing import (
-    WORDS,
-    CannotWeigh,
-    Scale,
-    _reading,
-    count_of,
-    load_values,
-    weigh_in_motion,
-)
+from ftdrive.stream.noise import unexplained_variance
+from ftdrive.stream.samples import Paired
+from ftdrive.stream.stream import Stream
+from ftdrive.stream.weighing import WORDS, CannotWeigh, Scale, _reading, count_of, load_values, weigh_in_motion
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired
+from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired, replayed
 
 POSE = Rotation.from_euler("xz", [170, 25], degrees=True).as_matrix()
 COM_M = np.array([0.01, 0.02, 0.15])
@@ -56,11 +48,11 @@ def rests(*each: tuple[Array, Array], seconds: float = 1.0) -> Paired:
     return paired(R, push=np.concatenate([np.tile(wrench, (n, 1)) for _, wrench in each]))
 
 
-def stream(rows: Paired) -> ReplayedStream:
-    return ReplayedStream(info(calibrated()), rows, clock=FakeClock())
+def stream(rows: Paired) -> Stream:
+    return replayed(info(calibrated()), rows, clock=FakeClock())
 
 
-def read(source: ReplayedStream, seconds: float) -> None:
+def read(source: Stream, seconds: float) -> None:
     source.clock.sleep(seconds)
     source.read(0.0)
 
@@ -119,7 +111,7 @@ def test_a_zero_needs_an_empty_gripper_at_rest() -> None:
         with pytest.raises(CannotWeigh) as refusal:
             Scale(source).zero()
         assert refusal.value.code == code
-        assert source.reference()[1] == float("inf")
+        assert source.processor.monitor.reference()[1] == float("inf")
 
 
 def as_read(wrench: Array, calibration: CalibrationResult) -> Array:
@@ -129,7 +121,7 @@ def as_read(wrench: Array, calibration: CalibrationResult) -> Array:
 
 def carried(
     mass_kg: float, *, push: Array = NOTHING, empty_s: float = 6.0, sensor: SensorMatrix | None = None
-) -> ReplayedStream:
+) -> Stream:
     """An arm that turns without rest; after `empty_s` it has a part, and from 4 s later on a push.
 
     The errors of the sensor are those that known loads have shown.
@@ -141,7 +133,7 @@ def carried(
     tool_kg = float(np.linalg.norm(TRUTH.gravity_force_base_N)) / G
     wrench = inertia(R, tool_kg, TRUTH.p_sensor_com_m) + weight * (t_s > empty_s)[:, None]
     wrench[t_s > empty_s + 4] += push
-    source = ReplayedStream(info(calibration), paired(R, push=wrench), clock=FakeClock())
+    source = replayed(info(calibration), paired(R, push=wrench), clock=FakeClock())
     source.track = "show"
     return source
 
@@ -215,11 +207,11 @@ def test_parts_are_counted_or_not() -> None:
 def test_a_mean_of_few_samples_counts_less() -> None:
     for n, factor in ((50, 1.2), (500, 1.02)):
         rows = paired(np.tile(POSE, (n, 1, 1)), rate_Hz=2.0 * n)
-        R, mean = _reading(rows, np.full(6, np.inf))
+        R, mean, covariance = _reading(rows, np.full(6, np.inf))
         dwell = mean_and_covariance(rows.raw)
         np.testing.assert_array_equal(R, POSE)
-        np.testing.assert_array_equal(mean.mean, dwell.mean)
-        np.testing.assert_allclose(mean.covariance, factor * dwell.covariance)
+        np.testing.assert_array_equal(mean, dwell.mean)
+        np.testing.assert_allclose(covariance, factor * dwell.covariance)
 
 
 def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftdrive.live.samples import WrenchFrame, frames_in_flange, sensor_origin_m
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, P_FLANGE_TCP_M, R_FLANGE_TCP, calibrated, info
+from ftdrive.stream.samples import WrenchFrame, frames_in_flange, sensor_origin_m
+from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, P_FLANGE_TCP_M, R_FLANGE_TCP, calibrated, info
 
 INFO = info(calibrated())
 R_BASE_FLANGE = Rotation.random(3, rng=np.random.default_rng(1)).as_matrix()

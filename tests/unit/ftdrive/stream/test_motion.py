@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
-from ftdrive.live.motion import REST, STATES, MotionTracker
-from tests.unit.ftdrive.live.simulated import P_FLANGE_SENSOR_M, TRUTH
+from ftdrive.stream.motion import REST, STATES, MotionTracker
+from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, TRUTH
 
 RATE_HZ, MASS_KG = 1000.0, 1.5
 CENTRED = TRUTH.R_flange_sensor @ -TRUTH.p_sensor_com_m

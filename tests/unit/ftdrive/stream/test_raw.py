@@ -8,18 +8,19 @@ import pytest
 
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig
-from ftdrive.live.raw import RawStream
 from ftdrive.recording.compensation import compensate_recording
-from ftdrive.recording.raw_table import RawTable
-from ftdrive.recording.table_pair import TablePair
+from ftdrive.recording.foreign import TablePair
+from ftdrive.recording.recorder import RawTable
+from ftdrive.stream.sources import CellSource
+from ftdrive.stream.stream import Stream
 from ftdrive.tables.table import Table
-from ftdrive.terminal.live_feed import Feed
-from ftdrive.terminal.live_screen import frame
-from ftdrive.terminal.live_view import Summary
+from ftdrive.terminal.live_screen import LiveScreen, frame
+from ftdrive.words.stream import Summary
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
-from tests.unit.ftdrive.live.simulated import NOISE, calibrated
-from tests.unit.ftdrive.live.test_stream import RATE_HZ, Sensor
+from tests.unit.ftdrive.stream.simulated import NOISE, calibrated
+from tests.unit.ftdrive.stream.test_stream import RATE_HZ, Sensor
+from tests.unit.ftdrive.terminal.fake_stream import SteppedFeed
 
 LOAD = np.array([30.0, -20.0, 80.0, 2.0, -1.0, 0.5])
 
@@ -30,9 +31,9 @@ def sensor(monkeypatch: pytest.MonkeyPatch) -> Sensor:
     return Sensor(FakeClock(), RATE_HZ)
 
 
-def raw(sensor: Sensor) -> RawStream:
+def raw(sensor: Sensor) -> Stream:
     config = CellConfig(RobotConfig(""), SensorConfig("fake://"), ToolConfig(""), clock=sensor.clock)
-    return RawStream(config, sensor)  # type: ignore[arg-type]  # a link of the tests
+    return Stream(CellSource(config, None, devices=(sensor, None)))  # type: ignore[arg-type]  # a link of the tests
 
 
 def test_readings_are_as_measured_and_a_tare_is_subtracted(sensor: Sensor) -> None:
@@ -43,7 +44,7 @@ def test_readings_are_as_measured_and_a_tare_is_subtracted(sensor: Sensor) -> No
         assert np.isnan(blocks[-1].chi2).all()
         assert blocks[-1].sigma == pytest.approx(NOISE, rel=0.2)
         # the load is no error of the sensor here: sigma is that of the noise of 100 samples
-        assert stream.sigma_of_mean(np.eye(3), 0.1) == pytest.approx(NOISE / 10, rel=0.4)
+        assert stream.processor.sigma_of_mean(np.eye(3), 0.1) == pytest.approx(NOISE / 10, rel=0.4)
         assert stream.tare().kind == "tare"
         after = [stream.read() for _ in range(120)]
         wrench, as_read = (np.concatenate([getattr(one, name) for one in after]) for name in ("wrench", "raw"))
@@ -73,14 +74,13 @@ def test_a_silent_sensor_raises_and_recovers(sensor: Sensor) -> None:
 
 def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
     with raw(sensor) as stream:
-        feed = Feed(stream)
+        feed = SteppedFeed(stream)
         summary = Summary(feed)
-        for _ in range(220):
-            feed.step()
+        screen = LiveScreen(feed, summary)
+        feed.step(220)
         for key in ("t", "x", "1"):
-            feed.request(key)
-        for _ in range(60):
-            feed.step()
+            screen.press(key)
+        feed.step(60)
         view = summary.view()
     for size in ((80, 24), (120, 40)):
         lines = [str(line) for line in frame(view, *size)]
@@ -97,7 +97,7 @@ def test_a_program_gets_readings_and_no_verdict(
     sensor: Sensor, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     sensor.push = LOAD
-    monkeypatch.setattr("ftdrive.commands.live.open_raw", lambda _, stack: stack.enter_context(raw(sensor)))
+    monkeypatch.setattr("ftdrive.commands.live.CellSource", lambda *_: raw(sensor).source)
     assert cli.run(["live", "--raw", "--sensor", "fake://", "--once", "--json"]) == 0
     reading = json.loads(capsys.readouterr().out)
     assert reading["raw"]["force_N"] == pytest.approx((sensor.motion.wrench(np.zeros(1))[0] + LOAD)[:3], abs=0.05)
@@ -112,8 +112,8 @@ def test_what_is_saved_is_compensated_beside_a_table_of_poses(sensor: Sensor, tm
         table = RawTable(path, stream.info)
         blocks = [stream.read() for _ in range(150)]
         for block in blocks:
-            table.write(block)
-        table.close()
+            table.add(block, [])
+        table.end()
         t_s = (np.concatenate([block.t_host_ns for block in blocks]) + stream.info.utc_offset_ns) * 1e-9
     seconds = np.arange(t_s[0] - 0.1, t_s[-1] + 0.1, 0.01)
     rows = np.c_[seconds, np.tile(sensor.motion.pose(np.zeros(1))[0].reshape(9), (len(seconds), 1))]

@@ -1,0 +1,116 @@
+"""One fact has one wording: in the terminal, on the page, in the report and in JSON."""
+
+import html
+import json
+import re
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+
+from ftcalib import CalibrationResult
+from ftcalib.findings import Verdict
+from ftdrive.report.facts import facts_of
+from ftdrive.report.page import templates, with_code
+from ftdrive.report.sections import capital
+from ftdrive.report.subject import Subject
+from ftdrive.runs.calibration import EMULATED, FOREIGN
+from ftdrive.session.events import State, StateChanged
+from ftdrive.terminal.live_screen import frame as live_frame
+from ftdrive.terminal.report import print_result
+from ftdrive.terminal.screen import frame
+from ftdrive.view.live_page import texts
+from ftdrive.view.outcome import conclude_calibration
+from ftdrive.view.page import Page
+from ftdrive.view.session_page import _state
+from ftdrive.words.session import SessionText, SessionView, state_in_words
+from ftdrive.words.stream import CONTACT, FREE, NOISE_UNKNOWN, Summary, calibration_in_words, state
+from tests.finding_examples import examples
+from tests.unit.ftdrive.exports.example import calibration
+from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
+
+
+def read(result: CalibrationResult) -> str:
+    """Return the text of the report without figures."""
+    environment = templates("ftdrive.report", "", "report", "")
+    environment.filters["sentence"] = lambda text: with_code(capital(text))
+    facts = facts_of(Subject(Path("poses.csv"), result, ""))
+    page = environment.get_template("report.html.j2").render(facts=facts, sections=[], drawn={}, version="")
+    return " ".join(html.unescape(re.sub("<[^>]*>", "", page)).split())
+
+
+def shown(result: CalibrationResult) -> str:
+    page = Page("ftdrive calibrate")
+    conclude_calibration(page, result, [])
+    return " ".join(str(json.loads(page.since(0)[1])).split())
+
+
+def test_every_finding_is_worded_alike(capsys: pytest.CaptureFixture[str]) -> None:
+    every = tuple(examples())
+    result = replace(calibration(), findings=every)
+    print_result(result, every=True)
+    terminal, report = " ".join(capsys.readouterr().out.split()), read(result).lower().replace("`", "")
+    for one in every:
+        assert one.found in terminal
+        assert one.fix in terminal
+        assert one.words.lower().replace("`", "") in report
+    assert [one["words"] for one in result.to_dict()["findings"]] == [one.words for one in every]
+
+
+@pytest.mark.parametrize("verdict", get_args(Verdict))
+def test_a_verdict_and_its_error_are_worded_alike(verdict: Verdict, capsys: pytest.CaptureFixture[str]) -> None:
+    some = {"good": "base_leans", "usable": "few_poses", "rejected": "repeated_poses"}[verdict]
+    result = replace(calibration(), findings=tuple(one for one in examples() if one.code == some))
+    print_result(result)
+    terminal, page, report = " ".join(capsys.readouterr().out.split()), shown(result), read(result)
+    error = re.search(rf"{verdict.upper()} (compensation error [^)]*\))", terminal)
+    assert error is not None
+    assert error[1] in page
+    assert error[1].removeprefix("compensation ") in report
+    for one in result.findings:
+        assert one.found in terminal
+        assert f"fix: {one.fix}" in terminal
+        assert one.found in page
+        assert f"fix: {one.fix}" in page
+    assert verdict.upper() in page
+    assert verdict.upper() in report
+    assert result.to_dict()["verdict"] == verdict
+
+
+@pytest.mark.parametrize("state", State)
+def test_every_state_of_a_session_is_worded_alike(state: State) -> None:
+    event, view = StateChanged(state=state, stop=3, stops=25, number=7, words="because"), SessionView()
+    view.update(event, time.monotonic())
+    where, said, words = state_in_words(view, time.monotonic())
+    screen = "\n".join(line.plain for line in frame(view, time.monotonic()).renderables)  # type: ignore[union-attr]
+    part: Any = _state(view, "", "")["state"]
+    assert said.startswith(state.upper())
+    assert f"{where}  {said}  {words}" in screen
+    assert (part["head"], part["lines"]) == (f"{where}  {said}", [words])
+    assert event.to_dict()["state"] == state
+    for line in SessionText(verbose=True).lines(event):
+        assert line.words in {"Tour", "Motion"} or line.words.lower() == f"{state}: {words}"
+
+
+@pytest.mark.parametrize(("said", "mark"), [(FREE, EMULATED), (CONTACT, EMULATED), (NOISE_UNKNOWN, FOREIGN)])
+def test_every_state_of_a_stream_is_worded_alike(said: str, mark: str) -> None:
+    stream = FakeStream("contact", block_s=0.05)
+    stream.info = replace(stream.info, emulated=mark == EMULATED, foreign=mark == FOREIGN)
+    feed = SteppedFeed(stream)
+    summary = Summary(feed)
+    feed.step(240 if said == CONTACT else 20)
+    view = summary.view()
+    if said == NOISE_UNKNOWN and view.reading is not None:
+        view = replace(view, reading=replace(view.reading, chi2=np.nan))
+    screen = "\n".join(map(str, live_frame(view, 120, 40)))
+    page = json.dumps(texts(view, view.live), ensure_ascii=False)
+    assert mark in stream.info.marks
+    assert state(view)[0] == said
+    assert said in screen.lower()
+    assert said in page
+    assert mark in screen
+    assert mark in page
+    assert "".join(text for text, _ in calibration_in_words(view)) in screen
