@@ -63,7 +63,7 @@ def test_the_matrix_is_found_within_its_sigma(ftdrive: CommandLine) -> None:
     find_matrix(ftdrive, "ur-rtde", ())
 
 
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_the_matrix_is_found_with_a_load_that_swings_as_slowly_as_a_real_one(ftdrive: CommandLine) -> None:
     # of 2 degrees, more was once left in the means of a busy computer than their covariance says
     find_matrix(ftdrive, "script", ("--swing", "1", *REAL_PACE))
