@@ -6,9 +6,9 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ftcalib.estimates import quantities_of, values_of
 from ftcalib.model import Array
 from ftcalib.result import CalibrationResult
+from ftcalib.shown import values_of
 
 # Where the tip is if no tool is described, from the flange.
 _USUAL_TIP_MM: Final = 200.0
@@ -84,19 +84,18 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
     That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
     an angle is at most half a turn.
     """
-    data = result.to_dict()
     errors = {}
-    for _, _, _, key in quantities_of(data):
+    for _, _, _, key, values, sigma, _ in result.estimates:
         if key not in truth:
             continue
         if key == "R_flange_sensor":
             error = Rotation.from_matrix(result.R_flange_sensor @ np.transpose(truth[key])).as_rotvec()
         else:
-            error = values_of(data[key], key) - values_of(truth[key], key)
+            error = values - values_of(truth[key], key)
             if key.endswith("_rad"):
                 # a ceiling is at both +180 and -180 degrees
                 error = np.remainder(error + np.pi, 2 * np.pi) - np.pi
-        errors[key] = error / values_of(data["sigma"][key], key)
+        errors[key] = error / sigma
     return errors
 
 

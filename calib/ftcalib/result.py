@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,13 +16,11 @@ from scipy.special import expit
 from ftcalib.compensation import Compensator
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadCalibration
-from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
-from ftcalib.files import JSON, check_format, is_changed, read_object, write_object
+from ftcalib.files import JSON, read_object, write_object
 from ftcalib.findings import Finding, Verdict, verdict_of
 from ftcalib.judge.verdict import SURE
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import (
-    PARAMETER_NAMES,
     Array,
     DriftResult,
     Parameters,
@@ -32,8 +30,8 @@ from ftcalib.model import (
     matrices_of,
     weight_and_tilt,
 )
-from ftcalib.notebook import figure_of, frame_of
-from ftcalib.rounding import counted, to_place_of, with_sigma
+from ftcalib.result_file import damage_in_words, document_of, fields_of, is_edited
+from ftcalib.rounding import counted
 from ftcalib.sensor_matrix import (
     SIZE,
     SQUARES,
@@ -44,10 +42,7 @@ from ftcalib.sensor_matrix import (
     joint_covariance,
     predicted_covariance,
 )
-
-FORMAT = "ftdrive.calibration/2"
-# The bias of a session with drift is its mean there.
-_EARLIER = "ftdrive.calibration/1"
+from ftcalib.shown import Estimate, axes_of, estimates_of, figure_of, frame_of, rows_of
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
 CONTRADICTS = 4.0
@@ -214,19 +209,14 @@ class CalibrationResult(Displayed):
         keep_finite(self, "", covariance=(15, 15), hidden_covariance=(15, 15), residuals=(n, 6))
         optional = {"measured_sigma": (6,), "weights": (n,), "cable_shift": (15,), "mean_bias": (6,)}
         keep_finite(self, "", **{name: shape for name, shape in optional.items() if getattr(self, name) is not None})
-        read: dict[str, Callable[[Mapping[str, Any]], object]] = {
-            "drift": lambda given: DriftResult(given["change"], given["sigma"]),
-            "response": lambda given: Response(given["coefficients"], given["covariance"]),
-            "sensor": SensorMatrix.from_dict,
-        }
-        for name, build in read.items():
-            if isinstance(given := getattr(self, name), Mapping):
-                object.__setattr__(self, name, build(given))
-        object.__setattr__(self, "weighed_kg", _mass_and_sigma(self.weighed_kg))
+        if self.weighed_kg is not None:
+            mass_kg, sigma_kg = self.weighed_kg
+            if not (0 < mass_kg < np.inf and 0 <= sigma_kg < np.inf):
+                raise ValueError(f"weighed_kg must be a mass and its sigma, not {list(self.weighed_kg)}")
+            object.__setattr__(self, "weighed_kg", (float(mass_kg), float(sigma_kg)))
         require_positive_definite(joint_covariance(self.covariance, self.response))
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
-        found = (one if isinstance(one, Finding) else Finding.from_dict(one) for one in self.findings)
-        object.__setattr__(self, "findings", tuple(found))
+        object.__setattr__(self, "findings", tuple(self.findings))
         for name in ("provenance", "quality"):
             try:
                 value = json.loads(json.dumps(dict(getattr(self, name)), allow_nan=False))
@@ -241,7 +231,7 @@ class CalibrationResult(Displayed):
         Two files with the same id subtract alike, whatever their provenance. The matrix of the sensor, which turns what
         is left into a contact, is not part of it: all tools share it.
         """
-        return self._id(None if self.response is None else self.response.to_dict())
+        return self._id(self.response and self.response.to_dict())
 
     def _id(self, response: JSON) -> str:
         """Return the id with these numbers of `response`, whose sigmas another computer may round otherwise."""
@@ -523,33 +513,18 @@ class CalibrationResult(Displayed):
 
     def _summary(self) -> Summary:
         amount = counted(self.n_poses, "pose") if self.motion is None else f"{100 * self.motion.used_share:.0f} % used"
-        rows = list[Row]()
-        for label, scale, unit, key, values, sigmas in self._estimates():
-            if key == "gravity_force_base_N":  # follows from mass and tilt
-                continue
-            cells = [
-                with_sigma(scale * value, scale * sigma) if sigma else f"{to_place_of(scale * value, 0.0)} fixed"
-                for value, sigma in zip(values, sigmas, strict=True)
-            ]
-            if key == "tilt_beta_rad":  # beside alpha
-                rows[-1] = Row("base tilt alpha, beta", [*rows[-1].cells, *cells], unit)
-            elif key == "inertia_kg_m2":
-                rows += [Row("inertia xx, yy, zz", cells[:3], unit), Row("inertia xy, xz, yz", cells[3:], unit)]
-            else:
-                rows.append(Row(f"{label} x, y, z" if len(cells) == 3 else label, cells, unit))
+        rows = rows_of(self.estimates)
         force_N, torque_Nm = self.likely_error()
         rows.insert(6, Row("error of a free tool, rms", [f"{force_N:.4f} N", f"{torque_Nm:.5f} N·m"]))
         title = f"Calibration {self.id}, {amount}, method {self.method}, estimates ± 1 sigma"
         return Summary(title, rows, self.reasons, self.verdict)
 
-    def _estimates(self) -> Iterator[tuple[str, float, str, str, Array, Array]]:
-        """Give each quantity as in `QUANTITIES`, with its elements and their sigmas, which are 0 if it was known."""
+    @property
+    def estimates(self) -> list[Estimate]:
+        """Each quantity with its sigma, in the order in which it is shown."""
         sigma = self.sigma
-        fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(self.covariance).max()))
-        for label, scale, unit, key in quantities_of(sigma):
-            value = getattr(self if hasattr(self, key) else self.motion, key)
-            sigmas = values_of(sigma[key], key)
-            yield label, scale, unit, key, values_of(value, key), np.where(sigmas <= fixed_below, 0.0, sigmas)
+        values = {key: getattr(self if hasattr(self, key) else self.motion, key) for key in sigma}
+        return estimates_of({**values, "sigma": sigma, "covariance": self.covariance})
 
     def to_frame(self) -> Any:
         """Return the estimates as a DataFrame of pandas, else of Polars.
@@ -567,8 +542,8 @@ class CalibrationResult(Displayed):
         """
         rows = [
             (f"{key}.{axis}" if axis else key, float(value), float(sigma), _SI[key.rpartition("_")[2]])
-            for _, _, _, key, values, sigmas in self._estimates()
-            for axis, value, sigma in zip(axes_of(len(values)), values, sigmas, strict=True)
+            for _, _, _, key, values, sigmas, known in self.estimates
+            for axis, value, sigma in zip(axes_of(len(values)), values, np.where(known, 0.0, sigmas), strict=True)
         ]
         return frame_of(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
 
@@ -598,55 +573,9 @@ class CalibrationResult(Displayed):
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a calibration file."""
         force_N, torque_Nm = self.predicted_error()
-        return {
-            "format": FORMAT,
-            "schema_version": 1,
-            "id": self.id,
-            "method": self.method,
-            "verdict": self.verdict,
-            "findings": [one.to_dict() for one in self.findings],
-            "n_poses": self.n_poses,
-            "mass_kg": self.mass_kg,
-            "weight_N": self.weight_N,
-            "gravity_force_base_N": self.gravity_force_base_N.tolist(),
-            "R_flange_sensor": self.R_flange_sensor.tolist(),
-            "force_bias_N": self.force_bias_N.tolist(),
-            "torque_bias_Nm": self.torque_bias_Nm.tolist(),
-            "p_sensor_com_m": self.p_sensor_com_m.tolist(),
-            "tilt_alpha_rad": self.tilt_alpha_rad,
-            "tilt_beta_rad": self.tilt_beta_rad,
-            "sigma": {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in self.sigma.items()},
-            "residual": self.residual_summary(),
-            "predicted_error": {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm},
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "p_value": self.p_value,
-            "noise_factor": self.noise_factor,
-            "noise_source": self.noise_source,
-            "measured_sigma": None if self.measured_sigma is None else self.measured_sigma.tolist(),
-            "components": dict(self.components),
-            "drift": None
-            if self.drift is None
-            else {"change": self.drift.change.tolist(), "sigma": self.drift.sigma.tolist()},
-            "mean_bias": None if self.mean_bias is None else self.mean_bias.tolist(),
-            "response": None if self.response is None else self.response.to_dict(),
-            "gain_sigma": self.gain_sigma,
-            "sensor": None if self.sensor is None else self.sensor.to_dict(),
-            "weighed_kg": None if self.weighed_kg is None else list(self.weighed_kg),
-            "cable_shift": None if self.cable_shift is None else self.cable_shift.tolist(),
-            "weights": None if self.weights is None else self.weights.tolist(),
-            "rejected_poses": list(self.rejected_poses),
-            "second_basin_chi2": self.second_basin_chi2,
-            "p_wrong": self.p_wrong,
-            "quality": dict(self.quality),
-            "g_m_s2": self.g_m_s2,
-            "parameter_names": list(PARAMETER_NAMES),
-            "covariance": self.covariance.tolist(),
-            "hidden_covariance": self.hidden_covariance.tolist(),
-            "residuals": self.residuals.tolist(),
-            "provenance": dict(self.provenance),
-            **({} if self.motion is None else self.motion.to_dict()),
-        }
+        predicted = {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm}
+        document = document_of(self, residual=self.residual_summary(), predicted_error=predicted)
+        return document if self.motion is None else {**document, **self.motion.to_dict()}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], *, accept_edited: bool = False) -> Self:
@@ -662,33 +591,11 @@ class CalibrationResult(Displayed):
         ------
         BadCalibration
         """
-        if document.get("format") != _EARLIER:
-            check_format(document, FORMAT, BadCalibration)
-        try:
-            later = ("cable_shift", "sensor", "weighed_kg", "mean_bias")
-            apart = {"parameters", "hidden_covariance", "motion", *later}
-            plain = [field.name for field in fields(cls) if field.name not in apart]
-            result = cls(
-                parameters=Parameters(**{field.name: document[field.name] for field in fields(Parameters)}),
-                # Files of version 0.1.0 and earlier have none of those that are asked for by `get`.
-                **{name: document[name] for name in plain} | {name: document.get(name) for name in later},
-                hidden_covariance=document.get("hidden_covariance", np.zeros((15, 15))),
-                motion=MotionResult.from_dict(document),
-            )
-            derived = (("id", result._id(document.get("response"))), ("verdict", result.verdict))
-            edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived)
-        except KeyError as exc:
-            raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
-        except (AttributeError, TypeError, ValueError) as exc:
-            raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
-        if not edited:
-            return result
-        if not accept_edited:
-            raise BadCalibration(
-                f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Take "
-                "it from a copy, or apply it as it is with --force (live, record, stream, compensate, export)."
-            )
-        return replace(result, provenance={**result.provenance, "edited": True})
+        with damage_in_words():
+            result = cls(**fields_of(document), motion=MotionResult.from_dict(document))
+            derived = {"id": result._id(document.get("response")), "verdict": result.verdict}
+            edited = is_edited(document, derived, accept=accept_edited)
+        return replace(result, provenance={**result.provenance, "edited": True}) if edited else result
 
     def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
@@ -711,15 +618,6 @@ def require_positive_definite(covariance: Array) -> None:
     least = float(np.linalg.eigvalsh(correlations)[0]) if free.any() else 0.0
     if least < INDEFINITE:
         raise ValueError(f"the covariance is not positive definite: its smallest normalised eigenvalue is {least:.2g}")
-
-
-def _mass_and_sigma(given: Sequence[float] | None) -> tuple[float, float] | None:
-    if given is None:
-        return None
-    mass_kg, sigma_kg = given
-    if not (0 < mass_kg < np.inf and 0 <= sigma_kg < np.inf):
-        raise ValueError(f"weighed_kg must be a mass and its sigma, not {list(given)}")
-    return float(mass_kg), float(sigma_kg)
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:

@@ -16,8 +16,8 @@ from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
-from ftcalib.notebook import frame_of
 from ftcalib.rounding import counted
+from ftcalib.shown import frame_of
 
 FORMAT = "ftdrive.dataset/1"
 

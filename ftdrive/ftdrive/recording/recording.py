@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, Protocol, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib import CalibrationResult, notebook
+from ftcalib import CalibrationResult, shown
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadCalibration, DataError
 from ftcalib.files import JSON, check_format, parsed_json
@@ -295,8 +295,8 @@ class Recording(Displayed):
         """
         if "t_host_ns" in (self.rows.dtype.names or ()) and len(self.rows):
             start_ns = int(self.rows["t_host_ns"][0])
-            return notebook.frame_of(table_of(self.rows, start_ns, self.header.info.utc_offset_ns))
-        return notebook.frame_of({name: self.table[name] for name in self.table.dtype.names or ()})
+            return shown.frame_of(table_of(self.rows, start_ns, self.header.info.utc_offset_ns))
+        return shown.frame_of({name: self.table[name] for name in self.table.dtype.names or ()})
 
     def _summary(self) -> Summary:
         info = self.header.info

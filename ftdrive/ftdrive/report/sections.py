@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ftcalib.estimates import FIXED_BELOW, axes_of, values_of
 from ftcalib.rounding import to_place_of, with_sigma
+from ftcalib.shown import axes_of, values_of
 from ftdrive.report.facts import label_of
 from ftdrive.report.subject import MAY_BE_MISSING
 from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
@@ -19,6 +19,8 @@ Facts = Mapping[str, Any]
 # One good pose in 1000 deviates more, in root mean square over the six channels.
 SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
+# N or N·m: the sigma of a channel without drift.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +299,7 @@ def drift(facts: Facts) -> Section:
         for k, (change, sigma) in enumerate(zip(found["change"], found["sigma"], strict=True)):
             unit, scale = (("N", 1.0), ("mN·m", 1e3))[k // 3]
             shown = ["-", "-", "-"]
-            if sigma > FIXED_BELOW:
+            if sigma > _ROUNDING:
                 shown = [*_pair(scale * change, scale * sigma, "+"), f"{change / sigma:+.1f}"]
             rows.append((f"{'FT'[k // 3]}{_AXES[k % 3]}, {unit}", *shown))
         columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")

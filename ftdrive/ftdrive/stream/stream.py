@@ -13,7 +13,7 @@ import numpy as np
 
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import FtdriveError
-from ftcalib.notebook import figure_of
+from ftcalib.shown import figure_of
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import ConfigError

@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 
 from ftcalib import CalibrationResult
-from ftcalib.estimates import FIXED_BELOW, quantities_of, values_of
 from ftcalib.rounding import to_place_of
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.runs.verification import Verified
@@ -56,13 +55,11 @@ def conclude_calibration(page: Page | None, result: CalibrationResult, commands:
     """Show verdict, estimates and findings, and the commands to type next, if there is a page."""
     if page is None:
         return
-    document, figures = result.to_dict(), []
-    for label, factor, unit, key in quantities_of(document):
-        values, sigmas = (factor * values_of(source[key], key) for source in (document, document["sigma"]))
-        sigma = float(sigmas.max())
-        fixed = sigma <= factor * FIXED_BELOW * float(np.sqrt(np.diag(result.covariance).max()))
-        if key in _SHOWN and not fixed:
-            rounded = ", ".join(to_place_of(value, sigma) for value in values)
+    figures = []
+    for label, factor, unit, key, values, sigmas, known in result.estimates:
+        if key in _SHOWN and not known.all():
+            sigma = float((factor * sigmas).max())
+            rounded = ", ".join(to_place_of(factor * value, sigma) for value in values)
             figures.append(number(label, rounded, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)"))
     lines = [f"{one.head}{one.words}".strip() for one in conclusion(result, hinted=False)]
     tone = {"good": GOOD, "usable": WARN, "rejected": BAD}[result.verdict]

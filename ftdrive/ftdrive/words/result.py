@@ -7,10 +7,10 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.accuracy import CONTACT_N, compensation_error, force_sigma_at_tip, uncompensated
-from ftcalib.estimates import FIXED_BELOW, axes_of, quantities_of, values_of
 from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftcalib.sensor_matrix import LEAST_COMMON_GAIN
+from ftcalib.shown import axes_of, estimates_of, values_of
 from ftdrive.runs.pose_hints import find_moved, hints, names_of
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.words.text import TextLine
@@ -23,7 +23,7 @@ _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
     ("after an hour", "hour"),
 )
-# N or N·m.
+# N or N·m, or a share of a mass.
 _ROUNDING = 1e-9
 SIGMA_OF_THE_TOOL = (
     "that of mounting, weight and centre of mass includes what errors of sensor, arm and mounts hide in them; the "
@@ -35,22 +35,19 @@ def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
     """Yield each number of a result from its JSON: key, axis, name with unit, truth if known, value, sigma."""
-    fixed_below = FIXED_BELOW * float(np.sqrt(np.diag(document["covariance"]).max()))
-    for label, scale, unit, key in quantities_of(document):
-        values, sigmas = (values_of(source[key], key) * scale for source in (document, document["sigma"]))
+    for label, scale, unit, key, values, sigmas, fixed in estimates_of(document):
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
         for i, axis in enumerate(axes_of(len(values))):
-            fixed = sigmas[i] <= fixed_below * scale
-            sigma = 0.0 if fixed else float(sigmas[i])
+            sigma = 0.0 if fixed[i] else float(sigmas[i] * scale)
             known = "" if truths is None else to_place_of(truths[i], sigma)
-            name = f"{label} {axis}".strip() + f", {unit}"
-            yield key, i, name, known, to_place_of(values[i], sigma), "fixed" if fixed else to_place_of(sigma, sigma)
+            name, value = f"{label} {axis}".strip() + f", {unit}", to_place_of(values[i] * scale, sigma)
+            yield key, i, name, known, value, "fixed" if fixed[i] else to_place_of(sigma, sigma)
 
 
 def mass_in_words(result: CalibrationResult) -> str | None:
     """Describe the mass with both parts of its sigma; None if it was known, or the sensor is declared perfect."""
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
-    if session_kg < FIXED_BELOW * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
+    if session_kg < _ROUNDING * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
         return None
     mass, session = (to_place_of(value, session_kg) for value in (result.mass_kg, session_kg))
     return f"{mass} kg ± {100 * result.scale_sigma:.2g} % (scale of the sensor) ± {session} kg (this session)"

@@ -1,0 +1,99 @@
+"""The file of a calibration: what it holds, how it becomes a result again, and whether it was edited since."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from ftcalib.errors import BadCalibration
+from ftcalib.files import JSON, check_format, is_changed
+from ftcalib.findings import Finding
+from ftcalib.model import PARAMETER_NAMES, Array, DriftResult, Parameters, read_only
+from ftcalib.sensor_matrix import Response, SensorMatrix
+
+_FORMAT = "ftdrive.calibration/2"
+# The bias of a session with drift is its mean there.
+_EARLIER = "ftdrive.calibration/1"
+
+# What a file has of a result, in its order.
+_NAMES = (
+    *("id", "method", "verdict", "findings", "n_poses", "mass_kg", "weight_N", "gravity_force_base_N"),
+    *("R_flange_sensor", "force_bias_N", "torque_bias_Nm", "p_sensor_com_m", "tilt_alpha_rad", "tilt_beta_rad"),
+    *("sigma", "residual", "predicted_error", "chi2", "dof", "p_value", "noise_factor", "noise_source"),
+    *("measured_sigma", "components", "drift", "mean_bias", "response", "gain_sigma", "sensor", "weighed_kg"),
+    *("cable_shift", "weights", "rejected_poses", "second_basin_chi2", "p_wrong", "quality", "g_m_s2"),
+    *("parameter_names", "covariance", "hidden_covariance", "residuals", "provenance"),
+)
+# Fields that are read as they are, and arrays. Files of version 0.1.0 and earlier have none of the later arrays.
+_PLAIN = (
+    *("chi2", "dof", "noise_source", "g_m_s2", "method", "provenance", "p_value", "components", "gain_sigma"),
+    *("second_basin_chi2", "quality"),
+)
+_ARRAYS, _LATER_ARRAYS = ("covariance", "residuals", "measured_sigma", "weights"), ("cable_shift", "mean_bias")
+
+
+def document_of(result: object, **computed: JSON) -> dict[str, JSON]:
+    """Return the content of the file of a calibration at rest: attributes of a result, and what is computed for it."""
+    computed |= {"parameter_names": list(PARAMETER_NAMES)}
+    held = {name: computed[name] if name in computed else _json(getattr(result, name)) for name in _NAMES}
+    return {"format": _FORMAT, "schema_version": 1, **held}
+
+
+def _json(value: Any) -> JSON:
+    if isinstance(value, DriftResult):
+        return {"change": value.change.tolist(), "sigma": value.sigma.tolist()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: _json(one) for name, one in value.items()}
+    if isinstance(value, tuple):
+        return [_json(one) for one in value]
+    return value.to_dict() if hasattr(value, "to_dict") else value
+
+
+def fields_of(document: Mapping[str, Any]) -> dict[str, Any]:
+    """Build the fields of a `CalibrationResult` at rest from the content of a file; unknown fields are ignored."""
+    if document.get("format") != _EARLIER:
+        check_format(document, _FORMAT, BadCalibration)
+    drift, response, sensor = document["drift"], document["response"], document.get("sensor")
+    weighed_kg = document.get("weighed_kg")
+    return {
+        "parameters": Parameters(**{each.name: document[each.name] for each in fields(Parameters)}),
+        **{name: document[name] for name in _PLAIN},
+        **{name: _array(document[name]) for name in _ARRAYS},
+        **{name: _array(document.get(name)) for name in _LATER_ARRAYS},
+        "hidden_covariance": _array(document.get("hidden_covariance", np.zeros((15, 15)))),
+        "findings": tuple(Finding.from_dict(one) for one in document["findings"]),
+        "drift": None if drift is None else DriftResult(drift["change"], drift["sigma"]),
+        "response": None if response is None else Response(response["coefficients"], response["covariance"]),
+        "sensor": None if sensor is None else SensorMatrix.from_dict(sensor),
+        "weighed_kg": None if weighed_kg is None else tuple(weighed_kg),
+    }
+
+
+def _array(value: Any) -> Array | None:
+    return None if value is None else read_only(value)
+
+
+@contextmanager
+def damage_in_words() -> Iterator[None]:
+    """Raise `BadCalibration`, one sentence, for a content from which no result can be built."""
+    try:
+        yield
+    except KeyError as exc:
+        raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
+    except (AttributeError, TypeError, ValueError) as exc:
+        raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
+
+
+def is_edited(document: Mapping[str, Any], derived: Mapping[str, JSON], *, accept: bool) -> bool:
+    """Whether a content differs from its checksum or from what follows from it; `BadCalibration` unless accepted."""
+    edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived.items())
+    if edited and not accept:
+        raise BadCalibration(
+            f"the content is not that of calibration {document.get('id')}: the file is damaged or was edited. Take "
+            "it from a copy, or apply it as it is with --force (live, record, stream, compensate, export)."
+        )
+    return edited
