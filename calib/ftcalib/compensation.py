@@ -17,7 +17,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from ftcalib.model import Array, Parameters, Rotations, matrices_of, read_only, skew
-from ftcalib.sensor_matrix import Response
+from ftcalib.sensor_matrix import Response, shown_gain
 
 Reals = NDArray[np.floating[Any]]
 
@@ -74,8 +74,7 @@ class Compensator:
             raise TypeError(f"dtype is {self.dtype}, expected float64 or float32")
         by_force = np.einsum("i,jk->kij", parameters.gravity_force_base_N, parameters.R_flange_sensor).reshape(3, 9)
         matrix = np.concatenate([by_force, skew(parameters.p_sensor_com_m) @ by_force])
-        if response is not None:
-            matrix += np.concatenate([response.force_gain, response.cross_talk_m]) @ by_force
+        matrix += shown_gain(response) @ by_force
         offset = parameters.bias
         self.matrix: Reals = matrix.astype(self.dtype)
         self.offset: Reals = offset.astype(self.dtype)

@@ -394,7 +394,7 @@ class CalibrationResult(Displayed):
         # The fit of the loads has the rotation of a run of its own, with its correlation.
         is_of_loads = self.provenance.get("dataset_sha256") in (sensor.provenance.get("datasets") or ())
         rotation = None if is_of_loads else self.covariance[:3, :3]
-        return sensor.after(self.parameters, self.shown_response, rotation, self._excess(sensor))
+        return sensor.contact_response(self.parameters, self.shown_response, rotation, self._excess(sensor))
 
     @property
     def known_contact(self) -> ContactResponse | None:

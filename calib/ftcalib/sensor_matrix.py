@@ -50,7 +50,7 @@ FORMAT = "ftdrive.sensor/1"
 
 # Errors that are not linear, relative to the load: the certificates of six sensors have .08 to .28 % of range.
 FLOOR: Final = 0.0025
-# How many of the numbers that a tool shows the usual size of the errors counts as.
+# Degrees of freedom of the prior on the size of the errors.
 _USUAL_COUNTS = 2.0
 
 # Plausible in a file: errors of the entries and their sigma relative to the ranges, the lever in m, the floor.
@@ -165,6 +165,11 @@ def joint_jacobian(parameters: Parameters, response: Response | None, R_base_fla
 def with_covariance(response: Response | None, joint: Array) -> Response | None:
     """Keep gain and cross-talk, if there are any, with another joint covariance."""
     return None if response is None else Response(response.coefficients, joint)
+
+
+def shown_gain(response: Response | None) -> Array:
+    """(6, 3) force and torque read beyond the true ones for a force at the centre of mass; 0 where none were found."""
+    return np.zeros((6, 3)) if response is None else np.concatenate([response.force_gain, response.cross_talk_m])
 
 
 def predicted_covariance(
@@ -316,21 +321,21 @@ class SensorMatrix(Displayed):
         """
         return _hidden_covariance(parameters, np.zeros(36), self.covariance[3:, 3:])
 
-    def after(
+    def contact_response(
         self,
         parameters: Parameters,
-        seen: Response | None,
+        shown: Response | None = None,
         rotation_covariance: Array | None = None,
         excess: tuple[float, float] | None = None,
     ) -> "ContactResponse":
-        """Return how the sensor reads a contact, after the calibration of a tool.
+        """Return how the sensor reads a contact, given what the calibration of a tool shows of its errors.
 
         Parameters
         ----------
         parameters : Parameters
             Of the tool.
-        seen : Response or None
-            What the tool shows of gain and cross-talk, with its covariance; None shows nothing.
+        shown : Response, optional
+            Gain and cross-talk of the tool, with their covariance. None: the prior remains.
         rotation_covariance : array, shape (3, 3), optional
             Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it. None: exactly known, or after loads
             that of their fit, because it has the poses of this calibration.
@@ -343,19 +348,20 @@ class SensorMatrix(Displayed):
             T = block_diag(R.T, np.eye(36))
             return ContactResponse(self, parameters, E, T @ self.covariance @ T.T)
         # A sensor that is declared perfect has nothing to learn.
-        if self.source != "loads" and seen is not None and C.any():
-            H, shown, remaining = shown_by(p), seen.coefficients, seen.covariance[15:, 15:]
-            # The tool shows how large the differences between the axes are; two numbers less count, as for Student's
-            # distribution. It shows nothing of the part that is common to them.
-            squares = (shown**2 + np.diag(remaining)) / self.shown_variance(p)
+        if self.source != "loads" and shown is not None and C.any():
+            H, coefficients, remaining = shown_by(p), shown.coefficients, shown.covariance[15:, 15:]
+            # Scaled inverse chi-square: the mean of the variance of the differences between the axes. The variance that
+            # is common to all axes keeps its prior.
+            squares = (coefficients**2 + np.diag(remaining)) / self.shown_variance(p)
             size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
             C = size * (C - self.common) + self.common
             if excess is not None:
                 H = np.concatenate([H, _common_gain(p)])
-                shown, remaining = np.append(shown, excess[0]), block_diag(remaining, np.array([[excess[1] ** 2]]))
+                coefficients = np.append(coefficients, excess[0])
+                remaining = block_diag(remaining, np.array([[excess[1] ** 2]]))
             prior = H @ C @ H.T
             gain = C @ H.T @ np.linalg.inv(prior)
-            E, C = (gain @ shown).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
+            E, C = (gain @ coefficients).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
         turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
         T = np.concatenate([mounting_turn(ENTRIES, p).T, np.eye(36)])
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
@@ -501,12 +507,11 @@ class ContactResponse:
         C = self.covariance(np.concatenate([np.eye(3), np.cross(p_sensor_m, np.eye(3))], axis=1)).mean(axis=0)
         return float(np.sqrt(np.trace(C[:3, :3]))), float(np.sqrt(np.trace(C[3:, 3:])))
 
-    def true_load(self, seen: Response | None) -> tuple[float, Array]:
-        """Return weight (N) and centre of mass (3,) of the tool itself, where its reading is decoded."""
+    def true_load(self, shown: Response) -> tuple[float, Array]:
+        """Return weight (N) and centre of mass (3,) of the tool itself: its reading, gain included, is decoded."""
         p = self.parameters
         reading = np.concatenate([np.eye(3), skew(p.p_sensor_com_m)]) * p.weight_N
-        if seen is not None:
-            reading += p.weight_N * np.concatenate([seen.force_gain, seen.cross_talk_m])
+        reading += p.weight_N * shown_gain(shown)
         force, torque = np.split(reading if self.decoder is None else self.decoder @ reading, 2)
         weight_N = float(np.trace(force)) / 3
         return weight_N, vector_of(torque) / (weight_N or 1.0)

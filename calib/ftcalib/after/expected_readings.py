@@ -181,7 +181,7 @@ def expected_with_smooth_errors(
     smooth, between, new = (_smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
     alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
-    coefficients = np.zeros(SIZE) if response is None else response.coefficients
+    coefficients = calibration.shown_response.coefficients
     stored = joint_jacobian(p, response, R_base_flange).reshape(len(J_new), -1)
     stored = stored @ joint_covariance(calibration.covariance, response) @ stored.T
     explanations, likelihood = [], []

@@ -104,8 +104,7 @@ def with_bias_change(calibration: Calibrated, change: Array, sigma: Array, *, me
 
     p, response = calibration.parameters, calibration.response
     new = replace(p, force_bias_N=p.force_bias_N + change[:3], torque_bias_Nm=p.torque_bias_Nm + change[3:])
-    if response is not None:
-        response = replace(response, covariance=changed(response.covariance))
+    response = with_covariance(response, changed(joint_covariance(calibration.covariance, response)))
     return Update(new, changed(calibration.covariance), 0.0, 0, "bias", response=response)
 
 

@@ -35,6 +35,7 @@ from ftcalib.sensor_matrix import (
     joint_jacobian,
     ranges,
     response_columns,
+    shown_gain,
     with_covariance,
 )
 
@@ -176,9 +177,9 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
     left = np.asarray(Compensator(tool, response=response).batch(wrench, R_base_flange), dtype=np.float64)
     u = tool.gravity_force_base_N * (g_m_s2 / weight_N) @ (R_base_flange @ tool.R_flange_sensor)  # (n, 3)
     A = _unit_readings(u)
-    if response is not None:
-        A[:, :3, 0] += u @ response.force_gain.T
-        A[:, 3:, 0] += u @ response.cross_talk_m.T
+    gain, cross_talk_m = np.split(shown_gain(response), 2)
+    A[:, :3, 0] += u @ gain.T
+    A[:, 3:, 0] += u @ cross_talk_m.T
 
     def covariance_of(x: Array, *, sensor: bool = True) -> Array:
         return _covariance(reference, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)

@@ -56,5 +56,5 @@ def matrix_lines(sensor: SensorMatrix, tip_m: float, beside: str) -> Iterator[st
 def _contact_sigma(sensor: SensorMatrix, tip_m: float) -> tuple[float, float]:
     """Return one sigma of force and torque of 100 N at the tip: of the length of the vector, mean over directions."""
     nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
-    force, torque = sensor.after(nothing, None).sigma_at(np.array([0, 0, tip_m]))
+    force, torque = sensor.contact_response(nothing).sigma_at(np.array([0, 0, tip_m]))
     return 100 * force, 100 * torque

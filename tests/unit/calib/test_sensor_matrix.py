@@ -38,7 +38,7 @@ def test_decoding_by_known_errors_is_exact_to_first_order() -> None:
     E = errors(rng, 0.001)
     found, seen = calibration_of(E, p)
     exact = SensorMatrix(E, 1e-12 * np.eye(39), "loads", LEVER_M)
-    contact = exact.after(found, seen)
+    contact = exact.contact_response(found, seen)
     true_flange = rng.normal(size=(20, 6)) * np.repeat([60.0, 6.0], 3)
 
     def in_sensor(R: Array) -> Array:
@@ -57,7 +57,7 @@ def test_a_tool_shows_the_errors_of_forces_at_its_centre_of_mass() -> None:
     rng, p = np.random.default_rng(1), parameters()
     found, seen = calibration_of(errors(rng), p)
     sure = Response(seen.coefficients, 1e-16 * np.eye(15 + SIZE))
-    contact = SensorMatrix.usual(lever_m=LEVER_M).after(found, sure)
+    contact = SensorMatrix.usual(lever_m=LEVER_M).contact_response(found, sure)
     force = 50 * rng.normal(size=(30, 3))
 
     def sigma(place: Array) -> float:
@@ -71,7 +71,7 @@ def test_a_tool_shows_the_errors_of_forces_at_its_centre_of_mass() -> None:
 
 
 def test_sigma_follows_the_prior_and_the_contact() -> None:
-    contact = SensorMatrix.usual(0.02).after(parameters(), None)
+    contact = SensorMatrix.usual(0.02).contact_response(parameters())
     along_x = contact.covariance(np.array([100.0, 0, 0, 0, 0, 0]))
     assert np.sqrt(along_x[0, 0]) == pytest.approx(np.hypot(2.0, 0.25), rel=1e-6)
     np.testing.assert_allclose(contact.covariance(np.full(6, 2.0)), 4 * contact.covariance(np.ones(6)))
@@ -82,7 +82,7 @@ def test_sigma_follows_the_prior_and_the_contact() -> None:
 def test_differences_between_the_axes_show_nothing_of_what_is_common_to_them() -> None:
     found = parameters()
     sure = Response(np.zeros(SIZE), 1e-16 * np.eye(15 + SIZE))
-    learnt = SensorMatrix.usual(0.02).after(found, sure)
+    learnt = SensorMatrix.usual(0.02).contact_response(found, sure)
     assert learnt.scale_sigma == pytest.approx(0.02 * np.sqrt(0.5), rel=0.2)
     C = learnt.hidden_covariance
     weight = found.gravity_force_base_N / found.weight_N
@@ -93,7 +93,7 @@ def test_differences_between_the_axes_show_nothing_of_what_is_common_to_them() -
 
 def test_a_rotation_of_the_sensor_turns_the_contact() -> None:
     exact = SensorMatrix(np.zeros((6, 6)), np.zeros((39, 39)), "loads", floor=0.0)
-    turned = exact.after(parameters(), None, 1e-6 * np.eye(3)).covariance(np.array([0, 0, 100.0, 0, 0, 0]))
+    turned = exact.contact_response(parameters(), None, 1e-6 * np.eye(3)).covariance(np.array([0, 0, 100.0, 0, 0, 0]))
     np.testing.assert_allclose(np.sqrt(np.diag(turned)), [0.1, 0.1, 0, 0, 0, 0], atol=1e-9)
 
 
@@ -104,10 +104,10 @@ def test_a_calibration_of_the_loads_has_the_rotation_of_their_fit() -> None:
     contact = np.array([0, 0, 100.0, 1, 2, 3])
     for columns, sigma in ((cancelling, [0, 0, 0]), (alone, [0.1, 0.1, 0])):
         sensor = SensorMatrix(np.zeros((6, 6)), 1e-6 * columns @ columns.T, "loads", floor=0.0)
-        of_loads = sensor.after(parameters(), None).covariance(contact)
+        of_loads = sensor.contact_response(parameters()).covariance(contact)
         np.testing.assert_allclose(np.sqrt(np.maximum(np.diag(of_loads)[:3], 0)), sigma, atol=1e-8)
         # Another run has a rotation of its own.
-        other = sensor.after(parameters(), None, 4e-6 * np.eye(3)).covariance(contact)
+        other = sensor.contact_response(parameters(), None, 4e-6 * np.eye(3)).covariance(contact)
         np.testing.assert_allclose(np.sqrt(np.diag(other)[:3]), [0.2, 0.2, 0], atol=1e-8)
 
 
@@ -123,7 +123,8 @@ def test_a_result_knows_whether_its_poses_are_of_the_loads() -> None:
 def test_a_weighed_tool_shows_the_gain_common_to_all_axes() -> None:
     found, seen = parameters(), Response(np.zeros(SIZE), 1e-8 * np.eye(15 + SIZE))
     excess = 0.03, 0.002
-    plain, weighed = (SensorMatrix.usual(lever_m=LEVER_M).after(found, seen, None, one) for one in (None, excess))
+    usual = SensorMatrix.usual(lever_m=LEVER_M)
+    plain, weighed = (usual.contact_response(found, seen, None, one) for one in (None, excess))
     force = np.array([30.0, -20, 40])
     true = np.concatenate([force, np.cross(found.p_sensor_com_m, force)])
     error, error_before = (np.linalg.norm((one.decode(1.03 * true) - true)[:3]) for one in (weighed, plain))
@@ -137,8 +138,8 @@ def test_a_weighed_tool_shows_the_gain_common_to_all_axes() -> None:
 def test_the_size_of_the_errors_is_learnt_from_the_tool(size: float) -> None:
     prior, contact = SensorMatrix.usual(0.02), np.array([0, 60.0, 0, 3, 0, 0])
     E = errors(np.random.default_rng(4), size * 0.02)
-    learnt = prior.after(*calibration_of(E, parameters())).covariance(contact)[1, 1]
-    assert (learnt > prior.after(parameters(), None).covariance(contact)[1, 1]) == (size > 1)
+    learnt = prior.contact_response(*calibration_of(E, parameters())).covariance(contact)[1, 1]
+    assert (learnt > prior.contact_response(parameters()).covariance(contact)[1, 1]) == (size > 1)
 
 
 def solved() -> CalibrationResult:

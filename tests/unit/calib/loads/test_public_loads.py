@@ -43,7 +43,7 @@ def test_one_load_of_each_line_corrects_all_others(load: int) -> None:
     read, applied = recorded()
     sensor = after_wrenches(read[:, load], applied[:, load])
     # A tool at the origin: its mounting takes the antisymmetric part of the errors of the force.
-    contact = sensor.after(Parameters(np.eye(3), *np.zeros((4, 3))), None)
+    contact = sensor.contact_response(Parameters(np.eye(3), *np.zeros((4, 3))))
     others = np.delete(np.arange(10), [0, load])
     A = sensor.error[:3, :3]
     turn = Rotation.from_rotvec([A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]] / np.array(2.0))

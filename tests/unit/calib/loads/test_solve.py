@@ -25,7 +25,7 @@ def test_contacts_are_decoded_within_their_sigma(name: str) -> None:
     solution = solved(sensor, runs)
     assert solution.verdict == "good", solution.findings
     result = solve(runs[0].dataset)
-    contact = solution.sensor.after(result.parameters, result.shown_response)
+    contact = solution.sensor.contact_response(result.parameters, result.shown_response)
     true, read = sensor.contacts(60)
     R = result.R_flange_sensor
     wanted = np.concatenate([half @ R for half in np.split(true, 2, axis=1)], axis=1)
