@@ -14,8 +14,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftcalib.motion.estimate import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
+from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.samples import Motion
 from ftcalib.poses.information import Guess
 from ftcalib.sensor_matrix import expected_error

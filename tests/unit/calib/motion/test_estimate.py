@@ -12,16 +12,10 @@ from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, skew
 from ftcalib.motion.estimate import (
     _SIZES,
-    DELAY_S,
-    GYRATION_M,
-    HEIGHT_M,
-    KNOT_S,
-    SLOW_S,
     TOUCH_N,
     TOUCH_NM,
     _first_kept,
     _local,
-    _Problem,
     _untouched,
     _without_contact,
     fit,
@@ -40,6 +34,7 @@ from ftcalib.motion.model import (
     lever_columns,
     wrench_of,
 )
+from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, KNOT_S, SLOW_S, Problem
 from ftcalib.motion.samples import Motion, Rows
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
@@ -79,7 +74,7 @@ WHITE = RowNoise(SIGMA[None], np.ones((1, 6, 1)), np.eye(6))
 class Dense:
     """The same problem as one matrix: readings in their noise, and the covariance of what is expected."""
 
-    def __init__(self, problem: _Problem, load: Load, drift: Array) -> None:
+    def __init__(self, problem: Problem, load: Load, drift: Array) -> None:
         rows = problem.rows
         motion = rows.motion.earlier(load.delay_s, rows.rate)
         knots = len(problem.knots)
@@ -123,10 +118,10 @@ class Dense:
 
 
 @pytest.fixture(scope="module")
-def posed() -> tuple[_Problem, Load, Array]:
+def posed() -> tuple[Problem, Load, Array]:
     truth = replace(load_of(Truth(), 3e-3), delay_s=0.01)
     rows = rows_of(45, truth, row_s=0.4)
-    problem = _Problem(rows, None, G, point_mass=False)
+    problem = Problem(rows, None, G, point_mass=False)
     rng = np.random.default_rng(1)
     near = truth.moved(1e-3 * rng.normal(size=SIZE))
     drift = rng.normal(size=(len(problem.knots), 6)) * np.repeat([0.05, 2e-3], 3)
@@ -135,7 +130,7 @@ def posed() -> tuple[_Problem, Load, Array]:
     return problem, near, effects
 
 
-def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[_Problem, Load, Array]) -> None:
+def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, Load, Array]) -> None:
     problem, _, _ = posed
     assert len(problem.knots) == 1 + round(44 * 0.4 / KNOT_S)
     assert (problem.knots[0], problem.knots[-1]) == (0.0, problem.rows.t_s[-1])
@@ -144,11 +139,11 @@ def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[_Problem, Load, Arr
     for seconds, knots in ((1.0, 2), (12.0, 3), (124.0, 25), (500.0, 25)):
         n = round(seconds / ROW_S)
         few = replace(problem.rows[np.zeros(n, np.intp)], t_s=np.arange(n) * np.float64(ROW_S))
-        assert len(_Problem(few, None, G, point_mass=False).knots) == knots
+        assert len(Problem(few, None, G, point_mass=False).knots) == knots
 
 
 @pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
-def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load, Array], off: tuple[str, ...]) -> None:
+def test_a_step_is_that_of_generalised_least_squares(posed: tuple[Problem, Load, Array], off: tuple[str, ...]) -> None:
     problem, load, effects = posed
     sizes = {name: 0.0 if name in off else size for name, size in ALL_ON.items()}
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
@@ -182,7 +177,7 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[_Problem, Load
 
 
 @pytest.mark.parametrize("name", _SIZES)
-def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: tuple[_Problem, Load, Array], name: str) -> None:
+def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: tuple[Problem, Load, Array], name: str) -> None:
     problem, load, effects = posed
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
     sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
@@ -257,11 +252,11 @@ def test_sigma_of_the_bias_is_right_beside_noise_of_seconds() -> None:
     assert 0.7 < np.sqrt(np.mean(errors**2)) < 2.2
 
 
-def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[_Problem, Load, Array]) -> None:
+def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[Problem, Load, Array]) -> None:
     """More rows than are summed at once, noise that is correlated, and rows that are left out."""
     _, load, _ = posed
     rows = rows_of(1010, load, seed=4)
-    wide = _Problem(rows, None, G, point_mass=False)
+    wide = Problem(rows, None, G, point_mass=False)
     effects = np.zeros(len(wide.basis))
     kept = all_kept(rows)
     kept[990:995] = False
@@ -318,10 +313,10 @@ def test_contact_is_first_judged_by_the_quiet_rows_of_each_state() -> None:
     noise = np.where(resting, 0.3, 1.0)[:, None] * SIGMA * rng.normal(size=(400, 6))
     noise[[150, 250, 50]] = np.outer([2.5, 5.5, 2.5], SIGMA)
     rows = replace(rows, wrench=rows.wrench + noise, speed_rad_s=np.where(resting, 0.0, 1.0))
-    problem = _Problem(rows, None, G, point_mass=False)
+    problem = Problem(rows, None, G, point_mass=False)
     assert np.flatnonzero(~_first_kept(problem, truth)).tolist() == [*range(48, 53), *range(248, 253)]
     pushed = replace(rows, wrench=rows.wrench + np.where(resting, 20.0, 0.0)[:, None] * SIGMA)
-    assert not _first_kept(_Problem(pushed, None, G, point_mass=False), truth)[:100].any()
+    assert not _first_kept(Problem(pushed, None, G, point_mass=False), truth)[:100].any()
 
 
 def test_a_delay_is_found_roughly_beside_contact() -> None:
@@ -356,7 +351,7 @@ def test_another_mounting_costs_what_its_own_fit_does() -> None:
     expected = np.r_[np.full(6, found.load.mass_kg * GYRATION_M**2), HEIGHT_M, DELAY_S]
     np.testing.assert_allclose(found.prior_share, np.sqrt(np.diag(found.covariance))[15:23] / expected)
     costs = []
-    for start in _Problem(rows, None, G, point_mass=False).starts():
+    for start in Problem(rows, None, G, point_mass=False).starts():
         load = start
         for _ in range(8):
             motion = rows.motion.earlier(load.delay_s, rows.rate)
