@@ -166,7 +166,8 @@ def apply_update(
     """Make a new calibration of an update.
 
     `residuals`, `chi2`, `dof` and `p_value` are those of the new readings. Noise beyond the measured one
-    (`components`) and the verdict are those of the old calibration, because new readings are too few for them.
+    (`components`) and the verdict are those of the old calibration, because new readings are too few for them. The
+    matrix of the sensor stays, and the mass by a scale unless the weight is estimated again.
 
     Parameters
     ----------
@@ -208,6 +209,8 @@ def apply_update(
         gain_sigma=calibration.gain_sigma,
         cable_shift=calibration.cable_shift,
         second_basin_chi2=calibration.second_basin_chi2,
+        sensor=calibration.sensor,
+        weighed_kg=None if "weight" in BLOCKS.get(update.kind, ("weight",)) else calibration.weighed_kg,
     )
 
 

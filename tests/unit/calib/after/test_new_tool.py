@@ -7,7 +7,7 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
-from ftcalib import CalibrationDataset, CalibrationResult, solve
+from ftcalib import CalibrationDataset, CalibrationResult, SensorMatrix, solve
 from ftcalib.after.expected_readings import sensor_error_columns
 from ftcalib.after.new_tool import _beyond, new_tool, together
 from ftcalib.after.state import known_response
@@ -45,8 +45,10 @@ def error(result: CalibrationResult, truth: Parameters) -> Array:
 def test_sigmas_of_a_new_tool_hold_and_its_parent_is_named(runs: int) -> None:
     z2 = []
     for seed in range(runs):
-        earlier = calibrated(24, seed % 4)
+        known = SensorMatrix.usual(0.005, source="data sheet")
+        earlier = replace(calibrated(24, seed % 4), sensor=known, weighed_kg=(TRUTH.weight_N / 9.80665, 1e-3))
         result = new_tool(earlier, poses(OTHER, FOUR, seed))
+        assert (result.sensor, result.weighed_kg) == (known, None)  # the scale had the other tool on it
         e = error(result, OTHER)
         z2.append(e @ np.linalg.solve(result.covariance, e) / 15)
         assert result.provenance["parent"] == {"id": earlier.id}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, solve
+from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, NotObservable, Parameters, SensorMatrix, solve
 from ftcalib.after.state import BLOCKS, Update, apply_update, reestimate, tare
 from ftcalib.model import Array, jacobian, predict
 from ftcalib.sensor_matrix import Response, response_columns
@@ -288,6 +288,16 @@ def test_an_update_makes_a_calibration_that_names_its_parent_and_survives_a_file
     one = tare(parent, R[:1], [dwell(truth(), R[0], rng)])
     with pytest.raises(NotObservable, match="use 2 poses or more"):
         apply_update(parent, one)
+
+
+def test_an_update_keeps_what_is_known_of_the_sensor_and_the_weighed_mass_of_the_same_tool() -> None:
+    sensor, R = SensorMatrix.usual(0.005, source="data sheet"), Rotation.random(12, rng=1).as_matrix()
+    solved = solve(CalibrationDataset.of(R, predict(truth(), R), wrench_cov=NOISE))
+    parent = replace(solved, sensor=sensor, weighed_kg=(2.0, 0.001))
+    for kind, weighed_kg in (("bias", (2.0, 0.001)), ("mounting", (2.0, 0.001)), ("payload", None), ("all", None)):
+        child = apply_update(parent, reestimate(parent, R, predict(truth(), R), joint(12), kind))
+        assert (child.sensor, child.weighed_kg) == (sensor, weighed_kg)
+        assert child.contact.sigma_at(np.zeros(3))[0] < replace(child, sensor=None).contact.sigma_at(np.zeros(3))[0]
 
 
 def test_shapes_that_do_not_fit_are_rejected() -> None:
