@@ -1,8 +1,17 @@
-"""What explains the data: which poses belong together, and which components of the noise act on them.
+"""What explains the data: which poses are outliers, and which variance components act on the others.
 
-The objective is the restricted likelihood at the best parameters, less what each component and each rejected pose must
-bring. Starting from all poses and from those that agree, parameters, variances, components and rejected poses are
-improved in turn until nothing changes.
+With the restricted likelihood L of `variance_components` on the kept poses, at its best parameters and variances, an
+explanation has the criterion
+
+    -2 (log L - sum_k gain_k) + sum_j (log det S_j + c + 6 log(max(d_j², c) / c))
+
+over the components k and the rejected poses j. gain_k is the least gain of a component, a penalty as of an information
+criterion. S_j is the leave-one-out covariance of pose j, d_j² its squared distance in it, and c the limit that one good
+pose in a thousand exceeds: at the limit, a rejected pose costs what it would if it were kept, and beyond it has a
+variance of its own (variance inflation: Cook, Holschuh and Weisberg, Technometrics 24, 1982).
+
+From two starts, all poses and those that a robust fit keeps, parameters, variances, components (forward selection,
+then backward elimination) and rejected poses are improved in turn until nothing changes.
 """
 
 from collections.abc import Sequence
@@ -48,11 +57,11 @@ from ftcalib.likelihood.variance_components import (
 )
 from ftcalib.model import Array, Parameters, predict
 
-# Which components of the noise the data show: added, dropped and exchanged by restricted likelihood.
+# Selection of the components: forward, backward and by exchange.
 
-# A gain or loss that no other component can regain.
+# Change of the log-likelihood that no other component makes up for.
 SURE = 20.0
-# Gain predicted from slope and curvature at zero.
+# Least gain, predicted from score and information at zero, of a component that is tried.
 WORTH_A_TRY = 1.0
 USUAL_HYSTERESIS = 0.001
 # Gain and cross-talk of real sensors.
@@ -268,19 +277,19 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
 
 # From here on single poses are looked at only when chi2 or `drift` asks for it.
 MANY_POSES = 20_000
-# So many of more than 1000 poses show whether the bias walks, and errors that have a structure.
+# Poses, drawn from more than 1000, in which walks and errors that have a structure are searched.
 SEARCHED = 300
-# Fewer do not show that poses are bumped by the shape of the distribution.
+# With fewer poses the distribution of the distances is not tested.
 POSES_FOR_THE_SHAPE = 500
-# P-value below which more than the measured noise is looked for.
+# P-value of chi2 below which components are searched.
 SUSPICIOUS = 0.01
-# The median of squared distances relative to their mean, in units of what Gaussian noise has.
+# Ratio of median to mean of the squared distances, relative to that of Gaussian noise.
 LIGHT_TAIL = 0.6
-# Rounds of the outer loop, which ends after a few.
+# Most rounds of the outer loop.
 ROUNDS = 20
 # Squared step, in standard deviations of the estimates.
 SETTLED = 1e-4
-# A minimum with chi2 higher by this is not the answer under any noise.
+# Difference of chi2 beyond which a minimum is excluded under any noise.
 FAR = 1000.0
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 

@@ -1,4 +1,17 @@
-"""The data of one session: poses in the order of time, what is known before, and what may act on the poses."""
+"""The data of one session: poses in the order of time, priors, and the components that may act on the poses.
+
+`Session.linearise` gives the mixed model of `variance_components` at parameters p. With the wrench h of `ftcalib.model`
+and its derivative J_i, pose i at time t_i leaves
+
+    r_i = wrench_i - h(p, R_i) = J_i Z x + b(t_i) + T_i u + J_i[:, :3] d_i + e_i,    e_i ~ N(0, D_i)
+
+    x    step of the free parameters: Z is the basis that exact constraints leave, tolerances are priors
+    b    drift of the bias: random walk, or linear in time
+    u    coefficients of gain, cross-talk, hysteresis and errors that have a structure
+    d_i  error of the orientation, which adds size² J J' to D_i (effective variance: Orear, Am. J. Phys. 50, 1982)
+
+D_i is the measured covariance of the mean; where it was not measured, white noise is a component too.
+"""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -30,25 +43,25 @@ Drift = Literal["auto", "none", "linear", "random-walk"]
 RANK_TOLERANCE = 1e-9
 # Usual ratio of torque noise to force noise.
 LEVER_M = 0.025
-# Fewer cannot separate force noise from torque noise: the usual ratio is taken.
+# With fewer poses the ratio of torque noise to force noise is assumed.
 FEW_POSES = 6
-# Fewer cannot separate gain and cross-talk from noise.
+# With fewer poses gain and cross-talk are not separated from noise.
 FEW_POSES_FOR_RESPONSE = 7
-# Fewer do not show how large gain and cross-talk are: they count as large as those of mounted sensors.
+# With fewer poses the variances of gain and cross-talk are at least those of usual sensors.
 FEW_POSES_FOR_GAIN = 12
-# Fewer cannot separate drift from unknown noise.
+# With fewer poses drift is not separated from unknown noise.
 FEW_POSES_WITHOUT_NOISE = 12
-# Fewer cannot separate it from gain and noise.
+# With fewer poses hysteresis is not separated from gain and noise.
 FEW_POSES_FOR_HYSTERESIS = 12
-# Fewer cannot separate the drifts of the axes of a group.
+# With fewer poses the axes of a group share one drift.
 POSES_FOR_EACH_AXIS = 50
-# Times the rounding of the data: what a fit to data without noise leaves.
+# Residuals of a fit to data without noise, relative to their rounding.
 EXACT = 100
-# Its multiples are spread evenly, and repeat no pattern.
+# Low-discrepancy sequence.
 GOLDEN_RATIO = (1 + 5**0.5) / 2
-# Residuals of one kind, relative to the other at the usual ratio, are no less.
+# Least ratio of the residuals of one kind to those of the other, at the usual ratio.
 UNEQUAL = 0.01
-# Least white noise where it was not measured, as a share of the residuals.
+# Noise floor where the noise was not measured, as a share of the residuals.
 FLOOR = 1e-3
 
 

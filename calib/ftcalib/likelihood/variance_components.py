@@ -1,7 +1,25 @@
 """Variance components by restricted maximum likelihood: what acts on the wrenches beyond the measured noise.
 
-Restricted likelihood (Patterson, Thompson 1971) allows for the parameters fitted to the same data. It is maximised over
-the logarithms of the variances with average information (Gilmour, Thompson, Cullis 1995), all in O(n).
+The residuals r of all poses at the present parameters follow a linear mixed model,
+
+    r = J x + T u + e,    e ~ N(0, V),    u_k ~ N(0, theta_k I),    V = blockdiag(D_i + white + rotation) + walk
+
+with x the step of the parameters, u the coefficients of what acts on all poses (`EFFECTS`), and the components of V
+linear in their variances theta. With X = (J, T), W = V^-1 and the prior information H0, g0 of x, the mixed model
+equations (Henderson, Biometrics 31, 1975) estimate x and u together,
+
+    H = X' W X + blockdiag(H0, I / theta_k),    C = H^-1,    (x, u) = C g,    g = X' W r + (g0, 0)
+
+and the restricted likelihood (Patterson and Thompson, Biometrika 58, 1971) allows for the estimates in the same data,
+
+    -2 log L(theta) = log det V + sum_k size_k log theta_k + log det H + r' W r - g' C g.
+
+It is maximised over log theta with score and average information (Gilmour, Thompson and Cullis, Biometrics 51, 1995),
+
+    P = W - W X C X' W,    V_k = theta_k dV / dtheta_k, or theta_k T_k T_k' for a component of u
+    score_k = (r' P V_k P r - tr(P V_k)) / 2,    information_kl = r' P V_k P V_l P r / 2,
+
+all in O(n). A slope of unknown size is a part of u with infinite variance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,19 +35,19 @@ from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.session_noise import Noise, centre, summed_products, walk_times
 from ftcalib.model import Array
 
-# A component stays when it raises the restricted log-likelihood by more than this: 2 % come in by chance.
+# Least gain in restricted log-likelihood of a component that is kept: 2 % pass by chance.
 GAIN = 2.0
-# The gain in likelihood for gain, cross-talk and hysteresis, whose 5 and 6 numbers come in by chance in 0.4 %.
+# The same for gain, cross-talk and hysteresis, which have 5 or 6 coefficients: 0.4 % pass by chance.
 GAIN_OF_RESPONSE = 3.0
-# Squared distance from the best variances, in their standard deviations.
+# Convergence: squared distance to the maximum, in standard deviations of the log variances.
 SETTLED = 1e-2
-# Damping that shortens a step; less hardly does.
+# Levenberg-Marquardt damping that shortens a step noticeably.
 CAREFUL = 0.3
-# A climb gains no more than this many times what slope and curvature promise.
+# Most that an ascent gains, relative to the quadratic prediction from score and information.
 HOPE = 10.0
-# Share of the white noise at which slope and curvature "at zero" are taken.
+# Variance, relative to the white noise, at which score and information of an absent component are evaluated.
 NEGLIGIBLE = 1e-4
-# Variances that no arm or sensor in working order exceeds. A larger one has another cause.
+# Upper bounds of the variances of an arm and a sensor in working order. A larger variance has another cause.
 LARGEST = {
     "rotation": float(np.deg2rad(3.0)) ** 2,
     "gain": 0.05**2,
@@ -38,7 +56,7 @@ LARGEST = {
     "kinematics": float(np.deg2rad(1.0)) ** 2,
     "load": 0.05**2,
 }
-# Fewer leave its size uncertain enough to matter.
+# With fewer poses the covariance allows for the uncertainty of the variances.
 POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
@@ -58,7 +76,7 @@ class Component:
 
     @property
     def needed(self) -> float:
-        """The gain in log-likelihood that it must bring."""
+        """Least gain in log-likelihood."""
         return GAIN_OF_RESPONSE if self.kind in EFFECTS else GAIN
 
 
@@ -158,7 +176,7 @@ class Linearised:
         return int(self.kept.sum()) * (2.0 if c.kind == "rotation" else float(np.count_nonzero(c.share)))
 
     def largest(self, c: Component) -> float:
-        """Variance that no arm or sensor in working order exceeds.
+        """Upper bound of the variance for an arm and a sensor in working order.
 
         An error of the gain acts on the torque of the weight too, as cross-talk at the lever of the centre of mass.
         """
@@ -166,16 +184,13 @@ class Linearised:
         return LARGEST.get(c.kind, np.inf) * at_lever
 
     def smallest(self, c: Component) -> float:
-        """Variance that the sensor or the arm may have, whatever too few data show."""
+        """Lower bound of the variance, where the data are too few to refute it."""
         return self.least.get(c.kind, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """Restricted likelihood for given variances, and what it was made from.
-
-    What acts on all poses at once is estimated with the parameters, as unknowns of mean zero and these variances.
-    """
+    """Restricted likelihood at given variances, with the solution of the mixed model equations there."""
 
     problem: Linearised
     components: tuple[Component, ...]
@@ -199,12 +214,12 @@ class Point:
 
     @property
     def worth(self) -> float:
-        """The log-likelihood less what each component must bring."""
+        """Penalised log-likelihood: less the least gain of each component."""
         return self.loglik - sum(c.needed for c in self.components)
 
     @property
     def too_large(self) -> bool:
-        """Whether a variance is at the limit of what has this cause."""
+        """Whether a variance is at its upper bound."""
         return any(v >= self.problem.largest(c) for c, v in zip(self.components, self.theta, strict=True))
 
     @property
@@ -214,13 +229,13 @@ class Point:
 
     @property
     def squared_step(self) -> float:
-        """That, in standard deviations of the estimates."""
+        """Squared length of the step, in standard deviations of the estimates."""
         m = len(self.step)
         return float(self.step @ np.linalg.solve(self.C[:m, :m], self.step))
 
     @property
     def noise(self) -> Noise:
-        """All of it."""
+        """Covariance of all components together."""
         return noise_of(self.problem, self.components, self.theta)
 
     def weigh_columns(self) -> tuple[Array, Array]:
@@ -261,10 +276,10 @@ class Point:
 
 
 def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
-    """Predict every pose from all others, drift and correlation included, without fitting again.
+    """Leave-one-out prediction of every pose, with drift and correlation, in closed form.
 
-    The exact leave-one-out of the linear model, and the prediction of poses that do not count: `P_kk^-1 (P y)_k` with
-    `P = W - W J C J' W`, W the inverse noise.
+    It is exact in the linear model: the residual is `P_kk^-1 (P y)_k` with `P = W - W J C J' W`, W the inverse noise.
+    Rejected poses are predicted from the kept ones.
 
     Parameters
     ----------
@@ -425,7 +440,7 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
 
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array, worse_than: float = -np.inf) -> Point:
-    """Climb to the best variances from these (k,), all positive; or until a log-likelihood seems out of reach."""
+    """Maximise from these variances (k,), all positive; stop early where `worse_than` seems out of reach."""
     problem = problem.with_only(components)
     if not components:
         return point(problem, components, theta)
@@ -456,17 +471,17 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             best, caution = trial, max(caution / 10, 1e-6)
         if gained < 1e-3 or (gained < 1e-2 and np.abs(step).max() < 0.05):
             break
-        # A variance that sinks without changing the likelihood will be dropped.
+        # A variance that decreases without changing the likelihood will be dropped.
         if gained < 1e-2 and (slope < 0.05).all():
             break
     return best
 
 
 def expected_variances(problem: Linearised, at: Point) -> Array:
-    """Give the variances (k,) with the white noise that is expected instead of the likeliest, which may be none.
+    """Return the variances (k,) with the posterior mean of the white noise in place of its mode, which may be 0.
 
     A drift that varies as fast as the poses leaves little for the noise, whose likelihood is then flat down to zero.
-    Its standard deviation is uniformly distributed before (Gelman 2006), and its square has a normal likelihood.
+    The prior of its standard deviation is uniform (Gelman 2006), the likelihood of its square is normal.
     """
     slope, information = score(problem, at, at.components, at.theta)
     scale = column_scale(information)

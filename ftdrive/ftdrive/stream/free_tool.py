@@ -1,4 +1,28 @@
-"""The filter of the free tool: its bias, how fast that drifts, the error of the calibration here, and a held part."""
+"""Kalman filter of a free tool: its bias and drift, the local error of the calibration, and a held part.
+
+The state is x = (b, d, c, s): bias (6), its rate (6), error of the calibration in this orientation (6), mass and mass
+times centre of mass of the part (4). Over dt seconds and a turn of the arm by phi, with a = exp(-phi / 0.5 rad) and
+the covariance S of the prediction of the calibration,
+
+    b <- b + dt d + N(0, dt walk²)    d <- d + N(0, dt q)    c <- a c + N(0, (1 - a²) S)    s <- s
+
+The residual y of a window, measured minus predicted wrench, has with the specific force f at the sensor and the
+matrix L of angular acceleration and centripetal terms
+
+    y = b + c + M [[f, -L], [0, -[f - L p]x]] s + e =: H x + e,    e ~ N(0, C)
+
+M is the response of the sensor, p the centre of mass of the part as last known, and C the noise of this state of
+motion, learnt from the innovations. The update is that of Kalman, with the innovation v = y - H x:
+
+    T = H P H' + C,    K = P H' T^-1,    x <- x + K v,    P <- P - K H P
+
+A window whose squared distance v' T^-1 v exceeds a gate is no update. Within the gate C is multiplied by
+max(1, (4 + v' T^-1 v) / (4 + 6)), the weight of Student's distribution with 4 degrees of freedom. Filters with several
+walks run side by side, and are mixed by their likelihoods with exponential forgetting (static multiple models).
+
+Source: Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, chapters 5
+(filter, gate) and 11 (multiple models); Lange, Little and Taylor, JASA 84, 1989 (Student's distribution).
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
