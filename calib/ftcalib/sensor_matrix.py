@@ -190,6 +190,50 @@ def expected_error(parameters: Parameters, covariance: Array, response: Response
     return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
+# What of the gain depends on the load.
+LOAD: Final = 0.005
+
+
+def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_base_flange: Array) -> Array:
+    """Give what errors of the sensor do to the reading of a load, for one sigma of each, beyond those of the tool.
+
+    The response to the tool is that to any load at its centre of mass. A load at another has a torque beside, to which
+    the sensor responds by errors of its own, as large as those that the tool shows.
+
+    Parameters
+    ----------
+    tool : Parameters
+        Of the calibration.
+    known : Response
+        Gain and cross-talk of the tool, as found or with the covariance that the fit leaves of the prior.
+    p : Parameters
+        Of the load.
+    R_base_flange : array, shape (n, 3, 3)
+
+    Returns
+    -------
+    array, shape (n, 6, 38)
+        Independent columns, the errors of `known` not among them.
+    """
+    square = known.coefficients**2 + np.diag(known.covariance)[15:]
+    in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / USUAL**2, [5]))
+    u, lever = gravity_wrench(p, R_base_flange)[:, :3], skew(p.p_sensor_com_m - tool.p_sensor_com_m)
+    entries = USUAL_GAIN * np.where(np.eye(3) > 0, 1.0, CROSS_TALK_SHARE)
+    columns = np.zeros((len(u), 6, 27))
+    columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * entries[0, 1] / RANGE_LEVER_M))
+    columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
+    columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
+    # A gain of one load is that of another but for what depends on the load.
+    other = min(abs(p.weight_N / tool.weight_N - 1), 1.0) if tool.weight_N else 1.0
+    loads = response_columns(p, R_base_flange) * np.minimum(np.sqrt(square), LOAD) * other
+    return np.concatenate([columns, loads], axis=2)
+
+
+def _products(A: Array, v: Array, sigma: Array) -> Array:
+    """Derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
+    return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
+
+
 ENTRIES = np.eye(36).reshape(36, 6, 6)
 """Derivative of an error (6, 6) of the matrix by its entries, row by row."""
 

@@ -15,7 +15,6 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.expected_readings import LOAD, sensor_error_columns
 from ftcalib.after.state import Update, apply_update
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import NotObservable
@@ -23,7 +22,15 @@ from ftcalib.findings import Finding
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
-from ftcalib.sensor_matrix import SIZE, Response, joint_covariance, joint_jacobian, response_columns
+from ftcalib.sensor_matrix import (
+    LOAD,
+    SIZE,
+    Response,
+    joint_covariance,
+    joint_jacobian,
+    response_columns,
+    sensor_error_columns,
+)
 
 # Share of good runs that the test of what was kept rejects.
 FALSE_ALARMS = 1e-4

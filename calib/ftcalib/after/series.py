@@ -171,7 +171,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     t_days : array, shape (n,)
         Since the calibration, in ascending order; any spacing.
     change : array, shape (n, k)
-        Change of the bias since the calibration, as `ftcalib.after.expected_readings` estimates it.
+        Change of the bias since the calibration, as `ftcalib.after.verification` estimates it.
     sigma : array, shape (n, k)
         One standard deviation from the readings of each verification, positive.
     calibration_sigma : array, shape (k,)

@@ -5,33 +5,54 @@ found (`components`), the drift of the bias since, and the uncertainty of the ca
 
     S = noise + J C J' + drift,    chi2 = r' S^-1 r
 
-`ftcalib.after.expected_readings` has its limit, which allows for noise that was estimated from the fit.
+What a fit of few poses estimated is uncertain, and so is what acts on its readings. Two explanations are kept:
+
+* The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
+* The measured noise, by a factor that only the residuals of the fit show, and what sensor, arm and cable usually do
+  (`response_columns`, `_smooth_errors`). The residuals show its size, but not what other joint angles do in one
+  orientation.
+
+Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
+over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
+1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
+predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Literal
 
 import numpy as np
+from scipy.linalg import block_diag, solve_triangular
+from scipy.special import chdtrc as chi2_sf
+from scipy.special import fdtrc as f_sf
 
-from ftcalib.after.expected_readings import (
-    BiasChange,
-    Expected,
-    bias_change,
-    expected_as_found,
-    expected_with_smooth_errors,
-)
 from ftcalib.after.state import BLOCKS, Update, reestimate
-from ftcalib.data.dataset import CalibrationDataset, finite
+from ftcalib.compensation import Compensator
+from ftcalib.data.dataset import CalibrationDataset, finite, pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
-from ftcalib.model import BIASES, Array, Parameters, angle_between_vectors, gravity_wrench, read_only, skew
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.structure import alike, hysteresis_columns
+from ftcalib.model import (
+    BIASES,
+    Array,
+    Parameters,
+    angle_between_vectors,
+    gravity_wrench,
+    jacobian,
+    predict,
+    read_only,
+    skew,
+)
 from ftcalib.result import CalibrationResult
+from ftcalib.sensor_matrix import SIZE, USUAL, joint_covariance, joint_jacobian, response_columns, with_covariance
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
 
 # Kind of update that makes up for each change.
-SINGLE: Mapping[str, Change] = {
+_SINGLE: Mapping[str, Change] = {
     "bias": "bias",
     "weight": "payload",
     "payload": "payload",
@@ -39,14 +60,245 @@ SINGLE: Mapping[str, Change] = {
     "mounting": "mounting",
     "base": "base",
 }
-SEVERAL = ("bias and payload", "all")
+_SEVERAL = ("bias and payload", "all")
 # Each parameter must lower chi2 by more than this: one in 200 does by chance.
-COST = 8.0
+_COST = 8.0
 # Probability of the remaining misfit below which a change does not explain the readings.
-UNEXPLAINED = 1e-3
+_UNEXPLAINED = 1e-3
 # Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1.
-INDISTINCT = 9.2
+_INDISTINCT = 9.2
 FEWEST = 2
+
+# Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
+_USUAL_GAINS = np.array([0.1, 1.0])
+_USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
+# Share of smooth errors that is not one of the orientation, where a fit reaches orientations with various joint angles.
+_OTHER_JOINTS = 0.8
+# Else what other joint angles add: variances of the size that the fit shows, and at least those of a usual arm.
+_BEYOND, _LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
+# Of more poses every second, third, ... shows smooth errors.
+_FEW_TO_SMOOTH = 100
+# Least share of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
+_LEAST_FACTOR = 0.1
+# Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
+_TURN_RAD, _CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
+
+_AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
+_CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """What unchanged readings scatter by, under one explanation."""
+
+    calibration: Update
+    """The calibration, with the drift of the bias since then in its covariance."""
+    noise: Array
+    """(6n, 6n) of the new readings: measured noise, errors of each pose, drift from the first to each."""
+    freedom: float
+    """Degrees of freedom from which the fit estimated this noise, or its factor; infinite if neither."""
+    factor: float = 1.0
+    """By which all variances are multiplied, noise and calibration; chi2 is without it."""
+    weight: float = 1.0
+    """Probability of the explanation, relative to the others of its kind."""
+
+    def distance(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, float]:
+        """Return the residuals (n, 6), their sigma (n, 6), and chi2 of all of them together."""
+        p, response = self.calibration.parameters, self.calibration.response
+        residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
+        S = self.noise + self.common(R_base_flange)
+        chi2 = float(residual.ravel() @ np.linalg.solve(S, residual.ravel()))
+        return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
+
+    def common(self, R_base_flange: Array) -> Array:
+        """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
+        p, response = self.calibration.parameters, self.calibration.response
+        C = joint_covariance(self.calibration.covariance, response)
+        K = joint_jacobian(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
+        return np.asarray(K @ C @ K.T)
+
+    def p_value(self, chi2: float, dof: int) -> float:
+        """Probability of a larger chi2."""
+        chi2 /= self.factor
+        return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
+
+    def deviance(self, chi2: float, dof: int) -> float:
+        """-2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
+        chi2 /= self.factor
+        return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
+
+
+def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
+    """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
+
+    A random walk of variance q² a pose moves the bias by q² to the first new pose, and from the mean of the N poses of
+    the tour, which earlier files have, by q² (N / 3 + 1). A linear drift goes on for as long as the tour. If the fit
+    found nothing, the measured noise has the factor chi2 / dof of the fit.
+    """
+    n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
+    n_used = calibration.n_poses - len(calibration.rejected_poses)
+    measured = np.zeros((n, 6, n, 6))
+    measured[range(n), :, range(n)] = wrench_cov
+    parts, gap, to_end = [], np.zeros(6), 0.0 if calibration.mean_bias is not None else n_used / 3
+    for name, sigma in _components(calibration).items():
+        kind, _, channels = name.partition("_")
+        part, since = np.zeros((n, 6, n, 6)), np.zeros(6)
+        c = _CHANNELS.get(channels, [])
+        freedom = len(c) * calibration.dof / 6
+        if kind == "walk":
+            part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (to_end + 1)
+            freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
+        elif kind == "slope":
+            part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
+            freedom = len(c)
+        elif kind == "rotation":  # turns about gravity do not show
+            turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
+            part[range(n), :, range(n)] = sigma**2 * (turn @ np.swapaxes(turn, 1, 2))
+            freedom = max(2 * n_used - 6, 2)
+        elif kind == "white":  # with unmeasured noise all of it
+            known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
+            for k in c:
+                part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
+        elif kind == "hysteresis":  # six shares, one for each axis
+            T = hysteresis_columns(calibration.parameters, R_base_flange).reshape(6 * n, -1)
+            part, freedom = (sigma**2 * T @ T.T).reshape(n, 6, n, 6), 6
+        else:  # gain and cross-talk act through the response
+            continue
+        gap += since
+        part[:, range(6), :, range(6)] += since[:, None, None]
+        parts.append((part.reshape(6 * n, 6 * n), freedom))
+    total = measured.reshape(6 * n, 6 * n) + sum((part for part, _ in parts), np.zeros((6 * n, 6 * n)))
+    noise = total - np.kron(np.ones((n, n)), np.diag(gap))
+    if not (parts or calibration.components) and calibration.noise_source == "measured":
+        factor = max(calibration.chi2 / calibration.dof, _LEAST_FACTOR)
+        return Expected(_add_drift(calibration, gap), noise, calibration.dof, factor)
+    # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
+    inverse = np.linalg.inv(total)
+    spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
+    return Expected(_add_drift(calibration, gap), noise, 1 / spread if spread else np.inf)
+
+
+def expected_with_smooth_errors(
+    calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
+) -> list[Expected]:
+    """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable of various sizes.
+
+    Empty if the noise was not measured, for parameters that were known or not estimated by maximum likelihood. The
+    weights sum to 1. Gain and cross-talk that the fit found have the variance that it gave them.
+
+    What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
+    Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
+    part, or its poses turn the wrist alone and cannot.
+    """
+    p, response = calibration.parameters, calibration.response
+    kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
+    complete = calibration.method == "ml" and calibration.dof == 6 * int(kept.sum()) - 15
+    if not complete or fitted.wrench_cov is None:
+        return []
+    rows = np.flatnonzero(kept)[:: -(-int(kept.sum()) // _FEW_TO_SMOOTH)]
+    R, dof = fitted.R_base_flange[rows], 6 * len(rows) - 15
+    D = block_diag(*pooled_covariance(fitted.wrench_cov, fitted.n_samples)[rows])
+    e = (fitted.wrench[rows] - predict(p, R)).ravel()
+    J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
+    T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
+    smooth, between, new = (_smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
+    alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
+    sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
+    coefficients = calibration.shown_response.coefficients
+    stored = joint_jacobian(p, response, R_base_flange).reshape(len(J_new), -1)
+    stored = stored @ joint_covariance(calibration.covariance, response) @ stored.T
+    explanations, likelihood = [], []
+    for share, of_gain, *of_kinds in product((0.0, _OTHER_JOINTS), _USUAL_GAINS, _USUAL_SMOOTH, _USUAL_SMOOTH):
+        square = np.square(of_kinds)
+        alike, gain = (1 - share) * square, np.where(sizes > 0, sizes, of_gain * USUAL) ** 2
+        S = D + np.tensordot(alike, smooth, 1) + np.tensordot(share * square, alone, 1) + (T * gain) @ T.T
+        to_new = np.tensordot(alike, between, 1) + (T_new * gain) @ T.T
+        L = np.linalg.cholesky(S)
+        white = solve_triangular(L, np.column_stack([J, e, to_new.T]), lower=True)
+        white_J, white_e, white_new = white[:, :15], white[:, 15], white[:, 16:]
+        H = white_J.T @ white_J
+        scale = column_scale(H)
+        H = H / np.outer(scale, scale)
+        C = np.linalg.inv(H) / np.outer(scale, scale)
+        x = C @ (white_J.T @ white_e)
+        left = white_e - white_J @ x
+        chi2 = float(left @ left)
+        logdet = 2 * float(np.log(np.diag(L)).sum() + np.log(scale).sum()) + float(np.linalg.slogdet(H)[1])
+        likelihood.append(-0.5 * (logdet + dof * np.log(chi2)))
+        factor = max(chi2 / dof, _LEAST_FACTOR)
+        off, B = white_new.T @ left + J_new @ x - T_new @ coefficients, J_new - white_new.T @ white_J
+        total = block_diag(*wrench_cov) + np.tensordot(alike, new, 1) + (T_new * gain) @ T_new.T
+        total -= white_new.T @ white_new
+        # Where joint angles follow from the orientation in the fit, others may do more than it shows.
+        total += np.tensordot(share * square if share else _BEYOND * square + _LEAST_BEYOND, alone_new, 1)
+        # The prediction as stored is off by what this explanation moves it.
+        total += B @ C @ B.T + np.outer(off, off) / factor
+        value, vector = np.linalg.eigh(total - stored / factor)
+        noise = (vector * np.maximum(value, 1e-6 * value[-1])) @ vector.T
+        joint = with_covariance(response, joint_covariance(calibration.covariance, response) / factor)
+        update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
+        explanations.append(Expected(update, noise, dof, factor))
+    weights = np.exp(np.array(likelihood) - max(likelihood))
+    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
+
+
+def _components(calibration: CalibrationResult) -> Mapping[str, float]:
+    """Components of the noise, and a linear drift that was part of the model."""
+    found = dict(calibration.components)
+    if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
+        found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
+    return found
+
+
+def _add_drift(calibration: CalibrationResult, gap: Array) -> Update:
+    """Add variances (6,) of the bias to the covariance of a calibration."""
+    covariance = calibration.covariance.copy()
+    joint = joint_covariance(calibration.covariance, calibration.response).copy()
+    covariance[BIASES, BIASES] += gap
+    joint[BIASES, BIASES] += gap
+    return Update(calibration.parameters, covariance, 0.0, 0, response=with_covariance(calibration.response, joint))
+
+
+def _smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
+    """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
+    correlated = alike(R_base_flange, others)
+    turn, turn_other = (jacobian(p, R)[..., :3] * _TURN_RAD for R in (R_base_flange, others))
+    of_arm = np.einsum("nm,nik,mjk->nimj", correlated, turn, turn_other)
+    return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(correlated, np.diag(_CABLE**2))])
+
+
+def bias_change(expected: Expected, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, Array]:
+    """Estimate the change of the six biases, as if nothing else had changed.
+
+    The residuals are r = H b + K e + noise, with b the change, H the identity for each pose, and e the errors of the
+    calibration, which all its verifications share. The change is the mean by generalised least squares,
+
+        b = G r,    G = (H' S^-1 H)^-1 H' S^-1,    S = noise + K C K',
+
+    and its covariance has two parts: G noise G' of this verification, G K C K' G' of the calibration.
+
+    Parameters
+    ----------
+    expected : Expected
+        What unchanged readings of these poses scatter by.
+    R_base_flange : array, shape (n, 3, 3)
+    wrench : array, shape (n, 6)
+        Mean readings as measured, N and N·m, in the sensor frame.
+
+    Returns
+    -------
+    change, sigma, calibration_sigma : array, shape (6,)
+        As in `Verification`.
+    """
+    residual, _, _ = expected.distance(R_base_flange, wrench)
+    common = expected.common(R_base_flange)
+    H = np.tile(np.eye(6), (len(wrench), 1))
+    weighted = np.linalg.solve(expected.noise + common, H).T
+    G = np.linalg.solve(weighted @ H, weighted)
+    noise, calibration = (
+        np.sqrt(expected.factor * np.diag(G @ part @ G.T).clip(0.0)) for part in (expected.noise, common)
+    )
+    return G @ residual.ravel(), noise, calibration
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,20 +318,25 @@ class Verification:
     change: Change | None
     """What has changed; None if passed, or if no change explains the readings."""
     reason: str
-    bias_change: BiasChange
-    """Change of the six biases, as if nothing else had changed."""
+    bias_change: Array
+    """(6,) new bias minus that of the calibration, as if nothing else had changed; force first, N and N·m."""
+    bias_sigma: Array
+    """(6,) one standard deviation from the readings of this verification, independent of any other."""
+    calibration_sigma: Array
+    """(6,) one standard deviation from the calibration: nearly the same error in all its verifications."""
     alternatives: tuple[Change, ...] = ()
     """Other changes that explain the readings as well."""
     update: Update | None = None
     """The smallest update that makes up for the change; None if passed, or if none does."""
 
     def __post_init__(self) -> None:
-        for name in ("residual", "predicted_sigma"):
+        for name in ("residual", "predicted_sigma", "bias_change", "bias_sigma", "calibration_sigma"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content as JSON; `update` is its kind, chi2 and dof."""
         update = self.update
+        bias = {"value": self.bias_change, "sigma": self.bias_sigma, "calibration_sigma": self.calibration_sigma}
         return {
             "passed": self.passed,
             "change": self.change,
@@ -90,7 +347,7 @@ class Verification:
             "p_value": self.p_value,
             "residual": self.residual.tolist(),
             "predicted_sigma": self.predicted_sigma.tolist(),
-            "bias_change": self.bias_change.to_dict(),
+            "bias_change": {name: value.tolist() for name, value in bias.items()},
             "update": None if update is None else {"kind": update.kind, "chi2": update.chi2, "dof": update.dof},
         }
 
@@ -124,8 +381,7 @@ def verify(
     wrench_cov : array, shape (n, 6, 6)
         Covariance of those means, pooled if they come from fewer than 100 samples (`ftcalib.data.dataset`).
     fitted : CalibrationDataset, optional
-        The poses of the calibration. They show how uncertain the noise is that a fit of few poses found, see
-        `ftcalib.after.expected_readings`.
+        The poses of the calibration. They show how uncertain the noise is that a fit of few poses found.
     false_alarms : float
         Share of unchanged sensors that do not pass, in poses like those of the calibration. In others it is about
         three times as large where arm, cable or sensor do more than usual.
@@ -169,7 +425,7 @@ def verify(
 
 def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
     residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
-    n = len(wrench)
+    n, (change, bias_sigma, calibration_sigma) = len(wrench), bias_change(expected, R_base_flange, wrench)
     return Verification(
         residual=residual,
         predicted_sigma=sigma,
@@ -179,7 +435,9 @@ def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: A
         passed=passed,
         change=None,
         reason=f"the {n} poses agree with the calibration (chi2 {chi2:.0f} for {6 * n} readings, p {p_value:.2g})",
-        bias_change=bias_change(expected, R_base_flange, wrench),
+        bias_change=change,
+        bias_sigma=bias_sigma,
+        calibration_sigma=calibration_sigma,
     )
 
 
@@ -192,7 +450,7 @@ def _changes(
     logdet = float(np.linalg.slogdet(expected.noise + expected.common(R_base_flange))[1])
     logdet += dof * float(np.log(expected.factor))
     found = {}
-    for kind in (*SINGLE, *SEVERAL):
+    for kind in (*_SINGLE, *_SEVERAL):
         try:
             update = reestimate(expected.calibration, R_base_flange, wrench, expected.noise, kind)
             if "centre of mass" in BLOCKS[kind] and calibration.gain_sigma:
@@ -200,8 +458,8 @@ def _changes(
                 update = reestimate(expected.calibration, R_base_flange, wrench, noise, kind)
         except NotObservable:
             continue
-        cost = expected.deviance(update.chi2, dof) + COST * (dof - update.dof)
-        if cost < unchanged and expected.p_value(update.chi2, update.dof) > UNEXPLAINED:
+        cost = expected.deviance(update.chi2, dof) + _COST * (dof - update.dof)
+        if cost < unchanged and expected.p_value(update.chi2, update.dof) > _UNEXPLAINED:
             found[kind] = logdet + cost, update
     return found
 
@@ -211,21 +469,21 @@ def _explain(
 ) -> Verification:
     """Name the change, with the update that makes up for it."""
     misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
-    single = sorted((kind for kind in found if kind in SINGLE), key=lambda kind: found[kind][0])
+    single = sorted((kind for kind in found if kind in _SINGLE), key=lambda kind: found[kind][0])
     if single:
         least, update = found[single[0]]
-        change = SINGLE[single[0]]
+        change = _SINGLE[single[0]]
         blocks = set(BLOCKS[single[0]])
         # A payload includes its weight: such a pair is no alternative, but more of the same.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
-        others = tuple(dict.fromkeys(SINGLE[kind] for kind in apart if found[kind][0] < least + INDISTINCT))
+        others = tuple(dict.fromkeys(_SINGLE[kind] for kind in apart if found[kind][0] < least + _INDISTINCT))
         reason = f"{_in_words(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
         if others:
             reason += (
                 f"; these poses do not distinguish it from a change of {' or '.join(others)}: verify with more poses"
             )
         return replace(alarm, change=change, alternatives=others, update=update, reason=reason)
-    for kind in SEVERAL:
+    for kind in _SEVERAL:
         if kind in found:
             update = found[kind][1]
             what = "bias and payload" if kind == "bias and payload" else "several quantities"

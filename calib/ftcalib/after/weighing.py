@@ -20,7 +20,6 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.expected_readings import LOAD, sensor_error_columns
 from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update, known_response
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
@@ -30,11 +29,13 @@ from ftcalib.model import Array, Parameters, jacobian, read_only, skew
 from ftcalib.result import CalibrationResult
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.sensor_matrix import (
+    LOAD,
     ContactResponse,
     joint_covariance,
     joint_jacobian,
     ranges,
     response_columns,
+    sensor_error_columns,
     shown_gain,
     with_covariance,
 )

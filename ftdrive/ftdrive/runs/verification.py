@@ -323,7 +323,7 @@ class Verified:
             "chi2": found.chi2,
             "dof": found.dof,
             "p_value": found.p_value,
-            "bias_change": found.bias_change.to_dict(),
+            "bias_change": found.to_dict()["bias_change"],
             "poses": [self._pose(row) for row in range(len(self.records))],
             "drift_check": None if self.drift is None else self.drift.to_dict(),
             "dataset_sha256": self.dataset.sha256(),

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
 from ftcalib import CalibrationResult
-from ftcalib.after.expected_readings import Expected, expected_as_found
 from ftcalib.after.state import Update
+from ftcalib.after.verification import Expected, expected_as_found
 from ftcalib.model import BIASES, Array, DriftResult, gravity_wrench, predict
 from tests.first_order import propagated
 from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated

@@ -8,13 +8,12 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, SensorMatrix, solve
-from ftcalib.after.expected_readings import sensor_error_columns
 from ftcalib.after.new_tool import _beyond, new_tool, together
 from ftcalib.after.state import known_response
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import Response, response_columns
+from ftcalib.sensor_matrix import Response, response_columns, sensor_error_columns
 from tests.first_order import assert_same, propagated
 from tests.unit.ftdrive.stream.simulated import NOISE, TRUTH, calibrated
 

@@ -9,9 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, Setup, solve
-from ftcalib.after.expected_readings import expected_with_smooth_errors
 from ftcalib.after.state import apply_update
-from ftcalib.after.verification import Verification, verify
+from ftcalib.after.verification import Verification, expected_with_smooth_errors, verify
 from ftcalib.model import Array, DriftResult, predict
 from ftcalib.poses.information import SUBSET_6, special
 from ftcalib.sensor_matrix import response_columns

@@ -8,13 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import solve
-from ftcalib.after.expected_readings import sensor_error_columns
 from ftcalib.after.state import Calibrated, tare
 from ftcalib.after.weighing import Weight, drift_since, holding, true_tool, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import Response, SensorMatrix, predicted_covariance, ranges
+from ftcalib.sensor_matrix import Response, SensorMatrix, predicted_covariance, ranges, sensor_error_columns
 from tests.first_order import assert_same, propagated
 from tests.loaded_sensor import LEVER_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor
 from tests.loaded_sensor import NOISE as LOAD_NOISE

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ftcalib.after.expected_readings import BiasChange
 from ftcalib.after.state import reestimate
 from ftcalib.after.verification import Verification
 from ftdrive.commands import verify as command
@@ -61,9 +60,9 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
     R, noise = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])]), np.eye(12) * 1e-4
     wrench = -calibration().compensate(np.zeros((2, 6)), R) + np.repeat([0.3, 0.0], 3)
     update = reestimate(calibration(), R, wrench, noise, "bias")
-    change = BiasChange(np.full(6, 0.3), np.full(6, 0.1), np.zeros(6))
+    change = np.full(6, 0.3), np.full(6, 0.1), np.zeros(6)
     found = Verification(
-        np.full((2, 6), 0.3), np.full((2, 6), 0.1), 99.0, 12, 1e-9, False, "bias", "…", change, (), update
+        np.full((2, 6), 0.3), np.full((2, 6), 0.1), 99.0, 12, 1e-9, False, "bias", "…", *change, (), update
     )
     path = folder / "verification.json"
     return Verified(Run(folder), calibration(), folder / "a.json", limits, None, (), found, None, path)  # type: ignore[arg-type]

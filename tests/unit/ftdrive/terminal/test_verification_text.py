@@ -7,7 +7,6 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ftcalib.after.expected_readings import BiasChange
 from ftcalib.after.verification import Verification
 from ftdrive.runs.verification import AcceptanceLimits
 from ftdrive.terminal import report
@@ -23,7 +22,9 @@ FOUND = Verification(
     passed=True,
     change=None,
     reason="the difference has a reason",
-    bias_change=BiasChange(np.zeros(6), np.ones(6), np.zeros(6)),
+    bias_change=np.zeros(6),
+    bias_sigma=np.ones(6),
+    calibration_sigma=np.zeros(6),
     alternatives=(),
     update=None,
 )
