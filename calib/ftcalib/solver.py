@@ -10,14 +10,22 @@ import numpy as np
 from ftcalib.data.dataset import CalibrationDataset, pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding, ordered
-from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.described_cell import contradictions
-from ftcalib.judge.faults import faults, no_weight, other_poses
+from ftcalib.judge.faults import CORRECTED, faults, no_weight, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
-from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, Quality, judge
+from ftcalib.judge.session_change import SessionChange, possible_changes
+from ftcalib.judge.verdict import (
+    SIGNIFICANT_SIGMAS,
+    Case,
+    Quality,
+    find_mistakes,
+    find_other_poses,
+    judge,
+    statistics,
+)
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.descent import column_scale
-from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.likelihood.fit import Estimate, Fit, fit
 from ftcalib.likelihood.session import RANK_TOLERANCE, Drift
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Parameters, predict
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
@@ -115,23 +123,33 @@ def solve(
     # Yu's and Carlson's methods assume nothing of the mounting, so the fit beside them does not either.
     assumed = known if estimator is None or method in BASELINES else None
     best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
-    judged = Judged.of(best) if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
+    found = best if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
     free = best if estimator else None
     if assumed is not None:
         free = _fit_freely(dataset, wrench_cov, drift, setup)
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    quality = _judge(judged, free, dataset, measured_sigma, known, g_m_s2, setup)
+    any_zero = setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset)
+    case = Case(
+        found=found,
+        t_s=dataset.t_s,
+        setup=replace(setup, sensor_has_arbitrary_zero=any_zero),
+        known=known,
+        free=free,
+        g_m_s2=g_m_s2,
+        written=_written(dataset),
+    )
+    quality = _judge(case, measured_sigma)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
     declares_sensor = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
     return CalibrationResult(
-        parameters=judged.parameters,
-        mean_bias=None if judged.drift is None else best.on_average.bias,
-        covariance=judged.covariance,
+        parameters=found.parameters,
+        mean_bias=None if found.drift is None else best.on_average.bias,
+        covariance=found.covariance,
         hidden_covariance=best.hidden_covariance(setup.orientation_rad),
-        residuals=judged.residuals,
-        chi2=judged.chi2 if wrench_cov is None else judged.measured_chi2,
-        dof=judged.dof,
+        residuals=found.residuals,
+        chi2=found.chi2 if wrench_cov is None else found.measured_chi2,
+        dof=found.dof,
         noise_source="residuals" if wrench_cov is None else "measured",
         g_m_s2=g_m_s2,
         method=method,
@@ -139,11 +157,11 @@ def solve(
         provenance={**(provenance or {}), **printed, "dataset_sha256": dataset.sha256()},
         p_value=quality.chi2_p,
         measured_sigma=measured_sigma,
-        weights=judged.weights,
-        components=judged.components,
-        drift=None if judged.drift is None else replace(judged.drift, course=None),
-        response=judged.response,
-        gain_sigma=judged.gain_sigma,
+        weights=found.weights,
+        components=found.components,
+        drift=None if found.drift is None else replace(found.drift, course=None),
+        response=found.response,
+        gain_sigma=0.0 if found.response is None else found.response.gain_sigma,
         cable_shift=quality.cable_shift,
         second_basin_chi2=best.second_basin_chi2,
         quality=quality.to_dict(),
@@ -222,31 +240,51 @@ def _fit(
     return best
 
 
-def _judge(
-    judged: Judged,
-    free: Fit | None,
-    dataset: CalibrationDataset,
-    measured_sigma: Array | None,
-    known: Known | None,
-    g_m_s2: float,
-    setup: Setup,
-) -> Quality:
-    """Judge estimates; `free` is the best fit to the same poses without known values, if they used some."""
+def _judge(case: Case, measured_sigma: Array | None) -> Quality:
+    """Judge estimates, with what explains the data better, the simplest first; `measured_sigma` (6,) is of a pose."""
     try:
-        require_positive_definite(judged.covariance)
-        require_positive_definite(joint_covariance(judged.covariance, judged.response))
+        require_positive_definite(case.found.covariance)
+        require_positive_definite(joint_covariance(case.found.covariance, case.found.response))
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
-    return judge(
-        judged,
-        t_s=dataset.t_s,
-        measured_sigma=measured_sigma,
-        setup=replace(setup, sensor_has_arbitrary_zero=setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset)),
-        known=known,
-        unconstrained=None if free is None else Judged.of(free),
-        g_m_s2=g_m_s2,
-        written=_written(dataset),
-    )
+    quality = statistics(case.found, case.t_s)
+    causes = find_mistakes(case, quality) or _find_change(case, quality, measured_sigma)
+    return judge(case, quality, causes or find_other_poses(case, quality))
+
+
+def _find_change(case: Case, quality: Quality, measured_sigma: Array | None) -> list[Finding]:
+    """Find a lasting change, where the fit needs what could hide one: components of the noise, or poses left out."""
+    found, t_s = case.freest, case.t_s
+    kinds = ("walk", "slope") if quality.chi2_p is None else ("walk", "slope", "white")
+    drifts = any(name.startswith(kinds) for name in found.components)
+    drifts |= bool(quality.errors) or not quality.used.all()
+    # Noise from the residuals hides a turn too.
+    if not isinstance(found, Fit) or not (drifts or (found.components and not quality.is_exact)):
+        return []
+    if t_s is None or not np.isfinite(t_s).all():
+        t_s = np.arange(len(found.wrench), dtype=np.float64)
+    rows, changes = possible_changes(found, t_s, steps=drifts)
+    R, cov, times = found.R_base_flange[rows], None if measured_sigma is None else np.diag(measured_sigma**2), t_s[rows]
+    costs = [_cost(one, R, cov, times) for one in changes]
+    if not np.isfinite(least := min(costs, default=np.inf)):
+        return []
+    # The same poses with the same noise have been fitted already.
+    again = cov is not None or len(rows) < len(found.wrench)
+    known = fit(R, found.wrench[rows], cov, t_s=times) if again else found
+    change = changes[costs.index(least)]
+    return [change.finding(rows, found.weights)] if least < known.minus_two_log_likelihood else []
+
+
+def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array) -> float:
+    """Minus twice the log-likelihood without a change, and what its numbers cost; infinite if much remains."""
+    try:
+        without = fit(R, change.corrected, cov, t_s=t_s)
+    except NotObservable:
+        return np.inf
+    left_N = np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1)))
+    if left_N > CORRECTED * without.parameters.weight_N:
+        return np.inf
+    return without.minus_two_log_likelihood + change.cost
 
 
 def _zero_is_arbitrary(dataset: CalibrationDataset) -> bool:
@@ -279,7 +317,7 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
 
 def _estimate(
     method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
-) -> Judged:
+) -> Estimate:
     """Apply a published method; `best` gives the degrees of freedom and the second solution."""
     parameters = estimator(dataset.wrench)
     noise = wrench_cov
@@ -289,7 +327,7 @@ def _estimate(
         noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
     # Cube roots err most where a component of the gravity force is zero, which their own estimate hides.
     truth = best.parameters if method in SPECIAL else parameters
-    return Judged.independent(
+    return Estimate.independent(
         parameters,
         _simulated_covariance(estimator, truth, dataset.R_base_flange, noise),
         dataset.R_base_flange,

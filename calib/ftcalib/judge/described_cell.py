@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.findings import Finding
 from ftcalib.judge import units
-from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.faults import channels
 from ftcalib.judge.observability import axes_along, evenly_spread
 from ftcalib.judge.units import FARTHEST_COM_M
 from ftcalib.known import Known, Setup, turn_between, unit_vector
+from ftcalib.likelihood.fit import Estimate
 from ftcalib.model import UP_IN_BASE, Array, Parameters
 from ftcalib.rounding import to_place_of
 
@@ -206,7 +206,7 @@ def _mass(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float
     return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects, unit_N=unit_N)]
 
 
-def unit_of_force(estimate: Judged, known: Known | None, setup: Setup, g_m_s2: float) -> tuple[float, float] | None:
+def unit_of_force(estimate: Estimate, known: Known | None, setup: Setup, g_m_s2: float) -> tuple[float, float] | None:
     """Return what a unit of force is by the known or the described mass, in N, and its standard deviation."""
     if known is not None and known.mass_kg is not None:
         true_kg, tolerance_kg = known.mass_kg, known.mass_tolerance_kg

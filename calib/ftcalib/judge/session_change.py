@@ -2,8 +2,8 @@
 
 The bias may also step several times, as by a program that zeroes the sensor at its start.
 
-Each change competes with drift, inexact orientations, gain and bumped poses: the data without it are fitted again, and
-it is named if their restricted likelihood is clearly larger.
+Each change competes with drift, inexact orientations, gain and bumped poses: the solver fits the data without it, and
+it is named if their restricted likelihood is larger by more than its `cost`.
 
 `cable_of` estimates what a cable may have moved.
 """
@@ -17,14 +17,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtrc as f_sf
 
-from ftcalib.errors import NotObservable
 from ftcalib.findings import CODES, Finding, Severity
-from ftcalib.judge.faults import CORRECTED, ROUNDING, rough_fit
-from ftcalib.likelihood.descent import FARTHEST, column_scale
-from ftcalib.likelihood.fit import Fit, fit
+from ftcalib.judge.faults import ROUNDING, rough_fit
+from ftcalib.likelihood.descent import column_scale
+from ftcalib.likelihood.fit import Fit
 from ftcalib.likelihood.session_noise import summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
-from ftcalib.likelihood.variance_components import EFFECTS, GAIN, GAIN_OF_RESPONSE, squared_length
 from ftcalib.model import (
     BIASES,
     Array,
@@ -73,6 +71,8 @@ KINDS = {
     "sensor_changed": [*TURN, *BIAS],
     "sensor_and_tool_turned": [*MOUNTING],
 }
+CHANGES = frozenset(("sensors_alternate", *KINDS))
+"""Codes of the findings that are changes, not mistakes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,83 +101,63 @@ class SessionChange:
         """The first pose after each change."""
         return np.flatnonzero(np.diff(self.rows)) + 1
 
+    @property
+    def cost(self) -> float:
+        """By how much minus twice the log-likelihood must fall without the change."""
+        n, times = len(self.rows), 1 if self.takes_turns else len(self.starts)
+        margin = LARGER_MARGIN if self.takes_turns or self.code == "bias_stepped" else MARGIN
+        return float(times * (len(KINDS[self.code]) * np.log(6 * n) + 2 * np.log(n) + margin))
 
-def session_change(
-    found: Fit, order: NDArray[np.intp], t_s: Array | None, sigma: Array | None, *, steps: bool = True
-) -> list[Finding]:
-    """Find a lasting change, or two sensors that take turns.
+    def finding(self, order: NDArray[np.intp], weights: Array) -> Finding:
+        """Name it.
+
+        Parameters
+        ----------
+        order : int array, shape (n,)
+            Rows of the session of these poses.
+        weights : array
+            Of all rows: 0 where one was left out.
+        """
+        poses, code = (order[self.starts] + 1).tolist(), self.code
+        values = {"pose": poses if len(poses) > 1 else poses[0]} | dict(self.values)
+        severity: Severity = "reject"
+        if code == "sensor_and_tool_turned":
+            code = "sensor_turned"
+        if self.takes_turns:
+            code = "sensors_alternate"
+        elif code == "bias_stepped" or not (weights[order[: self.starts[0]]] > 0.5).any():  # the load as it is now
+            severity = "limit"
+        needed = CODES[code].values
+        return Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})
+
+
+def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np.intp], list[SessionChange]]:
+    """Find the likeliest lasting change, or sensors that take turns, and the steps of the bias that leave the least.
 
     Parameters
     ----------
     found : Fit
         Without known values.
-    order : int array, shape (n,)
-        Rows by time.
-    t_s : array, shape (n,), optional
-    sigma : array, shape (6,), optional
-        Measured noise of a pose.
+    t_s : array, shape (n,)
     steps : bool
         Whether steps of the bias count: not where the fit found no drift that they would look like.
+
+    Returns
+    -------
+    rows : int array, shape (k,)
+        Those that were looked at, by time; of long sessions some.
+    changes : list of SessionChange
     """
+    rows = np.argsort(t_s, kind="stable")
     # Negative floor division rounds the step up.
-    order = order[:: -(-len(order) // (MOST_POSES if len(order) <= STRUCTURED_POSES else OF_MANY))]
-    n, R, wrench = len(order), found.R_base_flange[order], found.wrench[order]
-    if n < FEWEST_POSES:
-        return []
-    times = None if t_s is None else t_s[order]
-    cov = None if sigma is None else np.diag(sigma**2)
-    used = found.residuals[order][found.weights[order] > 0.5]
-    changes = [
-        likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3)),
-        bias_steps(R, wrench) if steps else None,
-    ]
-    costs = [(_cost(one, R, cov, times), one) for one in changes if one is not None]
-    cost, change = min(costs, key=lambda pair: pair[0], default=(np.inf, None))
-    if change is None or not np.isfinite(cost):
-        return []
-    # The same poses with the same noise have been fitted already.
-    known = found if sigma is None and n == len(found.wrench) else fit(R, wrench, cov, t_s=times)
-    if cost >= minus_two_log_likelihood(known):
-        return []
-    poses = (order[change.starts] + 1).tolist()
-    code, values = change.code, {"pose": poses if len(poses) > 1 else poses[0]} | dict(change.values)
-    severity: Severity = "reject"
-    if code == "sensor_and_tool_turned":
-        code = "sensor_turned"
-    if change.takes_turns:
-        code = "sensors_alternate"
-    elif code == "bias_stepped" or not (found.weights[order[: change.starts[0]]] > 0.5).any():  # the load as it is now
-        severity = "limit"
-    needed = CODES[code].values
-    return [Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})]
-
-
-def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array | None) -> float:
-    """Minus twice the log-likelihood without a change, and what its numbers cost; infinite if much remains."""
-    try:
-        without = fit(R, change.corrected, cov, t_s=t_s)
-    except NotObservable:
-        return np.inf
-    weight_N = without.parameters.weight_N
-    if np.sqrt(np.mean(np.sum(without.residuals[without.weights > 0.5, :3] ** 2, axis=1))) > CORRECTED * weight_N:
-        return np.inf
-    n, times = len(R), 1 if change.takes_turns else len(change.starts)
-    margin = LARGER_MARGIN if change.takes_turns or change.code == "bias_stepped" else MARGIN
-    costs = times * (len(KINDS[change.code]) * np.log(6 * n) + 2 * np.log(n) + margin)
-    return minus_two_log_likelihood(without) + float(costs)
-
-
-def minus_two_log_likelihood(found: Fit) -> float:
-    """Restricted, with what its components and its rejected poses cost."""
-    information = found.free.T @ found.information @ found.free
-    value = found.noise.logdet + float(np.linalg.slogdet(information)[1]) + found.chi2
-    value += sum(2 * (GAIN_OF_RESPONSE if name.startswith(EFFECTS) else GAIN) for name in found.components)
-    rejected = found.weights < 0.5
-    if rejected.any():
-        S = found.left_out_cov[rejected]
-        far = np.maximum(squared_length(found.left_out_residuals[rejected], S), FARTHEST)
-        value += float(np.linalg.slogdet(S)[1].sum() + np.sum(FARTHEST + 6 * np.log(far / FARTHEST)))
-    return value
+    rows = rows[:: -(-len(rows) // (MOST_POSES if len(rows) <= STRUCTURED_POSES else OF_MANY))]
+    if len(rows) < FEWEST_POSES:
+        return rows, []
+    R, wrench = found.R_base_flange[rows], found.wrench[rows]
+    used = found.residuals[rows][found.weights[rows] > 0.5]
+    likeliest = likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3))
+    stepped = bias_steps(R, wrench) if steps else None
+    return rows, [one for one in (likeliest, stepped) if one is not None]
 
 
 def likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:

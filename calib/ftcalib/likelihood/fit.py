@@ -1,8 +1,9 @@
 """Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,16 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import NotObservable
 from ftcalib.known import USUAL_GAIN, Constraints, Known
-from ftcalib.likelihood.descent import MAX_STEPS, Minimum, column_scale
+from ftcalib.likelihood.descent import FARTHEST, MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
 from ftcalib.likelihood.session import Drift, Session
 from ftcalib.likelihood.session_noise import Noise, summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.structure import hidden_columns, hidden_in_any_poses, structure_columns
 from ftcalib.likelihood.variance_components import (
+    EFFECTS,
+    GAIN,
+    GAIN_OF_RESPONSE,
     HYSTERESIS,
     POSES_THAT_SHOW_THE_NOISE,
     RESPONSE,
@@ -28,9 +32,10 @@ from ftcalib.likelihood.variance_components import (
     estimates_of_unknown_variances,
     left_out,
     point,
+    squared_length,
 )
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
-from ftcalib.sensor_matrix import SIZE, Response, sensor_columns
+from ftcalib.sensor_matrix import SIZE, Response, joint_covariance, sensor_columns, with_covariance
 
 # From this difference of the criterion on the data show a structure: real ones have 250 and more in 24 poses.
 _SURE = 40.0
@@ -42,73 +47,97 @@ _EXACT = 1e-18
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
 
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """Estimates and everything needed to judge them. Rejected poses count nowhere but in arrays with n rows."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Estimate:
+    """Estimates by any method, and what they leave of each pose. Rejected poses count only in arrays with n rows.
+
+    A pose is off by its own noise alone; a `Fit` may have found more.
+    """
 
     parameters: Parameters
     """With drift the biases are those at the last pose that counts."""
     on_average: Parameters
     """The same with the mean of the bias over the poses."""
-    information: Array
-    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
+    covariance: Array
+    """(15, 15) of the error coordinates `PARAMETER_NAMES`; zero along what is exactly known, without meaning where the
+    information lacks rank."""
     free: Array
     """(15, m) orthonormal basis of what is not exactly known: the identity without a `Known`."""
-    minima: tuple[Minimum, ...]
-    """By ascending chi2, R_flange_sensor at least 1° apart; the first is the answer."""
+    noise: Noise
+    """Covariance of all wrenches under the noise model; of a `Fit`, poses in the order of `order`."""
+    R_base_flange: Array
+    """(n, 3, 3)"""
+    wrench: Array
+    """(n, 6)"""
+    weights: Array
+    """(n,) 1 = used, 0 = rejected because it does not fit the others."""
     chi2: float
     """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
     dof: int
     measured_chi2: float
     """Chi2 of the same poses, best fit without drift, with gain and cross-talk where they were found, weighted by the
     measured noise alone; NaN without it."""
-    weights: Array
-    """(n,) 1 = used, 0 = rejected because it does not fit the others."""
-    components: Mapping[str, float]
+    second_basin_chi2: float | None = None
+    """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other."""
+    components: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise
     where it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
-    drift: DriftResult | None
-    noise: Noise
-    """Covariance of all wrenches under the noise model, poses in the order of `order`."""
-    order: NDArray[np.intp]
-    """(n,) row numbers by time."""
-    R_base_flange: Array
-    """(n, 3, 3)"""
-    wrench: Array
-    """(n, 6)"""
-    given_noise: Array
-    """(15, 15) covariance of the parameters if the noise model is taken as known."""
-    covariance: Array
-    """(15, 15) zero along what is exactly known; without meaning where the information lacks rank."""
-    response: Response | None
+    drift: DriftResult | None = None
+    response: Response | None = None
     """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
-    lag: tuple[Array, Array] | None
-    """Hysteresis and errors that have a structure (n, 6) of each pose, and their variance (n, 6, 6): compensation does
-    not know them; None where none were found."""
-    at: Point | None
-    """Restricted likelihood of all unknowns; None in many poses."""
     may_bend: bool = False
     """Whether noise stands for a response that is not linear, which the data show, but not clearly."""
 
-    @property
-    def wrench_cov(self) -> Array:
-        """(n, 6, 6) noise of each pose by itself, without drift."""
-        cov = np.empty_like(self.noise.D)
-        cov[self.order] = self.noise.D
-        return cov
+    @classmethod
+    def independent(  # noqa: PLR0913 - what an estimate rests on
+        cls,
+        parameters: Parameters,
+        covariance: Array,
+        R_base_flange: Array,
+        wrench: Array,
+        wrench_cov: Array,
+        weights: Array,
+        *,
+        measured: bool,
+        second_basin_chi2: float | None = None,
+        components: Mapping[str, float] | None = None,
+        free: Array | None = None,
+    ) -> Self:
+        """Take the estimates of another method, for poses with independent noise.
 
-    @property
-    def second_basin_chi2(self) -> float | None:
-        """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other.
-
-        Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+        Parameters
+        ----------
+        parameters : Parameters
+        covariance : array, shape (15, 15)
+        R_base_flange : array, shape (n, 3, 3)
+        wrench : array, shape (n, 6)
+        wrench_cov : array, shape (n, 6, 6)
+        weights : array, shape (n,)
+        measured : bool
+            Whether `wrench_cov` was measured, not estimated from the residuals.
+        second_basin_chi2 : float, optional
+        components : mapping, optional
+        free : array, shape (15, m), optional
+            Error coordinates that the method estimates: fewer where it assumes mounting or gravity.
         """
-        if len(self.minima) == 1:
-            return None
-        best, second = self.minima[0].chi2, self.minima[1].chi2
-        if any(name.startswith("white") for name in self.components):
-            return float(self.dof * np.log(second / best))
-        return second - best
+        r = np.asarray(wrench - predict(parameters, R_base_flange))[..., None]
+        chi2 = float(weights @ np.sum(r * np.linalg.solve(wrench_cov, r), axis=(1, 2)))
+        free = np.eye(15) if free is None else free
+        return cls(
+            parameters=parameters,
+            on_average=parameters,
+            covariance=covariance,
+            free=free,
+            noise=Noise(wrench_cov, kept=weights > 0),
+            R_base_flange=R_base_flange,
+            wrench=wrench,
+            weights=weights,
+            chi2=chi2,
+            dof=6 * int(weights.sum()) - int(free.shape[1]),
+            measured_chi2=chi2 if measured else float("nan"),
+            second_basin_chi2=second_basin_chi2,
+            components=components or {},
+        )
 
     @cached_property
     def residuals(self) -> Array:
@@ -118,7 +147,56 @@ class Fit:
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        """Left-out residuals and their covariance."""
+        """Left-out residuals and their covariance, without fitting again: exact for a linear model."""
+        J = jacobian(self.parameters, self.R_base_flange) @ self.free
+        WJ = self.noise.solve(J)
+        information = summed_products(J, WJ)
+        # Radians, newtons and metres stand side by side: without the scale the smallest eigenvalues count as zero.
+        scale = column_scale(information)
+        C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
+        return left_out(self.noise, WJ, self.noise.solve(self.residuals[..., None])[..., 0], C)
+
+    @property
+    def left_out_residuals(self) -> Array:
+        """(n, 6) measured minus what all other poses predict for this one, drift included, hysteresis not."""
+        return self._left_out[0]
+
+    @property
+    def left_out_cov(self) -> Array:
+        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
+        return self._left_out[1]
+
+    @cached_property
+    def elsewhere(self) -> Array:
+        """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
+        return np.zeros(6)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fit(Estimate):
+    """Estimates by maximum likelihood, under the noise that the data show."""
+
+    information: Array
+    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
+    order: NDArray[np.intp]
+    """(n,) row numbers by time."""
+    given_noise: Array
+    """(15, 15) covariance of the parameters if the noise model is taken as known."""
+    lag: tuple[Array, Array] | None
+    """Hysteresis and errors that have a structure (n, 6) of each pose, and their variance (n, 6, 6): compensation does
+    not know them; None where none were found."""
+    at: Point | None
+    """Restricted likelihood of all unknowns; None in many poses."""
+
+    @property
+    def wrench_cov(self) -> Array:
+        """(n, 6, 6) noise of each pose by itself, without drift."""
+        cov = np.empty_like(self.noise.D)
+        cov[self.order] = self.noise.D
+        return cov
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
         e, S = np.empty((len(self.order), 6)), np.empty((len(self.order), 6, 6))
         for part, noise in self.noise.parts():
             rows = self.order[part]
@@ -133,7 +211,7 @@ class Fit:
 
     @cached_property
     def elsewhere(self) -> Array:
-        """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
+        """(6,) as of an `Estimate`; zero in many poses, where it is small."""
         if self.at is None:
             return np.zeros(6)
         R, middle = Rotation.create_group("O").as_matrix(), self.R_base_flange[self.order].mean(axis=0)
@@ -161,19 +239,17 @@ class Fit:
         return np.asarray(moved @ moved.T)
 
     @property
-    def gain_sigma(self) -> float:
-        """Standard deviation of the entries of the gain; 0 if none was found."""
-        return 0.0 if self.response is None else self.response.gain_sigma
-
-    @property
-    def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict for this one, drift included, hysteresis not."""
-        return self._left_out[0]
-
-    @property
-    def left_out_cov(self) -> Array:
-        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
-        return self._left_out[1]
+    def minus_two_log_likelihood(self) -> float:
+        """Restricted, with what its components and its rejected poses cost."""
+        information = self.free.T @ self.information @ self.free
+        value = self.noise.logdet + float(np.linalg.slogdet(information)[1]) + self.chi2
+        value += sum(2 * (GAIN_OF_RESPONSE if name.startswith(EFFECTS) else GAIN) for name in self.components)
+        rejected = self.weights < 0.5
+        if rejected.any():
+            S = self.left_out_cov[rejected]
+            far = np.maximum(squared_length(self.left_out_residuals[rejected], S), FARTHEST)
+            value += float(np.linalg.slogdet(S)[1].sum() + np.sum(FARTHEST + 6 * np.log(far / FARTHEST)))
+        return value
 
 
 def fit(
@@ -239,11 +315,9 @@ def _beside(found: Fit, other: Fit) -> Fit:
     value, vector = np.linalg.eigh(more / np.outer(scale, scale))
     root = Z @ (scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0)))
     more = root @ root.T
-    response = found.response
-    if response is not None:
-        joint = response.covariance.copy()
-        joint[:15, :15] += more
-        response = replace(response, covariance=joint)
+    joint = joint_covariance(found.covariance, found.response).copy()
+    joint[:15, :15] += more
+    response = with_covariance(found.response, joint)
     bends = any(name.startswith("load") for name in other.components)  # and adds to the bias
     return replace(found, covariance=found.covariance + more, response=response, may_bend=bends)
 
@@ -302,17 +376,18 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
             T = problem.X[..., problem.columns(c)]
             lag[session.order] += at.effect(c)
             square[session.order] += found[c] * T @ np.swapaxes(T, 1, 2)
+    components, dof = {c.name: _deviation(session, c, v) for c, v in found.items()}, session.dof(e.kept)
     return Fit(
         parameters=parameters,
         on_average=best.parameters,
         information=best.information,
         free=session.constraints.free(best.parameters),
-        minima=tuple(minima),
         chi2=best.chi2,
-        dof=session.dof(e.kept),
+        dof=dof,
         measured_chi2=measured_chi2,
+        second_basin_chi2=_second_basin_chi2(minima, components, dof),
         weights=weights,
-        components={c.name: _deviation(session, c, v) for c, v in found.items()},
+        components=components,
         drift=_drift(session, best, noise, given_noise, found) if drifts else None,
         noise=noise,
         order=session.order,
@@ -324,6 +399,17 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         lag=None if lag is None else (lag, square),
         at=at if session.n <= STRUCTURED_POSES or session.structure() else None,
     )
+
+
+def _second_basin_chi2(minima: Sequence[Minimum], components: Iterable[str], dof: int) -> float | None:
+    """Compare the two best minima; None if there is one.
+
+    Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+    """
+    if len(minima) == 1:
+        return None
+    best, second = minima[0].chi2, minima[1].chi2
+    return float(dof * np.log(second / best)) if any(name.startswith("white") for name in components) else second - best
 
 
 def _deviation(session: Session, c: Component, variance: float) -> float:

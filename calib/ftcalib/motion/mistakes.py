@@ -5,8 +5,9 @@ of the forces, the sign of the moments of mass that of the torques, and the leve
 Angular velocities alone show none of this: inertia and lever absorb their scale.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -123,21 +124,13 @@ def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
 # ----------------------------------------------------------------------------------------------------- signs and poses
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Undone:
-    """Mistakes of signs, clock and poses, and how rows are without them."""
-
-    findings: tuple[Finding, ...] = ()
-    error: PoseError = field(default_factory=PoseError)
-    signs: Array = field(default_factory=lambda: np.ones(6))
-
-    def of(self, rows: Rows) -> Rows:
-        """Return the rows without the mistakes."""
-        return replace(self.error.corrected(rows), wrench=rows.wrench * self.signs) if self.findings else rows
+def nothing(rows: Rows) -> Rows:
+    """Undo nothing."""
+    return rows
 
 
-def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
-    """Find the mistakes of signs, clock and poses that explain the rows.
+def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Callable[[Rows], Rows]]:
+    """Find the mistakes of signs, clock and poses that explain the rows, and what undoes them in any rows.
 
     Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
 
@@ -151,10 +144,10 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     """
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
-        return Undone(named)
+        return named, nothing
     # A wrench without weight gives any scale.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
-        return Undone()
+        return [], nothing
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
     moment = float(load.inertia[:3].sum())
     sigma_moment = float(np.sqrt(free.covariance[INERTIA, INERTIA][:3, :3].sum()))
@@ -191,7 +184,12 @@ def undo(rows: Rows, free: FreeFit, spread_m: float) -> Undone:
     findings += other
     if not findings and off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE:
         findings += _by_clock("limit", values, parted)
-    return Undone(tuple(findings), PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+    undo = partial(_without, PoseError(scale, aside_m, turning), np.repeat(signs, 3))
+    return findings, undo if findings else nothing
+
+
+def _without(error: PoseError, signs: Array, rows: Rows) -> Rows:
+    return replace(error.corrected(rows), wrench=rows.wrench * signs)
 
 
 def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping[str, float] | None) -> list[Finding]:
@@ -200,14 +198,14 @@ def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping
     return [*compensated, Finding.of("clock_rate", severity, **of_clock)]
 
 
-def _axes(rows: Rows, change: Array) -> tuple[Finding, ...]:
+def _axes(rows: Rows, change: Array) -> list[Finding]:
     """Find wrong axes and orientations in what is left of the motion at rest, whose axes do not count."""
     static, left = at_rest(rows)
     if (left > _EXPLAINED * change).any():
-        return ()
+        return []
     some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
     named = faults(nearest_rotation(rows.motion.R_base_flange)[some], static[some])
-    return tuple(one for one in named if one.code in OF_AXES)
+    return [one for one in named if one.code in OF_AXES]
 
 
 def at_rest(rows: Rows) -> tuple[Array, Array]:

@@ -1,8 +1,9 @@
 """A calibration from a recording in motion."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from ftcalib.after.new_tool import CellPrior
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding, Severity, ordered, verdict_of
-from ftcalib.judge.cross_validation import Judged
 from ftcalib.judge.observability import assess
-from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Quality, judge
+from ftcalib.judge.verdict import REJECTED_SHARE, SIGNIFICANT_SIGMAS, USABLE_SHARE, Case, judge_motion
 from ftcalib.known import NOTHING, Known, Setup
+from ftcalib.likelihood.fit import Estimate
 from ftcalib.likelihood.structure import hidden_in_any_poses, yielding_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, nearest_rotation, predict
 from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
@@ -24,13 +25,13 @@ from ftcalib.motion.mistakes import (
     JUDGED_ROWS,
     OF_AXES,
     Stream,
-    Undone,
     at_rest,
     bias_steps,
     falls_to_zero,
     impossible,
+    mistakes_in,
+    nothing,
     stays,
-    undo,
     without_steps,
 )
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
@@ -67,8 +68,6 @@ MOSTLY = 0.5
 _UNEXPLAINED = 0.3
 # Components that are smooth over the poses.
 _SMOOTH = ("load", "cable", "rotation", "yielding")
-# A recording has no last pose from which a bias could go on, and its next use has an error of its own.
-_KEPT = ("loo_force_rms_N", "loo_torque_rms_Nm", "worst_pose", "residual_sigma", "lag1", "correlations")
 
 
 def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
@@ -129,61 +128,56 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
     data, ratio, delay_s = _on_one_clock(*data)
-    row_s = NARROW_S if guarded else WIDE_S
-    rows = rows_of(*data, delay_s, row_s)
-    undone = _undo(data, rows, known, g_m_s2) if positions else Undone()
-    delay_s += rough_delay(_select_rows(undone.of(rows), limit_rad_s), known, g_m_s2)
-    # The model is linear in the delay only near that of the rows: far from it they are filtered again.
-    for _ in range(3):
-        rows = undone.of(rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s))
-        used = _select_rows(rows, limit_rad_s)
-        massless = point_mass or not positions
-        best = fit(used, known, g_m_s2, prior=prior, point_mass=massless, guarded=guarded, zeroed_s=zeroed_s)
-        delay_s = rows.delay_s + best.load.delay_s
-        if abs(best.load.delay_s) < LINEAR_S:
-            break
-    if best.contradiction:
-        raise NotObservable(best.contradiction)
+    rows = rows_of(*data, delay_s, NARROW_S if guarded else WIDE_S)
+    mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], nothing)
+
+    def rows_at(delay_s: float) -> tuple[Rows, Rows]:
+        """Rows without the mistakes, and those that count."""
+        others = undo(rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
+        return others, _select_rows(others, limit_rad_s)
+
+    delay_s += rough_delay(_select_rows(undo(rows), limit_rad_s), known, g_m_s2)
+    fit_rows = partial(
+        fit,
+        known=known,
+        g_m_s2=g_m_s2,
+        prior=prior,
+        point_mass=point_mass or not positions,
+        guarded=guarded,
+        zeroed_s=zeroed_s,
+    )
+    rows, used, best = _fit(rows_at, delay_s, fit_rows)
     _require_determined(used, best, known)
-    duration_s = float(np.ptp(data[0][0]))
-    contacts = _contacts(used, best, data[0][0][0]) if positions else ()
+    start_s, delay_s = data[0][0][0], rows.delay_s + best.load.delay_s
     motion = MotionResult(
         best.load.inertia_kg_m2,
         delay_s,
         best.load.height_m,
         best.covariance[:23, :23],
-        min(best.kept.sum() * rows.row_s / duration_s, 1.0),
-        contacts,
+        min(best.kept.sum() * rows.row_s / float(np.ptp(data[0][0])), 1.0),
+        _contacts(used, best, start_s) if positions else (),
     )
-    quality, judged = _judge(used, best, setup, known, g_m_s2)
-    causes = list(undone.findings)
-    if ratio != 1:  # the other clock has that of the motion
-        causes = [one for one in causes if one.code not in ("clock_rate", "wrench_compensated")]
-        causes.append(Finding.of("clocks_differ", ratio=ratio))
-    causes += [Finding.of("zeroed", at_s=zeroed_s - data[0][0][0])] if len(zeroed_s) else []
-    aligned = used
-    if abs(best.load.delay_s) > LINEAR_S:
-        others = rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), row_s)
-        aligned = _select_rows(undone.of(others), limit_rad_s)
-    findings = [*quality.findings, *_mistakes(used, aligned, best, quality.findings)]
-    findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
-    findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
-    if is_coarse:
-        share_percent = 100 * len(used) / len(rows)
-        causes.append(Finding.of("motion_coarse", off_deg=np.degrees(coarse_rad), share_percent=share_percent))
-    if positions and verdict_of([*findings, *causes]) != "rejected":
-        findings += impossible(best)
-    findings = [*causes, *(one for one in findings if not _explained(one, causes))]
+    causes = _causes(mistakes, ratio, zeroed_s - start_s, coarse_rad, len(used) / len(rows))
+    places = _judged_rows(best)
+    quality = judge_motion(Case(_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
+    findings = list(causes)
+    if verdict_of(causes) != "rejected":  # which would explain all others
+        findings += _not_explained(quality.findings, causes)
+        aligned = used if abs(best.load.delay_s) <= LINEAR_S else rows_at(delay_s)[1]
+        findings += _other_wrench(used, aligned, best, quality.findings)
+        findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
+        findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
+        findings += impossible(best) if positions and verdict_of(findings) != "rejected" else []
     findings += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
-    places = np.r_[0:15, 23:34]
-    response = Response(best.load.response, best.covariance[np.ix_(places, places)]) if responding else None
+    joint = np.r_[0:15, 23:34]
+    response = Response(best.load.response, best.covariance[np.ix_(joint, joint)]) if responding else None
     return CalibrationResult(
         parameters=best.load.static,
         mean_bias=best.mean_bias,
         covariance=best.covariance[:15, :15],
         hidden_covariance=_hidden_covariance(used, best, setup.orientation_rad),
-        residuals=best.residuals[judged],
+        residuals=best.residuals[places],
         chi2=best.chi2,
         dof=max(6 * int(best.kept.sum()) - 23, 1),
         noise_source="residuals",
@@ -199,10 +193,50 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         quality={
             "next_use_force_rms_N": float(best.next_use[0]),
             "next_use_torque_rms_Nm": float(best.next_use[1]),
-            **{name: value for name, value in quality.to_dict().items() if name in _KEPT},
+            **quality.to_dict(),
         },
         motion=motion,
     )
+
+
+def _fit(
+    rows_at: Callable[[float], tuple[Rows, Rows]], delay_s: float, fit_rows: Callable[[Rows], MotionFit]
+) -> tuple[Rows, Rows, MotionFit]:
+    """Fit rows at a delay, and again at that of the fit, because the model is linear in it only near that of the rows.
+
+    Returns
+    -------
+    rows : Rows
+    used : Rows
+        Those that count.
+    best : MotionFit
+
+    Raises
+    ------
+    NotObservable
+        An earlier result contradicts the rows.
+    """
+    for _ in range(3):
+        rows, used = rows_at(delay_s)
+        best = fit_rows(used)
+        delay_s = rows.delay_s + best.load.delay_s
+        if abs(best.load.delay_s) < LINEAR_S:
+            break
+    if best.contradiction:
+        raise NotObservable(best.contradiction)
+    return rows, used, best
+
+
+def _causes(
+    mistakes: list[Finding], ratio: float, zeroed_at_s: Array, coarse_rad: float, share: float
+) -> list[Finding]:
+    """Name what was undone or left out before the fit."""
+    if ratio != 1:  # the other clock has that of the motion
+        mistakes = [one for one in mistakes if one.code not in ("clock_rate", "wrench_compensated")]
+        mistakes.append(Finding.of("clocks_differ", ratio=ratio))
+    zeroed = [Finding.of("zeroed", at_s=zeroed_at_s)] if len(zeroed_at_s) else []
+    coarse = {"off_deg": np.degrees(coarse_rad), "share_percent": 100 * share}
+    return [*mistakes, *zeroed, *([Finding.of("motion_coarse", **coarse)] if coarse_rad > _COARSE_RAD else [])]
 
 
 def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], float, float]:
@@ -317,31 +351,30 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
     return at_rest(rows)[0]
 
 
-def _judge(
-    rows: Rows, best: MotionFit, setup: Setup, known: Known | None, g_m_s2: float
-) -> tuple[Quality, NDArray[np.intp]]:
-    """Judge some kept rows as if they were poses; also return their places.
-
-    A pose is a mean, so each row has the mean residual of a second around it: what is quicker is vibration.
-    """
+def _judged_rows(best: MotionFit) -> NDArray[np.intp]:
     places = np.flatnonzero(best.kept)
-    places = places[:: max(1, len(places) // JUDGED_ROWS)]
+    return places[:: max(1, len(places) // JUDGED_ROWS)]
+
+
+def _estimate(rows: Rows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
+    """Return the estimates, with what they leave of the rows at these places.
+
+    Each row has the mean residual of a second around it: what is quicker is vibration.
+    """
     # An odd number of rows, so that the mean lies on its row.
     second = round(1 / rows.row_s / 2) * 2 + 1
     best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
-    weight_N = best.load.static.weight_N
-    judged = Judged.independent(
+    return Estimate.independent(
         best.load.static,
         best.covariance[:15, :15],
         nearest_rotation(rows.motion.R_base_flange[places]),
-        _static_wrench(rows, best, weight_N)[places],
+        _static_wrench(rows, best, best.load.static.weight_N)[places],
         best.sigma[places, :, None] ** 2 * np.eye(6),
         np.ones(len(places)),
         measured=False,
         second_basin_chi2=best.second_basin_chi2,
         components={name: size for name, size in best.components.items() if name.startswith(_SMOOTH)},
     )
-    return judge(judged, t_s=rows.t_s[places], setup=setup, known=known, g_m_s2=g_m_s2, single_poses=False), places
 
 
 def _means(best: MotionFit, rows: int) -> Array:
@@ -403,8 +436,10 @@ def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Strea
     return (wrench, poses), at_s
 
 
-def _undo(data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: float) -> Undone:
-    """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right."""
+def _find_mistakes(
+    data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: float
+) -> tuple[list[Finding], Callable[[Rows], Rows]]:
+    """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right, and what undoes them."""
     free = fit_freely(rows, known, g_m_s2)
     for _ in range(2):
         if abs(free.load.delay_s) < ALIGNED_S:
@@ -413,20 +448,16 @@ def _undo(data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: 
         rows = rows_of(*data, delay_s, rows.row_s)
         free = fit_freely(rows, known, g_m_s2)
     spread_m = float(np.linalg.norm(np.ptp(data[1][1][:, 9:], axis=0)))
-    return undo(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else Undone()
+    return mistakes_in(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else ([], nothing)
 
 
-def _explained(finding: Finding, causes: Sequence[Finding]) -> bool:
-    """Whether a finding is a consequence of a cause that motion shows."""
-    if verdict_of(causes) == "rejected":
-        return True
-    # A point of another device puts the centre of mass behind the sensor.
-    return finding.code == "torques_reversed" and not {"torques_about_tcp", "poses_of_tcp"}.isdisjoint(
-        one.code for one in causes
-    )
+def _not_explained(findings: Sequence[Finding], causes: Sequence[Finding]) -> list[Finding]:
+    """Leave out reversed torques where poses or torques are of another point, which puts the load behind the sensor."""
+    elsewhere = any(one.code in ("torques_about_tcp", "poses_of_tcp") for one in causes)
+    return [one for one in findings if not (elsewhere and one.code == "torques_reversed")]
 
 
-def _mistakes(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+def _other_wrench(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
     """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all.
 
     `aligned` has the delay of the fit, which wrong data may not have come near.

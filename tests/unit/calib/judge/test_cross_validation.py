@@ -6,7 +6,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ftcalib.judge.cross_validation import Judged, drift_ahead, standardize
+from ftcalib.judge.cross_validation import drift_ahead, standardize
+from ftcalib.likelihood.fit import Estimate
 from ftcalib.model import Array, DriftResult
 
 
@@ -26,11 +27,11 @@ def test_a_covariance_that_rounding_made_indefinite_still_scales_residuals() -> 
 CHANGE, SIGMA = np.array([0.3, 0, 0.4, 0, 0.01, 0]), np.array([0.02, 0.02, 0.02, 1e-3, 1e-3, 1e-3])
 
 
-def drifting(components: dict[str, float], rows: Array) -> Judged:
+def drifting(components: dict[str, float], rows: Array) -> Estimate:
     """Of 12 poses, whose bias grows by a twelfth of its change at each; the first and the last are left out."""
     share = (rows - 5.5) / 12
     drift, used = DriftResult(CHANGE, SIGMA, share[:, None] * CHANGE), (rows > 0) & (rows < 11)
-    return cast(Judged, SimpleNamespace(drift=drift, weights=used.astype(float), components=components))
+    return cast(Estimate, SimpleNamespace(drift=drift, weights=used.astype(float), components=components))
 
 
 @pytest.mark.parametrize(("interval_s", "per_min"), [(20.0, 3), (None, 6)])
@@ -61,5 +62,5 @@ def test_times_that_are_no_times_are_intervals_of_ten_seconds() -> None:
 
 
 def test_without_drift_nothing_is_ahead() -> None:
-    ahead = drift_ahead(cast(Judged, SimpleNamespace(drift=None)))
+    ahead = drift_ahead(cast(Estimate, SimpleNamespace(drift=None)))
     assert not np.concatenate([ahead.growth_per_min, ahead.square]).any()

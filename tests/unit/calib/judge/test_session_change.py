@@ -16,13 +16,13 @@ from ftcalib.judge.session_change import (
     _groups,
     bias_steps,
     likeliest_change,
-    minus_two_log_likelihood,
-    session_change,
 )
+from ftcalib.judge.verdict import Case, statistics
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.session import LEVER_M
 from ftcalib.model import Parameters, SPECIAL_R_flange_base, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, response_columns
+from ftcalib.solver import _find_change
 from tests.structured_cell import CELLS, Cell, flange, tour
 
 Array = NDArray[np.float64]
@@ -226,7 +226,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance_less_what_components_mus
     W = found.noise.solve(np.eye(144).reshape(24, 6, 144)).reshape(144, 144)
     J, e = jacobian(found.parameters, ORIENTATIONS).reshape(144, 15), found.residuals.ravel()
     logdet = np.linalg.slogdet(J.T @ W @ J)[1] - np.linalg.slogdet(W)[1]
-    assert minus_two_log_likelihood(found) == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
+    assert found.minus_two_log_likelihood == pytest.approx(logdet + e @ W @ e + 2 * (2 + 2), abs=1e-4)
 
 
 def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
@@ -239,7 +239,7 @@ def test_a_rejected_pose_costs_the_limit_and_a_logarithm_beyond_it() -> None:
     limit, distance = stats.chi2.isf(1e-3, 6), e @ np.linalg.solve(S, e)
     cost = np.linalg.slogdet(S)[1] + limit + 6 * np.log(distance / limit)
     assert found.components == others.components == {}
-    assert minus_two_log_likelihood(found) - minus_two_log_likelihood(others) == pytest.approx(cost, abs=0.01)
+    assert found.minus_two_log_likelihood - others.minus_two_log_likelihood == pytest.approx(cost, abs=0.01)
 
 
 def zeroed(places: list[int], seed: int, n: int = 24) -> CalibrationResult:
@@ -339,8 +339,8 @@ def test_a_change_is_named_from_some_of_many_poses(n: int, looked_at: int, monke
     R = Rotation.random(n, rng=3).as_matrix()
     wrench = predict(TOOL, R) + np.random.default_rng(4).normal(0, SIGMA, (n, 6))
     wrench[n // 2 :] += predict(TARED, R[n // 2 :]) - predict(TOOL, R[n // 2 :])
-    found = fit(R, wrench, np.diag(SIGMA**2))
-    (finding,) = session_change(found, np.arange(n), np.arange(float(n)), SIGMA)
+    case = Case(fit(R, wrench, np.diag(SIGMA**2)))
+    (finding,) = _find_change(case, statistics(case.found), SIGMA)
     assert finding.code == "bias_stepped"
     assert abs(finding.values["pose"] - n // 2) <= n // looked_at + 1
     assert set(sizes) == {looked_at}

@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
-from ftcalib.judge.cross_validation import DriftAhead, Judged, standardize
+from ftcalib.judge.cross_validation import DriftAhead, standardize
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
+    Case,
     Quality,
     _drift,
     _errors,
@@ -24,14 +25,16 @@ from ftcalib.judge.verdict import (
     _second_solution,
     _some_runs,
     _structure,
+    _structure_in_motion,
+    _successive_correlation,
     _weight,
-    judge,
     out_of_line,
     strong_correlations,
-    successive_correlation,
 )
+from ftcalib.likelihood.fit import Estimate
 from ftcalib.model import Array, DriftResult, SPECIAL_R_flange_base, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, Response, expected_error, predicted_covariance
+from ftcalib.solver import _judge
 from ftdrive import read_dataset
 from tests.known_cells import SIGMA, white
 from tests.known_cells import UPSIDE_DOWN as TRUTH
@@ -58,7 +61,7 @@ def fit(
     second: float | None = None,
     weights: Array | None = None,
     components: Mapping[str, float] | None = None,
-) -> Judged:
+) -> Estimate:
     n, noise = len(R), white(len(R)) if cov is None else cov
     weights = np.ones(n) if weights is None else weights
     used = weights > 0
@@ -68,7 +71,7 @@ def fit(
     J = jacobian(parameters, R[used])
     information = np.einsum("nki,nkl,nlj->ij", J, np.linalg.inv(noise[used]), J)
     covariance = np.asarray(np.linalg.inv(information))
-    return Judged.independent(
+    return Estimate.independent(
         parameters,
         covariance,
         R,
@@ -81,13 +84,18 @@ def fit(
     )
 
 
-def with_wrench(fitted: Judged, wrench: Array) -> Judged:
+def with_wrench(fitted: Estimate, wrench: Array) -> Estimate:
     """The same estimates, from 24 poses with measured noise, beside other readings."""
     p, R = fitted.parameters, fitted.R_base_flange
     noise, second = white(24), fitted.second_basin_chi2
-    return Judged.independent(
+    return Estimate.independent(
         p, fitted.covariance, R, wrench, noise, fitted.weights, measured=True, second_basin_chi2=second
     )
+
+
+def judge(found: Estimate, **given: Any) -> Quality:
+    """As `solve` judges it, with what is given of the case."""
+    return _judge(Case(found, **given), None)
 
 
 def noisy(rng: np.random.Generator, R: Array, truth: Parameters = TRUTH, sigma: Array = SIGMA) -> Array:
@@ -114,7 +122,7 @@ def test_left_out_residuals_are_those_of_real_refits() -> None:
     cov = SIGMA[:, None] * SIGMA * (A @ np.swapaxes(A, 1, 2)) / 9e4  # correlated, uneven, small: the model is linear
     wrench = predict(TRUTH, R) + (np.linalg.cholesky(cov) @ rng.normal(size=(8, 6, 1)))[..., 0]
     best = gauss_newton(R, wrench, cov)
-    fitted = Judged.independent(best, np.eye(15), R, wrench, cov, np.ones(8), measured=True)
+    fitted = Estimate.independent(best, np.eye(15), R, wrench, cov, np.ones(8), measured=True)
     left_out, left_out_cov = fitted.left_out_residuals, fitted.left_out_cov
     for k in range(8):
         others = np.arange(8) != k
@@ -215,9 +223,9 @@ def test_drift_shows_between_successive_poses_in_time_not_in_rows() -> None:
 
 def test_correlation_of_successive_poses_has_its_chance() -> None:
     rng = np.random.default_rng(9)
-    p = [successive_correlation(rng.normal(size=(24, 6)))[1] for _ in range(2000)]
+    p = [_successive_correlation(rng.normal(size=(24, 6)))[1] for _ in range(2000)]
     assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=0.015)
-    assert successive_correlation(np.tile(rng.normal(size=6), (9, 1)))[0] == pytest.approx(1)
+    assert _successive_correlation(np.tile(rng.normal(size=6), (9, 1)))[0] == pytest.approx(1)
 
 
 def test_strong_correlations_are_named() -> None:
@@ -308,9 +316,9 @@ def test_what_is_known_is_doubted_where_the_data_fit_without_it(channel: int) ->
     off = 3.0 if channel < 3 else 0.2  # N or N·m of every pose, as from a constraint that is wrong
     constrained = with_wrench(free, wrench + off * np.eye(6)[channel])
     kind, unit = ("force", "N") if channel < 3 else ("torque", "Nm")
-    finding = the(f"known_values_misfit_{kind}", judge(constrained, unconstrained=free))
+    finding = the(f"known_values_misfit_{kind}", judge(constrained, free=free))
     assert finding.values[f"residual_{unit}"] == pytest.approx(off, rel=0.02)
-    assert not any(code.startswith("known") for code in codes(judge(free, unconstrained=free)))
+    assert not any(code.startswith("known") for code in codes(judge(free, free=free)))
 
 
 def test_a_pose_out_of_line_is_pointed_at() -> None:
@@ -447,6 +455,7 @@ def test_wrong_units_of_torque_are_detected(
 
 FITTED = fit(R24, noisy(np.random.default_rng(30), R24), white(24))
 WEIGHT_N = FITTED.parameters.weight_N
+OF_20_N = replace(FITTED, parameters=replace(TRUTH, gravity_force_base_N=np.array([0, 0, -20.0])))
 
 
 def statistics(**values: Any) -> Quality:
@@ -454,6 +463,7 @@ def statistics(**values: Any) -> Quality:
     usual = {
         "used": np.ones(24, bool),
         "is_exact": False,
+        "accidents": True,
         "residual_sigma": np.ones(24),
         "worst_pose": 3,
     }
@@ -490,7 +500,7 @@ def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -
     across = np.cross(along, [1.0, 0, 0])
     covariance = 1e-9 * np.eye(15)
     covariance[3:6, 3:6] += (WEIGHT_N / sigmas) ** 2 * np.outer(along, along) + 1e3 * np.outer(across, across)
-    found = _weight(replace(FITTED, covariance=covariance), WEIGHT_N, Setup())
+    found = _weight(replace(FITTED, covariance=covariance), Setup())
     assert [one.code for one in found] == ["weight_insignificant"] * (not significant)
 
 
@@ -522,7 +532,7 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
 def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     components: dict[str, float], found: list[tuple[str, str]]
 ) -> None:
-    named = _structure(replace(FITTED, components=components), WEIGHT_N)
+    named = _structure(replace(FITTED, components=components))
     assert [(one.code, one.severity) for one in named] == found
 
 
@@ -537,13 +547,13 @@ def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     ],
 )
 def test_in_motion_a_smooth_error_is_named_only_where_it_limits(components: dict[str, float], found: list[str]) -> None:
-    named = _structure(replace(FITTED, components=components), WEIGHT_N, in_motion=True)
+    named = _structure_in_motion(replace(FITTED, components=components))
     assert [(one.code, one.severity) for one in named] == [(code, "limit") for code in found]
 
 
 def test_poses_are_pointed_at_beyond_their_limits() -> None:
-    def found(fitted: Judged = FITTED, **values: Any) -> list[str]:
-        return [one.code for one in _poses(fitted, statistics(**values), "note", Setup())]
+    def found(fitted: Estimate = FITTED, **values: Any) -> list[str]:
+        return [one.code for one in _poses(fitted, statistics(**values), Setup())]
 
     assert found() == []
     assert found(lag1_p=0.9e-3) == ["residuals_alike"]
@@ -562,10 +572,10 @@ def test_poses_are_pointed_at_beyond_their_limits() -> None:
     cov = np.zeros((24, 6, 6))
     for rows, unchecked in ((12, ["poses_unchecked"]), (13, []), (0, [])):
         cov[:, 1, 1] = np.where(np.arange(24) < rows, 1.01, 0.99) * WEIGHT_N**2
-        uncertain = replace(FITTED, left_out_cov=cov)
-        assert found(uncertain) == unchecked
-    lighter = replace(FITTED.parameters, gravity_force_base_N=0.9 * FITTED.parameters.gravity_force_base_N)
-    assert found(replace(uncertain, parameters=lighter), used=np.arange(24) < 7) == ["poses_rejected"]
+        uncertain = SimpleNamespace(parameters=FITTED.parameters, left_out_cov=cov)
+        assert found(cast(Estimate, uncertain)) == unchecked
+    uncertain.parameters = replace(TRUTH, gravity_force_base_N=0.9 * FITTED.parameters.gravity_force_base_N)
+    assert found(cast(Estimate, uncertain), used=np.arange(24) < 7) == ["poses_rejected"]
 
 
 def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
@@ -576,14 +586,14 @@ def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
         sigma = np.repeat([0.05, 0.04 * lever_m * WEIGHT_N / np.sqrt(3)], 3)
         wrench = noisy(np.random.default_rng(31), R24, truth, sigma)
         loud = fit(R24, wrench, white(24, sigma), start=truth, weights=used.astype(float))
-        largest, (finding,), left_out = _errors(loud, used, WEIGHT_N, few=False)
+        largest, (finding,), left_out = _errors(loud, used, few=False)
         length = [np.sqrt(np.mean(np.sum(part[used] ** 2, axis=1))) for part in np.hsplit(loud.left_out_residuals, 2)]
         assert left_out == pytest.approx(tuple(length))
         residual_Nm = np.sqrt(np.mean(np.sum(loud.residuals[used, 3:] ** 2, axis=1)))
         assert (finding.code, finding.severity, finding.values["source"]) == ("torque_error", "limit", "residuals")
         assert finding.values["error_Nm"] == pytest.approx(residual_Nm)
         assert finding.values["lever_m"] == pytest.approx(lever_m, rel=0.01)
-        assert largest == pytest.approx(residual_Nm / WEIGHT_N / finding.values["lever_m"])
+        assert largest == pytest.approx(residual_Nm / loud.parameters.weight_N / finding.values["lever_m"])
         assert (finding.values["share_percent"], finding.values["limit_percent"]) == (100 * largest, 2)
 
 
@@ -592,9 +602,13 @@ def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of
     measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
     expected = expected_error(measured.parameters, measured.covariance)
     quality, other = judge(measured), judge(unknown)
-    assert (*quality.next_use_rms,) == pytest.approx(expected)
+
+    def next_use(judged: Quality) -> tuple[Any, Any]:
+        return judged.uses["next_use_force_rms_N"], judged.uses["next_use_torque_rms_Nm"]
+
+    assert next_use(quality) == pytest.approx(expected)
     left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
-    assert (*other.next_use_rms,) == pytest.approx(left_out)
+    assert next_use(other) == pytest.approx(left_out)
 
 
 def test_many_poses_are_looked_at_in_runs() -> None:
@@ -622,12 +636,13 @@ def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_th
 ) -> None:
     drift = DriftResult(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
     ahead = DriftAhead(*np.zeros((3, 6)))
-    findings = _drift(drift, ahead, 20.0, is_cause=is_cause)
+    drifting = replace(OF_20_N, drift=drift)
+    findings = _drift(drifting, ahead, is_cause=is_cause)
     named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
     assert named == ([] if found is None else [found])
     if change[4]:
         still = DriftAhead(np.zeros(6), *[np.array([0, 0, 0, 0, 0.041**2, 0])] * 2)
-        assert _drift(drift, still, 20.0, is_cause=True)[0].severity == "limit"
+        assert _drift(drifting, still, is_cause=True)[0].severity == "limit"
 
 
 @pytest.mark.parametrize(("sigmas", "certain"), [(2.9, False), (3.1, True)])
@@ -635,7 +650,7 @@ def test_a_response_is_named_from_three_sigmas_on(sigmas: float, certain: bool) 
     covariance = np.diag(np.append(np.zeros(15), np.full(SIZE, 0.001**2)))
     for k, code in ((2, "axes_mixed"), (8, "cross_talk")):
         coefficients = sigmas * 0.001 * np.eye(SIZE)[k]
-        (finding,) = _response(Response(coefficients, covariance), WEIGHT_N)
+        (finding,) = _response(replace(FITTED, response=Response(coefficients, covariance)))
         assert finding.code == (code if certain else "response_small")
 
 
@@ -649,7 +664,7 @@ def test_known_values_are_doubted_where_the_data_leave_less_than_four_tenths_wit
     free = with_wrench(free, predict(free.parameters, R24) + scale * free.residuals)
     off = 0.5 * np.sqrt(1 / share**2 - 1)
     constrained = with_wrench(free, free.wrench + off * np.eye(6)[2])
-    assert ("known_values_misfit_force" in codes(judge(constrained, unconstrained=free))) == doubted
+    assert ("known_values_misfit_force" in codes(judge(constrained, free=free))) == doubted
 
 
 # Real sessions
@@ -660,14 +675,16 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
     drift, zero = DriftResult(change, sigma, np.zeros((2, 6))), np.zeros(6)
     for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
         ahead = DriftAhead(zero, *[np.array([0.0, at_next_use_N**2, 0, 0, 0, 0])] * 2)
-        (finding,) = _drift(drift, ahead, 20.0, is_cause=True)
+        (finding,) = _drift(replace(OF_20_N, drift=drift), ahead, is_cause=True)
         assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
 
 
 @pytest.mark.parametrize(("share", "codes"), [(1e-3, ["gain_x", "gain_y"]), (1e-6, ["response_small"])])
 def test_a_gain_that_no_sensor_resolves_is_not_named(share: float, codes: list[str]) -> None:
     covariance = 1e-16 * np.eye(15 + SIZE)
-    found = _response(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
+    found = _response(
+        replace(OF_20_N, response=Response(share * np.eye(SIZE)[0], covariance))
+    )  # a sensor resolves 1 mN
     assert [one.code for one in found] == codes
 
 

@@ -19,8 +19,8 @@ from ftcalib.motion.solve import (
     _contacts,
     _findings,
     _means,
-    _mistakes,
     _narrow,
+    _other_wrench,
     _range_deg,
     _require_determined,
     _select_rows,
@@ -207,7 +207,7 @@ def test_a_wrench_without_weight_and_one_of_another_recording_are_named() -> Non
 
     def named(wrench: Array, residuals: Array) -> list[tuple[str, Any]]:
         seen = replace(rows, wrench=wrench)
-        return [(one.code, one.values) for one in _mistakes(seen, seen, best_of(residuals=residuals), [])]
+        return [(one.code, one.values) for one in _other_wrench(seen, seen, best_of(residuals=residuals), [])]
 
     assert named(rows.wrench, np.tile(SIGMA, (200, 1))) == []
     weight = wrench_of(TRUTH, still)
