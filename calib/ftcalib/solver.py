@@ -1,8 +1,9 @@
 """Solve a dataset for a calibration."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -122,23 +123,16 @@ def solve(
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
     # Yu's and Carlson's methods assume nothing of the mounting, so the fit beside them does not either.
     assumed = known if estimator is None or method in BASELINES else None
-    best = _fit(dataset, wrench_cov, drift, known, assumed, g_m_s2, setup)
+    poses = dataset.R_base_flange, dataset.wrench, wrench_cov
+    fit_poses = partial(fit, *poses, t_s=dataset.t_s, drift=drift, gain_sigma=setup.gain_sigma)
+    best = _fit(fit_poses, dataset, known, assumed, g_m_s2, setup)
     found = best if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
     free = best if estimator else None
     if assumed is not None:
-        free = _fit_freely(dataset, wrench_cov, drift, setup)
+        free = _fit_freely(fit_poses, dataset)
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
-    any_zero = setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset)
-    case = Case(
-        found=found,
-        t_s=dataset.t_s,
-        setup=replace(setup, sensor_has_arbitrary_zero=any_zero),
-        known=known,
-        free=free,
-        g_m_s2=g_m_s2,
-        written=_written(dataset),
-    )
-    quality = _judge(case, measured_sigma)
+    cell = replace(setup, sensor_has_arbitrary_zero=setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset))
+    quality = _judge(Case(found, dataset.t_s, cell, known, free, g_m_s2, _written(dataset)), measured_sigma)
     deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
     declares_sensor = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
@@ -216,9 +210,8 @@ def _require_sense(dataset: CalibrationDataset) -> None:
 
 
 def _fit(
+    fit_poses: Callable[..., Fit],
     dataset: CalibrationDataset,
-    wrench_cov: Array | None,
-    drift: Drift,
     known: Known | None,
     assumed: Known | None,
     g_m_s2: float,
@@ -228,13 +221,12 @@ def _fit(
 
     Published methods use this fit too: for observability, and for the noise if it was not measured.
     """
-    poses = dataset.R_base_flange, dataset.wrench, wrench_cov
     try:
-        best = fit(*poses, t_s=dataset.t_s, drift=drift, known=assumed, g_m_s2=g_m_s2, gain_sigma=setup.gain_sigma)
-        _require_determined(dataset.R_base_flange, best, known)
+        best = fit_poses(known=assumed, g_m_s2=g_m_s2)
+        _require_determined(best, known)
     except NotObservable as exc:
         # A mistake in the data often leaves the poses undetermined: name it, rather than ask for more poses.
-        if named := _mistakes(dataset, wrench_cov, drift, known, g_m_s2, setup):
+        if named := _mistakes(fit_poses, dataset, known, g_m_s2, setup):
             raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
     return best
@@ -247,7 +239,7 @@ def _judge(case: Case, measured_sigma: Array | None) -> Quality:
         require_positive_definite(joint_covariance(case.found.covariance, case.found.response))
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
-    quality = statistics(case.found, case.t_s)
+    quality = statistics(case)
     causes = find_mistakes(case, quality) or _find_change(case, quality, measured_sigma)
     return judge(case, quality, causes or find_other_poses(case, quality))
 
@@ -358,30 +350,24 @@ def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | Non
     return known
 
 
-def _fit_freely(dataset: CalibrationDataset, wrench_cov: Array | None, drift: Drift, setup: Setup) -> Fit | None:
+def _fit_freely(fit_poses: Callable[..., Fit], dataset: CalibrationDataset) -> Fit | None:
     """Fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
-        poses = dataset.R_base_flange, dataset.wrench, wrench_cov
-        best = fit(*poses, t_s=dataset.t_s, drift=drift, gain_sigma=setup.gain_sigma)
-        _require_determined(dataset.R_base_flange, best, None)
+        best = fit_poses()
+        _require_determined(best, None)
     except NotObservable:
         return None
     return best
 
 
 def _mistakes(
-    dataset: CalibrationDataset,
-    wrench_cov: Array | None,
-    drift: Drift,
-    known: Known | None,
-    g_m_s2: float,
-    setup: Setup,
+    fit_poses: Callable[..., Fit], dataset: CalibrationDataset, known: Known | None, g_m_s2: float, setup: Setup
 ) -> list[Finding]:
     """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
     poses = dataset.R_base_flange, dataset.wrench
     findings = faults(*poses, setup.up, _written(dataset)) or other_poses(*poses) or no_weight(*poses)
-    if not findings and known is not None and (free := _fit_freely(dataset, wrench_cov, drift, setup)) is not None:
+    if not findings and known is not None and (free := _fit_freely(fit_poses, dataset)) is not None:
         findings = contradictions(known, free.parameters, free.covariance, g_m_s2, SIGNIFICANT_SIGMAS, setup.up)
     return findings
 
@@ -420,7 +406,7 @@ def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_f
     return [Finding.of("orientations_deviate", off_deg=np.degrees(deviation_rad), force_N=off_N)]
 
 
-def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) -> None:
+def _require_determined(best: Fit, known: Known | None) -> None:
     """Raise `NotObservable` for undetermined parameters, with advice if the poses alone are the reason."""
     Z = best.free
     information = Z.T @ best.information @ Z
@@ -430,7 +416,7 @@ def _require_determined(R_base_flange: Array, best: Fit, known: Known | None) ->
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
     ambiguous = best.second_basin_chi2 is not None and best.second_basin_chi2 < ACCEPTED_DELTA_CHI2
     if known is None and (free.any() or ambiguous):
-        require_observable(R_base_flange, best.parameters, best.wrench_cov)
+        require_observable(best.R_base_flange, best.parameters, best.wrench_cov)
     if free.any():
         share = ((Z @ V[:, free]) ** 2).sum(axis=1).reshape(5, 3).sum(axis=1) / free.sum()
         names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]

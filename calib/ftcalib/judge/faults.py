@@ -73,7 +73,7 @@ def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
     return Parameters(best.R.T, F_b, F0, P, T0)
 
 
-def least_rms(R_base_flange: Array, force_N: Array) -> float:
+def _least_rms(R_base_flange: Array, force_N: Array) -> float:
     """Root mean square force residual (N) that no rotation falls below: that of any (3, 3) matrix of its size."""
     Q = force_cost(R_base_flange, force_N, np.ones(len(force_N)))
     return float(np.sqrt(3 * max(np.linalg.eigvalsh(Q)[0], 0.0) / len(force_N)))
@@ -143,7 +143,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     explanations = []
     for code, values, R, y in _readings(R_base_flange, wrench, written):
         # No rotation does better than any matrix of its size: this bound spares the search over rotations.
-        if code != "columns_swapped" and least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
+        if code != "columns_swapped" and _least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
             continue
         trial = _Rough.of(R, y)
         (force, torque), limit = trial.shares, min(COLLAPSE * as_read.shares[0], CORRECTED)

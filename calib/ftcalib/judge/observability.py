@@ -134,7 +134,7 @@ def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov:
         raise NotObservable(replace(observability, advice=_advice(R_base_flange, parameters)[0]).sentence())
 
 
-def scaled_information(
+def _scaled_information(
     R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None
 ) -> Array:
     """Fisher information (15, 15) in units of 1 rad, weight, weight, lever and weight times lever.
@@ -168,14 +168,6 @@ def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tu
     return max(0.0, other.cost / (len(R_base_flange) * weight_N2)), other
 
 
-def wrong_basin_probability(delta_chi2: float) -> float:
-    """Probability that the second-best solution is the right one if its chi2 is larger by `delta_chi2`.
-
-    Calibrated on 8954 simulated calibrations; from `ACCEPTED_DELTA_CHI2` on, the best one is accepted.
-    """
-    return float(1 / (1 + np.exp(delta_chi2 / 2)))
-
-
 def different_orientations(R_base_flange: Array) -> int:
     """Count orientations that differ by more than half a degree; stops counting at 24."""
     # The first 24 of a usual tour all differ: one comparison of all pairs answers for it.
@@ -200,7 +192,7 @@ def _nearby(
 
     Also the information (15, 15) in units of its largest eigenvalue, and its weak directions (15, k).
     """
-    information = scaled_information(R_base_flange, parameters, wrench_cov)
+    information = _scaled_information(R_base_flange, parameters, wrench_cov)
     eigenvalues, V = np.linalg.eigh(information)
     free = eigenvalues < RANK_TOLERANCE * eigenvalues[-1]
     rank = 15 - int(free.sum())
@@ -352,7 +344,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
 
 def _worth(R_base_flange: Array, parameters: Parameters) -> float:
     """Volume of the information, and distance of gravity directions from a plane, which has a second solution."""
-    information = scaled_information(R_base_flange, parameters)
+    information = _scaled_information(R_base_flange, parameters)
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
     spread = spread / parameters.weight_N

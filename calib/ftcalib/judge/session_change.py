@@ -155,12 +155,12 @@ def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np
         return rows, []
     R, wrench = found.R_base_flange[rows], found.wrench[rows]
     used = found.residuals[rows][found.weights[rows] > 0.5]
-    likeliest = likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3))
+    likeliest = _likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3))
     stepped = bias_steps(R, wrench) if steps else None
     return rows, [one for one in (likeliest, stepped) if one is not None]
 
 
-def likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
+def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
     """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
 
     The poses are in the order of time. `scale` (6,) is how much each channel is off without a change, in any common

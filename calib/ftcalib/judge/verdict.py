@@ -17,14 +17,14 @@ from ftcalib.judge import described_cell, units
 from ftcalib.judge.cross_validation import DriftAhead, drift_ahead, standardize
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses, written_step
-from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES, wrong_basin_probability
+from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES
 from ftcalib.judge.session_change import CHANGES, cable_of
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.fit import Estimate, Fit
 from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
 from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array
-from ftcalib.sensor_matrix import expected_error
+from ftcalib.sensor_matrix import Response, expected_error
 
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
@@ -143,18 +143,13 @@ class Quality:
         }
 
 
-def statistics(found: Estimate, t_s: Array | None = None) -> Quality:
+def statistics(case: Case) -> Quality:
     """Return the numbers that a judgement rests on, without findings.
 
     Errors count relative to the weight, torques at a lever: the residual, the cross-validated error, which few poses
     cannot make look small, and the error expected over all orientations.
-
-    Parameters
-    ----------
-    found : Estimate
-    t_s : array, shape (n,), optional
-        As of `Case`.
     """
+    found, t_s = case.found, case.t_s
     used, finest = found.weights > 0.5, _finest(found.wrench)
     residuals = standardize(found.left_out_residuals, found.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
@@ -184,22 +179,17 @@ def statistics(found: Estimate, t_s: Array | None = None) -> Quality:
 
 
 def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
-    """Judge the estimates of a tour.
+    """Judge the estimates of a tour by their statistics and by what explains the data better: mistakes, or a change.
 
     Residuals up to three times the measured noise are good if the errors stay below 1 %, because orientations and
     cables always add to the noise of a good sensor.
-
-    Parameters
-    ----------
-    case : Case
-    quality : Quality
-        Its statistics.
-    causes : sequence of Finding
-        What explains the data better: mistakes, or a change in the session.
     """
     found, free = case.found, case.free
     mistaken, broken = any(one.code not in CHANGES for one in causes), _broken(found, quality, causes)
-    contradicted = _contradicted(case)
+    contradicted = list[Finding]()
+    if case.known is not None and free is not None:
+        at_its_best = free.parameters, free.covariance
+        contradicted = contradictions(case.known, *at_its_best, case.g_m_s2, SIGNIFICANT_SIGMAS, case.setup.up)
     gain = [] if causes else _gain_not_modelled(found, free)
     needs_no_misfit = gain or contradicted or quality.largest_share <= NOISY_SHARE
     explained = quality.is_exact or quality.fits_measured_noise or causes
@@ -217,7 +207,7 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
         *_poses(found, quality, case.setup),
         *_structure(found),
         *_drift(found, quality.ahead, is_cause=verdict_of([*broken, *causes]) == "good"),
-        *_response(found),
+        *_response(found.response, found.parameters.weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
         *([] if cable is None else cable[:1]),
     ]
     findings += _cell(case, quality, findings, mistaken=mistaken, broken=bool(broken))
@@ -235,7 +225,7 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
 
 def judge_motion(case: Case) -> Quality:
     """Judge the estimates of a recording in motion by rows of it, which are means and no poses of their own."""
-    found, quality = case.found, statistics(case.found)
+    found, quality = case.found, statistics(case)
     # Neighbouring rows of a motion differ too little to show a bias that changes with each.
     mistakes = [one for one in find_mistakes(case, quality) if one.code != "zeroed_each_pose"]
     mistakes = mistakes or find_other_poses(case, quality)
@@ -309,14 +299,6 @@ def _broken(found: Estimate, quality: Quality, causes: Sequence[Finding]) -> lis
     if quality.is_exact or any(_leaves_nothing(one, quality.finest) for one in causes):
         return []
     return broken_channels(found.wrench, found.R_base_flange)
-
-
-def _contradicted(case: Case) -> list[Finding]:
-    """Name the known values that the fit without them contradicts."""
-    if case.known is None or case.free is None:
-        return []
-    at_its_best = case.free.parameters, case.free.covariance
-    return contradictions(case.known, *at_its_best, case.g_m_s2, SIGNIFICANT_SIGMAS, case.setup.up)
 
 
 def _units(case: Case, quality: Quality, contradicted: Sequence[Finding] = ()) -> list[Finding]:
@@ -452,7 +434,9 @@ def _second_solution(found: Estimate, free: Estimate | None = None) -> list[Find
     delta = found.second_basin_chi2 / max(1.0, fitted.chi2 / fitted.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
         return []
-    return [Finding.of("second_solution", probability_percent=100 * wrong_basin_probability(max(delta, 0.0)))]
+    # Calibrated on 8954 simulated calibrations.
+    probability = float(1 / (1 + np.exp(max(delta, 0.0) / 2)))
+    return [Finding.of("second_solution", probability_percent=100 * probability)]
 
 
 def _gain_not_modelled(found: Estimate, free: Estimate | None) -> list[Finding]:
@@ -593,13 +577,13 @@ def _drift(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> list[Findin
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 
 
-def _response(found: Estimate) -> list[Finding]:
+def _response(response: Response | None, weight_N: float, *, assumed: bool = False) -> list[Finding]:
     """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
-    if (response := found.response) is None:
+    if response is None:
         return []
     gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
     certain = np.abs(gain) > 3 * sigma["force_gain"]
-    certain &= (sigma["force_gain"] > 0) & (np.abs(gain) * found.parameters.weight_N > RESOLUTION[0])
+    certain &= (sigma["force_gain"] > 0) & (np.abs(gain) * weight_N > RESOLUTION[0])
     findings = [
         Finding.of(f"gain_{axis}", gain_percent=100 * gain[k, k]) for k, axis in enumerate("xyz") if certain[k, k]
     ]
@@ -610,7 +594,7 @@ def _response(found: Estimate) -> list[Finding]:
     ]
     if (np.abs(cross_talk) > 3 * sigma["cross_talk_m"]).any():
         findings.append(Finding.of("cross_talk", torque_mNm=1e3 * np.abs(cross_talk).max()))
-    return findings or ([] if len(found.weights) < FEW_POSES_FOR_GAIN else [Finding.of("response_small")])
+    return findings or ([] if assumed else [Finding.of("response_small")])
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:

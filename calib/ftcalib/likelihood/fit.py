@@ -103,22 +103,10 @@ class Estimate:
         components: Mapping[str, float] | None = None,
         free: Array | None = None,
     ) -> Self:
-        """Take the estimates of another method, for poses with independent noise.
+        """Take the estimates of another method, for poses with independent noise `wrench_cov` (n, 6, 6).
 
-        Parameters
-        ----------
-        parameters : Parameters
-        covariance : array, shape (15, 15)
-        R_base_flange : array, shape (n, 3, 3)
-        wrench : array, shape (n, 6)
-        wrench_cov : array, shape (n, 6, 6)
-        weights : array, shape (n,)
-        measured : bool
-            Whether `wrench_cov` was measured, not estimated from the residuals.
-        second_basin_chi2 : float, optional
-        components : mapping, optional
-        free : array, shape (15, m), optional
-            Error coordinates that the method estimates: fewer where it assumes mounting or gravity.
+        `measured` says whether this was measured, not estimated from the residuals. `free` (15, m) is the identity
+        unless the method assumes mounting or gravity.
         """
         r = np.asarray(wrench - predict(parameters, R_base_flange))[..., None]
         chi2 = float(weights @ np.sum(r * np.linalg.solve(wrench_cov, r), axis=(1, 2)))
@@ -385,7 +373,7 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         chi2=best.chi2,
         dof=dof,
         measured_chi2=measured_chi2,
-        second_basin_chi2=_second_basin_chi2(minima, components, dof),
+        second_basin_chi2=_second_basin_chi2([one.chi2 for one in minima], components, dof),
         weights=weights,
         components=components,
         drift=_drift(session, best, noise, given_noise, found) if drifts else None,
@@ -401,14 +389,14 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
     )
 
 
-def _second_basin_chi2(minima: Sequence[Minimum], components: Iterable[str], dof: int) -> float | None:
-    """Compare the two best minima; None if there is one.
+def _second_basin_chi2(minima: Sequence[float], components: Iterable[str], dof: int) -> float | None:
+    """Compare the two least minima of chi2; None if there is one.
 
     Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
     """
     if len(minima) == 1:
         return None
-    best, second = minima[0].chi2, minima[1].chi2
+    best, second = minima[:2]
     return float(dof * np.log(second / best)) if any(name.startswith("white") for name in components) else second - best
 
 

@@ -7,7 +7,6 @@ Angular velocities alone show none of this: inertia and lever absorb their scale
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -65,6 +64,15 @@ JUDGED_ROWS: Final = 300
 OF_AXES: Final = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
+
+Undo = Callable[[Rows], Rows]
+"""What gives rows without mistakes."""
+
+
+def as_they_are(rows: Rows) -> Rows:
+    """Undo nothing."""
+    return rows
+
 
 Stream = tuple[Array, Array]
 """Times (n,) and values (n, k)."""
@@ -124,12 +132,7 @@ def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
 # ----------------------------------------------------------------------------------------------------- signs and poses
 
 
-def nothing(rows: Rows) -> Rows:
-    """Undo nothing."""
-    return rows
-
-
-def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Callable[[Rows], Rows]]:
+def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Undo]:
     """Find the mistakes of signs, clock and poses that explain the rows, and what undoes them in any rows.
 
     Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
@@ -144,10 +147,10 @@ def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Findin
     """
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
-        return named, nothing
+        return named, as_they_are
     # A wrench without weight gives any scale.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
-        return [], nothing
+        return [], as_they_are
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
     moment = float(load.inertia[:3].sum())
     sigma_moment = float(np.sqrt(free.covariance[INERTIA, INERTIA][:3, :3].sum()))
@@ -184,12 +187,8 @@ def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Findin
     findings += other
     if not findings and off > _DOUBTFUL_SIGMAS and share > _DOUBTFUL_SHARE:
         findings += _by_clock("limit", values, parted)
-    undo = partial(_without, PoseError(scale, aside_m, turning), np.repeat(signs, 3))
-    return findings, undo if findings else nothing
-
-
-def _without(error: PoseError, signs: Array, rows: Rows) -> Rows:
-    return replace(error.corrected(rows), wrench=rows.wrench * signs)
+    error, signs = PoseError(scale, aside_m, turning), np.repeat(signs, 3)
+    return findings, lambda rows: replace(error.corrected(rows), wrench=rows.wrench * signs) if findings else rows
 
 
 def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping[str, float] | None) -> list[Finding]:

@@ -25,12 +25,13 @@ from ftcalib.motion.mistakes import (
     JUDGED_ROWS,
     OF_AXES,
     Stream,
+    Undo,
+    as_they_are,
     at_rest,
     bias_steps,
     falls_to_zero,
     impossible,
     mistakes_in,
-    nothing,
     stays,
     without_steps,
 )
@@ -129,7 +130,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     data, zeroed_s = _without_zeroing(*data)
     data, ratio, delay_s = _on_one_clock(*data)
     rows = rows_of(*data, delay_s, NARROW_S if guarded else WIDE_S)
-    mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], nothing)
+    mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], as_they_are)
 
     def rows_at(delay_s: float) -> tuple[Rows, Rows]:
         """Rows without the mistakes, and those that count."""
@@ -137,16 +138,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         return others, _select_rows(others, limit_rad_s)
 
     delay_s += rough_delay(_select_rows(undo(rows), limit_rad_s), known, g_m_s2)
-    fit_rows = partial(
-        fit,
-        known=known,
-        g_m_s2=g_m_s2,
-        prior=prior,
-        point_mass=point_mass or not positions,
-        guarded=guarded,
-        zeroed_s=zeroed_s,
-    )
-    rows, used, best = _fit(rows_at, delay_s, fit_rows)
+    fit_rows = partial(fit, known=known, g_m_s2=g_m_s2, prior=prior, guarded=guarded, zeroed_s=zeroed_s)
+    rows, used, best = _fit(rows_at, delay_s, partial(fit_rows, point_mass=point_mass or not positions))
     _require_determined(used, best, known)
     start_s, delay_s = data[0][0][0], rows.delay_s + best.load.delay_s
     motion = MotionResult(
@@ -158,11 +151,14 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         _contacts(used, best, start_s) if positions else (),
     )
     causes = _causes(mistakes, ratio, zeroed_s - start_s, coarse_rad, len(used) / len(rows))
-    places = _judged_rows(best)
+    places = np.flatnonzero(best.kept)
+    places = places[:: max(1, len(places) // JUDGED_ROWS)]
     quality = judge_motion(Case(_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
     findings = list(causes)
     if verdict_of(causes) != "rejected":  # which would explain all others
-        findings += _not_explained(quality.findings, causes)
+        # A point of another device puts the load behind the sensor, as reversed torques do.
+        elsewhere = any(one.code in ("torques_about_tcp", "poses_of_tcp") for one in causes)
+        findings += [one for one in quality.findings if not (elsewhere and one.code == "torques_reversed")]
         aligned = used if abs(best.load.delay_s) <= LINEAR_S else rows_at(delay_s)[1]
         findings += _other_wrench(used, aligned, best, quality.findings)
         findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
@@ -202,20 +198,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
 def _fit(
     rows_at: Callable[[float], tuple[Rows, Rows]], delay_s: float, fit_rows: Callable[[Rows], MotionFit]
 ) -> tuple[Rows, Rows, MotionFit]:
-    """Fit rows at a delay, and again at that of the fit, because the model is linear in it only near that of the rows.
-
-    Returns
-    -------
-    rows : Rows
-    used : Rows
-        Those that count.
-    best : MotionFit
-
-    Raises
-    ------
-    NotObservable
-        An earlier result contradicts the rows.
-    """
+    """Fit rows at a delay, and again at that of the fit: the model is linear in it only near that of the rows."""
     for _ in range(3):
         rows, used = rows_at(delay_s)
         best = fit_rows(used)
@@ -351,11 +334,6 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
     return at_rest(rows)[0]
 
 
-def _judged_rows(best: MotionFit) -> NDArray[np.intp]:
-    places = np.flatnonzero(best.kept)
-    return places[:: max(1, len(places) // JUDGED_ROWS)]
-
-
 def _estimate(rows: Rows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
     """Return the estimates, with what they leave of the rows at these places.
 
@@ -438,7 +416,7 @@ def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Strea
 
 def _find_mistakes(
     data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: float
-) -> tuple[list[Finding], Callable[[Rows], Rows]]:
+) -> tuple[list[Finding], Undo]:
     """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right, and what undoes them."""
     free = fit_freely(rows, known, g_m_s2)
     for _ in range(2):
@@ -448,13 +426,7 @@ def _find_mistakes(
         rows = rows_of(*data, delay_s, rows.row_s)
         free = fit_freely(rows, known, g_m_s2)
     spread_m = float(np.linalg.norm(np.ptp(data[1][1][:, 9:], axis=0)))
-    return mistakes_in(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else ([], nothing)
-
-
-def _not_explained(findings: Sequence[Finding], causes: Sequence[Finding]) -> list[Finding]:
-    """Leave out reversed torques where poses or torques are of another point, which puts the load behind the sensor."""
-    elsewhere = any(one.code in ("torques_about_tcp", "poses_of_tcp") for one in causes)
-    return [one for one in findings if not (elsewhere and one.code == "torques_reversed")]
+    return mistakes_in(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else ([], as_they_are)
 
 
 def _other_wrench(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:

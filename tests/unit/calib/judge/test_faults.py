@@ -12,11 +12,11 @@ from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Finding, 
 from ftcalib.judge.faults import (
     CHANNELS,
     EULER_ORDERS,
+    _least_rms,
     _Rough,
     broken_channels,
     constant_weight,
     faults,
-    least_rms,
     other_poses,
     rough_fit,
 )
@@ -414,8 +414,8 @@ def test_no_rotation_leaves_less_than_the_bound() -> None:
         for orientations in (R, np.swapaxes(R, 1, 2)):
             left = wrench - predict(rough_fit(orientations, wrench), orientations)
             rms = np.sqrt(np.mean(np.sum(left[:, :3] ** 2, axis=1)))
-            assert least_rms(orientations, wrench[:, :3]) <= rms
-    assert least_rms(orientations, wrench[:, :3]) > 0.1 * rms  # inverted orientations can be left out by it
+            assert _least_rms(orientations, wrench[:, :3]) <= rms
+    assert _least_rms(orientations, wrench[:, :3]) > 0.1 * rms  # inverted orientations can be left out by it
 
 
 def test_a_weight_that_pulls_upwards_is_as_unlikely_as_residuals_e_times_as_large() -> None:

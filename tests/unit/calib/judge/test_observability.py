@@ -13,13 +13,12 @@ from ftcalib.judge.observability import (
     AMBIGUOUS_GAP,
     NOMINAL,
     Observability,
+    _scaled_information,
     assess,
     different_orientations,
     require_observable,
     require_orientations,
-    scaled_information,
     second_minimum,
-    wrong_basin_probability,
 )
 from ftcalib.model import Array, SPECIAL_R_flange_base, predict
 
@@ -224,12 +223,6 @@ def test_orientations_are_counted_with_half_a_degree() -> None:
     assert different_orientations(R24) == 24
 
 
-def test_odds_of_the_second_solution() -> None:
-    assert wrong_basin_probability(0) == 0.5
-    assert wrong_basin_probability(2) == pytest.approx(0.27, abs=0.01)
-    assert wrong_basin_probability(12) == pytest.approx(0.0025, abs=1e-4)
-
-
 SOUND = Observability(4, 15, 0.99e4, (), (), np.zeros((0, 3, 3)), 0.021)
 
 
@@ -260,12 +253,12 @@ def test_reason_and_advice_are_one_sentence(
 def test_information_counts_poses(com_m: float, lever_m: float) -> None:
     weight_N = 20.0
     tool = replace(NOMINAL, gravity_force_base_N=np.array([0, 0, -weight_N]), p_sensor_com_m=np.array([0, 0, com_m]))
-    information = scaled_information(R24, tool)
+    information = _scaled_information(R24, tool)
     in_torque_noise = (lever_m / 0.025) ** 2  # by which torques at the lever exceed their usual noise
     np.testing.assert_allclose(information[6:9, 6:9], 24 * np.eye(3), atol=1e-9)
     np.testing.assert_allclose(information[12:, 12:], 24 * in_torque_noise * np.eye(3), atol=1e-9)
     np.testing.assert_allclose(information[9:12, 9:12], 24 * 2 / 3 * in_torque_noise * np.eye(3), atol=1e-9)
     noise = weight_N**2 * np.diag(np.repeat([1.0, 0.025**2], 3))
-    np.testing.assert_allclose(scaled_information(R24, tool, np.tile(noise, (24, 1, 1))), information, atol=1e-9)
-    louder = scaled_information(R24, tool, np.tile(4 * noise, (24, 1, 1)))
+    np.testing.assert_allclose(_scaled_information(R24, tool, np.tile(noise, (24, 1, 1))), information, atol=1e-9)
+    louder = _scaled_information(R24, tool, np.tile(4 * noise, (24, 1, 1)))
     np.testing.assert_allclose(louder, information / 4, atol=1e-9)

@@ -14,8 +14,8 @@ from ftcalib.judge.session_change import (
     KINDS,
     SessionChange,
     _groups,
+    _likeliest_change,
     bias_steps,
-    likeliest_change,
 )
 from ftcalib.judge.verdict import Case, statistics
 from ftcalib.likelihood.fit import fit
@@ -156,7 +156,7 @@ def test_gain_and_cross_talk_of_a_fit_hide_no_part_of_a_change() -> None:
     rng = np.random.default_rng(0)
     wrench = np.where(np.arange(24)[:, None] < 14, predict(TOOL, ORIENTATIONS), predict(LIGHTER, ORIENTATIONS))
     wrench += rng.normal(0, SIGMA, wrench.shape) + response_columns(TOOL, ORIENTATIONS) @ rng.normal(0, 0.01, SIZE)
-    change = likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
+    change = _likeliest_change(TOOL, ORIENTATIONS, wrench, SIGMA)
     assert change is not None
     assert (change.code, change.starts.tolist()) == ("load_changed", [14])
     # Beside 15 free parameters the sigma of a step between two halves is about that of a mean of 4 poses.
@@ -190,7 +190,7 @@ def test_a_change_is_as_large_as_it_is_and_can_be_undone(
     wrench = np.where(rows[:, None], predict(after, ORIENTATIONS), predict(TOOL, ORIENTATIONS))
     wrench += 0.01 * np.random.default_rng(5).normal(0, SIGMA, wrench.shape)
     scale = SIGMA if measured else np.repeat([1.0, LEVER_M], 3)
-    change = likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, scale)
+    change = _likeliest_change(rough_fit(ORIENTATIONS, wrench), ORIENTATIONS, wrench, scale)
     assert change is not None
     assert (change.code, change.takes_turns) == (code, not rows[22])
     assert change.starts[0] == np.flatnonzero(rows)[0]
@@ -333,14 +333,14 @@ def test_a_change_is_named_from_some_of_many_poses(n: int, looked_at: int, monke
 
     def counted(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
         sizes.append(len(R))
-        return likeliest_change(parameters, R, wrench, scale)
+        return _likeliest_change(parameters, R, wrench, scale)
 
-    monkeypatch.setattr("ftcalib.judge.session_change.likeliest_change", counted)
+    monkeypatch.setattr("ftcalib.judge.session_change._likeliest_change", counted)
     R = Rotation.random(n, rng=3).as_matrix()
     wrench = predict(TOOL, R) + np.random.default_rng(4).normal(0, SIGMA, (n, 6))
     wrench[n // 2 :] += predict(TARED, R[n // 2 :]) - predict(TOOL, R[n // 2 :])
     case = Case(fit(R, wrench, np.diag(SIGMA**2)))
-    (finding,) = _find_change(case, statistics(case.found), SIGMA)
+    (finding,) = _find_change(case, statistics(case), SIGMA)
     assert finding.code == "bias_stepped"
     assert abs(finding.values["pose"] - n // 2) <= n // looked_at + 1
     assert set(sizes) == {looked_at}

@@ -71,26 +71,14 @@ def fit(
     J = jacobian(parameters, R[used])
     information = np.einsum("nki,nkl,nlj->ij", J, np.linalg.inv(noise[used]), J)
     covariance = np.asarray(np.linalg.inv(information))
-    return Estimate.independent(
-        parameters,
-        covariance,
-        R,
-        wrench,
-        noise,
-        weights,
-        measured=cov is not None,
-        second_basin_chi2=second,
-        components=components,
-    )
+    given = parameters, covariance, R, wrench, noise, weights
+    return Estimate.independent(*given, measured=cov is not None, second_basin_chi2=second, components=components)
 
 
 def with_wrench(fitted: Estimate, wrench: Array) -> Estimate:
     """The same estimates, from 24 poses with measured noise, beside other readings."""
-    p, R = fitted.parameters, fitted.R_base_flange
-    noise, second = white(24), fitted.second_basin_chi2
-    return Estimate.independent(
-        p, fitted.covariance, R, wrench, noise, fitted.weights, measured=True, second_basin_chi2=second
-    )
+    given = fitted.parameters, fitted.covariance, fitted.R_base_flange, wrench, white(24), fitted.weights
+    return Estimate.independent(*given, measured=True, second_basin_chi2=fitted.second_basin_chi2)
 
 
 def judge(found: Estimate, **given: Any) -> Quality:
@@ -479,8 +467,9 @@ def test_a_second_solution_counts_in_noise_as_it_is(delta: float, noise_factor: 
     scale = FITTED.chi2 / FITTED.dof / noise_factor**2
     noisier = replace(FITTED, chi2=FITTED.chi2 / scale, second_basin_chi2=delta * max(1, noise_factor**2))
     assert [one.code for one in _second_solution(noisier)] == ["second_solution"] * found
-    (close,) = _second_solution(replace(FITTED, second_basin_chi2=-1.0))
-    assert close.values["probability_percent"] == 50
+    for worse, percent in ((-1.0, 50.0), (0.0, 50.0), (2.0, 26.9), (11.99, 0.25)):
+        (close,) = _second_solution(replace(FITTED, chi2=FITTED.dof, second_basin_chi2=worse))
+        assert close.values["probability_percent"] == pytest.approx(percent, abs=0.01)
 
 
 def test_of_a_rejected_result_only_units_are_suspected_of_the_payload() -> None:
@@ -602,13 +591,10 @@ def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of
     measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
     expected = expected_error(measured.parameters, measured.covariance)
     quality, other = judge(measured), judge(unknown)
-
-    def next_use(judged: Quality) -> tuple[Any, Any]:
-        return judged.uses["next_use_force_rms_N"], judged.uses["next_use_torque_rms_Nm"]
-
-    assert next_use(quality) == pytest.approx(expected)
+    names = "next_use_force_rms_N", "next_use_torque_rms_Nm"
+    assert [quality.uses[name] for name in names] == pytest.approx([*expected])
     left_out = other.loo_force_rms_N, other.loo_torque_rms_Nm
-    assert next_use(other) == pytest.approx(left_out)
+    assert [other.uses[name] for name in names] == pytest.approx([*left_out])
 
 
 def test_many_poses_are_looked_at_in_runs() -> None:
@@ -650,7 +636,7 @@ def test_a_response_is_named_from_three_sigmas_on(sigmas: float, certain: bool) 
     covariance = np.diag(np.append(np.zeros(15), np.full(SIZE, 0.001**2)))
     for k, code in ((2, "axes_mixed"), (8, "cross_talk")):
         coefficients = sigmas * 0.001 * np.eye(SIZE)[k]
-        (finding,) = _response(replace(FITTED, response=Response(coefficients, covariance)))
+        (finding,) = _response(Response(coefficients, covariance), WEIGHT_N)
         assert finding.code == (code if certain else "response_small")
 
 
@@ -682,9 +668,7 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
 @pytest.mark.parametrize(("share", "codes"), [(1e-3, ["gain_x", "gain_y"]), (1e-6, ["response_small"])])
 def test_a_gain_that_no_sensor_resolves_is_not_named(share: float, codes: list[str]) -> None:
     covariance = 1e-16 * np.eye(15 + SIZE)
-    found = _response(
-        replace(OF_20_N, response=Response(share * np.eye(SIZE)[0], covariance))
-    )  # a sensor resolves 1 mN
+    found = _response(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
     assert [one.code for one in found] == codes
 
 

@@ -1,8 +1,5 @@
 """Maximum likelihood: as good as the data allow, in the right basin, with the noise the data show."""
 
-from types import SimpleNamespace
-from typing import cast
-
 import numpy as np
 import pytest
 from scipy import stats
@@ -12,15 +9,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import Parameters
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.descent import (
-    Descent,
-    Minimum,
-    Statistics,
-    coefficients,
-    coefficients_derivative,
-    features,
-    wrench_gram,
-)
+from ftcalib.likelihood.descent import Descent, Statistics, coefficients, coefficients_derivative, features, wrench_gram
 from ftcalib.likelihood.fit import Fit, _second_basin_chi2, fit
 from ftcalib.likelihood.session import Drift
 from ftcalib.likelihood.session_noise import CHUNK, Noise, inverse_blocks, summed_products
@@ -346,7 +335,7 @@ def test_a_second_minimum_is_worse_by_chi2_or_by_the_likelihood_of_its_own_noise
     rng = np.random.default_rng(11)
     p, R = truth(rng), haar(rng, 8)
     best = fit(R, predict(p, R) + noise(rng, 8), WHITE, drift="none")
-    minima = [cast(Minimum, SimpleNamespace(chi2=best.chi2 + more)) for more in (0.0, 9.0, 1e9)]
+    minima = best.chi2, best.chi2 + 9, 1e9
     assert _second_basin_chi2(minima[:1], {}, best.dof) is None
     assert _second_basin_chi2(minima, {"gain": 0.01}, best.dof) == pytest.approx(9)
     estimated = _second_basin_chi2(minima, {"white_force_N": 0.1}, best.dof)
@@ -355,7 +344,7 @@ def test_a_second_minimum_is_worse_by_chi2_or_by_the_likelihood_of_its_own_noise
         """Of residuals with the standard deviation that fits them best."""
         return float(-best.dof * np.log(np.sqrt(chi2 / best.dof)) - best.dof / 2)
 
-    odds = 2 * (loglik(minima[0].chi2) - loglik(minima[1].chi2))
+    odds = 2 * (loglik(minima[0]) - loglik(minima[1]))
     assert estimated == pytest.approx(odds)
 
 
