@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 import click
 
 from ftcalib.files import open_file
+from ftdrive.runs import is_run
 
 
 class Kind(NamedTuple):
@@ -85,7 +86,6 @@ _ALIKE = 0.75
 def kind_of(path: Path) -> str | None:
     """Return the kind of a file or folder, by its first bytes and its ending; None for one that no command takes."""
     from ftdrive.recording.foreign import is_bag, is_recording
-    from ftdrive.runs.run import is_run
 
     with suppress(OSError):
         if is_bag(path):
@@ -111,8 +111,6 @@ def kind_of(path: Path) -> str | None:
 
 def _runs_in(folder: Path) -> Iterator[Path]:
     """Yield the runs in a folder, the newest first."""
-    from ftdrive.runs.run import is_run
-
     yield from filter(is_run, sorted(folder.iterdir(), reverse=True))
 
 

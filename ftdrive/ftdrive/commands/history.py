@@ -11,12 +11,13 @@ import click
 from ftdrive.commands.options import FOLDER, JSON, STORE, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.weighings import WeighingDay
 from ftdrive.store import open_store
 from ftdrive.store.history import age_days, drifts, warnings
-from ftdrive.store.records import StoredResult, StoredWeighings, read_records, record_paths
+from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.text import echo, print_table
-from ftdrive.words.history import DAY_TITLES, day_row, result_table
+from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table
 
 # Fewer records have no three pairs of runs, and numpy takes as long as all else of a short list.
 _FEWEST_RUNS = 4
@@ -53,7 +54,7 @@ def history(
     moves in an hour.
     """
     left_out: tuple[str, ...] = ()
-    weighed: Sequence[StoredWeighings] = ()
+    weighed: Sequence[WeighingDay] = ()
     name = None
     if folders:
         if option := (
@@ -64,7 +65,7 @@ def history(
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
         results.sort(key=lambda one: (one.created_utc or "", one.id))
         checks = [one for one in records if isinstance(one, VerificationRecord)]
-        checks.sort(key=lambda one: one.to_store_dict()["created_utc"] or "")
+        checks.sort(key=lambda one: (one.created_utc is not None, one.created_utc))
     else:
         store = open_store(url)
         name = store.name
@@ -109,7 +110,7 @@ def history(
     print_table(titles, shown, folding={"arm", "tool", "verified", "run", "parent"})
     trend_lines = (f"trend: {drift}" for drift in found)
     warmth_lines = (line for one in warmth for line in one.lines())
-    weighing_lines = (f"last weighing: {one.in_words}" for one in weighed if one.mass_kg is not None)
+    weighing_lines = (f"last weighing: {last_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
     for line in (*trend_lines, *warmth_lines, *map(_HOUR.format_map, moved), *weighing_lines):
         echo(line)
     for words in advice:
@@ -121,7 +122,7 @@ def _print_left_out(left_out: Sequence[str]) -> None:
         messages.print(hanging(" left out: ", words))
 
 
-def _show_weighings(days: Sequence[StoredWeighings], name: str, left_out: Sequence[str], as_json: bool) -> None:
+def _show_weighings(days: Sequence[WeighingDay], name: str, left_out: Sequence[str], as_json: bool) -> None:
     _print_left_out(left_out)
     if as_json:
         write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})

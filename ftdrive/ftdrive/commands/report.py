@@ -30,8 +30,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.page import page
 from ftdrive.report.subject import MAY_BE_MISSING, read_subject, trust
+from ftdrive.runs import is_run
 from ftdrive.runs.bundle import unpack
-from ftdrive.runs.run import is_run
 from ftdrive.runs.source import SolveOptions, known_values, up_direction
 from ftdrive.store import store_url
 from ftdrive.tables.table import TableOptions

@@ -27,7 +27,7 @@ from ftdrive.commands.options import (
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.calibration import read_calibration, require_accepted
 from ftdrive.runs.run import Mode
-from ftdrive.runs.verification import AcceptanceLimits, Verified
+from ftdrive.runs.verification import Verified
 from ftdrive.session.events import Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.rehearsal import rehearse
@@ -92,7 +92,7 @@ def verify(
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     mode: Mode = "manual" if manual else "auto"
     options = SessionOptions(runs, "verify", mode=mode, fast=quick, resume=resume, real=not simulate, yes=yes)
-    path, limits, options = Verifying.chosen(options, path, poses, AcceptanceLimits(force_N, torque_Nm))
+    path, limits, options = Verifying.chosen(options, path, poses, (force_N, torque_Nm))
     with ExitStack() as stack:
         page = stack.enter_context(view.page("ftdrive verify"))
         station = None

@@ -22,8 +22,9 @@ from ftdrive import __version__
 from ftdrive.checks.arm import FlangeLoad, flange_load
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format, plain
+from ftdrive.runs import is_run
 from ftdrive.runs.calibration import MARKS, marks_of
-from ftdrive.runs.run import Run, is_run
+from ftdrive.runs.run import Run
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.stream.samples import sensor_origin_m
 

@@ -19,12 +19,13 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ftcalib.model import Array
 from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings, shows_bias
+from ftdrive.runs.weighings import WeighingDay
+from ftdrive.store.records import StoredCell, StoredResult, shows_bias
 from ftdrive.store.store import Store
 
 FORMAT: Final = "ftdrive.cells/1"
@@ -86,7 +87,7 @@ class Owners:
         self._by_serial = {cell.arm_serial: cell.name for cell in cells if cell.arm_serial}
         self._by_host = {cell.robot_host: cell.name for cell in cells if cell.robot_host and not cell.arm_serial}
 
-    def cell_of(self, result: StoredResult | StoredWeighings) -> str | None:
+    def cell_of(self, result: StoredResult | WeighingDay) -> str | None:
         """Return the name of the cell; None if no cell has this arm."""
         by_serial = self._by_serial.get(result.arm_serial) if result.arm_serial else None
         return by_serial or (self._by_host.get(result.robot_host) if result.robot_host else None)
@@ -133,25 +134,17 @@ WINDOW: Final = timedelta(days=90)
 NEWEST: Final = 3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BiasChanges:
-    """Changes of the bias since a calibration, by n verifications; force first, N and N·m, sensor frame."""
-
-    t_days: Array
-    """(n,) since the calibration, ascending."""
-    change: Array
-    """(n, 6)"""
-    sigma: Array
-    """(n, 6) of the readings of each verification."""
-    calibration_sigma: Array
-    """(6,) of the calibration."""
-    temperature_C: Array
-    """(n,) nan where it is not known."""
-
-    @property
-    def in_sigmas(self) -> Array:
-        """(n, 6) in sigmas of each verification."""
-        return np.asarray(self.change / self.sigma)
+# A row for each verification of a calibration: days since it, and how far the bias has changed, force first, N and N·m.
+Changes = NDArray[np.void]
+_COLUMNS: Final = np.dtype(
+    [
+        ("t_days", float),
+        ("temperature_C", float),  # nan where it is not known
+        ("change", float, 6),
+        ("sigma", float, 6),  # of the readings of this verification
+        ("calibration_sigma", float, 6),  # of the calibration, common to all
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,11 +154,11 @@ class Observed:
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
     """The newest accepted results of each tool, by cell, the oldest first."""
-    checks: Mapping[str, Sequence[BriefVerification]]
+    checks: Mapping[str, Sequence[VerificationRecord]]
     """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
-    changes: Mapping[str, BiasChanges]
+    changes: Mapping[str, Changes]
     """By calibration, where its verifications have them."""
-    weighings: Mapping[tuple[str | None, str | None, bool], StoredWeighings]
+    weighings: Mapping[tuple[str | None, str | None, bool], WeighingDay]
     """The last weighing by cell and tool, and whether the cell was emulated."""
     now: datetime
 
@@ -178,7 +171,7 @@ class Observed:
         for one in newest:
             if (name := owners.cell_of(one)) is not None:
                 results[name].append(one)
-        checks = dict[str, list[BriefVerification]]()
+        checks = dict[str, list[VerificationRecord]]()
         for check in recent:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
@@ -201,20 +194,20 @@ class Observed:
                 yield one
 
 
-def _changes(result: StoredResult, checks: Sequence[BriefVerification]) -> BiasChanges | None:
+def _changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Changes | None:
     """Return how the bias has changed since a calibration; None if no verification has this."""
-    used = [one for one in checks if shows_bias(one) and None not in one.bias]
-    bias = np.array([one.bias for one in used], dtype=np.float64).reshape(-1, 18)
-    measured = bias[:, 6:12].min(axis=1, initial=np.inf) > 0
-    if not measured.any():
-        return None
     start = when(result)
-    days = np.array([(when(one) - start).total_seconds() for one in used]) / 86400
-    known = np.array([one.temperature_C for one in used], dtype=np.float64)  # None becomes nan
-    change, sigma, common = np.split(bias[measured], 3, axis=1)
-    return BiasChanges(days[measured], change, sigma, np.median(common, axis=0), known[measured])
+    rows = [
+        ((when(one) - start).total_seconds() / 86400, one.temperature_C, *one[-3:])
+        for one in checks
+        if shows_bias(one) and None not in one[-3:]
+    ]
+    changes = np.array(rows, _COLUMNS)
+    changes = changes[changes["sigma"].min(axis=1, initial=np.inf) > 0]
+    return changes if len(changes) else None
 
 
-def when(one: StoredResult | VerificationRecord | BriefVerification) -> datetime:
+def when(one: StoredResult | VerificationRecord) -> datetime:
     """Return the time of a record that has one."""
-    return datetime.fromisoformat(str(one.created_utc))
+    made = one.created_utc
+    return made if isinstance(made, datetime) else datetime.fromisoformat(str(made))

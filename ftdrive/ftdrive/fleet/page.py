@@ -5,7 +5,7 @@ from datetime import datetime
 import numpy as np
 
 from ftdrive import __version__
-from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed
+from ftdrive.fleet.cells import WINDOW, Changes, Observed
 from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
 from ftdrive.report.page import templates, with_code
 from ftdrive.runs.verification import age_in_words
@@ -37,15 +37,15 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     )
 
 
-def _plot(changes: BiasChanges, start: datetime, now: datetime) -> str:
+def _plot(changes: Changes, start: datetime, now: datetime) -> str:
     """Draw the changes of the six biases over the last 90 days as SVG, in sigmas of each verification.
 
     Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.
     """
     # Lines in SVG: matplotlib is too slow for 200 plots.
     first = (now - WINDOW - start).total_seconds() / 86400
-    x = MARGIN + (changes.t_days - first) / WINDOW.days * (WIDTH - 2 * MARGIN)
-    sigmas = changes.in_sigmas
+    x = MARGIN + (changes["t_days"] - first) / WINDOW.days * (WIDTH - 2 * MARGIN)
+    sigmas = changes["change"] / changes["sigma"]
     most = max(LEAST_SIGMAS, float(np.abs(sigmas).max()))
     middle, unit = HEIGHT / 2, (HEIGHT / 2 - MARGIN) / most
     band = f'<rect x="0" y="{middle - 2 * unit:.1f}" width="{WIDTH}" height="{4 * unit:.1f}" class="band"/>'

@@ -9,7 +9,9 @@ from ftcalib.files import JSON
 from ftcalib.rounding import counted
 from ftdrive.errors import BadStore
 from ftdrive.runs.verification import age_in_words
-from ftdrive.store.records import StoredCell, StoredWeighings, tool_in_words
+from ftdrive.runs.weighings import WeighingDay
+from ftdrive.store.records import StoredCell
+from ftdrive.words.history import tool_in_words
 from ftdrivers.clock import Clock
 
 
@@ -50,7 +52,7 @@ class CellState:
     temperature_C: float | None = None
     drift: BiasDrift | None = None
     """None with too few verifications."""
-    weighings: StoredWeighings | None = None
+    weighings: WeighingDay | None = None
     """The last day with weighings; None without any in the last 90 days."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
@@ -71,7 +73,7 @@ class CellState:
         return {**plain, "is_due": self.is_due(now)}
 
 
-def _counts(day: StoredWeighings) -> dict[str, JSON]:
+def _counts(day: WeighingDay) -> dict[str, JSON]:
     refused: dict[str, JSON] = {code: number for code, number in day.refusals.items() if number}
     named: dict[str, JSON] = {name: getattr(day, name) for name in ("last_utc", "mass_kg", "mass_sigma_kg")}
     return {"day": day.day, "number": day.weighings, "refused": refused, **named}

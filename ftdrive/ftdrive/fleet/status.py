@@ -17,10 +17,10 @@ from scipy.special import fdtrc as f_sf
 from ftcalib.after.series import drift_onset, spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
 from ftcalib.rounding import to_place_of
-from ftdrive.fleet.cells import WINDOW, BiasChanges, Observed, when
+from ftdrive.fleet.cells import WINDOW, Changes, Observed, when
 from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult
+from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store
 
 # The level of a drift is the mean of the verifications of the last week.
@@ -50,15 +50,16 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     return Fleet(tuple(states), _findings(observed, states))
 
 
-def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
+def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
     """Return the drift of a bias since its calibration at `start`; None with too few verifications."""
     if changes is None:
         return None
-    onset = drift_onset(changes.t_days, changes.change, changes.sigma, changes.calibration_sigma)
+    t_days, change, sigma = changes["t_days"], changes["change"], changes["sigma"]
+    onset = drift_onset(t_days, change, sigma, np.median(changes["calibration_sigma"], axis=0))
     if onset is None:
         return None
-    lately = changes.t_days > changes.t_days[-1] - LEVEL_DAYS
-    level = float(np.abs(changes.in_sigmas[lately].mean(axis=0)).max())
+    lately = t_days > t_days[-1] - LEVEL_DAYS
+    level = float(np.abs((change / sigma)[lately].mean(axis=0)).max())
     if not onset.found.any():
         return BiasDrift(level, found=False, words="")
     k = int(onset.p_value.argmin())
@@ -73,7 +74,7 @@ def _drift_of(changes: BiasChanges | None, start: datetime) -> BiasDrift | None:
 
 def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
-    check: BriefVerification | VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
+    check: VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
     if check is None and calibrated < observed.now - WINDOW:  # its verifications may be too old to be read with it
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)
@@ -336,20 +337,19 @@ def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
         yield from _finding(model, sensors)
 
 
-def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: BiasChanges) -> None:
-    known = np.isfinite(changes.temperature_C)
-    T = changes.temperature_C[known]
+def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: Changes) -> None:
+    changes = changes[np.isfinite(changes["temperature_C"])]
+    T = changes["temperature_C"]
     if not spans_temperature(T, FEWEST):
         return
     found = sensors.setdefault(serial, _Sums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
     found.cells.add(cell)
     found.dof += len(T) - 3
-    weight = 1 / changes.sigma[known].T  # (6, n)
-    base = np.stack([np.ones_like(T), changes.t_days[known] - changes.t_days[known].mean()], axis=1)
+    weight = 1 / changes["sigma"].T  # (6, n)
+    base = np.stack([np.ones_like(T), changes["t_days"] - changes["t_days"].mean()], axis=1)
     Q, _ = np.linalg.qr(weight[..., None] * base)  # (6, n, 2)
     x, y = (
-        part - (Q @ (Q.swapaxes(1, 2) @ part[..., None]))[..., 0]
-        for part in (weight * T, weight * changes.change[known].T)
+        part - (Q @ (Q.swapaxes(1, 2) @ part[..., None]))[..., 0] for part in (weight * T, weight * changes["change"].T)
     )
     found.xx += np.sum(x * x, axis=1)
     found.xy += np.sum(x * y, axis=1)

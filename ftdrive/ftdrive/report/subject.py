@@ -13,8 +13,9 @@ from ftcalib.files import read_object
 from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.runs.run import Run, is_run
-from ftdrive.runs.source import SolveOptions, read_source, solve_in_motion
+from ftdrive.runs import is_run
+from ftdrive.runs.run import Run
+from ftdrive.runs.source import RecordedData, SolveOptions, read_source, solve_in_motion
 from ftdrive.runs.verification import age_of, newest, verification_near
 
 # If a store cannot be read: why.
@@ -98,7 +99,7 @@ def _of_result(source: Path, result: CalibrationResult) -> Subject:
         data = read_source(folder, SolveOptions())
         if data.dataset.sha256() == result.provenance.get("dataset_sha256"):
             run = Run(folder)
-            return Subject(source, result, run.solve_command, data.dataset, run, data.records, data.circumstances)
+            return Subject(source, result, run.solve_command, data.dataset, run, data.records, _known_of(data))
     return Subject(source, result, "")
 
 
@@ -110,7 +111,7 @@ def _of_data(source: Path, options: SolveOptions) -> Subject:
         command = " ".join([run.solve_command, *options.words])
         return Subject(source, saved or solve_in_motion(run, options.known), command, run=run)
     data, result = read_source(source, options), saved
-    solved_with = {"drift": options.drift, **data.circumstances}
+    solved_with = {"drift": options.drift, **_known_of(data)}
     method = cast("Method", options.method)
     command = " ".join(["ftdrive solve", shlex.quote(str(source)), *options.words])
     if run is not None and options == SolveOptions():
@@ -119,6 +120,10 @@ def _of_data(source: Path, options: SolveOptions) -> Subject:
         result = solve(data.dataset, method, **solved_with, provenance=data.provenance)
         solved_with |= {"default": result} if method == "ml" else {}
     return Subject(source, result, command, data.dataset, run, data.records, solved_with)
+
+
+def _known_of(data: RecordedData) -> dict[str, Any]:
+    return {"known": data.known, "g_m_s2": data.g_m_s2, "setup": data.setup}
 
 
 def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tuple[CalibrationResult | None, str]:

@@ -42,9 +42,10 @@ from ftcalib.files import MOST_BYTES as _MOST_IN_MEMORY
 from ftdrive.cell.config import recorded_cell
 from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, check_permissions, check_workcell
 from ftdrive.errors import BadBundle
+from ftdrive.runs import is_run
 from ftdrive.runs.calibration import sensor_files, versions
 from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
-from ftdrive.runs.run import LOCK, Run, is_run
+from ftdrive.runs.run import LOCK, Run
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
 _URL_HOST = re.compile(r"\b([a-z][a-z0-9+-]*)://(?:[^/@\s]*@)?([A-Za-z0-9][A-Za-z0-9.-]*)")

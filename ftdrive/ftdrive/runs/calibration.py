@@ -22,6 +22,7 @@ from ftcalib.files import JSON, newest_path
 from ftdrive import __version__
 from ftdrive.cell.config import without_password
 from ftdrive.errors import NotAccepted
+from ftdrive.runs import at, is_run
 
 # A list of results needs no numpy.
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "Calib
     """
     path = Path(path)
     file = newest_path(path / "calibration.json") if path.is_dir() else path
-    if not file.exists() and (path / "run.json").is_file():
+    if not file.exists() and is_run(path):
         folder = quote(str(path))
         raise FileNotFoundError(
             f"{path} has no calibration, because its run was interrupted or its result rejected. Solve its poses:\n"
@@ -147,16 +148,13 @@ def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
     """
     from ftdrivers.interfaces import NOT_REPORTED
 
-    devices = origin.get("devices")
-    sensor = devices.get("sensor") if isinstance(devices, Mapping) else None
-    sensor = sensor if isinstance(sensor, Mapping) else {}
-    facts = sensor.get("facts")
-    facts = facts if isinstance(facts, Mapping) else {}
-    values = {name: fact.get("value") if isinstance(fact := facts.get(name), Mapping) else None for name in _FACTS}
-    named = {name: one if isinstance(one := sensor.get(name), str) else None for name in ("model", "serial")}
-    serial = None if named["serial"] in ("", NOT_REPORTED) else named["serial"]
-    is_emulated = bool(origin.get("station") or origin.get("emulated"))
-    return {**named, "serial": serial, **values, "emulated": is_emulated}
+    model, serial = (at(origin, "devices", "sensor", name) for name in ("model", "serial"))
+    return {
+        "model": model if isinstance(model, str) else None,
+        "serial": serial if isinstance(serial, str) and serial not in ("", NOT_REPORTED) else None,
+        **{name: at(origin, "devices", "sensor", "facts", name, "value") for name in _FACTS},
+        "emulated": bool(origin.get("station") or origin.get("emulated")),
+    }
 
 
 def difference(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:

@@ -388,11 +388,6 @@ class _Whole(dict[str, Any]):
         raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
 
 
-def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run."""
-    return (folder / "run.json").is_file()
-
-
 def _read_record(path: Path) -> PoseRecord:
     try:
         data = read_arrays(path)

@@ -8,16 +8,18 @@ in the run folders beside that of the calibration, in those in `runs` beside the
 `runs` of the current folder.
 """
 
+import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from shlex import quote
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 
 import ftcalib
 from ftcalib.errors import BadCalibration, BadDataset, NotObservable
-from ftcalib.files import JSON, check_format, read_object, write_object
+from ftcalib.files import JSON, check_format, object_of, read_file, write_object
+from ftdrive.runs import at, number_at, numbers_at, text_at, time_at
 from ftdrive.runs.calibration import made_now, marks_of
 
 # The record alone needs no numpy: a list of results starts without it.
@@ -30,38 +32,44 @@ if TYPE_CHECKING:
     from ftdrive.runs.run import Run
 
 FORMAT: Final = "ftdrive.verification/1"
+# Largest differences of force (N) and torque (N·m) that pass. If either is given, they decide instead of the predicted
+# uncertainty.
+Limits = tuple[float | None, float | None]
+NO_LIMITS: Final = None, None
 # Share of verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
+# Fields of a verification that streams and recordings keep.
+RECORDED: Final = (
+    *("path", "calibration_id", "created_utc", "passed", "change", "reason"),
+    *("force_max_N", "torque_max_Nm"),
+)
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
 
 
-@dataclass(frozen=True, slots=True)
-class VerificationRecord:
-    """The outcome of a verification of a calibration.
-
-    Streams and recordings keep it up to `torque_max_Nm`, the store all but the two largest differences.
-    """
+class VerificationRecord(NamedTuple):
+    """The outcome of a verification of a calibration: a tuple, because a fleet reads 20,000 of them a minute."""
 
     path: Path
     """verification.json, in its run folder."""
     calibration_id: str
     created_utc: datetime | None
-    """None only in the store, of a file that does not say it."""
+    """None of a file that does not say it."""
     passed: bool
     change: str | None
     """What has changed, such as "bias"; None if nothing, or if no change explains the readings."""
     reason: str | None
     force_max_N: float | None = None
+    """Largest difference, as `torque_max_Nm`; not in the store."""
     torque_max_Nm: float | None = None
     id: str = ""
-    """12 hex digits of the SHA-256 of its file."""
+    """12 hex digits of the SHA-256 of its file; empty in a recording, which keeps nothing of what follows."""
     temperature_C: float | None = None
-    bias_change: list[float] | None = None
+    bias_change: Sequence[float] | None = None
     """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
-    bias_change_sigma: list[float] | None = None
+    bias_change_sigma: Sequence[float] | None = None
     """(6,) its standard deviation from the readings of this verification."""
-    calibration_sigma: list[float] | None = None
+    calibration_sigma: Sequence[float] | None = None
     """(6,) its standard deviation from the calibration, which all its verifications share."""
 
     @property
@@ -72,63 +80,32 @@ class VerificationRecord:
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a verification.json; unknown fields are ignored. Raises `BadCalibration` or `OSError`."""
-        try:
-            document = read_object(path, BadCalibration)
-            check_format(document, FORMAT, BadCalibration)
-            found = document.get("calibration")
-            identity = found.get("id") if isinstance(found, Mapping) else None
-            return cls.from_dict({**document, "path": str(path), "calibration_id": identity})
-        except BadCalibration as error:
-            raise BadCalibration(f"{path}: {error}") from error
+        content = read_file(path)
+        document = object_of(content, BadCalibration)
+        check_format(document, FORMAT, BadCalibration)
+        bias = (numbers_at(document, 6, "bias_change", name) for name in ("value", "sigma", "calibration_sigma"))
+        record = cls.from_dict({**document, "path": str(path), "calibration_id": at(document, "calibration", "id")})
+        digest, temperature_C = hashlib.sha256(content).hexdigest(), number_at(document, "temperature_C")
+        return cls(*record[:8], digest[:12], temperature_C, *bias)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`; unknown fields are ignored. Raises `BadCalibration`."""
-        try:
-            return cls(
-                Path(document["path"]),
-                str(document["calibration_id"]),
-                datetime.fromisoformat(document["created_utc"]),
-                bool(document["passed"]),
-                document["change"],
-                str(document["reason"]),
-                float(document["force_max_N"]),
-                float(document["torque_max_Nm"]),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise BadCalibration(f"the verification cannot be read ({error}): the file is damaged") from error
+        """Build from what a recording keeps; unknown fields are ignored. Raises `BadCalibration`."""
+        path, calibration_id = Path(str(document.get("path"))), text_at(document, "calibration_id")
+        largest = number_at(document, "force_max_N"), number_at(document, "torque_max_Nm")
+        created, passed = time_at(document, "created_utc"), document.get("passed")
+        if calibration_id is None or not isinstance(passed, bool) or None in largest:
+            raise BadCalibration(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
+        change, reason = text_at(document, "change"), text_at(document, "reason")
+        made = None if created is None else datetime.fromisoformat(created)
+        return cls(path, calibration_id, made, passed, change, reason, *largest)
 
-    def to_dict(self) -> dict[str, JSON]:
-        """Return what streams and recordings keep of it."""
-        return {
-            "path": str(self.path),
-            "calibration_id": self.calibration_id,
-            "created_utc": None if self.created_utc is None else self.created_utc.isoformat(),
-            "passed": self.passed,
-            "change": self.change,
-            "reason": self.reason,
-            "force_max_N": self.force_max_N,
-            "torque_max_Nm": self.torque_max_Nm,
-        }
-
-    def to_store_dict(self) -> dict[str, Any]:
-        """Return what the store and the list of results keep of it."""
+    def to_dict(self, names: Sequence[str] = RECORDED) -> dict[str, Any]:
+        """Return fields as JSON, by default those of streams and recordings; `run` may be one of them."""
         # With microseconds, so that texts sort as times.
         created = None if self.created_utc is None else self.created_utc.isoformat(timespec="microseconds")
-        return {
-            "id": self.id,
-            "path": str(self.path),
-            "run": self.run,
-            "calibration_id": self.calibration_id,
-            "created_utc": created,
-            "passed": self.passed,
-            "change": self.change,
-            "reason": self.reason,
-            "temperature_C": self.temperature_C,
-            "bias_change": self.bias_change,
-            "bias_change_sigma": self.bias_change_sigma,
-            "calibration_sigma": self.calibration_sigma,
-        }
+        values = {**self._asdict(), "path": str(self.path), "run": self.run, "created_utc": created}
+        return {name: values[name] for name in names}
 
     def in_words(self, now: datetime | None) -> str:
         """Return the result and its age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
@@ -200,19 +177,6 @@ def calibration_in_words(
     return ", ".join(words)
 
 
-@dataclass(frozen=True, slots=True)
-class AcceptanceLimits:
-    """Largest differences that pass. If either is given, it decides instead of the predicted uncertainty."""
-
-    force_N: float | None = None
-    torque_Nm: float | None = None
-
-    @property
-    def given(self) -> bool:
-        """Whether either limit is given."""
-        return self.force_N is not None or self.torque_Nm is not None
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
     """A verification run, compared with the calibration."""
@@ -220,7 +184,7 @@ class Verified:
     run: "Run"
     calibration: "CalibrationResult"
     calibration_path: Path
-    limits: AcceptanceLimits
+    limits: Limits
     dataset: "CalibrationDataset"
     records: "tuple[PoseRecord, ...]"
     """One for each row of the dataset."""
@@ -232,37 +196,37 @@ class Verified:
     @property
     def force_N(self) -> "Array":
         """(n,) norm of the difference at each pose."""
-        return _norms(self.verification.residual[:, :3])
+        return self._differences(slice(3))
 
     @property
     def torque_Nm(self) -> "Array":
         """(n,) norm of the difference at each pose."""
-        return _norms(self.verification.residual[:, 3:])
+        return self._differences(slice(3, 6))
+
+    def _differences(self, axes: slice) -> "Array":
+        import numpy as np
+
+        return np.asarray(np.linalg.norm(self.verification.residual[:, axes], axis=1))
 
     @property
     def passed(self) -> bool:
         """Whether the calibration holds, by the limits given or by its predicted uncertainty."""
-        if not self.limits.given:
-            return bool(self.verification.passed)
-        return not self.exceeded
+        return bool(self.verification.passed) if self.limits == NO_LIMITS else not self.exceeded
 
     @property
     def exceeded(self) -> tuple[str, ...]:
         """Limits that a pose exceeds, in words with the values."""
-        pairs = (
-            (self.force_N, self.limits.force_N, "--max-force", "N"),
-            (self.torque_Nm, self.limits.torque_Nm, "--max-torque", "N·m"),
-        )
+        found = (self.force_N, "--max-force", "N"), (self.torque_Nm, "--max-torque", "N·m")
         return tuple(
-            f"{found.max():.3g} {unit} is above {option} {limit:g} {unit}"
-            for found, limit, option, unit in pairs
-            if limit is not None and found.max() > limit
+            f"{sizes.max():.3g} {unit} is above {option} {limit:g} {unit}"
+            for (sizes, option, unit), limit in zip(found, self.limits, strict=True)
+            if limit is not None and sizes.max() > limit
         )
 
     @property
     def failure(self) -> str:
         """Why it failed."""
-        return "; ".join(self.exceeded if self.limits.given else (self.verification.reason,))
+        return self.verification.reason if self.limits == NO_LIMITS else "; ".join(self.exceeded)
 
     @property
     def marks(self) -> tuple[str, ...]:
@@ -314,9 +278,9 @@ class Verified:
             "reason": found.reason,
             "update": self.update_name,
             "limits": {
-                "force_N": self.limits.force_N,
-                "torque_Nm": self.limits.torque_Nm,
-                "false_alarms": None if self.limits.given else FALSE_ALARMS,
+                "force_N": self.limits[0],
+                "torque_Nm": self.limits[1],
+                "false_alarms": FALSE_ALARMS if self.limits == NO_LIMITS else None,
             },
             "force_max_N": float(self.force_N.max()),
             "torque_max_Nm": float(self.torque_Nm.max()),
@@ -345,7 +309,7 @@ class Verified:
         }
 
 
-def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: AcceptanceLimits) -> Verified:
+def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: Limits) -> Verified:
     """Compare the poses of a run with the calibration of a file; write dataset.json and verification.json."""
     from ftcalib.after.verification import verify
     from ftcalib.data.dataset import pooled_covariance
@@ -390,9 +354,3 @@ def save_update(verified: Verified) -> Path:
     path = run.new_path("calibration")
     apply_update(old, verified.update, provenance).save(path)
     return path
-
-
-def _norms(vectors: "Array") -> "Array":
-    import numpy as np
-
-    return np.asarray(np.linalg.norm(vectors, axis=1))

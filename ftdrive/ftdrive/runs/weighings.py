@@ -10,12 +10,14 @@ The file has every weighing. The store has one row for it, however many there ar
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file, read_lines
+from ftdrive.runs import number_at, text_at, time_at
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -35,53 +37,64 @@ def is_weighings(path: Path) -> bool:
     return path.match(FILES)
 
 
-class WeighingsFile:
-    """The weighings of one origin on one day, in a file; other programs may add lines at the same time."""
+def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: Sequence[Mapping[str, JSON]]) -> Path:
+    """Add lines to the file of an origin, the rest of its header, on a day (ISO 8601); return it when they are on disk.
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.header: Mapping[str, JSON] = {}
-        self.size = 0
-        """Bytes that were read."""
-        self.weighings = 0
-        """Number of weighings of a part: an empty gripper does not count."""
-        self.refusals = dict.fromkeys(REFUSALS, 0)
-        self.last: Mapping[str, JSON] = {}
-        """The last line of a part."""
-        self._lines = 0
+    Other programs may add lines at the same time. Raises `OSError`; the file is then as it was.
+    """
+    import fcntl
+
+    from ftdrive.runs.numbers import append_lines
+
+    key = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:8]
+    path = folder / FILES.replace("*", f"{day}-{key}")
+    folder.mkdir(parents=True, exist_ok=True)
+    with path.open("a+b", buffering=0) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(0, end - _TAIL))
+        tail = file.read()
+        # A power failure may have cut off the last line.
+        begin = end - len(tail) + tail.rfind(b"\n") + 1
+        file.truncate(begin)
+        append_lines(file, begin, [*([] if begin else [{"format": FORMAT, "day": day, **origin}]), *lines])
+        try:
+            os.fsync(file.fileno())
+        except OSError:
+            file.truncate(begin)
+            raise
+    return path
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WeighingDay:
+    """The weighings of one day (UTC) with one calibration on one arm: a file, or the sum of several."""
+
+    id: str
+    """Name of the file without its ending."""
+    path: str
+    day: str = ""
+    """As ISO 8601."""
+    tool: str | None = None
+    arm_serial: str | None = None
+    sensor_serial: str | None = None
+    robot_host: str | None = None
+    calibration_id: str | None = None
+    emulated: bool = False
+    size: int = 0
+    """Bytes that were read; what a file has beyond them is new."""
+    weighings: int = 0
+    """Number of weighings of a part: an empty gripper does not count."""
+    refusals: Mapping[str, int]
+    """By the codes of `REFUSALS`."""
+    last_utc: str | None = None
+    """When the last part was weighed."""
+    mass_kg: float | None = None
+    mass_sigma_kg: float | None = None
 
     @classmethod
-    def of(cls, folder: Path, origin: Mapping[str, JSON], day: str) -> Self:
-        """Return the file of an origin, which is the rest of its header, on a day as ISO 8601."""
-        key = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:8]
-        found = cls(folder / FILES.replace("*", f"{day}-{key}"))
-        found.header = {"format": FORMAT, "day": day, **origin}
-        return found
-
-    def append(self, lines: Sequence[Mapping[str, JSON]]) -> None:
-        """Add lines, and the header to a new file; returns when they are on disk. Raises `OSError`."""
-        import fcntl
-
-        from ftdrive.runs.numbers import append_lines
-
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        with self.path.open("a+b", buffering=0) as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            end = file.seek(0, os.SEEK_END)
-            file.seek(max(0, end - _TAIL))
-            tail = file.read()
-            # A power failure may have cut off the last line.
-            begin = end - len(tail) + tail.rfind(b"\n") + 1
-            file.truncate(begin)
-            append_lines(file, begin, [*([] if begin else [self.header]), *lines])
-            try:
-                os.fsync(file.fileno())
-            except OSError:
-                file.truncate(begin)
-                raise
-
-    def read(self) -> None:
-        """Read the lines since the last call; a last line without its end does not count.
+    def load(cls, path: Path, before: Self | None = None) -> Self:
+        """Read a file, or on from what was read `before`; a last line without its end does not count.
 
         Raises
         ------
@@ -92,25 +105,53 @@ class WeighingsFile:
         # Imported here, because a list of weighings from the store needs no zipfile.
         from ftdrive.runs.numbers import read_line
 
-        with open_file(self.path) as file:
-            file.seek(self.size)
-            for line in read_lines(file, BadDataset, self._lines + 1):
+        found = before or cls(id=path.stem, path=str(path), refusals=dict.fromkeys(REFUSALS, 0))
+        size, weighings, refusals, last = found.size, found.weighings, {**found.refusals}, None
+        with open_file(path) as file:
+            first = 1 + file.read(size).count(b"\n")
+            for number, line in enumerate(read_lines(file, BadDataset, first), first):
                 if not line.endswith(b"\n"):
                     break
-                if (found := read_line(line.decode(errors="replace"))) is None:
-                    raise BadDataset(f"line {self._lines + 1} of the weighings is damaged: take the file from a copy")
-                self._take(found)
-                self._lines += 1
-                self.size += len(line)
-        if not self._lines:
+                if (content := read_line(line.decode(errors="replace"))) is None:
+                    raise BadDataset(f"line {number} of the weighings is damaged: take the file from a copy")
+                if number == 1:
+                    check_format(content, FORMAT, BadDataset)
+                    found = replace(
+                        found,
+                        day=text_at(content, "day") or "",
+                        tool=text_at(content, "tool"),
+                        arm_serial=text_at(content, "arm_serial"),
+                        sensor_serial=text_at(content, "sensor_serial"),
+                        robot_host=text_at(content, "robot_host"),
+                        calibration_id=text_at(content, "calibration_id"),
+                        emulated=content.get("emulated") is True,
+                    )
+                elif (code := content.get("refused")) is not None:
+                    refusals[code if code in refusals else "other"] += 1
+                elif content.get("is_something"):
+                    weighings += not content.get("poses", 1) > 1  # more poses of the same part
+                    last = content
+                size += len(line)
+        if not size:
             raise BadDataset("the file has no weighings: delete it")
+        if last is not None:
+            mass_kg, sigma_kg = number_at(last, "mass_kg"), number_at(last, "mass_sigma_kg")
+            found = replace(found, last_utc=time_at(last, "t_utc"), mass_kg=mass_kg, mass_sigma_kg=sigma_kg)
+        return replace(found, size=size, weighings=weighings, refusals=refusals)
 
-    def _take(self, line: dict[str, Any]) -> None:
-        if not self._lines:
-            check_format(line, FORMAT, BadDataset)
-            self.header = line
-        elif (code := line.get("refused")) is not None:
-            self.refusals[code if code in self.refusals else "other"] += 1
-        elif line.get("is_something"):
-            self.weighings += not line.get("poses", 1) > 1  # more poses of the same part
-            self.last = line
+
+def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:
+    """Sum up the files of each tool and arm, and keep the last weighing; the oldest first.
+
+    A tool has several files on a day if it was calibrated meanwhile.
+    """
+    found = dict[tuple[object, ...], WeighingDay]()
+    for one in sorted(days, key=lambda one: (one.day, one.last_utc or "", one.id)):
+        key = (one.tool, one.arm_serial, one.robot_host, one.emulated)
+        before = found.pop(key, None)
+        if before is not None and before.day == one.day:
+            refusals = {code: number + before.refusals[code] for code, number in one.refusals.items()}
+            found[key] = replace(one, weighings=one.weighings + before.weighings, refusals=refusals)
+        else:
+            found[key] = one
+    return [*found.values()]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Final, Literal, Self
@@ -22,7 +22,7 @@ from ftdrive.planning.planner import guess_of, plan_verification, speeds_of
 from ftdrive.planning.search.nodes import WRIST_6_RAD, from_usual_wrist
 from ftdrive.runs.calibration import read_calibration
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import AcceptanceLimits, Verified, fitted_dataset, save_update, verify_run
+from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, fitted_dataset, save_update, verify_run
 from ftdrive.session.events import Compared, Operator, Question
 from ftdrive.session.live_fit import free_wrench
 from ftdrive.session.open_session import Judge
@@ -56,15 +56,16 @@ class Verifying:
 
     @staticmethod
     def chosen(
-        options: SessionOptions, path: Path | None, poses: int | None, limits: AcceptanceLimits
-    ) -> tuple[Path | None, AcceptanceLimits, SessionOptions]:
+        options: SessionOptions, path: Path | None, poses: int | None, limits: Limits
+    ) -> tuple[Path | None, Limits, SessionOptions]:
         """Return what is verified and how: as given, or as the run that is resumed was begun. Raises `ConfigError`."""
         quick, resume = options.fast, options.resume
         if quick and poses is not None:
             raise ConfigError("--quick and --poses exclude one another: leave one of them out")
         if resume is None:
             return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
-        given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limits.given}
+        limited = limits != NO_LIMITS
+        given = {"--calibration": path, "--quick": quick, "--poses": poses, "--max-force or --max-torque": limited}
         if wrong := [option for option, value in given.items() if value]:
             raise ConfigError(f"--resume continues with the options of its run: leave out {' and '.join(wrong)}")
         run = Run(resume)
@@ -72,7 +73,7 @@ class Verifying:
             raise ConfigError(f"{resume} is not a verification: continue it with {run.resume_command}")
         begun = run.header()["verification"]
         options = replace(options, poses=begun["poses"], fast=begun["quick"])
-        return Path(begun["path"]), AcceptanceLimits(**begun["limits"]), options
+        return Path(begun["path"]), (begun["limits"]["force_N"], begun["limits"]["torque_Nm"]), options
 
     @classmethod
     def of(cls, cell: CellConfig, path: Path, options: SessionOptions) -> Self:
@@ -84,11 +85,11 @@ class Verifying:
             cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
         return cls(cell, calibration, path, options.poses, options.runs)
 
-    def take(self, operator: Operator, limits: AcceptanceLimits, options: SessionOptions) -> Verified:
+    def take(self, operator: Operator, limits: Limits, options: SessionOptions) -> Verified:
         """Guide the operator through the poses, and compare them with the calibration. Raises as `take_poses`."""
         # The run keeps what is verified and how, so that --resume continues alike.
         kept = {"path": str(self.path.absolute()), "poses": options.poses, "quick": options.fast}
-        about = {**kept, "limits": asdict(limits), "id": self.calibration.id}
+        about = {**kept, "limits": dict(zip(("force_N", "torque_Nm"), limits, strict=True)), "id": self.calibration.id}
         run = take_poses(self, operator, replace(options, description={"verification": about, **options.description}))
         if run is None:
             raise RuntimeError("a verification is never a dry run")

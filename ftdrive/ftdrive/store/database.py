@@ -36,8 +36,8 @@ from sqlalchemy.exc import ArgumentError, DBAPIError, NoSuchModuleError
 from ftdrive.cell.config import user_folder
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import Record, StoredResult, StoredWeighings
+from ftdrive.runs.weighings import REFUSALS, WeighingDay
+from ftdrive.store.records import Record, StoredResult
 from ftdrivers.installation import missing_extra
 
 # Version of the index, kept in the database.
@@ -106,7 +106,7 @@ cells: Final = Table(
 RECORDS: Final[Mapping[type[Record], Table]] = {
     StoredResult: results,
     VerificationRecord: verifications,
-    StoredWeighings: weighings,
+    WeighingDay: weighings,
 }
 
 # Collation that sorts texts alike everywhere.

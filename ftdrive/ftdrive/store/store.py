@@ -4,25 +4,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.runs.weighings import REFUSALS, is_weighings
+from ftdrive.runs.weighings import REFUSALS, WeighingDay, is_weighings, sum_up
 from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
-from ftdrive.store.records import (
-    BriefVerification,
-    Record,
-    StoredCell,
-    StoredResult,
-    StoredWeighings,
-    read_records,
-    record_paths,
-    sum_up,
-)
+from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
 # For another writer.
 WAIT_S = 5.0
@@ -30,13 +22,6 @@ WAIT_S = 5.0
 _MOST = 5000
 
 _Stored = TypeVar("_Stored")
-
-# Columns of a check.
-_CHECK = [
-    *(database.verifications.c[name] for name in BriefVerification._fields[:-1]),
-    *(database.verifications.c[f"{name}_{axis}"] for name in database.WRENCHES for axis in database.AXES),
-]
-_SINGLE = tuple(column.name for column in database.verifications.columns if not column.name.endswith(database.AXES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +86,7 @@ class Store:
         gone = [path for path in known if not Path(path).exists() and Path(path).parent.parent.is_dir()]
         return self._add(record_paths([*folders, *parents]), forget=gone)
 
-    def put_weighings(self, record: StoredWeighings) -> None:
+    def put_weighings(self, record: WeighingDay) -> None:
         """Insert the weighings of a day, or replace them."""
         with self._current.writing() as connection:
             self._write(connection, [record])
@@ -124,7 +109,7 @@ class Store:
         if records or forget:
             with self._current.writing() as connection:
                 self._write(connection, records, forget)
-        kinds = (StoredResult, VerificationRecord, StoredWeighings)
+        kinds = (StoredResult, VerificationRecord, WeighingDay)
         results, verifications, weighings = (sum(isinstance(one, kind) for one in records) for kind in kinds)
         return Indexed(results, verifications, weighings, unreadable)
 
@@ -165,7 +150,7 @@ class Store:
         """Return the newest verification of a calibration, if there is one."""
         return next(reversed(self.verifications(calibration_id)), None)
 
-    def weighings(self, most: int, tool: str | None = None) -> list[StoredWeighings]:
+    def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
         """Return the last days with weighings, or those of a tool, the oldest first."""
         table = database.weighings
         query = select(table).order_by(table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id).limit(most)
@@ -173,7 +158,7 @@ class Store:
             query = query.where(table.c.tool == tool)
         return self._read(query, _to_weighings)[::-1]
 
-    def last_weighings(self, since_day: str, tool: str | None = None) -> list[StoredWeighings]:
+    def last_weighings(self, since_day: str, tool: str | None = None) -> list[WeighingDay]:
         """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
         return sum_up(self._read(_last_weighings(since_day, tool), _to_weighings))
 
@@ -183,21 +168,21 @@ class Store:
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
+    ) -> tuple[list[StoredCell], list[StoredResult], list[VerificationRecord], list[WeighingDay]]:
         """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
 
         Of each tool on each arm it has the `newest` results that are not rejected, of verifications and weighings those
         from `since` on. Also `last_weighings`.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
-        checks = select(*_CHECK).where(database.verifications.c.created_utc >= start)
+        checks = select(database.verifications).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
             cells = _rows(connection, select(database.cells), _to_cell)
             results = _rows(connection, _newest_accepted(newest), _to_result)
-            found = _rows(connection, checks, _to_check)
+            found = _rows(connection, checks, _to_verification)
             weighings = _rows(connection, _last_weighings(start[:10]), _to_weighings)
         cells.sort(key=lambda cell: cell.name)
-        return cells, results, sorted(found, key=lambda check: check.created_utc), sum_up(weighings)
+        return cells, results, sorted(found, key=attrgetter("created_utc")), sum_up(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:
@@ -257,7 +242,7 @@ def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
 
 
 def _to_row(record: Record | StoredCell) -> dict[str, Any]:
-    row = record.to_store_dict() if isinstance(record, VerificationRecord) else asdict(record)
+    row = record.to_dict(STORED) if isinstance(record, VerificationRecord) else asdict(record)
     row |= {f"refused_{code}": number for code, number in row.pop("refusals", {}).items()}
     for name in database.WRENCHES if isinstance(record, VerificationRecord) else ():
         values = row.pop(name) or [None] * len(database.AXES)
@@ -273,29 +258,15 @@ def _to_cell(row: Row[Any]) -> StoredCell:
     return StoredCell(**row._asdict())
 
 
-def _to_verification(row: Row[Any]) -> VerificationRecord:
-    values = dict(zip(_SINGLE, row, strict=False))
-    path, _, created = values.pop("path"), values.pop("run"), values.pop("created_utc")
-    return VerificationRecord(
-        path=Path(path),
-        created_utc=None if created is None else datetime.fromisoformat(created),
-        **values,
-        bias_change=_wrench(row[-18:-12]),
-        bias_change_sigma=_wrench(row[-12:-6]),
-        calibration_sigma=_wrench(row[-6:]),
-    )
+def _to_verification(row: Sequence[Any]) -> VerificationRecord:
+    id_, path, _, calibration_id, created, passed, change, reason, temperature_C, *bias = row
+    made = None if created is None else datetime.fromisoformat(created)
+    wrenches = (None if bias[k] is None else bias[k : k + 6] for k in (0, 6, 12))
+    outcome = (Path(path), calibration_id, made, passed, change, reason)
+    return VerificationRecord(*outcome, None, None, id_, temperature_C, *wrenches)
 
 
-def _to_weighings(row: Row[Any]) -> StoredWeighings:
+def _to_weighings(row: Row[Any]) -> WeighingDay:
     values = row._asdict()
     refusals = {code: values.pop(f"refused_{code}") for code in REFUSALS}
-    return StoredWeighings(**values, refusals=refusals)
-
-
-def _to_check(row: Sequence[Any]) -> BriefVerification:
-    calibration_id, created_utc, passed, change, temperature_C, *bias = row
-    return BriefVerification(calibration_id, created_utc, passed, change, temperature_C, tuple(bias))
-
-
-def _wrench(values: Sequence[Any]) -> list[float] | None:
-    return None if values[0] is None else list(values)
+    return WeighingDay(**values, refusals=refusals)

@@ -12,8 +12,7 @@ from ftcalib.errors import DataError
 from ftcalib.files import JSON
 from ftdrive.cell.config import user_folder
 from ftdrive.errors import ConfigError
-from ftdrive.runs.weighings import FOLDER, WeighingsFile
-from ftdrive.store.records import StoredWeighings
+from ftdrive.runs.weighings import FOLDER, WeighingDay, append_weighings
 
 # Time between two writes to the store.
 EVERY_S: Final = 30.0
@@ -48,7 +47,9 @@ class WeighingLog:
         self._folder = folder or user_folder("data") / FOLDER
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
-        self._file: WeighingsFile | None = None
+        # File of the day that is written, and what was read of it.
+        self._day, self._path = "", Path()
+        self._read: WeighingDay | None = None
         # Whether the file has lines that the store lacks.
         self._is_new = False
         # Whether the store may lack other files of the folder.
@@ -102,11 +103,12 @@ class WeighingLog:
     def _append(self) -> None:
         while self._waiting:
             day = self._waiting[0][0]
-            if self._file is None or self._file.header["day"] != day:
+            if self._day != day:
                 if self._is_new:
                     self._index()
-                self._file = WeighingsFile.of(self._folder, self._origin, day)
-            self._file.append([line for at, line in self._waiting if at == day])
+                self._day, self._read = day, None
+            lines = [line for at, line in self._waiting if at == day]
+            self._path = append_weighings(self._folder, self._origin, day, lines)
             self._waiting = [one for one in self._waiting if one[0] != day]
             self._is_new = True
 
@@ -120,9 +122,8 @@ class WeighingLog:
         if self._lacks_older:
             self._store.index(self._folder)  # what an outage kept from the store
             self._lacks_older = False
-        if self._file is not None:
-            self._file.read()
-            self._store.put_weighings(StoredWeighings.of(self._file))
+        self._read = WeighingDay.load(self._path, self._read)
+        self._store.put_weighings(self._read)
         self._is_new = False
 
     def _attempt(self, failure: str, write: Callable[[], None]) -> None:

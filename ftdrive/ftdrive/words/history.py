@@ -4,9 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 
+from ftcalib.rounding import counted, with_sigma
+from ftdrive.runs.calibration import EMULATED
 from ftdrive.runs.verification import VerificationRecord
+from ftdrive.runs.weighings import WeighingDay
 from ftdrive.store.history import age_days
-from ftdrive.store.records import StoredResult, StoredWeighings
+from ftdrive.store.records import StoredResult
 from ftdrive.words.text import GLUE
 
 DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
@@ -15,16 +18,36 @@ _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias
 _OPTIONAL = {"°C", "parent"}
 
 
-def day_row(one: StoredWeighings) -> tuple[str, ...]:
+def tool_in_words(tool: str | None, *, emulated: bool) -> str:
+    """Return the name of a tool, which is EMULATED in an emulated cell whose tool has no other name."""
+    if not emulated:
+        return tool or "-"
+    return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
+
+
+def last_weighing_in_words(one: WeighingDay) -> str:
+    """Return tool, time and mass of the last part of a day, and how many there were."""
+    counts = f"{counted(one.weighings, 'part')}, {sum(one.refusals.values())} refused on this day"
+    time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
+    return f"{tool_in_words(one.tool, emulated=one.emulated)}, {time}: {_mass_in_words(one)}; {counts}"
+
+
+def _mass_in_words(one: WeighingDay) -> str:
+    if one.mass_kg is None or one.mass_sigma_kg is None:
+        return "-"
+    return f"{with_sigma(one.mass_kg, one.mass_sigma_kg)} kg"
+
+
+def day_row(one: WeighingDay) -> tuple[str, ...]:
     """Return the weighings of a day below `DAY_TITLES`."""
     return (
         one.day,
         one.arm_serial or one.robot_host or "-",
-        one.tool_in_words,
+        tool_in_words(one.tool, emulated=one.emulated),
         f"{one.weighings}",
         ", ".join(f"{number} {code}" for code, number in one.refusals.items() if number) or "-",
         "-" if one.last_utc is None else one.last_utc[11:19],
-        one.mass_in_words,
+        _mass_in_words(one),
         Path(one.path).name,
     )
 
@@ -49,7 +72,7 @@ def _row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> 
         one.id[:6],
         "-" if one.created_utc is None else one.created_utc[:10],
         one.arm_serial or one.arm_model or "-",
-        one.tool_in_words,
+        tool_in_words(one.tool, emulated=one.emulated),
         one.verdict,
         f"{one.mass_kg:.4f}",
         verified,

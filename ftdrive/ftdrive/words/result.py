@@ -253,11 +253,10 @@ def verification_in_lines(verified: Verified, *, every: bool = False) -> list[Te
 
 def _verdict_in_words(verified: Verified) -> str:
     """Describe the largest differences, and the limits that decide."""
-    limits = verified.limits
     words = f"largest difference {_in_brief(verified.force_N.max())} N, {_in_brief(verified.torque_Nm.max())} N·m"
-    if limits.given:
-        given = ((limits.force_N, "N"), (limits.torque_Nm, "N·m"))
-        return f"{words}; limit {', '.join(f'{limit:g} {unit}' for limit, unit in given if limit is not None)}"
+    limits = zip(verified.limits, ("N", "N·m"), strict=True)
+    if given := [f"{limit:g} {unit}" for limit, unit in limits if limit is not None]:
+        return f"{words}; limit {', '.join(given)}"
     found = verified.verification
     alarms = f"false alarms: {100 * FALSE_ALARMS:g} in 100, near the poses of the fit"
     return f"{words}; chi2 {found.chi2:.0f} for {found.dof} degrees of freedom, p {found.p_value:.2g} ({alarms})"

@@ -14,7 +14,7 @@ from ftdrive.errors import ConfigError, Declined, NotAccepted, exit_code, in_a_s
 from ftdrive.fleet.cells import refuse_variables
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
-from ftdrive.runs.verification import AcceptanceLimits, Verified
+from ftdrive.runs.verification import NO_LIMITS, Verified
 from ftdrive.session.events import Question
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.verifying import POSES, Verifying, save_wanted_update
@@ -107,7 +107,7 @@ def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
     """Guide the operator through a verification, as `ftdrive verify` does without options."""
     task = Verifying.of(cell, path, options)
     with open_operator(command=task.command) as operator:
-        verified = task.take(operator, AcceptanceLimits(), options)
+        verified = task.take(operator, NO_LIMITS, options)
     print_verification(verified)
     saved = save_wanted_update(verified, "ask", PlainOperator(quiet=messages.quiet).ask)
     if saved is not None:

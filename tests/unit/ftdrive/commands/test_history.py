@@ -18,7 +18,7 @@ from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_folder
 from ftdrive.commands.options import CellOptions, Source
 from ftdrive.runs.run import Run
-from ftdrive.runs.weighings import FOLDER, WeighingsFile
+from ftdrive.runs.weighings import FOLDER, append_weighings
 from ftdrive.store import index_run
 from ftdrive.store.database import SCHEMA, default_file
 from ftdrive.store.store import Store
@@ -83,9 +83,10 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
     run("history", "--index", runs)
     days = [(datetime.now(UTC) - timedelta(days=27 - n)).date().isoformat() for n in range(28)]
     for n, day in enumerate(days):
-        file = WeighingsFile.of(user_folder("data") / FOLDER, {"tool": "gripper", "arm_serial": "arm-1"}, day)
+        origin: dict[str, Any] = {"tool": "gripper", "arm_serial": "arm-1"}
         part = {"t_utc": f"{day}T10:15:00+00:00", "is_something": True, "mass_sigma_kg": 1e-3, "mass_kg": 0.2 + n / 1e3}
-        file.append([part, {"refused": "cable"}, {"refused": "cable"}])
+        lines: list[dict[str, Any]] = [part, {"refused": "cable"}, {"refused": "cable"}]
+        append_weighings(user_folder("data") / FOLDER, origin, day, lines)
     run("history", "--index", user_folder("data") / FOLDER)
     (line,) = [one for one in run("history")[1].splitlines() if one.startswith("last weighing: ")]
     assert line == f"last weighing: gripper, {days[-1]} 10:15: 0.2270 ± 0.0010 kg; 1 part, 2 refused on this day"
@@ -103,8 +104,8 @@ def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Call
 def test_a_day_without_a_weighing_has_no_line(run: Callable[..., Ran], runs: Path) -> None:
     run("history", "--index", runs)
     day = datetime.now(UTC).date().isoformat()
-    file = WeighingsFile.of(user_folder("data") / FOLDER, {"tool": "welder", "arm_serial": "1"}, day)
-    file.append([{"refused": "cable"}])
+    origin: dict[str, Any] = {"tool": "welder", "arm_serial": "1"}
+    append_weighings(user_folder("data") / FOLDER, origin, day, [{"refused": "cable"}])
     run("history", "--index", user_folder("data") / FOLDER)
     assert len(json.loads(run("history", "--json")[1])["last_weighings"]) == 1
     assert "last weighing" not in run("history")[1]

@@ -14,7 +14,7 @@ from ftcalib.after.verification import Verification
 from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
-from ftdrive.runs.verification import AcceptanceLimits, Verified
+from ftdrive.runs.verification import NO_LIMITS, Limits, Verified
 from ftdrive.session.options import SessionOptions
 from ftdrive.session.verifying import Verifying, save_wanted_update
 from ftdrive.words.result import _verdict_in_words
@@ -48,14 +48,14 @@ def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: 
 
 def test_a_resumed_verification_keeps_its_options(begun: Path) -> None:
     options = SessionOptions(begun.parent, resume=begun)
-    path, limits, options = Verifying.chosen(options, None, None, AcceptanceLimits())
-    assert (path, options.poses, limits) == (Path("cell/calibration.json"), 3, AcceptanceLimits(force_N=0.5))
+    path, limits, options = Verifying.chosen(options, None, None, NO_LIMITS)
+    assert (path, options.poses, limits) == (Path("cell/calibration.json"), 3, (0.5, None))
     calibrate = Run.create(begun.parent, "calibrate", {"mode": "auto"}).folder
     with pytest.raises(ConfigError, match="ftdrive calibrate --resume"):
-        Verifying.chosen(replace(options, resume=calibrate), None, None, AcceptanceLimits())
+        Verifying.chosen(replace(options, resume=calibrate), None, None, NO_LIMITS)
 
 
-def failed(folder: Path, limits: AcceptanceLimits) -> Any:
+def failed(folder: Path, limits: Limits) -> Any:
     """A failed verification of two poses, without its files."""
     R, noise = np.stack([np.eye(3), np.diag([1.0, -1.0, -1.0])]), np.eye(12) * 1e-4
     wrench = -calibration().compensate(np.zeros((2, 6)), R) + np.repeat([0.3, 0.0], 3)
@@ -70,9 +70,9 @@ def failed(folder: Path, limits: AcceptanceLimits) -> Any:
 
 def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
     assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in _verdict_in_words(
-        failed(tmp_path, AcceptanceLimits())
+        failed(tmp_path, NO_LIMITS)
     )
-    given = failed(tmp_path, AcceptanceLimits(force_N=1.0, torque_Nm=0.1))
+    given = failed(tmp_path, (1.0, 0.1))
     assert _verdict_in_words(given) == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
     assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
 
@@ -87,9 +87,9 @@ def test_an_update_is_saved_only_if_it_is_wanted(
     monkeypatch.setattr("ftdrive.session.verifying.save_update", lambda _: tmp_path)
     ask: Any = lambda question: command._ask(None, True, question)  # noqa: E731
     with CliRunner().isolation(typed) as (out, *_):
-        found = save_wanted_update(failed(tmp_path, AcceptanceLimits()), update, ask)
+        found = save_wanted_update(failed(tmp_path, NO_LIMITS), update, ask)
         printed = out.getvalue().decode()
     assert (found is not None) is wanted
     if update == "ask":
         assert json.loads(printed.splitlines()[0])["text"].startswith("An update of the bias is sufficient.")
-    assert save_wanted_update(failed(tmp_path, AcceptanceLimits(force_N=1.0)), "yes", ask) is None
+    assert save_wanted_update(failed(tmp_path, (1.0, None)), "yes", ask) is None

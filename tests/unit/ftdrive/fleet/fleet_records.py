@@ -14,8 +14,8 @@ from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.verification import VerificationRecord, newest
-from ftdrive.runs.weighings import REFUSALS
-from ftdrive.store.records import BriefVerification, StoredCell, StoredResult, StoredWeighings, sum_up
+from ftdrive.runs.weighings import REFUSALS, WeighingDay, sum_up
+from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.stream.simulated import calibrated
 
@@ -86,7 +86,7 @@ def daily(of: StoredResult, days: int, seed: int = 0, added: Array | None = None
     return [check(of, days - 1 - i, bias_change=(SIGMA * row).tolist(), **more) for i, row in enumerate(values)]
 
 
-def weighed(name: str, days_ago: float, **more: Any) -> StoredWeighings:
+def weighed(name: str, days_ago: float, **more: Any) -> WeighingDay:
     """The last weighing of the cell `name`."""
     at = time(days_ago)
     values: dict[str, Any] = {
@@ -106,20 +106,11 @@ def weighed(name: str, days_ago: float, **more: Any) -> StoredWeighings:
         "mass_kg": 0.25,
         "mass_sigma_kg": 1e-3,
     }
-    return StoredWeighings(**(values | more))
+    return WeighingDay(**(values | more))
 
 
 def time(days_ago: float) -> str:
     return (NOW - timedelta(days=days_ago)).isoformat(timespec="microseconds")
-
-
-def _check(one: VerificationRecord) -> BriefVerification:
-    nothing: list[float | None] = [None] * 6
-    bias = (one.bias_change or nothing, one.bias_change_sigma or nothing, one.calibration_sigma or nothing)
-    values = tuple(value for part in bias for value in part)
-    return BriefVerification(
-        one.calibration_id, one.to_store_dict()["created_utc"] or "", one.passed, one.change, one.temperature_C, values
-    )
 
 
 @dataclass
@@ -129,14 +120,14 @@ class FakeStore:
     kept_cells: Sequence[StoredCell] = ()
     kept_results: Sequence[StoredResult] = ()
     kept_checks: Sequence[VerificationRecord] = field(default_factory=list)
-    kept_weighings: Sequence[StoredWeighings] = ()
+    kept_weighings: Sequence[WeighingDay] = ()
 
     def cells(self) -> list[StoredCell]:
         return sorted(self.kept_cells, key=lambda one: one.name)
 
     def fleet(
         self, newest: int, since: datetime
-    ) -> tuple[list[StoredCell], list[StoredResult], list[BriefVerification], list[StoredWeighings]]:
+    ) -> tuple[list[StoredCell], list[StoredResult], list[VerificationRecord], list[WeighingDay]]:
         return self.cells(), self._newest_accepted(newest), self._checks(since), sum_up(self.kept_weighings)
 
     def _newest_accepted(self, most: int) -> list[StoredResult]:
@@ -150,9 +141,9 @@ class FakeStore:
                 kept.append(one)
         return kept[::-1]
 
-    def _checks(self, since: datetime) -> list[BriefVerification]:
+    def _checks(self, since: datetime) -> list[VerificationRecord]:
         found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= since]
-        return [_check(one) for one in sorted(found, key=lambda one: (one.created_utc or NOW, one.id))]
+        return sorted(found, key=lambda one: (one.created_utc or NOW, one.id))
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         found = [one for one in self.kept_checks if one.calibration_id == calibration_id]
@@ -163,7 +154,7 @@ def store(
     cells: Sequence[StoredCell],
     results: Sequence[StoredResult],
     checks: Sequence[Any] = (),
-    weighings: Sequence[StoredWeighings] = (),
+    weighings: Sequence[WeighingDay] = (),
 ) -> Store:
     return cast("Store", FakeStore(cells, results, checks, weighings))
 
@@ -172,7 +163,7 @@ def fleet(
     cells: Sequence[StoredCell],
     results: Sequence[StoredResult],
     checks: Sequence[Any] = (),
-    weighings: Sequence[StoredWeighings] = (),
+    weighings: Sequence[WeighingDay] = (),
 ) -> Fleet:
     return fleet_state(store(cells, results, checks, weighings), NOW)
 

@@ -1,6 +1,5 @@
 """Findings across cells: each is named where it is planted, and nowhere else."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -113,7 +112,7 @@ def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
 
 
 def check_at(one: Any, T: float) -> Any:
-    return replace(one, temperature_C=float(T))
+    return one._replace(temperature_C=float(T))
 
 
 def test_a_drift_in_a_warming_season_is_no_dependence_on_temperature() -> None:

@@ -18,7 +18,7 @@ from ftcalib.routine import PoseRecord
 from ftdrive.errors import ConfigError
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Reading, Run
-from ftdrive.runs.verification import AcceptanceLimits, Verified, save_update, verification_near, verify_run
+from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, save_update, verification_near, verify_run
 from ftdrive.session.along_plan import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
 from ftdrive.session.options import SessionOptions
@@ -27,7 +27,6 @@ from ftdrive.session.verifying import RunningComparison, Verifying
 from ftdrivers.interfaces import DeviceInfo
 from tests.unit.ftdrive.fake_cell import Lab
 
-NO_LIMITS = AcceptanceLimits()
 TURNED = Rotation.from_euler("z", 5, degrees=True).as_matrix()
 
 
@@ -65,7 +64,7 @@ def take(lab: Lab, calibration: CalibrationResult) -> Callable[..., Run]:
     return run
 
 
-def verified(run: Run, calibration: CalibrationResult, limits: AcceptanceLimits = NO_LIMITS) -> Verified:
+def verified(run: Run, calibration: CalibrationResult, limits: Limits = NO_LIMITS) -> Verified:
     path = run.folder.parent / str(calibration.provenance["run"]) / "calibration.json"
     return verify_run(run, calibration, path, limits)
 
@@ -150,8 +149,8 @@ def test_given_limits_decide_instead_of_the_prediction(
 ) -> None:
     lab.sensor.push = np.array([0.3, 0.4, 0.0, 0.0, 0.0, 0.0])
     run = take()
-    assert verified(run, calibration, AcceptanceLimits(force_N=0.8)).passed
-    strict = verified(run, calibration, AcceptanceLimits(force_N=0.1, torque_Nm=0.1))
+    assert verified(run, calibration, (0.8, None)).passed
+    strict = verified(run, calibration, (0.1, 0.1))
     assert not strict.passed
     (words,) = strict.exceeded
     assert "--max-force 0.1 N" in words

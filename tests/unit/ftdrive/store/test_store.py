@@ -206,7 +206,7 @@ def test_the_change_of_the_bias_comes_back_to_the_last_digit(store_url: str, tmp
     for one in Store(store_url).verifications():
         found.append((one.bias_change, one.bias_change_sigma, one.calibration_sigma))
     assert found == [(value, sigma, shared), *3 * [(None, None, None)]]
-    assert [one.bias for one in Store(store_url).fleet(1, FIRST)[2]] == [(*value, *sigma, *shared), *3 * [(None,) * 18]]
+    assert Store(store_url).fleet(1, FIRST)[2] == Store(store_url).verifications()
 
 
 def test_the_newest_are_selected_by_time_in_any_zone(store_url: str, tmp_path: Path) -> None:
@@ -217,9 +217,7 @@ def test_the_newest_are_selected_by_time_in_any_zone(store_url: str, tmp_path: P
     store = Store(store_url)
     store.index(tmp_path)
     since = (FIRST + timedelta(days=2)).astimezone(timezone(timedelta(hours=-9)))
-    assert [one.created_utc for one in store.fleet(1, since)[2]] == [
-        one.to_store_dict()["created_utc"] for one in store.verifications()[3:]
-    ]
+    assert store.fleet(1, since)[2] == store.verifications()[3:]
     assert [one.run for one in store.verifications()] == ["no-time", "0", "1", "2", "3"]
 
 

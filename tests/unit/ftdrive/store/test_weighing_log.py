@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ftdrive.runs.weighings import WeighingsFile
+from ftdrive.runs.weighings import append_weighings
 from ftdrive.store.store import Store
 from ftdrive.store.weighing_log import WeighingLog
 from tests.unit.ftdrive.store.contents import connected, dump
@@ -82,7 +82,7 @@ def test_rebuilt_it_is_the_same_and_a_deleted_day_is_forgotten(logs: Logs) -> No
     assert store.rebuild().weighings == 2
     assert dump(logs.url) == grown
     assert store.index(logs.folder).weighings == 0
-    WeighingsFile.of(logs.folder, ORIGIN, "2026-11-26").append([part(0.4)])
+    append_weighings(logs.folder, ORIGIN, "2026-11-26", [part(0.4)])
     assert store.index(logs.folder).weighings == 1, "it has grown"
     assert store.weighings(9)[0].weighings == 3
     next(logs.folder.glob("weighings-2026-11-26-*")).unlink()
@@ -117,14 +117,14 @@ def test_a_store_that_cannot_be_written_is_reported_once_and_caught_up(tmp_path:
 
 def test_lines_wait_for_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     logs = Logs(tmp_path / "weighings", f"sqlite:///{tmp_path}/store.sqlite")
-    append, failures = WeighingsFile.append, iter([True, True, False])
+    failures = iter([True, True, False])
 
-    def failing(self: WeighingsFile, lines: Any) -> None:
+    def failing(*of: Any) -> Path:
         if next(failures, False):
             raise OSError(28, "No space left on device")
-        append(self, lines)
+        return append_weighings(*of)
 
-    monkeypatch.setattr(WeighingsFile, "append", failing)
+    monkeypatch.setattr("ftdrive.store.weighing_log.append_weighings", failing)
     for mass in (0.1, 0.2, 0.3):  # closed each time, so that the lines come one by one
         logs.write(mass)
     assert [one.weighings for one in Store(logs.url).weighings(9)] == [1]

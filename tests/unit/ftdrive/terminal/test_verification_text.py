@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ftcalib.after.verification import Verification
-from ftdrive.runs.verification import AcceptanceLimits
+from ftdrive.runs.verification import NO_LIMITS
 from ftdrive.terminal import report
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.report import print_verification
@@ -37,7 +37,7 @@ def verified(found: Verification = FOUND, *, passed: bool = True, drift: Any = N
         verification=found,
         records=[SimpleNamespace(pose=SimpleNamespace(number=number)) for number in (3, 12)],
         dataset=SimpleNamespace(wrench=wrench),
-        limits=AcceptanceLimits(),
+        limits=NO_LIMITS,
         force_N=np.array([0.05, 0.5]),
         torque_Nm=np.array([0.005, 0.0]),
         passed=passed,

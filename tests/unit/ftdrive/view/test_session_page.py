@@ -16,7 +16,7 @@ from ftdrive.errors import Declined
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import certifier_for
 from ftdrive.runs.source import Outcome
-from ftdrive.runs.verification import AcceptanceLimits, verify_run
+from ftdrive.runs.verification import verify_run
 from ftdrive.session import session
 from ftdrive.session.events import (
     Compared,
@@ -574,7 +574,7 @@ def test_a_verification_ends_with_its_verdict(
     options = SessionOptions(runs, "verify", poses=2, description=about)
     run = session.take_poses(Verifying(lab.cell, result, path, 2, runs), lab.operator, options)
     assert run is not None
-    verified = verify_run(run, result, path, AcceptanceLimits(limit_N))
+    verified = verify_run(run, result, path, (limit_N, None))
     capsys.readouterr()
     verify._report(verified, "no", page, again="", as_json=False)
     terminal, parts = printed(capsys), parts_of(page)
