@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
-from importlib.metadata import version
 from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,12 +18,13 @@ import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
 from ftcalib.after.series import difference
-from ftcalib.errors import BadCalibration, BadDataset, DataError
-from ftcalib.files import read_file, read_object, write_new
+from ftcalib.errors import BadCalibration, BadDataset
+from ftcalib.files import read_file, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftcalib.rounding import counted
 from ftdrive import __version__
 from ftdrive.fleet.workers import (
+    SAME,
     Call,
     OtherVersion,
     Workers,
@@ -33,7 +33,8 @@ from ftdrive.fleet.workers import (
     folder_of_worker,
     require_version,
 )
-from ftdrive.runs.run import Run
+from ftdrive.runs.calibration import versions
+from ftdrive.runs.run import IN_MOTION, Run
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
@@ -46,18 +47,12 @@ def solved_path(folder: Path) -> Path:
     return folder / f"solved-{__version__}.json"
 
 
-def run_folders(folders: Iterable[Path]) -> list[Path]:
-    """Return the runs among these folders, and those directly in them, each once and by name."""
-    found = {run.parent for one in folders for name in ("run.json", "*/run.json") for run in one.resolve().glob(name)}
-    return sorted(found)
-
-
 def is_calibration(folder: Path, since: datetime | None) -> bool:
     """Return whether a run is a calibration since that time; True for a damaged one too, so that it is reported."""
     try:
-        header = read_object(folder / "run.json", BadDataset)
+        header = Run(folder).header()
         recent = since is None or datetime.fromisoformat(header["created_utc"]) >= since
-    except (BadDataset, OSError, KeyError, TypeError, ValueError):
+    except (BadDataset, OSError, TypeError, ValueError):
         return True
     return recent and header.get("command") != "verify"
 
@@ -81,11 +76,10 @@ def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[
 
 def _how_to_finish(folder: Path) -> str:
     try:
-        mode = Run(folder).header().get("mode")
-    except (DataError, OSError):
-        mode = None
-    if mode in ("sweep", "passive"):
-        return f"start again with `ftdrive calibrate --{mode}`"
+        if (mode := Run(folder).mode) in IN_MOTION:
+            return f"start again with `ftdrive calibrate --{mode}`"
+    except (BadDataset, OSError):
+        pass
     return "`ftdrive calibrate --resume RUN` finishes one"
 
 
@@ -142,7 +136,8 @@ def _solved_motion(folder: Path, version: str) -> bytes:
 
 
 def _versions() -> dict[str, str]:
-    return {"ftdrive": __version__, **{name: version(name) for name in ("numpy", "scipy")}}
+    """Return the versions on which the last digits depend."""
+    return {name: found for name, found in versions().items() if name in SAME}
 
 
 def _content(result: CalibrationResult) -> bytes:

@@ -10,8 +10,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ftdrive.commands.options import FOLDER, JSON, STORE, write_json
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.fleet.resolve import SolvedAgain, run_folders, runs_to_solve, solve_again, solved_path
+from ftdrive.fleet.resolve import SolvedAgain, runs_to_solve, solve_again, solved_path
 from ftdrive.fleet.workers import cluster_workers, local_workers
+from ftdrive.runs import run_folders
 from ftdrive.store import open_store
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.text import echo

@@ -13,8 +13,9 @@ import pytest
 
 from ftcalib import CalibrationResult, Finding
 from ftdrive.errors import ConfigError
-from ftdrive.fleet.resolve import Comparison, is_calibration, run_folders, solve_again, solve_task, solved_path, task_of
+from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_task, solved_path, task_of
 from ftdrive.fleet.workers import Workers
+from ftdrive.runs import run_folders
 from tests.calibrated_runs import FIRST, calibrated_run, dataset, swept_run
 
 
