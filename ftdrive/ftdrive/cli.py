@@ -133,8 +133,8 @@ def cli(verbose: int, quiet: bool) -> None:
 cli.add_command(_help)
 
 
-@cli.group("fleet", cls=_LazyGroup, modules=_FLEET)
-def _fleet() -> None:
+@cli.group(cls=_LazyGroup, modules=_FLEET)
+def fleet() -> None:
     """Watch many cells: which are due, which sensor drifts, what is wrong in several of them."""
 
 
