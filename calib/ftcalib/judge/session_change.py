@@ -10,7 +10,7 @@ it is named if their restricted likelihood is larger by more than its `cost`.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -244,23 +244,29 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         left = gram[:, :9, :9] - cross @ np.linalg.pinv(gram[:, 9:, 9:], hermitian=True) @ cross.swapaxes(1, 2)
         return np.asarray(3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - steps - 1) - _SHAPE) + finest)
 
-    def with_another(others: Steps) -> Iterator[tuple[Steps, float]]:
-        """Add each possible step to others: all steps, and the mean square of force that they leave."""
-        bounds, at = np.array([0, *others, n]), np.arange(1, n)
-        k = np.searchsorted(bounds, at, side="right")
-        before, after = bounds[k - 1], bounds[np.minimum(k, len(bounds) - 1)]
-        gram = total - means(bounds[:-1], bounds[1:]).sum(axis=0) + means(before, after)
-        gram -= means(before, at) + means(at, after)
-        square = square_left(gram, len(others) + 1)
-        for i in np.flatnonzero(np.minimum(at - before, after - at) >= FEWEST_BETWEEN):
-            yield tuple(sorted([*others, int(at[i])])), float(square[i])
+    def with_another(beam: Sequence[Steps]) -> dict[Steps, float]:
+        """Add each possible step to each set of others: all steps, and the mean square of force that they leave."""
+        bounds, added = np.array([[0, *others, n] for others in beam]), dict[Steps, tuple[int, int]]()
+        for i, own in enumerate(bounds.tolist()):
+            for first, last in pairwise(own):
+                for at in range(first + FEWEST_BETWEEN, last - FEWEST_BETWEEN + 1):
+                    added[tuple(sorted([*beam[i], at]))] = i, at
+        if not added:
+            return {}
+        i, at = np.array([*added.values()]).T
+        k = np.sum(bounds[i] <= at[:, None], axis=1)
+        before, after = bounds[i, k - 1], bounds[i, k]
+        of_parts = means(bounds[:, :-1].ravel(), bounds[:, 1:].ravel()).reshape(len(beam), -1, 12, 12)
+        gram = (total - of_parts.sum(axis=1))[i] + means(before, after)
+        square = square_left(gram - (means(before, at) + means(at, after)), len(beam[0]) + 1)
+        return dict(zip(added, square.tolist(), strict=True))
 
     everything = total - means(np.array([0]), np.array([n]))
     # The first set must be better than none, and a larger one clearly better.
     least = 3 * n * float(np.log(square_left(everything, 0)[0])) + LARGER_MARGIN
     best, beam = Steps(), [Steps()]
     for count in range(1, min(MOST_STEPS, n - 2 - _SHAPE // 3) + 1):
-        left_by = dict(one for steps in beam for one in with_another(steps))
+        left_by = with_another(beam)
         beam = sorted(left_by, key=left_by.__getitem__)[: max(BEAM, 1000 // n)]
         if not beam:
             break
