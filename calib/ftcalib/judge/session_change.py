@@ -108,24 +108,16 @@ class SessionChange:
         margin = LARGER_MARGIN if self.takes_turns or self.code == "bias_stepped" else MARGIN
         return float(times * (len(KINDS[self.code]) * np.log(6 * n) + 2 * np.log(n) + margin))
 
-    def finding(self, order: NDArray[np.intp], weights: Array) -> Finding:
-        """Name it.
-
-        Parameters
-        ----------
-        order : int array, shape (n,)
-            Rows of the session of these poses.
-        weights : array
-            Of all rows: 0 where one was left out.
-        """
-        poses, code = (order[self.starts] + 1).tolist(), self.code
+    def finding(self, rows: NDArray[np.intp], weights: Array) -> Finding:
+        """Name it, by the rows (n,) of the session that were looked at, and the weights of all its rows."""
+        poses, code = (rows[self.starts] + 1).tolist(), self.code
         values = {"pose": poses if len(poses) > 1 else poses[0]} | dict(self.values)
         severity: Severity = "reject"
         if code == "sensor_and_tool_turned":
             code = "sensor_turned"
         if self.takes_turns:
             code = "sensors_alternate"
-        elif code == "bias_stepped" or not (weights[order[: self.starts[0]]] > 0.5).any():  # the load as it is now
+        elif code == "bias_stepped" or not (weights[rows[: self.starts[0]]] > 0.5).any():  # the load as it is now
             severity = "limit"
         needed = CODES[code].values
         return Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})
