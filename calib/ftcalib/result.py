@@ -30,7 +30,7 @@ from ftcalib.model import (
     matrices_of,
     weight_and_tilt,
 )
-from ftcalib.result_file import damage_in_words, document_of, fields_of, is_edited
+from ftcalib.result_file import document_of, fields_of, is_edited
 from ftcalib.rounding import counted
 from ftcalib.sensor_matrix import (
     SIZE,
@@ -42,7 +42,7 @@ from ftcalib.sensor_matrix import (
     joint_covariance,
     predicted_covariance,
 )
-from ftcalib.shown import Estimate, axes_of, estimates_of, figure_of, frame_of, rows_of
+from ftcalib.shown import Estimate, estimates_of, figure_of, frame_of, rows_of
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
 CONTRADICTS = 4.0
@@ -542,8 +542,9 @@ class CalibrationResult(Displayed):
         """
         rows = [
             (f"{key}.{axis}" if axis else key, float(value), float(sigma), _SI[key.rpartition("_")[2]])
-            for _, _, _, key, values, sigmas, known in self.estimates
-            for axis, value, sigma in zip(axes_of(len(values)), values, np.where(known, 0.0, sigmas), strict=True)
+            for one in self.estimates
+            for key, sigmas in [(one.key, np.where(one.is_known, 0.0, one.sigma))]
+            for axis, value, sigma in zip(one.axes, one.values, sigmas, strict=True)
         ]
         return frame_of(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
 
@@ -591,10 +592,14 @@ class CalibrationResult(Displayed):
         ------
         BadCalibration
         """
-        with damage_in_words():
+        try:
             result = cls(**fields_of(document), motion=MotionResult.from_dict(document))
             derived = {"id": result._id(document.get("response")), "verdict": result.verdict}
             edited = is_edited(document, derived, accept=accept_edited)
+        except KeyError as exc:
+            raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
+        except (AttributeError, TypeError, ValueError) as exc:
+            raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
         return replace(result, provenance={**result.provenance, "edited": True}) if edited else result
 
     def save(self, path: str | Path) -> None:

@@ -1,7 +1,6 @@
 """The file of a calibration: what it holds, how it becomes a result again, and whether it was edited since."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
@@ -75,17 +74,6 @@ def fields_of(document: Mapping[str, Any]) -> dict[str, Any]:
 
 def _array(value: Any) -> Array | None:
     return None if value is None else read_only(value)
-
-
-@contextmanager
-def damage_in_words() -> Iterator[None]:
-    """Raise `BadCalibration`, one sentence, for a content from which no result can be built."""
-    try:
-        yield
-    except KeyError as exc:
-        raise BadCalibration(f"the calibration lacks the field {exc.args[0]}: the file is damaged.") from exc
-    except (AttributeError, TypeError, ValueError) as exc:
-        raise BadCalibration(f"the calibration cannot be read ({exc}): the file is damaged.") from exc
 
 
 def is_edited(document: Mapping[str, Any], derived: Mapping[str, JSON], *, accept: bool) -> bool:

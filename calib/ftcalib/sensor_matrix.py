@@ -254,7 +254,7 @@ def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
     return np.asarray((gain_sigma * share * F[:, None] / F).ravel() ** 2)
 
 
-def gain_at(E: Array, p: Array) -> tuple[Array, Array]:
+def _gain_at(E: Array, p: Array) -> tuple[Array, Array]:
     """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
     P = skew(p)
     return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
@@ -266,15 +266,15 @@ def vector_of(M: Array) -> Array:
     return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
 
 
-def mounting_turn(E: Array, p: Array) -> Array:
+def _mounting_turn(E: Array, p: Array) -> Array:
     """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
-    return vector_of(gain_at(E, p)[0])
+    return vector_of(_gain_at(E, p)[0])
 
 
 def shown_by(p: Array) -> Array:
     """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
-    force, torque = gain_at(ENTRIES, p)
-    torque = torque - skew(p) @ skew(mounting_turn(ENTRIES, p))
+    force, torque = _gain_at(ENTRIES, p)
+    torque = torque - skew(p) @ skew(_mounting_turn(ENTRIES, p))
     parts = [
         np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
         for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
@@ -407,7 +407,7 @@ class SensorMatrix(Displayed):
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ coefficients).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
         turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
-        T = np.concatenate([mounting_turn(ENTRIES, p).T, np.eye(36)])
+        T = np.concatenate([_mounting_turn(ENTRIES, p).T, np.eye(36)])
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
@@ -493,7 +493,7 @@ class ContactResponse:
         """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
         if not self.error.any():
             return None
-        turn = skew(mounting_turn(self.error, self.parameters.p_sensor_com_m))
+        turn = skew(_mounting_turn(self.error, self.parameters.p_sensor_com_m))
         return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
@@ -568,7 +568,7 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
     a gain common to all axes a weight, with a centre of mass that is as much nearer. No orientation shows them.
     """
     p = parameters.p_sensor_com_m
-    turn, (_, torque) = mounting_turn(ENTRIES, p), gain_at(ENTRIES, p)
+    turn, (_, torque) = _mounting_turn(ENTRIES, p), _gain_at(ENTRIES, p)
     (scale,) = _common_gain(p)
     columns = np.zeros((15, 36))
     columns[:3] = parameters.R_flange_sensor @ turn.T
@@ -583,5 +583,5 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
 
 def _common_gain(p: Array) -> Array:
     """Return the derivative (1, 36) of the gain common to all axes, of a tool at p, by the entries of E."""
-    force, _ = gain_at(ENTRIES, p)
+    force, _ = _gain_at(ENTRIES, p)
     return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

@@ -51,6 +51,11 @@ class Estimate(NamedTuple):
     is_known: NDArray[np.bool_]
     """(k,) whether a number was taken as known: its sigma is one of rounding."""
 
+    @property
+    def axes(self) -> Sequence[str]:
+        """(k,) names of the numbers."""
+        return {1: ("",), 3: tuple("xyz"), 6: ("xx", "yy", "zz", "xy", "xz", "yz")}[len(self.values)]
+
 
 def estimates_of(document: Mapping[str, Any]) -> list[Estimate]:
     """Return the estimates in the content of a calibration file: values, `sigma` and `covariance`."""
@@ -60,11 +65,6 @@ def estimates_of(document: Mapping[str, Any]) -> list[Estimate]:
         values, sigma = (values_of(source[key], key) for source in (document, document["sigma"]))
         found.append(Estimate(label, factor, unit, key, values, sigma, sigma <= known_below))
     return found
-
-
-def axes_of(count: int) -> Sequence[str]:
-    """Return the names of the elements of a number, a vector, or a symmetric tensor."""
-    return {1: ("",), 3: tuple("xyz"), 6: ("xx", "yy", "zz", "xy", "xz", "yz")}[count]
 
 
 def values_of(value: Any, key: str) -> Array:

@@ -52,12 +52,12 @@ class Calibrated(Estimated, Protocol):
         """Gain and cross-talk of the sensor."""
 
 
-def known_response(calibration: Estimated, found: Response | None) -> Response | None:
-    """Return gain and cross-talk as found, or zero with the covariance that the fit leaves of the prior.
+def known_response(known: Calibrated) -> Response | None:
+    """Return gain and cross-talk as found, or of a calibration without them zero with what the fit leaves of the prior.
 
     None for an update of a calibration that has none.
     """
-    return calibration.shown_response if found is None and isinstance(calibration, CalibrationResult) else found
+    return known.shown_response if isinstance(known, CalibrationResult) else known.response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -360,7 +360,7 @@ def tare(
             "changed."
         )
     # What the fit does not know of the sensor acts on a part that is weighed after the tare.
-    shown = known_response(calibration, calibration.response)
+    shown = known_response(calibration)
     known = Update(calibration.parameters, calibration.covariance, 0.0, 0, response=shown)
     update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):

@@ -127,6 +127,24 @@ class Expected:
         chi2 /= self.factor
         return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
 
+    def bias_change(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, Array]:
+        """Return the change (6,) of the biases, as if nothing else had changed, and both sigmas as in `Verification`.
+
+        The residuals are r = H b + K e + noise, with b the change, H the identity for each pose, and e the errors of
+        the calibration, which all its verifications share. By generalised least squares,
+
+            b = G r,    G = (H' S^-1 H)^-1 H' S^-1,    S = noise + K C K',
+
+        with the covariance G noise G' from this verification, and G K C K' G' from the calibration.
+        """
+        residual, _, _ = self.distance(R_base_flange, wrench)
+        common = self.common(R_base_flange)
+        H = np.tile(np.eye(6), (len(wrench), 1))
+        weighted = np.linalg.solve(self.noise + common, H).T
+        G = np.linalg.solve(weighted @ H, weighted)
+        noise, calibration = (np.sqrt(self.factor * np.diag(G @ part @ G.T).clip(0.0)) for part in (self.noise, common))
+        return G @ residual.ravel(), noise, calibration
+
 
 def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
     """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
@@ -267,40 +285,6 @@ def _smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
     return np.array([of_arm.reshape(6 * len(R_base_flange), -1), np.kron(correlated, np.diag(_CABLE**2))])
 
 
-def bias_change(expected: Expected, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, Array]:
-    """Estimate the change of the six biases, as if nothing else had changed.
-
-    The residuals are r = H b + K e + noise, with b the change, H the identity for each pose, and e the errors of the
-    calibration, which all its verifications share. The change is the mean by generalised least squares,
-
-        b = G r,    G = (H' S^-1 H)^-1 H' S^-1,    S = noise + K C K',
-
-    and its covariance has two parts: G noise G' of this verification, G K C K' G' of the calibration.
-
-    Parameters
-    ----------
-    expected : Expected
-        What unchanged readings of these poses scatter by.
-    R_base_flange : array, shape (n, 3, 3)
-    wrench : array, shape (n, 6)
-        Mean readings as measured, N and N·m, in the sensor frame.
-
-    Returns
-    -------
-    change, sigma, calibration_sigma : array, shape (6,)
-        As in `Verification`.
-    """
-    residual, _, _ = expected.distance(R_base_flange, wrench)
-    common = expected.common(R_base_flange)
-    H = np.tile(np.eye(6), (len(wrench), 1))
-    weighted = np.linalg.solve(expected.noise + common, H).T
-    G = np.linalg.solve(weighted @ H, weighted)
-    noise, calibration = (
-        np.sqrt(expected.factor * np.diag(G @ part @ G.T).clip(0.0)) for part in (expected.noise, common)
-    )
-    return G @ residual.ravel(), noise, calibration
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Verification:
     """Result of a verification; arrays are read-only."""
@@ -425,7 +409,7 @@ def verify(
 
 def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
     residual, sigma, chi2 = expected.distance(R_base_flange, wrench)
-    n, (change, bias_sigma, calibration_sigma) = len(wrench), bias_change(expected, R_base_flange, wrench)
+    n, (change, bias_sigma, calibration_sigma) = len(wrench), expected.bias_change(R_base_flange, wrench)
     return Verification(
         residual=residual,
         predicted_sigma=sigma,

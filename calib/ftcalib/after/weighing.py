@@ -171,7 +171,7 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
     n = len(wrench)
     R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
-    tool, response = reference.parameters, known_response(reference, reference.response)
+    tool, response = reference.parameters, known_response(reference)
     weight_N = tool.weight_N
     if not weight_N > 0:
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
@@ -336,7 +336,7 @@ def _covariance(
 
     Without `sensor` the sensor has no errors of its own for the part.
     """
-    tool, response = reference.parameters, known_response(reference, reference.response)
+    tool, response = reference.parameters, known_response(reference)
     n, held = len(noise), _part(tool, x_N)
     J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
     across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)

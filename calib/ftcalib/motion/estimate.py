@@ -18,17 +18,7 @@ from ftcalib.after.new_tool import WHOLE, CellPrior
 from ftcalib.known import Known
 from ftcalib.model import Array, DriftResult, Parameters, angle_between
 from ftcalib.motion.model import GAINS, ORDER, SIZE, Load, PoseError, RowNoise, jacobian, runs, states
-from ftcalib.motion.problem import (
-    DELAY_S,
-    EXPECTED,
-    GYRATION_M,
-    HEIGHT_M,
-    NEVER,
-    RIDGE,
-    ROUGH_ROWS,
-    Problem,
-    Step,
-)
+from ftcalib.motion.problem import DELAY_S, EXPECTED, GYRATION_M, HEIGHT_M, NEVER, RIDGE, ROUGH_ROWS, Problem, Step
 from ftcalib.motion.samples import Rows
 
 # Squared distance of a row in contact.
@@ -150,7 +140,7 @@ def fit(
     solved = Step.none()
     for stage in range(_STAGES):
         state = states(rows.speed_rad_s, kept)
-        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
+        r = problem.residuals(load, effects)
         absorbed = problem.absorb(load, rows[kept], solved)
         # An autoregression would take the noise of seconds before its size is chosen.
         order = ORDER if stage > _ALWAYS else 0
@@ -168,7 +158,7 @@ def fit(
         solved = problem.solve(sizes, sums, load, effects)
         load = load.moved(solved.step[:SIZE])
         effects = effects + problem.basis @ solved.step[SIZE:]
-        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
+        r = problem.residuals(load, effects)
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
         kept = _untouched(r) if guarded else _without_contact(distance)
     contradiction = ""
@@ -176,7 +166,7 @@ def fit(
         if prior.has_response:
             sizes |= {"gain": np.inf, "cross_talk": np.inf}
         load, effects, solved, contradiction = _join(problem, prior, sizes, (load, effects), (noise, kept, state))
-        r = rows.wrench - problem.predict(load, rows) - problem.effect(load, rows, effects)
+        r = problem.residuals(load, effects)
         distance = np.sum((r / noise.scale[state] @ noise.root.T) ** 2, axis=1)
     chi2, others = problem.sums(load, effects, noise, kept, state)[2], []
     for other, _ in roughs[1:] if prior is None else ():

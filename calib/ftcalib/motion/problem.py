@@ -95,18 +95,7 @@ _MANY = 1000
 
 
 class Problem:
-    """Rows of a motion with the unknowns that explain them.
-
-    Parameters
-    ----------
-    rows : Rows
-    known : Known, optional
-    g_m_s2 : float
-    point_mass : bool
-        Whether the inertia about the centre of mass is known to be 0.
-    zeroed_s : array, shape (k,)
-        Times at which the sensor was zeroed.
-    """
+    """Rows of a motion with the unknowns that explain them; arguments as of `ftcalib.motion.estimate.fit`."""
 
     def __init__(
         self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
@@ -158,6 +147,16 @@ class Problem:
         groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
         return groups, at + 3 - start
 
+    def residuals(self, load: Load, effects: Array) -> Array:
+        """Wrench (n, 6) of all rows less that of load and effects."""
+        rows, others = self.rows, effects[6 * self.courses :]
+        wrench = self.hats(rows.t_s) @ self.drift(effects)
+        if others.any():
+            for start in range(0, len(rows), _CHUNK):
+                part = slice(start, start + _CHUNK)
+                wrench[part] += self.columns(load, rows[part])[1] @ others
+        return np.asarray(rows.wrench - self.predict(load, rows) - wrench)
+
     def hats(self, t_s: Array) -> Array:
         """Weight (n, courses) of each knot, and of the bias before each zeroing."""
         knots = _hats(self.knots, t_s)
@@ -199,16 +198,6 @@ class Problem:
         motion = rows.motion.earlier(load.delay_s, rows.rate)
         J, slow = jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
         return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)
-
-    def effect(self, load: Load, rows: Rows, effects: Array) -> Array:
-        """Wrench (n, 6) of the effects."""
-        wrench = self.hats(rows.t_s) @ self.drift(effects)
-        others = effects[6 * self.courses :]
-        if others.any():
-            for start in range(0, len(rows), _CHUNK):
-                part = slice(start, start + _CHUNK)
-                wrench[part] += self.columns(load, rows[part])[1] @ others
-        return np.asarray(wrench)
 
     def drift(self, effects: Array) -> Array:
         """Bias (courses, 6) at the knots and before each zeroing."""

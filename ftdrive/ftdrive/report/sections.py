@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ftcalib.motion.model import INERTIA_NAMES
 from ftcalib.rounding import to_place_of, with_sigma
-from ftcalib.shown import axes_of, values_of
+from ftcalib.shown import values_of
 from ftdrive.report.facts import label_of
 from ftdrive.report.subject import MAY_BE_MISSING
 from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
@@ -498,7 +499,7 @@ def motion(facts: Facts) -> Section:
         "g·m². Good: all positive, and each at most the sum of the others.",
     ]
     entries = (1e3 * values_of(one, "inertia_kg_m2") for one in (moments, of_moments))
-    rows = [(axes, f"{value:.3f}", f"{sigma:.3f}") for axes, value, sigma in zip(axes_of(6), *entries, strict=True)]
+    rows = [(axes, f"{value:.3f}", f"{sigma:.3f}") for axes, value, sigma in zip(INERTIA_NAMES, *entries, strict=True)]
     tables = [Table("Inertia about the centre of mass, sensor axes, g·m²", ("axes", "estimate", "± 1 sigma"), rows)]
     keys, columns = ("duration_s", "force_N", "torque_Nm"), ("at, s", "for, s", "force, N", "torque, N·m")
     touches = [(f"{one['t_s']:.1f}", *(rounded(one[key], 2) for key in keys)) for one in found["contacts"]]

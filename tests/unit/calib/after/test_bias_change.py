@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
 from ftcalib.after.state import Update
-from ftcalib.after.verification import Expected, bias_change, verify
+from ftcalib.after.verification import Expected, verify
 from ftcalib.model import Array, predict
 from tests.known_cells import UPRIGHT as TRUTH
 
@@ -39,7 +39,7 @@ def simulated(verifications: int, calibrations: int) -> list[list[tuple[Array, A
         parameters = TRUTH.moved(rng.multivariate_normal(np.zeros(15), covariance))
         expected = Expected(Update(parameters, covariance, 0.0, 0), noise, np.inf)
         wrenches = predict(CHANGED, R) + each * rng.normal(size=(verifications, 6, 6))
-        found.append([bias_change(expected, R, wrench) for wrench in wrenches])
+        found.append([expected.bias_change(R, wrench) for wrench in wrenches])
     return found
 
 
@@ -92,6 +92,6 @@ def test_a_channel_without_any_noise_has_a_change_too() -> None:
     noise = np.asarray(block_diag(*(np.diag(np.r_[0.0, SIGMA[1:] ** 2]) for _ in range(6))))
     R = orientations(6, 3)
     expected = Expected(Update(TRUTH, covariance_of_a_calibration(), 0.0, 0), noise, np.inf)
-    change, *sigmas = bias_change(expected, R, predict(CHANGED, R))
+    change, *sigmas = expected.bias_change(R, predict(CHANGED, R))
     np.testing.assert_allclose(change, CHANGE, atol=1e-9)
     assert np.isfinite(sigmas).all()

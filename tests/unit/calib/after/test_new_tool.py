@@ -137,7 +137,7 @@ def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None
     dataset = replace(poses(now, R, 0), wrench=y)
     assert dataset.wrench_cov is not None
     noise = block_diag(*(pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, now))))
-    known = known_response(earlier, earlier.response)
+    known = known_response(earlier)
     assert known is not None
     sensor = sensor_error_columns(p, known, now, R).reshape(24, -1)
     if response is None:
