@@ -17,9 +17,9 @@ CONTACT_N: Final = 100.0
 # Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
 # Grid of elevation and azimuth.
-STEP_DEG = 10
+_STEP_DEG = 10
 # Turns of the tool about its axis at each direction, over a whole turn.
-TURNS = 12
+_TURNS = 12
 
 
 def error_map(result: CalibrationResult) -> dict[str, Any]:
@@ -29,8 +29,8 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
     (n, m), the largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations, and
     `worst_direction` (3,) of flange z in base.
     """
-    elevation = np.radians(np.arange(-90, 91, STEP_DEG))
-    azimuth = np.radians(np.arange(-180, 181, STEP_DEG))
+    elevation = np.radians(np.arange(-90, 91, _STEP_DEG))
+    azimuth = np.radians(np.arange(-180, 181, _STEP_DEG))
     R = orientations(elevation, azimuth)
     variance = np.diagonal(result.wrench_covariance(R), axis1=-2, axis2=-1)
     document: dict[str, Any] = {
@@ -50,14 +50,14 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
 
 
 def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
-    """Return R_base_flange (n, m, TURNS, 3, 3): flange z in these directions, turned about itself.
+    """Return R_base_flange (n, m, 12, 3, 3): flange z in these directions, turned about itself.
 
     Elevation (n,) is from the base xy-plane, azimuth (m,) about base z from base x.
     """
     tip, turn = np.meshgrid(np.pi / 2 - elevation_rad, azimuth_rad, indexing="ij")
     point = Rotation.from_euler("ZY", np.stack([turn, tip], axis=-1).reshape(-1, 2)).as_matrix()
-    spin = Rotation.from_rotvec(np.outer(np.linspace(0, 2 * np.pi, TURNS, endpoint=False), [0, 0, 1])).as_matrix()
-    return np.asarray(point[:, None] @ spin).reshape(*tip.shape, TURNS, 3, 3)
+    spin = Rotation.from_rotvec(np.outer(np.linspace(0, 2 * np.pi, _TURNS, endpoint=False), [0, 0, 1])).as_matrix()
+    return np.asarray(point[:, None] @ spin).reshape(*tip.shape, _TURNS, 3, 3)
 
 
 def tip_of(result: CalibrationResult) -> Array:

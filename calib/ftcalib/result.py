@@ -45,7 +45,7 @@ from ftcalib.sensor_matrix import (
 from ftcalib.shown import Estimate, estimates_of, figure_of, frame_of, rows_of
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
-CONTRADICTS = 4.0
+_CONTRADICTS = 4.0
 
 # Eigenvalues of a correlation matrix below this are no rounding.
 INDEFINITE = -1e-6
@@ -409,7 +409,7 @@ class CalibrationResult(Displayed):
         noise_kg = self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
         excess, sigma = self.mass_kg / mass_kg - 1, float(np.hypot(sigma_kg, noise_kg)) / mass_kg
         # Beyond that it is another tool, or a unit, and no gain: the verdict names it.
-        return (excess, sigma) if abs(excess) <= CONTRADICTS * np.hypot(sensor.sigma[0, 0], sigma) else None
+        return (excess, sigma) if abs(excess) <= _CONTRADICTS * np.hypot(sensor.sigma[0, 0], sigma) else None
 
     @property
     def shown_response(self) -> Response:

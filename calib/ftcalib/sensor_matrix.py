@@ -234,7 +234,7 @@ def _products(A: Array, v: Array, sigma: Array) -> Array:
     return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
 
 
-ENTRIES = np.eye(36).reshape(36, 6, 6)
+_ENTRIES = np.eye(36).reshape(36, 6, 6)
 """Derivative of an error (6, 6) of the matrix by its entries, row by row."""
 
 
@@ -273,8 +273,8 @@ def _mounting_turn(E: Array, p: Array) -> Array:
 
 def shown_by(p: Array) -> Array:
     """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
-    force, torque = _gain_at(ENTRIES, p)
-    torque = torque - skew(p) @ skew(_mounting_turn(ENTRIES, p))
+    force, torque = _gain_at(_ENTRIES, p)
+    torque = torque - skew(p) @ skew(_mounting_turn(_ENTRIES, p))
     parts = [
         np.einsum("kij,aij->ka", basis, M) / np.einsum("kij,kij->k", basis, basis)[:, None]
         for basis, M in ((GAIN, force), (CROSS_TALK_M, torque))
@@ -407,7 +407,7 @@ class SensorMatrix(Displayed):
             gain = C @ H.T @ np.linalg.inv(prior)
             E, C = (gain @ coefficients).reshape(6, 6), C - gain @ (prior - remaining) @ gain.T
         turned = np.zeros((3, 3)) if rotation_covariance is None else R.T @ rotation_covariance @ R
-        T = np.concatenate([_mounting_turn(ENTRIES, p).T, np.eye(36)])
+        T = np.concatenate([_mounting_turn(_ENTRIES, p).T, np.eye(36)])
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
@@ -503,7 +503,7 @@ class ContactResponse:
     def error_columns(self, wrench: Array) -> Array:
         """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by what `error_covariance` is of."""
         turns = -np.kron(np.eye(2), skew(np.eye(3)))
-        effects = np.concatenate([turns, ENTRIES])
+        effects = np.concatenate([turns, _ENTRIES])
         if self.decoder is not None:
             effects = self.decoder @ effects
         return np.asarray(np.einsum("aij,...j->...ia", effects, wrench))
@@ -568,7 +568,7 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
     a gain common to all axes a weight, with a centre of mass that is as much nearer. No orientation shows them.
     """
     p = parameters.p_sensor_com_m
-    turn, (_, torque) = _mounting_turn(ENTRIES, p), _gain_at(ENTRIES, p)
+    turn, (_, torque) = _mounting_turn(_ENTRIES, p), _gain_at(_ENTRIES, p)
     (scale,) = _common_gain(p)
     columns = np.zeros((15, 36))
     columns[:3] = parameters.R_flange_sensor @ turn.T
@@ -583,5 +583,5 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
 
 def _common_gain(p: Array) -> Array:
     """Return the derivative (1, 36) of the gain common to all axes, of a tool at p, by the entries of E."""
-    force, _ = _gain_at(ENTRIES, p)
+    force, _ = _gain_at(_ENTRIES, p)
     return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

@@ -39,7 +39,7 @@ WHOLE = (0, 1, 2, 3, 4)
 _MOUNTING, _BASE = WHOLE[:3], WHOLE[3:]
 
 # From the rows of the prior that count to the misfit, its degrees of freedom, and the parameters.
-Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
+_Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
 
 
 class CellPrior:
@@ -97,7 +97,7 @@ class CellPrior:
         rows[5:, 15:] = np.eye(size - 15)
         return rows
 
-    def contradiction(self, chi2: float, dof: int, refit: Refit, what: str, alone: str) -> str:
+    def contradiction(self, chi2: float, dof: int, refit: _Refit, what: str, alone: str) -> str:
         """Name what does not hold any more; empty where the prior fits.
 
         Parameters
@@ -138,7 +138,7 @@ class CellPrior:
 
 
 # Share of a load by which a sensor responds to it otherwise than to a smaller one, at most: usually, and rarely.
-LOADS = (LOAD, 0.02)
+_LOADS = (LOAD, 0.02)
 _MOST_STEPS = 30
 # Squared step in standard deviations.
 _SETTLED = 1e-12
@@ -181,7 +181,7 @@ def new_tool(
     prior, poses_in_words = CellPrior(earlier), "the poses"
     alone = "calibrate this tool alone, from 12 poses or more"
     # A response that depends on the load shows at a larger one: in full where no change of the cell explains the poses.
-    for load in LOADS:
+    for load in _LOADS:
         weights: Array = np.linalg.inv(noise + np.diag(_beyond(earlier, start, load))).astype(np.float64)
         poses = dataset.R_base_flange, dataset.wrench, weights
         found = _fit_tool(prior, *poses, WHOLE)

@@ -13,7 +13,7 @@ from ftcalib.model import Array, Parameters, read_only
 # The difference of two calibrations, in standard deviations and tested jointly.
 
 # A standard deviation below this share of the largest is one of rounding: the value was taken as known.
-KNOWN = 1e-9
+_KNOWN = 1e-9
 # An eigenvalue of a correlation matrix below this is one of rounding too.
 _SINGULAR = 1e-10
 # A difference in a direction that both calibrations take as known counts from here on.
@@ -97,7 +97,7 @@ def difference(first: Estimated, second: Estimated) -> Difference:
 def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare:
     """Test some rows; directions without variance count only if they differ."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    known = sigma[rows] <= KNOWN * sigma.max()
+    known = sigma[rows] <= _KNOWN * sigma.max()
     if np.any(change[rows[known]] != 0):
         return ChiSquare(np.inf, len(rows), 0.0)
     free = rows[~known]
@@ -138,7 +138,7 @@ SIGNIFICANT = 1e-5
 # A drift has gone on for so long: a sudden change of the last days is no drift yet.
 LEAST_DAYS = 7.0
 # If the series begins later, the error of the calibration limits its level no more, because more may have changed.
-NEAR_DAYS = 14.0
+_NEAR_DAYS = 14.0
 # A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1.
 CLEARLY = 6.0
 
@@ -180,7 +180,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
     if len(t_days) < FEWEST:
         return None
     weight, known = 1 / np.square(sigma), 1 / np.maximum(np.square(calibration_sigma), 1e-12 * np.square(sigma[0]))
-    near = t_days[0] <= NEAR_DAYS
+    near = t_days[0] <= _NEAR_DAYS
     if not near:
         known = np.zeros_like(known)
     first = 0
@@ -312,7 +312,7 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
 # temperature that does not predict such runs better than the other runs alone is of no use, however steep its slope.
 
 # Between the coldest and the warmest run.
-LEAST_K = 3.0
+_LEAST_K = 3.0
 # Largest p-value of a slope that is used.
 SURE = 1e-3
 # Older runs do not count: their walk says little about today.
@@ -357,8 +357,8 @@ class BiasTemperature:
 
 
 def spans_temperature(temperature_C: Array, fewest: int) -> bool:
-    """Whether so many runs, over `LEAST_K` at least, can show a change with the temperature."""
-    return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= LEAST_K)
+    """Whether so many runs, over 3 K at least, can show a change with the temperature."""
+    return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= _LEAST_K)
 
 
 def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Array) -> BiasTemperature | None:

@@ -47,9 +47,9 @@ FALSE_ALARMS = 1e-5
 # A mass of so many sigmas differs from zero.
 LEAST_SIGMAS = 4.0
 # Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less.
-DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
+_DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
 # Usual change of a bias within days, one standard deviation, N and N·m.
-USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
+_USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
 
 # Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
 # near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone.
@@ -122,9 +122,9 @@ class Weight(Displayed):
         return [with_sigma(1e3 * x, 1e3 * s) for x, s in zip(self.p_sensor_com_m, self.com_sigma_m, strict=True)]
 
 
-def drift_since(seconds: float, per_h: Array = DRIFT_PER_H) -> Array:
+def drift_since(seconds: float, per_h: Array = _DRIFT_PER_H) -> Array:
     """Return one standard deviation (6,) of the change of a bias since so long, N and N·m; infinite is never zeroed."""
-    return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, USUAL_DRIFT))
+    return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, _USUAL_DRIFT))
 
 
 def weigh(  # noqa: PLR0913 - the readings and what is known of them

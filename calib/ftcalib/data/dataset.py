@@ -28,8 +28,8 @@ Orientation = Literal["R_base_flange", "R_flange_base"]
 # N, N·m or their squares: no sensor measures more, and powers of it must not overflow.
 LARGEST = 1e9
 # N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits.
-LEAST_VARIANCE = 1e-18
-MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
+_LEAST_VARIANCE = 1e-18
+_MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -169,7 +169,7 @@ class CalibrationDataset(Displayed):
             Neither package is installed.
         """
         columns = {"t": self.t_s} if np.isfinite(self.t_s).all() else {}
-        columns |= dict(zip(MATRIX_COLUMNS, self.R_base_flange.reshape(-1, 9).T, strict=True))
+        columns |= dict(zip(_MATRIX_COLUMNS, self.R_base_flange.reshape(-1, 9).T, strict=True))
         columns |= dict(zip(CHANNELS, self.wrench.T, strict=True))
         if self.wrench_cov is not None:
             sigma = np.sqrt(np.diagonal(self.wrench_cov, axis1=1, axis2=2))
@@ -294,7 +294,7 @@ def _covariances(cov: Array) -> Array:
 
 def _covariance_problem(C: Array) -> str | None:
     variance = np.diag(C)
-    if variance.min() < LEAST_VARIANCE:
+    if variance.min() < _LEAST_VARIANCE:
         return f"the variance of {CHANNELS[variance.argmin()]} is {variance.min():g}, less than that of any sensor"
     correlation = C / np.outer(np.sqrt(variance), np.sqrt(variance))
     asymmetry = np.abs(correlation - correlation.T).max()
@@ -309,11 +309,11 @@ def _covariance_problem(C: Array) -> str | None:
 # Covariances of pose means that come from few samples each.
 
 # With this many independent samples, the covariance of a pose counts as much as the common shape.
-TRUSTED_SAMPLES = 100.0
+_TRUSTED_SAMPLES = 100.0
 # Median of the variance of six Gaussian values, relative to its mean: that of chi-square with 5 degrees, over 5.
-MEDIAN_SCATTER = 0.8702920382191053
+_MEDIAN_SCATTER = 0.8702920382191053
 # A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance.
-UNLIKE = 3.0
+_UNLIKE = 3.0
 
 
 def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
@@ -351,7 +351,7 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
         if np.abs(size - before).max() <= 1e-12 * size.max():
             break
     spread = _spread_within(S, shape)
-    typical = float(np.median(spread * freedom)) / MEDIAN_SCATTER / (1 - 1 / len(S))
+    typical = float(np.median(spread * freedom)) / _MEDIAN_SCATTER / (1 - 1 / len(S))
     freedom *= min(1.0, 2 / max(typical, 1e-12))
     # Equal sizes scatter by 2 / (6 freedom) in the logarithm, whose mean is half of that low: remove both.
     log_size, scatter = np.log(size), 2 / (6 * freedom)
@@ -360,8 +360,8 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     real = max(found - float(np.average(scatter, weights=freedom)), 0.0)
     size = np.exp(mean + (log_size - mean) * real / (real + scatter) + np.minimum(scatter, found) / 2)
     own, common = np.ones(len(known)), np.zeros(len(known))
-    unlike = 1 - UNLIKE * 2 / freedom / np.maximum(spread, 1e-12)
-    own[known] = np.maximum(freedom / (freedom + TRUSTED_SAMPLES), unlike)
+    unlike = 1 - _UNLIKE * 2 / freedom / np.maximum(spread, 1e-12)
+    own[known] = np.maximum(freedom / (freedom + _TRUSTED_SAMPLES), unlike)
     common[known] = (1 - own[known]) * size
     pooled = own[:, None, None] * wrench_cov
     for i, j in np.ndindex(6, 6):  # without a second array of that size

@@ -26,7 +26,7 @@ _CONTACT = float(chi2_isf(6, 1e-7))
 # Least residual of a row in contact, in a motion that a guard has watched.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
 # Quantile of the residuals of a state that has no contact.
-_QUIET = 0.4
+QUIET = 0.4
 # Share of rows; beyond it the model does not fit at all.
 _MOST_CONTACT = 0.8
 # Rows left out on both sides of a contact, which the filter spreads.
@@ -339,8 +339,8 @@ def _first_kept(problem: Problem, load: Load) -> NDArray[np.bool_]:
     r = rows.wrench - problem.predict(load, rows)
     state = states(rows.speed_rad_s, np.ones(len(rows), bool))
     size = np.abs(r).reshape(-1, 2, 3)
-    quiet = np.array([np.quantile(size[state == k], _QUIET, axis=(0, 2)) for k in np.unique(state)])
-    scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + _QUIET) / 2) + 1e-12
+    quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
+    scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
     distance = np.sum((r / np.repeat(scale, 3, axis=1)[state]) ** 2, axis=1)
     return _without_contact(distance / 2)
 
