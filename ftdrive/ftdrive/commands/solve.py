@@ -133,7 +133,7 @@ def solve(
     """
     check_simulate(simulate, real={"DATASET": sources, "--wrench": chosen["wrench"]}, emulated={"--sensor": sensor})
     given = {**chosen, "test": test, "cases": cases, "joined": joined, "output": output}
-    options = SolveOptions.of_solve(sources, given, simulate=simulate)
+    options = SolveOptions.of_solve(sources, simulate=simulate, **given)
     sources = sources if options.pair is None else options.pair[:1]
     if joined:
         _solve_together(sources, options, output, force, every, as_json)
@@ -268,9 +268,19 @@ def _show_all(
     source: Path,
     place: Path,
 ) -> None:
-    data: Any = read_place(place, options)  # of poses: no recording in motion has this method
+    data = read_place(place, options)
+    assert isinstance(data, RecordedData)  # noqa: S101 - no recording in motion has this method
     with working("Solving with all methods"):
-        compared = compare(data.dataset, **options.of_solution(data), test=tests, truth=data.truth)
+        compared = compare(
+            data.dataset,
+            drift=options.drift,
+            known=data.known,
+            g_m_s2=data.g_m_s2,
+            setup=data.setup,
+            as_published=options.as_published,
+            test=tests,
+            truth=data.truth,
+        )
     if as_json:
         given = {"as_published": options.as_published, **({} if test is None else {"test_set": str(test)})}
         methods = [one.to_dict() for one in compared]

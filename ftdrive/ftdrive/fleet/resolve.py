@@ -93,7 +93,9 @@ def task_of(folder: Path) -> tuple[bytes, bytes]:
     own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
     given = {
         "version": __version__,
-        "circumstances": {"g_m_s2": found.g_m_s2, "setup": asdict(found.setup), "method": run.method},
+        "method": run.method,
+        "g_m_s2": found.g_m_s2,
+        "setup": asdict(found.setup),
         "provenance": {"created_utc": own.get("created_utc"), **found.origin},
     }
     return read_file(run.dataset_path), json.dumps(given).encode()
@@ -111,8 +113,8 @@ def solve_task(dataset: bytes, task: bytes) -> bytes:
     except ValueError as error:
         raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
     provenance = {**given["provenance"], "versions": _versions()}
-    circumstances = given["circumstances"] | {"setup": Setup(**given["circumstances"]["setup"])}
-    return _content(solve(CalibrationDataset.from_dict(document), **circumstances, provenance=provenance))
+    poses, g_m_s2, setup = CalibrationDataset.from_dict(document), given["g_m_s2"], Setup(**given["setup"])
+    return _content(solve(poses, given["method"], g_m_s2=g_m_s2, setup=setup, provenance=provenance))
 
 
 def _solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:

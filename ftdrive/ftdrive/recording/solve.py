@@ -10,8 +10,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult, Known, Setup
-from ftcalib import solve as solve_dataset
-from ftcalib.after.new_tool import new_tool
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.motion.samples import Means
 from ftcalib.motion.solve import solve_motion
@@ -49,19 +47,15 @@ def solve_place(data: Moving | RecordedData, options: SolveOptions) -> Calibrati
     Raises `ConfigError` for values that a method cannot use.
     """
     if isinstance(data, RecordedData):
-        earlier = options.earlier or data.earlier
-        if earlier is not None:
-            require_same_cell(earlier, data.provenance)
-            return new_tool(earlier, data.dataset, data.provenance)
         method: Any = options.method
         try:
-            return solve_dataset(data.dataset, method, **options.of_solution(data), provenance=data.provenance)
+            return data.solve(method, drift=options.drift, as_published=options.as_published, earlier=options.earlier)
         except ValueError as error:
             raise ConfigError(str(error)) from error
-    how: dict[str, Any] = {"earlier": options.earlier, "known": options.known, "point_mass": options.point_mass}
+    known, earlier, point_mass = options.known, options.earlier, options.point_mass
     if isinstance(data, Run):
-        return solve_in_motion(data, **how)
-    return solve_recording(data, up_in_base=options.up_in_base, **how)
+        return solve_in_motion(data, known, earlier=earlier, point_mass=point_mass)
+    return solve_recording(data, known=known, point_mass=point_mass, up_in_base=options.up_in_base, earlier=earlier)
 
 
 def solve_recording(

@@ -1,6 +1,5 @@
 """A recording of a free tool in motion, raw: every sample of sensor and arm, in one file of a run or in parts of it."""
 
-import hashlib
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -10,12 +9,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ftcalib import CalibrationResult, Known
 from ftcalib.errors import BadDataset
-from ftcalib.files import read_file
 from ftcalib.model import Array
 from ftcalib.motion.samples import Means, measured_s
-from ftcalib.motion.solve import solve_motion
 from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -130,22 +126,3 @@ def files_of(path: Path) -> list[Path]:
     if not files:
         raise BadDataset(f"{path} has no samples yet: record for some seconds")
     return files
-
-
-def solve_motion_file(
-    path: Path, *, height_m: float | None, known: Known | None, provenance: Mapping[str, Any], **circumstances: Any
-) -> CalibrationResult:
-    """Calibrate from the recording of a run; circumstances as for `ftcalib.motion.solve.solve_motion`."""
-    wrench, poses = means_of(path)
-    digest = hashlib.sha256()
-    for file in files_of(path):
-        digest.update(read_file(file))
-    source = {"recording": path.name, "recording_sha256": digest.hexdigest()}
-    return solve_motion(
-        wrench,
-        poses,
-        known=known,
-        height_m=height_m,
-        provenance={**provenance, **source},
-        **circumstances,
-    )

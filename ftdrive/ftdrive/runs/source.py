@@ -1,5 +1,6 @@
 """Datasets, calibrations and recorded runs from any place that commands accept: run folders and single files."""
 
+import hashlib
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -17,15 +18,18 @@ from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import read_file
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters
+from ftcalib.motion.solve import solve_motion
+from ftcalib.result import Method
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG, orientation_accuracy_deg
 from ftdrive.cell.units import numbers
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import down_of
+from ftdrive.runs import at
 from ftdrive.runs.calibration import made_now, read_calibration, versions
 from ftdrive.runs.load import Load
-from ftdrive.runs.motion import solve_motion_file
+from ftdrive.runs.motion import files_of, means_of
 from ftdrive.runs.run import Run
 from ftdrive.tables.table import Table, TableOptions
 from ftdrivers.errors import BadUrl
@@ -95,18 +99,38 @@ class SolveOptions:
     """The same as typed, quoted for a shell."""
 
     @classmethod
-    def of_solve(cls, sources: Sequence[Path], given: Mapping[str, Any], *, simulate: bool) -> Self:
-        """Return what the options of `ftdrive solve` mean, by name; raises `ConfigError` if they contradict."""
-        method, drift, earlier, test = (given[name] for name in ("method", "drift", "earlier", "test"))
-        joined, cases, output = (given[name] for name in ("joined", "cases", "output"))
-        wrench, orientation_file = given["wrench"], given["orientation_file"]
-        known = [given[name] for name in ("mass_kg", "level_deg", "mounting_deg")]
+    def of_solve(  # noqa: PLR0913 - the options of the command
+        cls,
+        sources: Sequence[Path],
+        *,
+        method: str,
+        orientation: Orientation,
+        drift: Drift,
+        mass_kg: float | None,
+        level_deg: float | None,
+        mounting_deg: str | None,
+        up: str | None,
+        as_published: bool,
+        earlier: Path | None,
+        wrench: Path | None,
+        orientation_file: Path | None,
+        point_mass: bool,
+        wrench_topic: str | None,
+        pose_topic: str | None,
+        table: TableOptions | None,
+        test: Path | None,
+        cases: bool,
+        joined: bool,
+        output: Path | None,
+        simulate: bool,
+    ) -> Self:
+        """Return what the options of `ftdrive solve` mean; raises `ConfigError` if they contradict each other."""
         if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
             raise ConfigError("--wrench and --orientation-file are one recording: give both, and no DATASET")
         pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
         if not (sources or pair or simulate):
             raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
-        others = (earlier, pair, test, *known, given["up"])
+        others = (earlier, pair, test, mass_kg, level_deg, mounting_deg, up)
         if cases and (method != "ml" or drift != "auto" or joined or any(one is not None for one in others)):
             raise ConfigError(
                 "--table-iii has methods and test sets of its own: leave out --method, --test and other data, --drift "
@@ -114,7 +138,7 @@ class SolveOptions:
             )
         if test is not None and method != "all":
             raise ConfigError("--test compares methods: add --method all")
-        if given["as_published"] and method != "all" and not method.startswith("carlson-"):
+        if as_published and method != "all" and not method.startswith("carlson-"):
             raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
         if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
             raise ConfigError("--from and --together are for --method ml, one of the two at a time")
@@ -126,21 +150,17 @@ class SolveOptions:
             raise ConfigError("--output takes one result: give one dataset and one method")
         return cls(
             method,
-            given["orientation"],
+            orientation,
             drift,
-            known_values(*known),
-            up_direction(given["up"]),
-            as_published=given["as_published"],
+            known_values(mass_kg, level_deg, mounting_deg),
+            up_direction(up),
+            as_published=as_published,
             earlier=None if earlier is None else read_calibration(earlier),
             pair=pair,
-            point_mass=given["point_mass"],
-            topics=(given["wrench_topic"], given["pose_topic"]),
-            table=given["table"],
+            point_mass=point_mass,
+            topics=(wrench_topic, pose_topic),
+            table=table,
         )
-
-    def of_solution(self, data: "RecordedData") -> dict[str, Any]:
-        """Return what `ftcalib.solve` and `ftcalib.compare` take beside dataset and provenance."""
-        return {"drift": self.drift, "as_published": self.as_published, **data.circumstances}
 
 
 def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
@@ -273,10 +293,29 @@ class RecordedData:
     earlier: CalibrationResult | None = None
     """The result that gives a new tool its mounting, base and gain."""
 
-    @property
-    def circumstances(self) -> dict[str, Any]:
-        """What `ftcalib.solve` takes beside dataset and provenance."""
-        return {"g_m_s2": self.g_m_s2, "setup": self.setup, "known": self.known}
+    def solve(
+        self,
+        method: Method,
+        *,
+        drift: Drift = "auto",
+        as_published: bool = False,
+        earlier: CalibrationResult | None = None,
+    ) -> CalibrationResult:
+        """Calibrate; with an earlier result, given or of the run, only the tool is new."""
+        earlier = earlier or self.earlier
+        if earlier is not None:
+            require_same_cell(earlier, self.provenance)
+            return new_tool(earlier, self.dataset, self.provenance)
+        return solve(
+            self.dataset,
+            method,
+            drift=drift,
+            known=self.known,
+            g_m_s2=self.g_m_s2,
+            setup=self.setup,
+            provenance=self.provenance,
+            as_published=as_published,
+        )
 
     @property
     def p_flange_sensor_m(self) -> Array:
@@ -300,9 +339,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         run = Run(source)
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
-        records = run.records()
-        dataset, of_run = _dataset_of(run, records)
-        found = RecordedData(dataset, of_run.provenance(), of_run.g_m_s2, of_run.setup, None, records, _earlier_of(run))
+        found = _data_of(run, run.records())
     elif source.suffix == ".json":
         found = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
     else:
@@ -402,21 +439,15 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
         raise ConfigError(f"--from: result {earlier.id} is rejected: take an accepted one")
     before, now = earlier.provenance, provenance
     for device in ("sensor", "arm"):
-        serials = [_of(one, "devices", device, "serial") for one in (before, now)]
+        serials = [at(one, "devices", device, "serial") for one in (before, now)]
         if all(serials) and serials[0] != serials[1]:
             raise ConfigError(
                 f"--from: result {earlier.id} is of {device} {serials[0]}, the new data of {serials[1]}: take one of "
                 f"the same {device}"
             )
-    mounts = [_of(one, "setup", "mount") for one in (before, now)]
+    mounts = [at(one, "setup", "mount") for one in (before, now)]
     if all(mounts) and mounts[0] != mounts[1]:
         raise ConfigError(f"--from: result {earlier.id} is of mount {mounts[0]}, the new data of {mounts[1]}")
-
-
-def _of(document: Any, *keys: str) -> Any:
-    for key in keys:
-        document = document.get(key) if isinstance(document, Mapping) else None
-    return document
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -467,33 +498,32 @@ def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
     """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
-    found = circumstances_of(run)
-    earlier = earlier or _earlier_of(run)
+    found, earlier = circumstances_of(run), earlier or _earlier_of(run)
     if earlier is not None:
         require_same_cell(earlier, found.origin)
-    return solve_motion_file(
-        run.motion_path,
-        height_m=found.setup.sensor_height_m,
+    wrench, poses = means_of(run.motion_path)
+    digest = hashlib.sha256()
+    for file in files_of(run.motion_path):
+        digest.update(read_file(file))
+    recording = {"recording": run.motion_path.name, "recording_sha256": digest.hexdigest()}
+    return solve_motion(
+        wrench,
+        poses,
         known=known,
         earlier=earlier,
         point_mass=point_mass,
         guarded=run.mode == "sweep",
-        provenance=found.provenance(),
+        height_m=found.setup.sensor_height_m,
         g_m_s2=found.g_m_s2,
         setup=found.setup,
+        provenance={**found.provenance(), **recording},
     )
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    dataset, found = _dataset_of(run, records)
-    earlier, provenance = _earlier_of(run), found.provenance()
-    if earlier is None:
-        result = solve(dataset, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
-    else:
-        require_same_cell(earlier, provenance)
-        result = new_tool(earlier, dataset, provenance)
-    return Outcome(run, dataset, result, drift_check(records))
+    data = _data_of(run, records)
+    return Outcome(run, data.dataset, data.solve(run.method), drift_check(records))
 
 
 def _earlier_of(run: Run) -> CalibrationResult | None:
@@ -502,72 +532,69 @@ def _earlier_of(run: Run) -> CalibrationResult | None:
     return None if document is None else CalibrationResult.from_dict(document)
 
 
-def _dataset_of(run: Run, records: Sequence[PoseRecord]) -> tuple[CalibrationDataset, Circumstances]:
+def _data_of(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
     found = circumstances_of(run)
     marks = {"emulated": True} if found.origin["station"] is not None else {}
     if "load" in found.origin:
         marks["load"] = found.origin["load"]
-    return dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **marks}), found
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **marks})
+    return RecordedData(dataset, found.provenance(), found.g_m_s2, found.setup, None, records, _earlier_of(run))
 
 
 def circumstances_of(run: Run) -> Circumstances:
-    """Return what `solve` takes beside the data of a run, without reading them."""
-    header = run.header()
-    config = header["config"]
-    setup, robot = _described(run, config, Load.of_header(header)), config.get("robot", {})
-    mounting, height_mm = setup["mounting"], setup["height_mm"]
-    origin = {
-        "devices": header.get("devices", {}),
-        "run": run.folder.name,
-        "station": header.get("station"),
-        "setup": setup,
-        "temperature_C": run.temperature_C(),
-        **({"load": dict(header["load"])} if "load" in header else {}),
-    }
-    return Circumstances(
-        float(config["site"]["g_m_s2"]),
-        Setup(
-            up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
-            tool_mass_kg=setup["tool_mass_kg"],
-            tool_mass_sigma_kg=setup["tool_mass_sigma_kg"],
-            cylinders_m=[[value / 1e3 for value in row] for row in setup["cylinders_mm"]],
-            sensor_height_m=None if height_mm is None else height_mm / 1e3,
-            sensor_mass_kg=setup["sensor_mass_kg"],
-            payload_kg=setup["payload_kg"],
-            sensor_accuracy_percent=setup["accuracy_percent"],
-            sensor_range=setup["range"],
-            orientation_accuracy_deg=orientation_accuracy_deg(robot.get("host"), robot.get("orientation_accuracy_deg")),
-            sensor_has_arbitrary_zero="zero" in (_of(origin, "devices", "sensor", "facts") or ()),
-        ),
-        origin,
-    )
-
-
-def _described(run: Run, config: Mapping[str, Any], load: Load | None) -> dict[str, Any]:
-    """Return what a result is bound to or compared with: payload last reported, tool, mount label and mounting.
+    """Return what `solve` takes beside the data of a run, without reading them.
 
     A tool with a load is another tool, with another name, so that its result serves no session of the tool alone.
     """
+    header = run.header()
+    config, load = header["config"], Load.of_header(header)
+    sensor, tool, workcell, robot = (config.get(name, {}) for name in ("sensor", "tool", "workcell", "robot"))
     payload_kg = p_flange_payload_m = None
     for event in run.events():
-        if event.get("event") == "weighed":
+        if event.get("event") == "weighed":  # the last one counts
             payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
-    sensor, tool, workcell = (config.get(section, {}) for section in ("sensor", "tool", "workcell"))
-    tool_kg, measured = tool.get("mass_kg"), workcell.get("measured")
-    return {
+    tool_kg, mounting, height_mm = tool.get("mass_kg"), workcell.get("mounting"), sensor.get("height_mm")
+    tool_kg = tool_kg + load.mass_kg if load and tool_kg else tool_kg
+    tool_sigma_kg = None if load else tool.get("mass_sigma_kg")
+    # The centre of mass of a tool with a load may be anywhere between the two.
+    cylinders_mm = [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") and not load else []
+    ranges = [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None
+    # What a result is bound to or compared with.
+    described = {
         "payload_kg": payload_kg,
         "p_flange_payload_m": p_flange_payload_m,
         "sensor_mass_kg": sensor.get("mass_kg"),
         "accuracy_percent": sensor.get("accuracy_percent"),
-        "range": [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None,
-        "mounting": workcell.get("mounting"),
-        "height_mm": sensor.get("height_mm"),
-        "tool_mass_kg": tool_kg + load.mass_kg if load and tool_kg else tool_kg,
-        "tool_mass_sigma_kg": None if load else tool.get("mass_sigma_kg"),
-        # The centre of mass of a tool with a load may be anywhere between the two.
-        "cylinders_mm": [list(row) for row in tool.get("cylinders_mm", ())] if measured and not load else [],
+        "range": ranges,
+        "mounting": mounting,
+        "height_mm": height_mm,
+        "tool_mass_kg": tool_kg,
+        "tool_mass_sigma_kg": tool_sigma_kg,
+        "cylinders_mm": cylinders_mm,
         "tool": f"{tool.get('name')} with {load}" if load else tool.get("name"),
         "mount": sensor.get("mount"),
     }
+    origin = {
+        "devices": header.get("devices", {}),
+        "run": run.folder.name,
+        "station": header.get("station"),
+        "setup": described,
+        "temperature_C": run.temperature_C(),
+        **({"load": dict(header["load"])} if "load" in header else {}),
+    }
+    setup = Setup(
+        up_in_base=None if mounting is None else (-down_of(mounting)).tolist(),
+        tool_mass_kg=tool_kg,
+        tool_mass_sigma_kg=tool_sigma_kg,
+        cylinders_m=[[value / 1e3 for value in row] for row in cylinders_mm],
+        sensor_height_m=None if height_mm is None else height_mm / 1e3,
+        sensor_mass_kg=sensor.get("mass_kg"),
+        payload_kg=payload_kg,
+        sensor_accuracy_percent=sensor.get("accuracy_percent"),
+        sensor_range=ranges,
+        orientation_accuracy_deg=orientation_accuracy_deg(robot.get("host"), robot.get("orientation_accuracy_deg")),
+        sensor_has_arbitrary_zero="zero" in (at(origin, "devices", "sensor", "facts") or ()),
+    )
+    return Circumstances(float(config["site"]["g_m_s2"]), setup, origin)

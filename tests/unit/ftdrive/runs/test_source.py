@@ -28,14 +28,16 @@ def test_a_known_direction_of_gravity_is_that_of_the_mounting(
     found = read_source(
         dataset, SolveOptions(known=Known(gravity_direction_base=(0, 0, -1), mass_kg=2.0), up_in_base=up)
     )
-    known = found.circumstances["known"]
+    known = found.known
+    assert known is not None
     np.testing.assert_array_equal(known.gravity_direction_base, down)
     assert known.mass_kg == 2.0
-    assert found.circumstances["g_m_s2"] == STANDARD_GRAVITY_M_S2
+    assert found.g_m_s2 == STANDARD_GRAVITY_M_S2
     assert found.provenance.get("up_in_base") == (None if up is None else list(up))
-    free = read_source(dataset, SolveOptions(known=Known(mass_kg=2.0), up_in_base=up)).circumstances["known"]
+    free = read_source(dataset, SolveOptions(known=Known(mass_kg=2.0), up_in_base=up)).known
+    assert free is not None
     assert free.gravity_direction_base is None
-    assert read_source(dataset, SolveOptions()).circumstances["known"] is None
+    assert read_source(dataset, SolveOptions()).known is None
 
 
 def test_a_recording_in_motion_has_no_poses(tmp_path: Path) -> None:
