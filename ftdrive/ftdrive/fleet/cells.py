@@ -198,11 +198,12 @@ def _changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Chan
     """Return how the bias has changed since a calibration; None if no verification has this."""
     start = when(result)
     rows = [
-        ((when(one) - start).total_seconds() / 86400, one.temperature_C, *one[-3:])
+        ((when(one) - start).total_seconds() / 86400, one.temperature_C, *change, *sigma, *common)
         for one in checks
-        if shows_bias(one) and None not in one[-3:]
+        if shows_bias(one) and (change := one.bias_change)
+        if (sigma := one.bias_change_sigma) and (common := one.calibration_sigma)
     ]
-    changes = np.array(rows, _COLUMNS)
+    changes = np.array(rows, np.float64).reshape(-1, 20).view(_COLUMNS)[:, 0]  # of None becomes nan
     changes = changes[changes["sigma"].min(axis=1, initial=np.inf) > 0]
     return changes if len(changes) else None
 

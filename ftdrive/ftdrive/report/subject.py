@@ -42,7 +42,7 @@ def trust(
     found = None
     if last is not None:
         made = None if last.created_utc is None else last.created_utc.astimezone(UTC).isoformat()
-        about = {"passed": last.passed, "change": last.change, "reason": last.reason or "", "path": str(last.path)}
+        about = {"passed": last.passed, "change": last.change, "reason": last.reason or "", "path": last.path}
         found = {"created_utc": made, **about}
     return {"words": words, "last_verification": found, "store_error": error}
 

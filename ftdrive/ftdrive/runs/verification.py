@@ -50,7 +50,7 @@ _COPIED: Final = ("devices", "station", "setup", "edited")
 class VerificationRecord(NamedTuple):
     """The outcome of a verification of a calibration: a tuple, because a fleet reads 20,000 of them a minute."""
 
-    path: Path
+    path: str
     """verification.json, in its run folder."""
     calibration_id: str
     created_utc: datetime | None
@@ -75,7 +75,7 @@ class VerificationRecord(NamedTuple):
     @property
     def run(self) -> str:
         """Name of its run folder."""
-        return self.path.parent.name
+        return Path(self.path).parent.name
 
     @classmethod
     def load(cls, path: Path) -> Self:
@@ -91,11 +91,13 @@ class VerificationRecord(NamedTuple):
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
         """Build from what a recording keeps; unknown fields are ignored. Raises `BadCalibration`."""
-        path, calibration_id = Path(str(document.get("path"))), text_at(document, "calibration_id")
+        path, calibration_id = str(document.get("path")), text_at(document, "calibration_id")
         largest = number_at(document, "force_max_N"), number_at(document, "torque_max_Nm")
         created, passed = time_at(document, "created_utc"), document.get("passed")
         if calibration_id is None or not isinstance(passed, bool) or None in largest:
-            raise BadCalibration(f"{path.name} lacks the id of its calibration or the outcome: the file is damaged")
+            raise BadCalibration(
+                f"{Path(path).name} lacks the id of its calibration or the outcome: the file is damaged"
+            )
         change, reason = text_at(document, "change"), text_at(document, "reason")
         made = None if created is None else datetime.fromisoformat(created)
         return cls(path, calibration_id, made, passed, change, reason, *largest)
@@ -104,7 +106,7 @@ class VerificationRecord(NamedTuple):
         """Return fields as JSON, by default those of streams and recordings; `run` may be one of them."""
         # With microseconds, so that texts sort as times.
         created = None if self.created_utc is None else self.created_utc.isoformat(timespec="microseconds")
-        values = {**self._asdict(), "path": str(self.path), "run": self.run, "created_utc": created}
+        values = {**self._asdict(), "run": self.run, "created_utc": created}
         return {name: values[name] for name in names}
 
     def in_words(self, now: datetime | None) -> str:

@@ -259,11 +259,12 @@ def _to_cell(row: Row[Any]) -> StoredCell:
 
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
-    id_, path, _, calibration_id, created, passed, change, reason, temperature_C, *bias = row
+    # By place, because a name takes as long as all the rest.
+    id_, path, _, calibration_id, created, passed, change, reason, temperature_C = row[:9]
     made = None if created is None else datetime.fromisoformat(created)
-    wrenches = (None if bias[k] is None else bias[k : k + 6] for k in (0, 6, 12))
-    outcome = (Path(path), calibration_id, made, passed, change, reason)
-    return VerificationRecord(*outcome, None, None, id_, temperature_C, *wrenches)
+    wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (9, 15, 21)]
+    outcome = calibration_id, made, passed, change, reason
+    return VerificationRecord(path, *outcome, None, None, id_, temperature_C, *wrenches)
 
 
 def _to_weighings(row: Row[Any]) -> WeighingDay:

@@ -2,7 +2,6 @@
 
 from datetime import UTC, datetime
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -52,7 +51,7 @@ def info() -> StreamInfo:
         p_flange_tcp_m=np.array([0.0, 0.0, 0.1]),
         versions={"ftdrive": "1"},
         verification=VerificationRecord(
-            Path("verification.json"), "0" * 12, datetime(2026, 11, 22, tzinfo=UTC), False, "bias", "…", 0.5, 0.01
+            "verification.json", "0" * 12, datetime(2026, 11, 22, tzinfo=UTC), False, "bias", "…", 0.5, 0.01
         ),
         calibration_state="calibration 29ce87, good, 3 d old, VERIFICATION FAILED 2 h ago (bias)",
     )

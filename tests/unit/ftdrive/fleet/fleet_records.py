@@ -4,7 +4,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -66,7 +65,7 @@ def check(of: StoredResult, days_ago: float, *, passed: bool = True, **more: Any
     id_ = f"{of.id}-verified-{days_ago:g}"
     values = {
         "id": id_,
-        "path": Path(f"/runs/{id_}/verification.json"),
+        "path": f"/runs/{id_}/verification.json",
         "calibration_id": of.id,
         "created_utc": NOW - timedelta(days=days_ago),
         "passed": passed,

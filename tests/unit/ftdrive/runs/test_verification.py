@@ -58,7 +58,7 @@ def test_the_newest_verification_of_this_calibration_counts(tmp_path: Path, besi
     for place in (path, path.parent):
         found = verification_near(place, calibration().id)
         assert found is not None
-        assert (found.path, found.passed, found.change) == (newest, False, "bias")
+        assert (found.path, found.passed, found.change) == (str(newest), False, "bias")
 
 
 def test_a_calibration_outside_of_a_run_folder_has_its_runs_beside_it(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def test_an_unchanged_cell_passes_at_poses_that_were_not_used(
         assert abs(bias) < 6 * np.hypot(sigma, common), one
     last = verification_near(run.folder.parent / str(calibration.provenance["run"]), calibration.id)
     assert last is not None
-    assert (last.passed, last.path) == (True, found.path.absolute())
+    assert (last.passed, last.path) == (True, str(found.path.absolute()))
     with pytest.raises(NotObservable):
         save_update(found)
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from functools import cache, cached_property
 from itertools import islice
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -97,7 +96,7 @@ INFO = StreamInfo(
     p_flange_tcp_m=np.array([0.0, 0.0, 0.17]),
     versions={"ftdrive": "1.0"},
     verification=VerificationRecord(
-        path=Path("runs/2026-11-16T060000Z-verify/verification.json"),
+        path="runs/2026-11-16T060000Z-verify/verification.json",
         calibration_id=calibration().id,
         created_utc=datetime(2026, 11, 16, 6, tzinfo=UTC),
         passed=True,
