@@ -17,7 +17,7 @@ from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.text import echo, print_table
-from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table
+from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
 # Fewer records have no three pairs of runs, and numpy takes as long as all else of a short list.
 _FEWEST_RUNS = 4
@@ -79,7 +79,8 @@ def history(
     _print_left_out(left_out)
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
-    warmth, moved = [], list[dict[str, Any]]()
+    warmth: dict[Any, Any] = {}
+    moved = list[dict[str, Any]]()
     if len(results) + len(checks) >= _FEWEST_RUNS or any(one.temperature_C is not None for one in results):
         from ftdrive.store.trends import hour_changes, temperatures
 
@@ -94,7 +95,7 @@ def history(
         rows = [one.to_dict(age_days(one.created_utc, now), last.get(one.id)) for one in results]
         about = {
             "trends": [one.to_dict() for one in found],
-            "temperature": [one.to_dict() for one in warmth],
+            "temperature": [dict(zip(_MOUNTED, key, strict=True)) | _as_json(fit) for key, fit in warmth.items()],
             "hour_changes": moved,
             "warnings": advice,
             "last_weighings": [asdict(one) for one in weighed],
@@ -109,12 +110,27 @@ def history(
     titles, shown = result_table(results, last, now)
     print_table(titles, shown, folding={"arm", "tool", "verified", "run", "parent"})
     trend_lines = (f"trend: {drift}" for drift in found)
-    warmth_lines = (line for one in warmth for line in one.lines())
+    warmth_lines = (line for (serial, *_), fit in warmth.items() for line in temperature_lines(serial, fit))
     weighing_lines = (f"last weighing: {last_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
     for line in (*trend_lines, *warmth_lines, *map(_HOUR.format_map, moved), *weighing_lines):
         echo(line)
     for words in advice:
         answer.print(hanging(" ! ", words, answer), style="yellow")
+
+
+def _as_json(fit: Any) -> dict[str, Any]:
+    """Return the fields of a `ftcalib.after.series.BiasTemperature`."""
+    return {
+        "slope_per_K": fit.slope.tolist(),
+        "sigma_per_K": fit.sigma.tolist(),
+        "n": fit.n,
+        "coldest_C": fit.coldest_C,
+        "warmest_C": fit.warmest_C,
+        "left_out_error": fit.error.tolist(),
+        "left_out_error_without": fit.error_without.tolist(),
+        "p_value": fit.p_value.tolist(),
+        "applied": list(fit.predicts),
+    }
 
 
 def _print_left_out(left_out: Sequence[str]) -> None:

@@ -243,8 +243,8 @@ def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFindi
 
 def _load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
     """Sensor and adapter drop out of the moment about the axis, whatever their mass and height."""
-    R, covariance = np.array(one.numbers["R_flange_sensor"]), one.covariance
-    arm_m = R @ np.array(one.numbers["p_sensor_com_m"])
+    R, covariance = one.parameters.R_flange_sensor, one.covariance
+    arm_m = R @ one.parameters.p_sensor_com_m
     J = np.concatenate([-skew(arm_m), R], axis=1)  # by the rotation about the flange axes, and by the centre
     rows = np.r_[0:3, 9:12]
     sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))

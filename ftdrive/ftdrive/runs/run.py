@@ -329,20 +329,12 @@ class Run(Displayed):
         return sorted(int(name) for name in names if name.isdecimal())
 
 
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_object(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
 _Kind = tuple[str, Callable[[Any], bool]]
-_TEXT: _Kind = "a text", _is_text
-_TEXT_OR_NULL: _Kind = "a text or null", lambda value: value is None or _is_text(value)
-_TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_is_text, value))
-_OBJECT: _Kind = "an object", _is_object
-_OBJECTS: _Kind = "an object of objects", lambda value: _is_object(value) and all(map(_is_object, value.values()))
+_TEXT: _Kind = "a text", lambda value: isinstance(value, str)
+_TEXT_OR_NULL: _Kind = "a text or null", lambda value: isinstance(value, str | None)
+_TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_TEXT[1], value))
+_OBJECT: _Kind = "an object", lambda value: isinstance(value, dict)
+_OBJECTS: _Kind = "an object of objects", lambda value: _OBJECT[1](value) and all(map(_OBJECT[1], value.values()))
 # Types of the fields of run.json; `recorded` checks those of config.
 _KINDS: Mapping[str, _Kind] = {
     "config": _OBJECTS,

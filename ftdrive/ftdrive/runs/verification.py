@@ -240,11 +240,6 @@ class Verified:
         """The smallest sufficient update; None if the calibration holds, or if only a new calibration helps."""
         return self.verification.update
 
-    @property
-    def update_name(self) -> str | None:
-        """What the update estimates, such as "bias", "payload" or "all"."""
-        return None if self.update is None else self.update.kind
-
     def next_command(self, saved: Path | None, again: str = "") -> str:
         """Return what to type after it, where the update is saved; `again` are options, such as " --simulate"."""
         if saved is not None:
@@ -256,7 +251,8 @@ class Verified:
     @property
     def updated(self) -> str:
         """What the update replaces, in words."""
-        return "all values" if self.update_name == "all" else f"the {self.update_name}"
+        kind = None if self.update is None else self.update.kind
+        return "all values" if kind == "all" else f"the {kind}"
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of verification.json."""
@@ -278,7 +274,7 @@ class Verified:
             "change": found.change,
             "alternatives": list(found.alternatives),
             "reason": found.reason,
-            "update": self.update_name,
+            "update": None if self.update is None else self.update.kind,
             "limits": {
                 "force_N": self.limits[0],
                 "torque_Nm": self.limits[1],

@@ -100,8 +100,8 @@ def _of_sensor(
         checks = [check for each in alike for check in store.verifications(each.id)]
     except BadStore:
         return None, None
-    warmth = temperatures(alike, checks) if one.temperature_C is not None else []
-    temperature = next((found.fit for found in warmth if any(found.fit.predicts)), None)
+    fits = temperatures(alike, checks).values() if one.temperature_C is not None else ()
+    temperature = next((fit for fit in fits if any(fit.predicts)), None)
     return temperature, next(iter(hour_changes(alike, checks).values()), None)
 
 

@@ -110,49 +110,6 @@ def _estimated(
     return kept
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SensorTemperature:
-    """The bias of one sensor in one mounting against its temperature."""
-
-    sensor_serial: str
-    arm_serial: str | None
-    mount: str | None
-    fit: BiasTemperature
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON."""
-        fit = self.fit
-        return {
-            "sensor_serial": self.sensor_serial,
-            "arm_serial": self.arm_serial,
-            "mount": self.mount,
-            "slope_per_K": fit.slope.tolist(),
-            "sigma_per_K": fit.sigma.tolist(),
-            "n": fit.n,
-            "coldest_C": fit.coldest_C,
-            "warmest_C": fit.warmest_C,
-            "left_out_error": fit.error.tolist(),
-            "left_out_error_without": fit.error_without.tolist(),
-            "p_value": fit.p_value.tolist(),
-            "applied": list(fit.predicts),
-        }
-
-    def lines(self) -> Iterator[str]:
-        """Yield one line for the force and one for the torque."""
-        fit = self.fit
-        for k, (quantity, unit) in enumerate((("force bias", "N"), ("torque bias", "N·m"))):
-            part = slice(3 * k, 3 * k + 3)
-            slopes = ", ".join(
-                with_sigma(slope, sigma, "+") for slope, sigma in zip(fit.slope[part], fit.sigma[part], strict=True)
-            )
-            use = "applied by --tool" if fit.predicts[k] else "not applied"
-            yield (
-                f"temperature, {self.sensor_serial}, {quantity}: {slopes} {unit}/K (1 sigma, {fit.n} runs, "
-                f"{fit.coldest_C:.0f} to {fit.warmest_C:.0f} °C); runs left out differ by {fit.error[k]:.2g} {unit} "
-                f"with it, {fit.error_without[k]:.2g} {unit} without: {use}"
-            )
-
-
 # Serial number of a sensor, that of its arm, and its mount.
 Mounted = tuple[str, str | None, str | None]
 
@@ -167,13 +124,16 @@ class _Run(NamedTuple):
 
 def temperatures(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
-) -> list[_SensorTemperature]:
-    """Fit each sensor on each arm and mount that has runs enough."""
-    return [
-        _SensorTemperature(*mounted, fit)
-        for mounted, found in _runs(results, verifications).items()
-        if (fit := _fit([run for run in found if run.temperature_C is not None])) is not None
-    ]
+) -> dict[Mounted, BiasTemperature]:
+    """Fit the bias of each sensor against its temperature, where it has runs enough."""
+    found = dict[Mounted, BiasTemperature]()
+    for mounted, runs in _runs(results, verifications).items():
+        known = [run for run in runs if run.temperature_C is not None]
+        days = [(run.created_utc - known[0].created_utc).total_seconds() / 86400 for run in known]
+        columns = (np.array([getattr(run, name) for run in known]) for name in ("temperature_C", "bias", "sigma"))
+        if known and (fit := bias_temperature(np.array(days), *columns)) is not None:
+            found[mounted] = fit
+    return found
 
 
 def hour_changes(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, Array]:
@@ -220,11 +180,3 @@ def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationR
         bias = calibration.parameters.bias + change
         found.append(_Run(check.created_utc, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
     return {mounted: sorted(found, key=lambda run: run.created_utc) for mounted, found in runs.items()}
-
-
-def _fit(runs: Sequence[_Run]) -> BiasTemperature | None:
-    if not runs:
-        return None
-    days = [(run.created_utc - runs[0].created_utc).total_seconds() / 86400 for run in runs]
-    columns = (np.array([getattr(run, name) for run in runs]) for name in ("temperature_C", "bias", "sigma"))
-    return bias_temperature(np.array(days), *columns)

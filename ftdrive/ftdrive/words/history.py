@@ -1,8 +1,9 @@
 """What the store has, as rows of tables and as lines: results, their trends, weighings."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ftcalib.rounding import counted, with_sigma
 from ftdrive.runs.calibration import EMULATED
@@ -11,6 +12,9 @@ from ftdrive.runs.weighings import WeighingDay
 from ftdrive.store.history import age_days
 from ftdrive.store.records import StoredResult
 from ftdrive.words.text import GLUE
+
+if TYPE_CHECKING:  # a list of results needs no numpy
+    from ftcalib.after.series import BiasTemperature
 
 DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
@@ -30,6 +34,19 @@ def last_weighing_in_words(one: WeighingDay) -> str:
     counts = f"{counted(one.weighings, 'part')}, {sum(one.refusals.values())} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{tool_in_words(one.tool, emulated=one.emulated)}, {time}: {_mass_in_words(one)}; {counts}"
+
+
+def temperature_lines(serial: str, fit: "BiasTemperature") -> Iterator[str]:
+    """Yield how the bias of a sensor follows its temperature: one line for the force and one for the torque."""
+    for k, (quantity, unit) in enumerate((("force bias", "N"), ("torque bias", "N·m"))):
+        pairs = zip(fit.slope[3 * k : 3 * k + 3], fit.sigma[3 * k : 3 * k + 3], strict=True)
+        slopes = ", ".join(with_sigma(slope, sigma, "+") for slope, sigma in pairs)
+        use = "applied by --tool" if fit.predicts[k] else "not applied"
+        yield (
+            f"temperature, {serial}, {quantity}: {slopes} {unit}/K (1 sigma, {fit.n} runs, "
+            f"{fit.coldest_C:.0f} to {fit.warmest_C:.0f} °C); runs left out differ by {fit.error[k]:.2g} {unit} "
+            f"with it, {fit.error_without[k]:.2g} {unit} without: {use}"
+        )
 
 
 def _mass_in_words(one: WeighingDay) -> str:

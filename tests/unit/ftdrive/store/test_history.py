@@ -12,6 +12,7 @@ from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.trends import QuantityTrend, hour_changes, temperatures
+from ftdrive.words.history import temperature_lines
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 from tests.unit.ftdrive.stream.simulated import calibrated
 
@@ -151,11 +152,12 @@ def test_the_temperature_of_a_sensor_is_fitted_over_calibrations_and_verificatio
     step[BIASES] = 10 * slope
     new_run(tmp_path, "warm", result(8, step, temperature_C=35.0))
     verified(folder, "of no known calibration", 9, temperature_C=60.0)
-    (found,) = temperatures(*records(tmp_path))
-    assert (found.fit.n, found.fit.coldest_C, found.fit.warmest_C) == (8, 22.0, 36.0)
-    assert np.abs((found.fit.slope - slope) / found.fit.sigma).max() < 4
-    assert found.to_dict()["applied"] == [True, True]
-    force, torque = found.lines()
+    ((mounted, fit),) = temperatures(*records(tmp_path)).items()
+    assert mounted == ("ft-1", "arm-1", None)
+    assert (fit.n, fit.coldest_C, fit.warmest_C) == (8, 22.0, 36.0)
+    assert np.abs((fit.slope - slope) / fit.sigma).max() < 4
+    assert fit.predicts == (True, True)
+    force, torque = temperature_lines("ft-1", fit)
     assert "temperature, ft-1, force bias: +0." in force
     assert force.endswith("applied by --tool")
     assert "N·m/K (1 sigma, 8 runs, 22 to 36 °C)" in torque
