@@ -188,8 +188,6 @@ class FleetReading:
     fleet: Fleet
     read: datetime
     """When it was read from the store, UTC."""
-    now: datetime
-    """When it is passed on, UTC; later than `read` while the store cannot be read."""
     store_up: bool = True
 
 
@@ -208,15 +206,15 @@ def serve(
     """
     # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
     time = now()
-    reading = FleetReading(fleet_at(time), time, time)
+    reading = FleetReading(fleet_at(time), time)
     while True:
         update(reading)
         clock.sleep(EVERY_S)
         was_up, time = reading.store_up, now()
         try:
-            reading = FleetReading(fleet_at(time), time, time)
+            reading = FleetReading(fleet_at(time), time)
         except BadStore as error:
-            reading = replace(reading, now=time, store_up=False)
+            reading = replace(reading, store_up=False)
             if was_up:
                 say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - reading.read)} old.")
         else:

@@ -42,4 +42,4 @@ def fleet(*cells: CellState, findings: tuple[FleetFinding, ...] = ()) -> Fleet:
 
 def reading(*cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True) -> FleetReading:
     """A reading of a moment ago."""
-    return FleetReading(Fleet(cells, findings), NOW, NOW, store_up)
+    return FleetReading(Fleet(cells, findings), NOW, store_up)
