@@ -2,7 +2,7 @@
 
 A stage is a class: from the settings `Stages` it makes one of itself, or none where it has nothing to do. `Processor`
 runs them in this order. What a free tool exerts is subtracted first, whichever settings are on, because contact is
-judged by what that leaves; `Decoder` adds again what was not to be subtracted.
+judged by what that leaves; the decoder adds again what was not to be subtracted.
 """
 
 from abc import ABC, abstractmethod
@@ -79,7 +79,7 @@ class Stage(ABC):
         """Return the next wrenches (n, 6), N and N·m."""
 
 
-class FreeToolAtRest(Stage):
+class _FreeToolAtRest(Stage):
     """Subtract weight and bias; of a sensor alone, which has no calibration, the tare."""
 
     is_of_free_tool = True
@@ -96,7 +96,7 @@ class FreeToolAtRest(Stage):
         return wrench - passing.gravity - passing.bias
 
 
-class InertialWrench(Stage):
+class _InertialWrench(Stage):
     """Subtract the inertial wrench of the load; needs a calibration and the position of the sensor."""
 
     is_of_free_tool = True
@@ -120,7 +120,7 @@ class InertialWrench(Stage):
         return wrench if passing.inertial is None else wrench - passing.inertial
 
 
-class Decoder(Stage):
+class _Decoder(Stage):
     """Decode a contact by the matrix of the sensor, as known loads have shown it; needs a calibration.
 
     Weight or bias that is not to be subtracted is added again as read, because the matrix is that of contacts.
@@ -140,7 +140,7 @@ class Decoder(Stage):
         return wrench if self._settings.bias else wrench + passing.bias
 
 
-class Filter(Stage):
+class _Filter(Stage):
     """Notch and low-pass as second-order sections, whose state lasts from block to block.
 
     It begins in the steady state of its first sample, so that there is no transient. A frequency is between 0 and half
@@ -206,7 +206,7 @@ class Frame(Stage):
         return self._transform(wrench, passing.rows.R_base_flange)
 
 
-class Deadband(Stage):
+class _Deadband(Stage):
     """Shorten force and torque vectors by a deadband; shorter ones become zero.
 
     The length counts and not each axis, so that a deadband is the same in all axes. The noise of what remains is that
@@ -232,7 +232,7 @@ class Deadband(Stage):
         return np.asarray((vectors * left).reshape(-1, 6))
 
 
-STAGES: tuple[type[Stage], ...] = (FreeToolAtRest, InertialWrench, Decoder, Filter, Frame, Deadband)
+STAGES: tuple[type[Stage], ...] = (_FreeToolAtRest, _InertialWrench, _Decoder, _Filter, Frame, _Deadband)
 """All, in their order."""
 
 
