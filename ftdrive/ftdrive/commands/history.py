@@ -65,7 +65,7 @@ def history(
         results = [one for one in records if isinstance(one, StoredResult) and tool in {None, one.tool}]
         results.sort(key=lambda one: (one.created_utc or "", one.id))
         checks = [one for one in records if isinstance(one, VerificationRecord)]
-        checks.sort(key=lambda one: (one.created_utc is not None, one.created_utc))
+        checks.sort(key=lambda one: one.created_utc or "")
     else:
         store = open_store(url)
         name = store.name

@@ -309,9 +309,7 @@ def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, J
         "id": calibration.id,
         "marks": list(marks_of(calibration)),
         "created_utc": made if isinstance(made, str) else None,
-        "verification": None
-        if last is None
-        else {name: last.to_dict()[name] for name in ("created_utc", "passed", "change")},
+        "verification": None if last is None else last.to_dict(("created_utc", "passed", "change")),
         "made_by": f"ftdrive {__version__}",
         "sign": "wrench on the sensor, sensor axes, about the sensor origin; contact = decoder (raw - bias - weight)",
         **{name: result[name] for name in _FIELDS},
@@ -465,7 +463,7 @@ def _made_by(calibration: CalibrationResult, verification: VerificationRecord | 
     verified = "not verified"
     if verification is not None:
         verified = "last verified" if verification.passed else "VERIFICATION FAILED"
-        verified += f" {verification.to_dict()['created_utc']}"
+        verified += f" {verification.created_utc}"
     marks = "".join(f"{mark} " for mark in marks_of(calibration))
     return f"{marks}ftdrive calibration {calibration.id}, made {date}, {verified}; made by ftdrive {__version__}"
 

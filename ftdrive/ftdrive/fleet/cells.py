@@ -210,5 +210,4 @@ def _changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Chan
 
 def when(one: StoredResult | VerificationRecord) -> datetime:
     """Return the time of a record that has one."""
-    made = one.created_utc
-    return made if isinstance(made, datetime) else datetime.fromisoformat(str(made))
+    return datetime.fromisoformat(str(one.created_utc))

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Any, cast
 
@@ -41,9 +41,7 @@ def trust(
     words = ", ".join([*age_of(result, now), "not verified" if last is None else last.in_words(now)])
     found = None
     if last is not None:
-        made = None if last.created_utc is None else last.created_utc.astimezone(UTC).isoformat()
-        about = {"passed": last.passed, "change": last.change, "reason": last.reason or "", "path": last.path}
-        found = {"created_utc": made, **about}
+        found = last.to_dict(("created_utc", "passed", "change", "reason", "path")) | {"reason": last.reason or ""}
     return {"words": words, "last_verification": found, "store_error": error}
 
 

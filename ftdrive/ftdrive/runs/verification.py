@@ -53,8 +53,8 @@ class VerificationRecord(NamedTuple):
     path: str
     """verification.json, in its run folder."""
     calibration_id: str
-    created_utc: datetime | None
-    """None of a file that does not say it."""
+    created_utc: str | None
+    """As ISO 8601 with microseconds, so that texts sort as times; None of a file that does not say it."""
     passed: bool
     change: str | None
     """What has changed, such as "bias"; None if nothing, or if no change explains the readings."""
@@ -93,25 +93,23 @@ class VerificationRecord(NamedTuple):
         """Build from what a recording keeps; unknown fields are ignored. Raises `BadCalibration`."""
         path, calibration_id = str(document.get("path")), text_at(document, "calibration_id")
         largest = number_at(document, "force_max_N"), number_at(document, "torque_max_Nm")
-        created, passed = time_at(document, "created_utc"), document.get("passed")
+        passed = document.get("passed")
         if calibration_id is None or not isinstance(passed, bool) or None in largest:
             raise BadCalibration(
                 f"{Path(path).name} lacks the id of its calibration or the outcome: the file is damaged"
             )
-        change, reason = text_at(document, "change"), text_at(document, "reason")
-        made = None if created is None else datetime.fromisoformat(created)
-        return cls(path, calibration_id, made, passed, change, reason, *largest)
+        made, change = time_at(document, "created_utc"), text_at(document, "change")
+        return cls(path, calibration_id, made, passed, change, text_at(document, "reason"), *largest)
 
     def to_dict(self, names: Sequence[str] = RECORDED) -> dict[str, Any]:
         """Return fields as JSON, by default those of streams and recordings; `run` may be one of them."""
-        # With microseconds, so that texts sort as times.
-        created = None if self.created_utc is None else self.created_utc.isoformat(timespec="microseconds")
-        values = {**self._asdict(), "run": self.run, "created_utc": created}
+        values = {**self._asdict(), "run": self.run}
         return {name: values[name] for name in names}
 
     def in_words(self, now: datetime | None) -> str:
         """Return the result and its age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
-        age = timedelta(0) if now is None or self.created_utc is None else now - self.created_utc
+        made = self.created_utc
+        age = timedelta(0) if now is None or made is None else now - datetime.fromisoformat(made)
         if self.passed:
             return f"verified {age_in_words(age)} ago"
         return f"VERIFICATION FAILED {age_in_words(age)} ago" + (f" ({self.change})" if self.change else "")
@@ -128,8 +126,8 @@ def verification_near(place: Path, calibration_id: str) -> VerificationRecord | 
 
 def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
     """Return the verification that was made last; None without any that has a time."""
-    timed = [(record.created_utc, record) for record in records if record.created_utc is not None]
-    return max(timed, key=lambda pair: pair[0], default=(None, None))[1]
+    timed = (record for record in records if record.created_utc is not None)
+    return max(timed, key=lambda record: record.created_utc or "", default=None)
 
 
 def _records_near(place: Path) -> Iterator[VerificationRecord]:

@@ -18,10 +18,9 @@ OTHER_TEMPERATURE_K: Final = 10.0
 _FEWEST = 3
 
 
-def age_days(created_utc: str | datetime | None, now: datetime) -> float | None:
+def age_days(created_utc: str | None, now: datetime) -> float | None:
     """Return the days since a time; None where the time is unknown."""
-    made = datetime.fromisoformat(created_utc) if isinstance(created_utc, str) else created_utc
-    return None if made is None else (now - made).total_seconds() / 86400
+    return None if created_utc is None else (now - datetime.fromisoformat(created_utc)).total_seconds() / 86400
 
 
 def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:

@@ -260,11 +260,9 @@ def _to_cell(row: Row[Any]) -> StoredCell:
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
     # By place, because a name takes as long as all the rest.
-    id_, path, _, calibration_id, created, passed, change, reason, temperature_C = row[:9]
-    made = None if created is None else datetime.fromisoformat(created)
+    id_, path, _, *outcome = row[:8]  # without the name of the run
     wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (9, 15, 21)]
-    outcome = calibration_id, made, passed, change, reason
-    return VerificationRecord(path, *outcome, None, None, id_, temperature_C, *wrenches)
+    return VerificationRecord._make((path, *outcome, None, None, id_, row[8], *wrenches))
 
 
 def _to_weighings(row: Row[Any]) -> WeighingDay:

@@ -178,5 +178,6 @@ def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationR
         if change is None or sigma_6 is None or check.created_utc is None:
             continue
         bias = calibration.parameters.bias + change
-        found.append(_Run(check.created_utc, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
+        time = datetime.fromisoformat(check.created_utc)
+        found.append(_Run(time, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
     return {mounted: sorted(found, key=lambda run: run.created_utc) for mounted, found in runs.items()}

@@ -1,6 +1,5 @@
 """A compensated stream that never was: a calibration, its header and its blocks."""
 
-from datetime import UTC, datetime
 from functools import cache
 
 import numpy as np
@@ -51,7 +50,7 @@ def info() -> StreamInfo:
         p_flange_tcp_m=np.array([0.0, 0.0, 0.1]),
         versions={"ftdrive": "1"},
         verification=VerificationRecord(
-            "verification.json", "0" * 12, datetime(2026, 11, 22, tzinfo=UTC), False, "bias", "…", 0.5, 0.01
+            "verification.json", "0" * 12, "2026-11-22T00:00:00.000000+00:00", False, "bias", "…", 0.5, 0.01
         ),
         calibration_state="calibration 29ce87, good, 3 d old, VERIFICATION FAILED 2 h ago (bias)",
     )

@@ -67,7 +67,7 @@ def check(of: StoredResult, days_ago: float, *, passed: bool = True, **more: Any
         "id": id_,
         "path": f"/runs/{id_}/verification.json",
         "calibration_id": of.id,
-        "created_utc": NOW - timedelta(days=days_ago),
+        "created_utc": time(days_ago),
         "passed": passed,
         "change": None if passed else "bias",
         "reason": None,
@@ -141,8 +141,9 @@ class FakeStore:
         return kept[::-1]
 
     def _checks(self, since: datetime) -> list[VerificationRecord]:
-        found = [one for one in self.kept_checks if one.created_utc is not None and one.created_utc >= since]
-        return sorted(found, key=lambda one: (one.created_utc or NOW, one.id))
+        start = since.isoformat(timespec="microseconds")
+        found = [one for one in self.kept_checks if (one.created_utc or "") >= start]
+        return sorted(found, key=lambda one: (one.created_utc or "", one.id))
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         found = [one for one in self.kept_checks if one.calibration_id == calibration_id]

@@ -3,7 +3,6 @@
 import math
 from collections import deque
 from collections.abc import Iterator
-from datetime import UTC, datetime
 from functools import cache, cached_property
 from itertools import islice
 from typing import Any, Literal
@@ -98,7 +97,7 @@ INFO = StreamInfo(
     verification=VerificationRecord(
         path="runs/2026-11-16T060000Z-verify/verification.json",
         calibration_id=calibration().id,
-        created_utc=datetime(2026, 11, 16, 6, tzinfo=UTC),
+        created_utc="2026-11-16T06:00:00.000000+00:00",
         passed=True,
         change=None,
         reason="the calibration holds",
