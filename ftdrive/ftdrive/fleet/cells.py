@@ -25,7 +25,7 @@ from ftdrive.cell.config import read_toml, settings
 from ftdrive.errors import ConfigError
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import WeighingDay
-from ftdrive.store.records import StoredCell, StoredResult, shows_bias
+from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store
 
 FORMAT: Final = "ftdrive.cells/1"
@@ -200,7 +200,7 @@ def _changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Chan
     rows = [
         ((when(one) - start).total_seconds() / 86400, one.temperature_C, *change, *sigma, *common)
         for one in checks
-        if shows_bias(one) and (change := one.bias_change)
+        if one.shows_bias and (change := one.bias_change)
         if (sigma := one.bias_change_sigma) and (common := one.calibration_sigma)
     ]
     changes = np.array(rows, np.float64).reshape(-1, 20).view(_COLUMNS)[:, 0]  # of None becomes nan

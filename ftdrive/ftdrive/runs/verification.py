@@ -77,6 +77,11 @@ class VerificationRecord(NamedTuple):
         """Name of its run folder."""
         return Path(self.path).parent.name
 
+    @property
+    def shows_bias(self) -> bool:
+        """Whether the change of the bias that it has estimated counts: another change, or a hand, spoils that."""
+        return self.passed or self.change == "bias"
+
     @classmethod
     def load(cls, path: Path) -> Self:
         """Read a verification.json; unknown fields are ignored. Raises `BadCalibration` or `OSError`."""

@@ -18,6 +18,7 @@ from typing import Final, Self
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file, read_lines
 from ftdrive.runs import number_at, text_at, time_at
+from ftdrive.runs.numbers import append_lines, read_line
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -32,19 +33,12 @@ REFUSALS: Final = (
 _TAIL: Final = 1 << 16
 
 
-def is_weighings(path: Path) -> bool:
-    """Whether a file has weighings, by its name."""
-    return path.match(FILES)
-
-
 def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: Sequence[Mapping[str, JSON]]) -> Path:
     """Add lines to the file of an origin, the rest of its header, on a day (ISO 8601); return it when they are on disk.
 
     Other programs may add lines at the same time. Raises `OSError`; the file is then as it was.
     """
     import fcntl
-
-    from ftdrive.runs.numbers import append_lines
 
     key = hashlib.sha256(json.dumps(origin, sort_keys=True).encode()).hexdigest()[:8]
     path = folder / FILES.replace("*", f"{day}-{key}")
@@ -102,9 +96,6 @@ class WeighingDay:
             The file is damaged or of another format.
         OSError
         """
-        # Imported here, because a list of weighings from the store needs no zipfile.
-        from ftdrive.runs.numbers import read_line
-
         found = before or cls(id=path.stem, path=str(path), refusals=dict.fromkeys(REFUSALS, 0))
         size, weighings, refusals, last = found.size, found.weighings, {**found.refusals}, None
         with open_file(path) as file:

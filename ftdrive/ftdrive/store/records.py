@@ -10,7 +10,7 @@ from ftcalib.files import JSON
 from ftdrive.runs import at, number_at, numbers_at, run_folders, text_at, time_at
 from ftdrive.runs.calibration import EMULATED, marks_of
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay, is_weighings
+from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay
 
 # A list of results needs no numpy.
 if TYPE_CHECKING:
@@ -119,14 +119,6 @@ STORED: Final = (
 )
 
 
-def shows_bias(check: VerificationRecord) -> bool:
-    """Whether the change of the bias that a verification has estimated counts.
-
-    It passed, or found that the bias has changed: another change, or a hand on the tool, spoils the estimate.
-    """
-    return check.passed or check.change == "bias"
-
-
 def record_paths(folders: Iterable[Path]) -> list[Path]:
     """Return the files that become records, of runs or of the runs in folders, each once and by name.
 
@@ -155,7 +147,7 @@ def _read_record(path: Path) -> Record:
 
     Raises `BadCalibration` or `BadDataset` for a damaged file or another format, or `OSError`.
     """
-    if is_weighings(path):
+    if path.match(FILES):
         return WeighingDay.load(path)
     return VerificationRecord.load(path) if path.name.startswith("verification") else _result(path)
 

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.runs.weighings import REFUSALS, WeighingDay, is_weighings, sum_up
+from ftdrive.runs.weighings import FILES, REFUSALS, WeighingDay, sum_up
 from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
@@ -199,7 +199,7 @@ def _known(connection: Connection, paths: Sequence[Path]) -> set[str]:
     known = {
         path for table in database.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)
     }
-    growing = [path for path in paths if str(path) in known and is_weighings(path)]
+    growing = [path for path in paths if str(path) in known and path.match(FILES)]
     for start in range(0, len(growing), _MOST):
         sizes = {str(path): path.stat().st_size for path in growing[start : start + _MOST]}
         table = database.weighings

@@ -12,6 +12,7 @@ from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.calibration import with_sensor
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
+from ftdrive.store.trends import hour_changes, temperatures
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 # Searched beside the store, so that a run that is not indexed yet counts too.
@@ -92,8 +93,6 @@ def _of_sensor(
     store: Store, one: StoredResult, results: Iterable[StoredResult]
 ) -> tuple[BiasTemperature | None, Array | None]:
     """Return what other runs of the sensor show: how its bias follows a known temperature, and moves in an hour."""
-    from ftdrive.store.trends import hour_changes, temperatures
-
     same = (one.sensor_serial, one.arm_serial, one.mount)
     alike = [each for each in results if (each.sensor_serial, each.arm_serial, each.mount) == same]
     try:

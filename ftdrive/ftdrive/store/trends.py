@@ -12,7 +12,7 @@ from ftcalib.after.series import FEWEST_ESTIMATES, BiasTemperature, Trend, bias_
 from ftcalib.model import BIASES, PARAMETER_NAMES, Array
 from ftcalib.rounding import with_sigma
 from ftdrive.runs.verification import VerificationRecord
-from ftdrive.store.records import StoredResult, shows_bias
+from ftdrive.store.records import StoredResult
 
 # Largest p-value of a trend that counts.
 SIGNIFICANT: Final = 0.01
@@ -171,7 +171,7 @@ def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationR
             time = datetime.fromisoformat(one.created_utc)
             found.append(_Run(time, one.tool, one.temperature_C, one.parameters.bias, sigma))
     for check in verifications:
-        if check.calibration_id not in made or not shows_bias(check):
+        if check.calibration_id not in made or not check.shows_bias:
             continue
         found, calibration = made[check.calibration_id]
         change, sigma_6 = check.bias_change, check.bias_change_sigma
