@@ -151,24 +151,25 @@ def turn_columns(load: Load, motion: Motion) -> Array:
 
 
 def lever_columns(load: Load, motion: Motion) -> Array:
-    """Derivative (n, 6, 3) of the wrench by the place of the centre of mass, in sensor axes, where only forces see it.
+    """Derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
 
-    Cross-talk moves the centre that torques show. That of the forces stays in its place.
+    Antisymmetric cross-talk shifts the centre of mass that the torques of the weight show, and not this one.
     """
     static = load.static
     dU = -load.mass_kg * static.R_flange_sensor.T @ motion.Omega_rad2_s2 @ static.R_flange_sensor
     return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-# Share of the variance below which a function is left out, and orientations that the functions rest on.
+# Share of the variance below which a component is left out, and most orientations of the kernel matrix.
 _NEGLIGIBLE, _RESTING_ON = 1e-3, 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothFunctions:
-    """Functions of the orientation whose sum, with independent weights of unit variance, is smooth.
+    """Principal components of a Gaussian process on the orientations of a recording, centred there.
 
-    They are the principal ones of a Gaussian process on the orientations of a recording, less their mean there.
+    A sum with independent coefficients of unit variance is a smooth function of the orientation, with the correlation
+    of `alike`. At other orientations it is extended by the kernel (Nyström).
     """
 
     R_base_flange: Array
@@ -180,7 +181,7 @@ class SmoothFunctions:
 
     @classmethod
     def of(cls, R_base_flange: Array) -> Self:
-        """Choose for the orientations (n, 3, 3) of a recording."""
+        """Compute the components for the orientations (n, 3, 3) of a recording."""
         at = R_base_flange[:: -(-len(R_base_flange) // _RESTING_ON)]
         correlated = alike(at, at)
         centred = correlated - correlated.mean(axis=0)
@@ -192,7 +193,7 @@ class SmoothFunctions:
         return int(self.weights.shape[1])
 
     def __call__(self, R_base_flange: Array) -> Array:
-        """Return their values (n, k)."""
+        """Return the values (n, k) of the components."""
         return np.asarray((alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
 
 
@@ -239,17 +240,17 @@ def _vee(M: Array) -> Array:
     return np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
 
 
-# Noise of the rows, from their residuals: by state of motion, correlated between channels and in time.
+# Noise of the rows, from their residuals: scaled by state of motion, autoregressive, correlated between channels.
 
 REST_RAD_S = 0.02
 # Classes of speed, beside rest.
 CLASSES = 3
-# Rows that show the noise of a state; fewer count with the next faster one.
+# Fewest rows of a state of motion: with fewer it joins the next faster state.
 FEWEST = 40
-# Order of the autoregression, in rows.
+# Largest order of the autoregression.
 ORDER = 6
 _ROWS_PER_ORDER = 25
-# Largest partial correlation: a larger one would predict a row from the one before alone.
+# Upper bound of a partial autocorrelation, which keeps the filter stable.
 _MOST = 0.98
 
 
@@ -274,14 +275,19 @@ def runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowNoise:
-    """A model of the noise that makes rows independent and of unit variance."""
+    """Autoregressive model of the noise, whose filter makes rows independent and of unit variance.
+
+    With z_t the row divided by the scale of its state, for each channel, and a_k of the order of least BIC,
+
+        e_t = root (z_t - sum_k a_k z_(t-k)) / sigma_a
+    """
 
     scale: Array
     """(states, 6) standard deviation of a row."""
     filters: Array
-    """(order + 1, 6, order + 1) by rows before in the run, channel, and lag: predictors divided by their error."""
+    """(order + 1, 6, order + 1) by rows before in the run, channel, and lag: (1, -a_1, …) / sigma_a."""
     root: Array
-    """(6, 6) inverse root of the correlation between channels of what they leave."""
+    """(6, 6) inverse root of the correlation between the channels of the innovations."""
 
     @classmethod
     def of(
@@ -300,14 +306,14 @@ class RowNoise:
         ----------
         residuals : array, shape (n, 6)
         absorbed : array, shape (n, 6, k)
-            A root of the covariance of what the fit predicts: so much noise it has taken from the residuals.
+            Root of the covariance of the prediction, by which the fit has lowered the variance of the residuals.
         state, place : array, shape (n,)
             As `states` and `runs` return them.
         bursts : bool
-            Whether noise that seems weaker at the frequencies of the motion than above them counts as white: gears
-            shake the tool quickly where a joint reverses, but unequal weights let that reach low frequencies.
+            Whether noise whose spectrum rises with the frequency counts as white: gears shake the tool quickly where a
+            joint reverses, and unequal weights of the rows carry that to low frequencies.
         order : int
-            Largest of the autoregression.
+            Largest order of the autoregression.
         """
         X = np.concatenate([residuals[:, :, None], absorbed], axis=2)
         common = np.sqrt(np.mean(np.sum(X**2, axis=2), axis=0)) + 1e-12
@@ -323,10 +329,7 @@ class RowNoise:
         return cls(scale, noise.filters, np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(6))))
 
     def whiten(self, X: Array, state: NDArray[np.intp], place: NDArray[np.intp]) -> Array:
-        """Return values (n, 6, k) of rows as independent ones of unit variance.
-
-        A row is predicted from the rows before it in its run, as many as the order, fewer at the beginning.
-        """
+        """Return the innovations of values (n, 6, k) of rows; at the beginning of a run the order is lower."""
         X = X / self.scale[state][:, :, None]
         order = self.filters.shape[0] - 1
         filters = self.filters[np.minimum(place, order)]
@@ -337,7 +340,7 @@ class RowNoise:
 
 
 def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool, order: int = ORDER) -> Array:
-    """Predictors (order + 1, order + 1) of a channel by Levinson's recursion, of the order of least BIC."""
+    """Prediction error filters (order + 1, order + 1) of a channel by Levinson's recursion; the order has least BIC."""
     most, size = min(order, len(unit) // _ROWS_PER_ORDER), len(unit)
     lags = np.empty(most + 1)
     for lag in range(most + 1):
@@ -358,7 +361,7 @@ def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool, order: int =
 
 
 def _of_equal_order(channels: list[Array]) -> Array:
-    """Stack filters (order + 1, channels, order + 1): beyond its order a channel keeps its last one."""
+    """Stack filters (order + 1, channels, order + 1): beyond its order a channel keeps its last filter."""
     size = max(len(one) for one in channels)
     padded = [np.pad(one, ((0, size - len(one)), (0, size - len(one))), mode="constant") for one in channels]
     for one, wide in zip(channels, padded, strict=True):
