@@ -263,3 +263,26 @@ def inertial_wrench(
     torque_Nm = -mass_kg * np.cross(p_sensor_com_m, motion.linear_acceleration_m_s2)
     torque_Nm -= alpha @ I_origin + np.cross(omega, omega @ I_origin)
     return np.concatenate([force_N, torque_Nm], axis=1)
+
+
+class MovedLoad:
+    """A load that the arm moves: its motion and inertial wrench, from poses, `reach` of them on each side."""
+
+    def __init__(self, parameters: Parameters, g_m_s2: float, p_flange_sensor_m: Array, reach: int) -> None:
+        self._mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
+        self._parameters, self._p_flange_sensor_m, self._reach = parameters, p_flange_sensor_m, reach
+
+    def motion(self, t_s: Array, R_base_flange: Array, p_base_flange_m: Array) -> SensorMotion:
+        """Return the motion at n poses, but for those with too few neighbours; an unknown position does not move."""
+        return motion_of_poses(
+            t_s,
+            R_base_flange,
+            np.nan_to_num(p_base_flange_m),
+            R_flange_sensor=self._parameters.R_flange_sensor,
+            p_flange_sensor_m=self._p_flange_sensor_m,
+            reach=self._reach,
+        )
+
+    def wrench(self, motion: SensorMotion, inertia_kg_m2: Array | None = None) -> Array:
+        """Return the wrench (m, 6) of a motion; without the inertia the mass counts as a point."""
+        return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d
 
 from ftcalib.after.state import Calibrated
-from ftcalib.compensation import SensorMotion, inertial_wrench, motion_of_poses
+from ftcalib.compensation import MovedLoad
 from ftcalib.model import Parameters, skew
 from ftdrive.stream.samples import Paired, StreamInfo
 from ftdrivers.interfaces import Array
@@ -114,29 +114,6 @@ class MotionTracker:
             change_flange_m = np.einsum("nij,in->nj", R_base_flange[felt], change_m[:, felt])
             wrench[felt] = change_flange_m @ self._felt_by_change.T
         return wrench
-
-
-class MovedLoad:
-    """A load that the arm moves: its motion and inertial wrench, from poses, `reach` of them on each side."""
-
-    def __init__(self, parameters: Parameters, g_m_s2: float, p_flange_sensor_m: Array, reach: int) -> None:
-        self._mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
-        self._parameters, self._p_flange_sensor_m, self._reach = parameters, p_flange_sensor_m, reach
-
-    def motion(self, t_s: Array, R_base_flange: Array, p_base_flange_m: Array) -> SensorMotion:
-        """Return the motion at n poses, but for those with too few neighbours; an unknown position does not move."""
-        return motion_of_poses(
-            t_s,
-            R_base_flange,
-            np.nan_to_num(p_base_flange_m),
-            R_flange_sensor=self._parameters.R_flange_sensor,
-            p_flange_sensor_m=self._p_flange_sensor_m,
-            reach=self._reach,
-        )
-
-    def wrench(self, motion: SensorMotion, inertia_kg_m2: Array | None = None) -> Array:
-        """Return the wrench (m, 6) of a motion; without the inertia the mass counts as a point."""
-        return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)
 
 
 class Neighbours:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib import CalibrationResult
-from ftcalib.compensation import Compensator
+from ftcalib.compensation import Compensator, MovedLoad
 from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.model import skew
 from ftdrive.stream.motion import (
@@ -17,7 +17,6 @@ from ftdrive.stream.motion import (
     READING_S,
     REST,
     STATES,
-    MovedLoad,
     samples_in_reading,
     wrench_by_acceleration,
 )

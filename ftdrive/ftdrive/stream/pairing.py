@@ -13,10 +13,10 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ftcalib import CalibrationResult
+from ftcalib.compensation import MovedLoad
 from ftcalib.errors import BadDataset
 from ftcalib.model import jacobian, skew
 from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
-from ftdrive.stream.motion import MovedLoad
 from ftdrive.stream.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
