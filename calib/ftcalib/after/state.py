@@ -83,23 +83,23 @@ class Update:
         object.__setattr__(self, "residuals", read_only(self.residuals))
 
 
-def with_bias_change(calibration: Calibrated, change: Array, sigma: Array, *, measured: bool = False) -> Update:
+def with_bias_change(calibration: Calibrated, change: Array, variance: Array, *, measured: bool = False) -> Update:
     """Return a calibration or an update of it whose bias has changed by so much.
 
     Parameters
     ----------
     calibration : CalibrationResult or Update
-    change, sigma : array, shape (6,)
-        N and N·m, sensor axes; one standard deviation.
+    change, variance : array, shape (6,)
+        N and N·m, sensor axes, and their squares.
     measured : bool
-        Whether sigma is that of the new bias itself, and not of the change alone.
+        Whether the variance is that of the new bias itself, and not of the change alone.
     """
 
     def changed(covariance: Array) -> Array:
         covariance = np.array(covariance)
         if measured:
             covariance[BIASES], covariance[:, BIASES] = 0.0, 0.0
-        covariance[BIASES, BIASES] += sigma**2
+        covariance[BIASES, BIASES] += variance
         return covariance
 
     p, response = calibration.parameters, calibration.response

@@ -28,7 +28,7 @@ from scipy.linalg import block_diag, solve_triangular
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import fdtrc as f_sf
 
-from ftcalib.after.state import BLOCKS, Update, reestimate
+from ftcalib.after.state import BLOCKS, Update, reestimate, with_bias_change
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import CalibrationDataset, finite, pooled_covariance
 from ftcalib.errors import BadDataset, NotObservable
@@ -187,13 +187,14 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
         parts.append((part.reshape(6 * n, 6 * n), freedom))
     total = measured.reshape(6 * n, 6 * n) + sum((part for part, _ in parts), np.zeros((6 * n, 6 * n)))
     noise = total - np.kron(np.ones((n, n)), np.diag(gap))
+    drifted = with_bias_change(calibration, np.zeros(6), gap)
     if not (parts or calibration.components) and calibration.noise_source == "measured":
         factor = max(calibration.chi2 / calibration.dof, _LEAST_FACTOR)
-        return Expected(_add_drift(calibration, gap), noise, calibration.dof, factor)
+        return Expected(drifted, noise, calibration.dof, factor)
     # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
     inverse = np.linalg.inv(total)
     spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
-    return Expected(_add_drift(calibration, gap), noise, 1 / spread if spread else np.inf)
+    return Expected(drifted, noise, 1 / spread if spread else np.inf)
 
 
 def expected_with_smooth_errors(
@@ -266,15 +267,6 @@ def _components(calibration: CalibrationResult) -> Mapping[str, float]:
     if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
         found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
     return found
-
-
-def _add_drift(calibration: CalibrationResult, gap: Array) -> Update:
-    """Add variances (6,) of the bias to the covariance of a calibration."""
-    covariance = calibration.covariance.copy()
-    joint = joint_covariance(calibration.covariance, calibration.response).copy()
-    covariance[BIASES, BIASES] += gap
-    joint[BIASES, BIASES] += gap
-    return Update(calibration.parameters, covariance, 0.0, 0, response=with_covariance(calibration.response, joint))
 
 
 def _smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:

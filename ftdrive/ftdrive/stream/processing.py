@@ -182,7 +182,7 @@ class ToolMonitor:
             if any(event.kind == "load-step" for event in events):
                 self.hold(None if tracked.part_kg < NOTHING_KG else weight_of(tracked, self._calibration))
             if (tracked.sigma < _APPLIED).all():
-                update = with_bias_change(self._calibration, tracked.bias, tracked.sigma, measured=True)
+                update = with_bias_change(self._calibration, tracked.bias, tracked.sigma**2, measured=True)
                 self.following.filter.subtract(self.tool.follow(update, self._newest_ns))
 
     @property

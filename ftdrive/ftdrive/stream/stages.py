@@ -347,7 +347,8 @@ class FreeTool:
         self._references = references
         empty, _, then_C = references[-1]
         if self._temperature is not None:
-            empty = with_bias_change(empty, *self._temperature.change(then_C, self._now_C))
+            change, sigma = self._temperature.change(then_C, self._now_C)
+            empty = with_bias_change(empty, change, sigma**2)
         before, self._bias_change = self._bias_change, empty.parameters.bias - self._calibration.parameters.bias
         self.empty, self.expected = empty, self._with_part(empty)
         return np.asarray(self._bias_change - before)

@@ -123,7 +123,7 @@ def test_only_what_predicts_is_applied_and_never_beyond_the_runs() -> None:
 
 def test_a_changed_bias_widens_its_sigma_alone() -> None:
     before, step = calibrated(), np.arange(1.0, 7.0)
-    after = with_bias_change(before, step, 0.1 * step)
+    after = with_bias_change(before, step, (0.1 * step) ** 2)
     wrench = np.concatenate([after.parameters.force_bias_N, after.parameters.torque_bias_Nm])
     assert wrench == pytest.approx(np.concatenate([before.force_bias_N, before.torque_bias_Nm]) + step)
     wider = np.diag(after.covariance - before.covariance)
@@ -135,7 +135,9 @@ def test_a_measured_bias_has_its_own_sigma_also_beside_a_gain() -> None:
     joint = np.eye(26) + 0.1
     before = replace(calibrated(), covariance=joint[:15, :15], response=Response(np.full(11, 0.01), joint))
     step = np.arange(1.0, 7.0)
-    added, measured = (with_bias_change(before, step, 0.1 * step, measured=measured) for measured in (False, True))
+    added, measured = (
+        with_bias_change(before, step, (0.1 * step) ** 2, measured=measured) for measured in (False, True)
+    )
     for after in (added, measured):
         assert after.response is not None
         np.testing.assert_array_equal(after.response.covariance[:15, :15], after.covariance)
