@@ -20,7 +20,6 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, NotObservable, solve
-from ftcalib.judge.cross_validation import standardize
 from ftcalib.likelihood import fit as likelihood
 from ftcalib.model import UP_IN_BASE, Array, SPECIAL_R_flange_base, predict
 from ftcalib.published.methods import published
@@ -77,7 +76,7 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
     R_test = Rotation.random(25, rng=rng).as_matrix()
     free = sim.readings(truth, R_test) + s * rng.normal(size=(25, 6))
     total = np.diag(s**2) + predicted_covariance(fit.parameters, C, None, R_test)
-    distance = (standardize(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
+    distance = (likelihood.standardize(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
     record: dict[str, object] = {
         "square": sim.blocks(e**2),
         "bound": sim.blocks(np.diag(sim.bound(truth, R, np.diag(s**2)))),

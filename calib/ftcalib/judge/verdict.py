@@ -1,4 +1,7 @@
-"""All findings about a fit, which give its verdict: how well it predicts, and whether it is plausible."""
+"""All findings about estimates, which give their verdict: how well they predict, and whether they are plausible.
+
+Cross-validation interpolates a drift, but a calibration is used after its tour: `drift_ahead` extrapolates it.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +17,15 @@ from ftcalib.data.dwell_mean import RESOLUTION
 from ftcalib.files import JSON
 from ftcalib.findings import Finding, Severity, Verdict, folded, ordered, verdict_of
 from ftcalib.judge import described_cell, units
-from ftcalib.judge.cross_validation import DriftAhead, drift_ahead, standardize
 from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import COLLAPSE, ROUNDING, broken_channels, constant_weight, faults, other_poses, written_step
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, RECOMMENDED_POSES
 from ftcalib.judge.session_change import CHANGES, cable_of
 from ftcalib.known import NOTHING, Known, Setup
-from ftcalib.likelihood.fit import Estimate, Fit
+from ftcalib.likelihood.fit import Estimate, Fit, standardize
 from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
 from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
+from ftcalib.likelihood.variance_components import FORCE, TORQUE, component
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array
 from ftcalib.sensor_matrix import Response, expected_error
 
@@ -50,7 +53,49 @@ ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
 # Probability of a false reason.
 SURE = 1e-3
 
+# From pose to pose, if their times are not known.
+USUAL_INTERVAL_S = 10.0
+# From the last pose to the next use.
+NEXT_USE_S = 60.0
+HOUR = 3600.0 / NEXT_USE_S
+# A linear drift is mostly the beginning of a warm-up, of 10 to 30 min.
+WARM_UP = 1200.0 / NEXT_USE_S
+
 _RMS = "force_rms_N", "torque_rms_Nm"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DriftAhead:
+    """The bias at the next use, a minute after the last pose, less that of the result; zero without drift."""
+
+    growth_per_min: Array
+    """(6,) change in the next minute: its size if the bias is linear in time, its standard deviation if it walks."""
+    square: Array
+    """(6,) expected square at the next use."""
+    hour_square: Array
+    """(6,) the same an hour after the last pose."""
+
+
+def drift_ahead(found: Estimate, t_s: Array | None = None) -> DriftAhead:
+    """Extrapolate the drift that was found; without finite times `t_s` (n,) one pose every 10 s in their order."""
+    if found.drift is None or found.drift.course is None:
+        return DriftAhead(*np.zeros((3, 6)))
+    n = len(found.weights)
+    timed = t_s is not None and np.isfinite(t_s).all() and np.ptp(t_s) > 0
+    time = np.asarray(t_s if timed else USUAL_INTERVAL_S * np.arange(n), dtype=np.float64)
+    used = np.flatnonzero(found.weights > 0)
+    first, last = used[np.argmin(time[used])], used[np.argmax(time[used])]
+    intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
+    walk = np.zeros(6)
+    for channels in (FORCE, TORQUE, *([c] for c in range(6))):
+        # A random walk has no direction: only its variance grows until the next use.
+        walk[channels] += intervals * found.components.get(component("walk", channels).name, 0.0) ** 2
+    linear = np.where(walk > 0, 0.0, found.drift.change * NEXT_USE_S / (time[last] - time[first]))
+    # The change from the first pose to the last has the errors of both ends.
+    known = found.drift.sigma**2 / 2
+    square = linear**2 + walk + known
+    hour = (WARM_UP * (1 - np.exp(-HOUR / WARM_UP)) * linear) ** 2 + HOUR * walk + known
+    return DriftAhead(np.sqrt(walk + linear**2), square, hour)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,7 +15,7 @@ from ftcalib.known import USUAL_GAIN, Constraints, Known
 from ftcalib.likelihood.descent import FARTHEST, MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
 from ftcalib.likelihood.session import Drift, Session
-from ftcalib.likelihood.session_noise import Noise, summed_products
+from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.structure import hidden_columns, hidden_in_any_poses, structure_columns
 from ftcalib.likelihood.variance_components import (
@@ -238,6 +238,24 @@ class Fit(Estimate):
             far = np.maximum(squared_length(self.left_out_residuals[rejected], S), FARTHEST)
             value += float(np.linalg.slogdet(S)[1].sum() + np.sum(FARTHEST + 6 * np.log(far / FARTHEST)))
         return value
+
+
+def standardize(residuals: Array, covariance: Array) -> Array:
+    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    unit = np.empty_like(residuals)
+    for first in range(0, len(residuals), CHUNK):
+        part = slice(first, first + CHUNK)
+        unit[part] = np.linalg.solve(_root(covariance[part]), residuals[part, :, None])[..., 0]
+    return unit
+
+
+def _root(covariance: Array) -> Array:
+    """Give roots A with A A' = covariance (n, 6, 6), which rounding may have made indefinite."""
+    try:
+        return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
+    except np.linalg.LinAlgError:
+        value, vector = np.linalg.eigh(covariance)
+        return np.asarray(vector * np.sqrt(np.maximum(value, 1e-12 * value[:, -1:]))[:, None])
 
 
 def fit(

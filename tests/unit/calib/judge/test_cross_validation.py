@@ -6,8 +6,8 @@ from typing import cast
 import numpy as np
 import pytest
 
-from ftcalib.judge.cross_validation import drift_ahead, standardize
-from ftcalib.likelihood.fit import Estimate
+from ftcalib.judge.verdict import drift_ahead
+from ftcalib.likelihood.fit import Estimate, standardize
 from ftcalib.model import Array, DriftResult
 
 

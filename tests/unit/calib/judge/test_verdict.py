@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, Parameters, Setup, solve
-from ftcalib.judge.cross_validation import DriftAhead, standardize
 from ftcalib.judge.faults import faults
 from ftcalib.judge.verdict import (
     Case,
+    DriftAhead,
     Quality,
     _drift,
     _errors,
@@ -31,7 +31,7 @@ from ftcalib.judge.verdict import (
     out_of_line,
     strong_correlations,
 )
-from ftcalib.likelihood.fit import Estimate
+from ftcalib.likelihood.fit import Estimate, standardize
 from ftcalib.model import Array, DriftResult, SPECIAL_R_flange_base, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, Response, expected_error, predicted_covariance
 from ftcalib.solver import _judge
