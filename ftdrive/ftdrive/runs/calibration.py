@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 from importlib.metadata import version
+from math import isfinite
 from pathlib import Path
 from shlex import quote
 from typing import TYPE_CHECKING, Any, Final
@@ -22,7 +23,7 @@ from ftcalib.files import JSON, newest_path
 from ftdrive import __version__
 from ftdrive.cell.config import without_password
 from ftdrive.errors import NotAccepted
-from ftdrive.runs import at, is_run
+from ftdrive.runs import is_run
 
 # A list of results needs no numpy.
 if TYPE_CHECKING:
@@ -60,6 +61,41 @@ def versions() -> dict[str, str]:
     """Return the versions of the software behind a result."""
     found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
     return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
+
+
+def at(document: Any, *keys: str) -> Any:
+    """Return the value below these keys; None if there is no such place."""
+    for key in keys:
+        document = document.get(key) if isinstance(document, Mapping) else None
+    return document
+
+
+def text_at(document: Any, *keys: str) -> str | None:
+    """Return a text that every database takes: without zero characters and halves of a surrogate pair."""
+    found = at(document, *keys)
+    return found.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(found, str) and found else None
+
+
+def number_at(document: Any, *keys: str) -> float | None:
+    """Return a finite number; None for anything else."""
+    found = at(document, *keys)
+    usable = isinstance(found, int | float) and not isinstance(found, bool) and isfinite(found)
+    return float(found) if usable else None
+
+
+def numbers_at(document: Any, n: int, *keys: str) -> list[float] | None:
+    """Return a list of n finite numbers; None for anything else."""
+    found = at(document, *keys)
+    known = [one for one in map(number_at, found) if one is not None] if isinstance(found, list) else []
+    return known if len(known) == n == len(found or ()) else None
+
+
+def time_at(document: Any, *keys: str) -> str | None:
+    """Return a time as UTC in ISO 8601 with microseconds, so that texts sort as times; None for anything else."""
+    try:
+        return datetime.fromisoformat(at(document, *keys)).astimezone(UTC).isoformat(timespec="microseconds")
+    except (TypeError, ValueError):
+        return None
 
 
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "CalibrationResult":

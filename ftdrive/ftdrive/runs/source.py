@@ -26,8 +26,7 @@ from ftdrive.cell.units import numbers
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import down_of
-from ftdrive.runs import at
-from ftdrive.runs.calibration import made_now, read_calibration, versions
+from ftdrive.runs.calibration import at, made_now, read_calibration, versions
 from ftdrive.runs.load import Load
 from ftdrive.runs.motion import files_of, means_of
 from ftdrive.runs.run import Run

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, Self
 import ftcalib
 from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.files import JSON, check_format, object_of, read_file, write_object
-from ftdrive.runs import at, number_at, numbers_at, text_at, time_at
-from ftdrive.runs.calibration import made_now, marks_of
+from ftdrive.runs.calibration import at, made_now, marks_of, number_at, numbers_at, text_at, time_at
 
 # The record alone needs no numpy: a list of results starts without it.
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from typing import Final, Self
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file, read_lines
-from ftdrive.runs import number_at, text_at, time_at
+from ftdrive.runs.calibration import number_at, text_at, time_at
 from ftdrive.runs.numbers import append_lines, read_line
 
 FORMAT: Final = "ftdrive.weighings/1"

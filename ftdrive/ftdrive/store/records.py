@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from ftcalib.errors import DataError
 from ftcalib.files import JSON
-from ftdrive.runs import at, number_at, numbers_at, run_folders, text_at, time_at
-from ftdrive.runs.calibration import EMULATED, marks_of
+from ftdrive.runs import run_folders
+from ftdrive.runs.calibration import EMULATED, at, marks_of, number_at, numbers_at, text_at, time_at
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay
 
