@@ -68,7 +68,9 @@ def traced(arguments: Sequence[str], *, to_the_first_move: bool) -> None:
             signal.raise_signal(signal.SIGINT)
 
     from ftdrive.cli import run
+    from ftdrive.terminal import console
 
+    vars(console)["_PATIENCE_S"] = 3600.0  # a traced command is slow: it would print that it works
     threading.setprofile(profile)
     sys.setprofile(profile)
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere):

@@ -77,7 +77,8 @@ def test_what_was_recognised_is_printed_and_kept(solved: Solved) -> None:
         t(POSES, "time_ms", 1e-3) | wrench(POSES) | columns("A B C", POSES.R.as_euler("ZYX", degrees=True))
     )
     assert code == 0
-    assert err == "poses.csv: columns of KUKA; angles in degrees"
+    # a busy computer prints that it solves, too
+    assert err.splitlines()[0] == "poses.csv: columns of KUKA; angles in degrees"
     assert json.loads(out)["provenance"]["table"] == "columns of KUKA; angles in degrees"
     assert "table" not in json.loads(solved(PLAIN)[1])["provenance"]
 
