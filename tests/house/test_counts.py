@@ -16,17 +16,17 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 70706,
-    "files": 310,
-    "dataclasses": 236,
-    "public functions and classes": 1430,
-    "import statements inside functions": 113,
-    "test lines": 81533,
+    "product lines": 70587,
+    "files": 308,
+    "dataclasses": 231,
+    "public functions and classes": 1428,
+    "import statements inside functions": 108,
+    "test lines": 81508,
 }
 ROOMS = {
     "a: calibrate, to the first move": 70,
     "b: live --replay": 30,
-    "c: solve of poses": 37,
+    "c: solve of poses": 36,
     "d: solve of a recording in motion": 37,
 }
 """Modules that a command walks through: the definition is that of `rooms.py`."""

@@ -14,8 +14,15 @@ from ftcalib.files import JSON
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import predicted_covariance
 from ftdrive.stream.free_tool import Following
-from ftdrive.stream.motion import GYRATION_M, READING_S, REST, samples_in_reading, wrench_by_acceleration
-from ftdrive.stream.noise import NoiseEstimator, SensorNoise
+from ftdrive.stream.noise import (
+    GYRATION_M,
+    READING_S,
+    REST,
+    NoiseEstimator,
+    SensorNoise,
+    samples_in_reading,
+    wrench_by_acceleration,
+)
 from ftdrive.stream.samples import Ns, Paired
 
 # The covariance of a calibration is evaluated again after so much turning.

@@ -36,8 +36,7 @@ from ftcalib.after.weighing import LEAST_SIGMAS, Weight, moment_as_read
 from ftcalib.files import JSON
 from ftcalib.model import Array, skew
 from ftcalib.rounding import with_sigma
-from ftdrive.stream.motion import GYRATION_M, REST, STATES
-from ftdrive.stream.noise import NoiseEstimator, Window, Windows
+from ftdrive.stream.noise import GYRATION_M, REST, STATES, NoiseEstimator, Window, Windows
 from ftdrive.stream.samples import Paired, StreamEvent, StreamInfo, Tracked
 
 # What a state has.

@@ -20,8 +20,7 @@ from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
 from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.stream.free_tool import NOTHING_KG, Following, weight_of
-from ftdrive.stream.motion import READING_S, REST, Neighbours, wrench_by_acceleration
-from ftdrive.stream.noise import NoiseEstimator, variance_at_next_use
+from ftdrive.stream.noise import READING_S, REST, NoiseEstimator, variance_at_next_use, wrench_by_acceleration
 from ftdrive.stream.samples import (
     Block,
     EventKind,
@@ -40,6 +39,7 @@ from ftdrive.stream.stages import (
     TARE_S,
     Frame,
     FreeTool,
+    Neighbours,
     Passing,
     Stage,
     stages_in_words,

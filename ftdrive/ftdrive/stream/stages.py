@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from ftcalib.after.series import BiasTemperature
 from ftcalib.after.state import Calibrated, Update, compare_with_prediction, tare, with_bias_change
 from ftcalib.after.weighing import Weight, holding
-from ftcalib.compensation import Compensator
+from ftcalib.compensation import Compensator, MovedLoad
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
 from ftdrive.errors import ConfigError
-from ftdrive.stream.motion import MotionTracker
+from ftdrive.stream.noise import REST, MotionTracker
 from ftdrive.stream.samples import FrameTransform, Paired, Stages, StreamInfo, WrenchFrame
 from ftdrivers.interfaces import Array
 
@@ -36,6 +36,8 @@ TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
 """A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
 
+# Poses of this spacing give the acceleration, over twice so long: longer ones lose the edges of a move, and are later.
+_KNOT_S, _REACH_S = 0.002, 0.015
 # Largest motion of the flange during a tare.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4
 
@@ -259,6 +261,79 @@ def stages_in_words(settings: Stages) -> str:
 
 
 # --------------------------------------------------------------------------------------------------- bias and gravity
+
+
+class Neighbours:
+    """Samples with the poses on both sides of them, which show the inertial wrench of the load.
+
+    While that is subtracted, the newest samples wait for the poses after them.
+    """
+
+    def __init__(self, info: StreamInfo) -> None:
+        motion = info.calibration.motion
+        self._tensor = None if motion is None else motion.inertia_kg_m2
+        self._g_m_s2, self._p_flange_sensor_m = info.calibration.g_m_s2, info.p_flange_sensor_m
+        self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
+        knot_s = self._stride / info.sensor_rate_Hz
+        self._reach = max(2, round(max(_REACH_S, 2 / info.arm_rate_Hz) / knot_s))
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the samples before an interruption."""
+        self._buffer: Paired | None = None
+        self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
+        # Rows of the buffer that are processed.
+        self._done = 0
+
+    @property
+    def knows_tensor(self) -> bool:
+        """Whether the inertia of the tool was calibrated."""
+        return self._tensor is not None
+
+    def arrange(
+        self, rows: Paired, states: NDArray[np.int8], felt: Array, load: Calibrated, *, on: bool, last: bool
+    ) -> tuple[Paired, NDArray[np.int8], Array, Array | None]:
+        """Add samples with their motion; return those that are due, and the inertial wrench (n, 6) if it is wanted.
+
+        `last` is whether no more poses come, so that none waits for them.
+        """
+        if self._buffer is None and not (on and len(rows)):
+            return rows, states, felt, None
+        buffer = rows if self._buffer is None else Paired.concatenate([self._buffer, rows])
+        self._states, self._felt = np.concatenate([self._states, states]), np.concatenate([self._felt, felt])
+        end, inertial = len(buffer), None
+        neighbours = self._reach * self._stride
+        if on and np.isfinite(buffer.p_base_flange_m[-1]).all():
+            inertial, ready = self.wrench(buffer, load)
+            end = end if last else max(ready, self._done)
+            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # the poses after them
+            state = self._states[ahead]
+            # at rest nothing is subtracted, because that would amplify the noise of the joints
+            inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])
+        else:
+            state = self._states[self._done : end]
+        rows, felt = buffer.rows(slice(self._done, end)), self._felt[self._done : end]
+        # knots stay where they are
+        keep = max(0, end - neighbours - self._stride) // self._stride * self._stride
+        self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
+        self._states, self._felt = self._states[keep:], self._felt[keep:]
+        if not on:
+            self.restart()
+        return rows, state, felt, inertial
+
+    def wrench(self, rows: Paired, load: Calibrated) -> tuple[Array, int]:
+        """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
+        knots = np.arange(0, len(rows), self._stride)
+        t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
+        # a coarse clock repeats times
+        knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
+        if len(knots) < 2 * self._reach + 2:
+            return np.zeros((len(rows), 6)), 0
+        moved = MovedLoad(load.parameters, self._g_m_s2, self._p_flange_sensor_m, self._reach)
+        motion = moved.motion(t_s[knots], rows.R_base_flange[knots], rows.p_base_flange_m[knots])
+        at_knots = moved.wrench(motion, self._tensor)
+        wrench = np.stack([np.interp(t_s, motion.t_s, column) for column in at_knots.T], axis=1)
+        return wrench, int(knots[-1 - self._reach]) + 1
 
 
 class _Reference(NamedTuple):

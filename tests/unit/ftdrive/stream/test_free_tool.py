@@ -10,8 +10,7 @@ from scipy.stats import multivariate_normal
 
 from ftcalib.model import Array
 from ftdrive.stream.free_tool import ANY_BIAS, FreeToolFilter, _corrected, _less, _observed, _place, _State
-from ftdrive.stream.motion import REST
-from ftdrive.stream.noise import Window
+from ftdrive.stream.noise import REST, Window
 from ftdrive.stream.samples import StreamEvent, Tracked
 
 NOISE = np.repeat([0.08, 0.004], 3)

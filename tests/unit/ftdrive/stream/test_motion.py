@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ftcalib.model import Array
-from ftdrive.stream.motion import REST, STATES, MotionTracker
+from ftdrive.stream.noise import REST, STATES, MotionTracker
 from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, TRUTH
 
 RATE_HZ, MASS_KG = 1000.0, 1.5

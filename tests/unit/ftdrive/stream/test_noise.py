@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array
-from ftdrive.stream.motion import REST
-from ftdrive.stream.noise import NoiseEstimator, SensorNoise
+from ftdrive.stream.noise import REST, NoiseEstimator, SensorNoise
 
 RATE_HZ, SIZE = 1000.0, 20
 """A reading is 0.02 s."""

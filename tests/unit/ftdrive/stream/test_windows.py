@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from ftcalib.model import Array, skew
-from ftdrive.stream.motion import REST
-from ftdrive.stream.noise import SensorNoise, Window, Windows
+from ftdrive.stream.noise import REST, SensorNoise, Window, Windows
 from ftdrive.stream.samples import Paired
 from tests.unit.ftdrive.stream.simulated import (
     P_FLANGE_SENSOR_M,
