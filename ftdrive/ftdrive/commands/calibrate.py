@@ -1,13 +1,16 @@
 """`ftdrive calibrate`: a guided calibration."""
 
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from pathlib import Path
 from shlex import quote
-from typing import Any
+from typing import Any, Final
 
 import click
 from click.core import ParameterSource
 
+from ftcalib.published.methods import SPECIAL
 from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.commands.options import (
     ALL,
@@ -31,14 +34,16 @@ from ftdrive.commands.options import (
     view_options,
     write_json,
 )
-from ftdrive.runs.calibration import require_accepted
+from ftdrive.errors import ConfigError
+from ftdrive.runs.calibration import read_calibration, require_accepted
 from ftdrive.runs.load import Load
 from ftdrive.runs.pose_hints import hints
-from ftdrive.runs.run import Run
+from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome
-from ftdrive.session.options import SessionOptions, refuse_contradictions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.rehearsal import put_on
 from ftdrive.session.session import calibrate as guide
+from ftdrive.session.session import method_of_poses
 from ftdrive.store import index_run
 from ftdrive.terminal.console import beside, messages
 from ftdrive.terminal.report import print_result
@@ -46,6 +51,22 @@ from ftdrive.terminal.screen import open_operator
 from ftdrive.view.outcome import conclude_calibration, on_page
 from ftdrive.view.page import Page
 from ftdrive.view.session_page import conclude
+
+_LONGEST_SWEEP_S: Final = 120
+_MODES: Final[Sequence[Mode]] = ("step", "manual", "listen", "sweep", "passive")
+_POSES: Final = ("--quick", "--minimal", "--set")
+_EXCLUDE_ONE_ANOTHER: Final = (
+    tuple(f"--{mode}" for mode in _MODES),
+    (*_POSES, "--plan", "--resume", "--sweep", "--passive"),
+    ("--from", "--set"),
+    *(("--method", other) for other in ("--from", "--resume", "--sweep", "--passive")),
+    *(("--load", other) for other in (*_POSES, "--method", "--from", "--sweep", "--passive", "--resume")),
+    ("--at", "--gripped"),
+    ("--fast", "--sweep", "--passive"),
+    ("--from", "--resume", "--passive"),
+    *((f"--{hand}", plan) for hand in ("manual", "listen", "passive") for plan in (*_POSES, "--output", "--png")),
+    *(("--simulate", described) for described in ("--config", "--robot", "--tool")),
+)
 
 HEADINGS = {
     "The cell": "--config --robot --sensor --tool --control --simulate",
@@ -134,8 +155,8 @@ def calibrate(
     word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
     continues.
     """
-    _refuse_contradictions(click.get_current_context())
-    options = SessionOptions.of_calibration(chosen)
+    refuse_contradictions(_given(click.get_current_context()))
+    options, load = _options_of(**chosen)
     with ExitStack() as stack:
         page = stack.enter_context(view.page("ftdrive calibrate"))
         header = {} if options.resume is None else Run(options.resume).header_to_resume()
@@ -144,7 +165,7 @@ def calibrate(
         simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
             # A load swings as slowly as it does on a real arm.
-            swings = options.load is not None and not options.load.gripped
+            swings = load is not None and not load.gripped
             pace = REAL_PACE if options.mode in ("sweep", "passive") or swings else ()
             station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
             cell, origin = station.cell, station.description
@@ -156,15 +177,15 @@ def calibrate(
             cell = described.cell_to_resume(resumed, header, messages.print) if resumed else described.cell()
         options = replace(options, real=not simulate, description={**origin, **options.description})
         if simulate:
-            if load := Load.of_header(header) if options.resume else options.load:
-                put_on(station, load)
+            if on_tool := Load.of_header(header) if options.resume else load:
+                put_on(station, on_tool)
             station.start_mover(options.with_recorded_mode().mode, messages.print)
         with (
             declined_aborts(),
             open_operator(as_json=as_json) as operator,
             on_page(page, operator, options) as (shown, options),
         ):
-            outcome = guide(cell, shown, options)
+            outcome = guide(cell, shown, options, load)
         if outcome is None:
             beside(as_json).print(words := "Dry run: nothing has moved.")
             if page is not None:
@@ -196,9 +217,53 @@ def _report(outcome: Outcome, page: Page | None, *, simulate: bool, every: bool,
     conclude_calibration(page, result, commands)
 
 
-def _refuse_contradictions(context: click.Context) -> None:
+def _options_of(
+    *,
+    quick: bool,
+    minimal: bool,
+    method: str,
+    earlier: Path | None,
+    load: str | None,
+    at: str | None,
+    gripped: bool,
+    seconds: float | None,
+    **others: Any,
+) -> tuple[SessionOptions, Load | None]:
+    """Return what the options mean, and the load on the tool. Raises `ConfigError`."""
+    flags = {mode: others.pop(mode) for mode in _MODES}
+    mode: Mode = next((mode for mode, is_given in flags.items() if is_given), "auto")
+    poses = 6 if minimal or gripped else 24 if earlier is None else 4
+    options = SessionOptions(
+        poses=12 if quick else poses,
+        method=method_of_poses(method),
+        mode=mode,
+        seconds=seconds or (600.0 if flags["passive"] else 20.0),
+        description={} if earlier is None else {"earlier": read_calibration(earlier).to_dict()},
+        **others,
+    )
+    return options, None if load is None else Load.of(load, at, gripped=gripped)
+
+
+def _given(context: click.Context) -> dict[str, Any]:
+    """Return the options that were given, with their values by name."""
     names = {one.name: max(one.opts, key=len) for one in context.command.params}
     given = {names[name]: value for name, value in context.params.items() if value}
     if context.get_parameter_source("method") is ParameterSource.DEFAULT:
         del given["--method"]
-    refuse_contradictions(given)
+    return given
+
+
+def refuse_contradictions(given: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` for options that exclude one another; their values by name."""
+    if "--load" not in given and (place := [option for option in ("--at", "--gripped") if option in given]):
+        raise ConfigError(f"{place[0]} goes with --load MASS: give the mass of the load in kg")
+    for group in _EXCLUDE_ONE_ANOTHER:
+        both = [option for option in group if option in given]
+        if len(both) > 1:
+            raise ConfigError(f"{both[0]} and {both[1]} exclude one another: leave one of them out")
+    if "--manual" in given and (method := given.get("--method")) in SPECIAL:
+        words = f"--manual ends before the 24 orientations that {method} needs"
+        raise ConfigError(f"{words}: leave it out, or choose --method lrom")
+    seconds = given.get("--seconds")
+    if seconds is not None and (seconds > _LONGEST_SWEEP_S if "--sweep" in given else "--passive" not in given):
+        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")

@@ -21,8 +21,8 @@ from ftdrive.planning.planner import certifier_for
 from ftdrive.runs.calibration import require_accepted
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Outcome
-from ftdrive.session.options import method_of_poses
 from ftdrive.session.rehearsal import contact_errors, rehearse, rehearse_loads
+from ftdrive.session.session import method_of_poses
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import open_operator

@@ -29,7 +29,7 @@ from ftdrive.runs.calibration import read_calibration, require_accepted
 from ftdrive.runs.run import Mode
 from ftdrive.runs.verification import Verified
 from ftdrive.session.events import Question
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.rehearsal import rehearse
 from ftdrive.session.verifying import Answer, Verifying, save_wanted_update
 from ftdrive.store import index_run

@@ -10,6 +10,7 @@ from ftcalib.loads.model import KnownLoad
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
+from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
 
 # Of a mass without a sigma of its own: a kitchen scale.
 MASS_SHARE: Final = 1e-3
@@ -46,6 +47,18 @@ class Load(KnownLoad):
     def sampling(self, usual: Sampling) -> Sampling:
         """Return how a pose is sampled: a swing needs several periods, and time to decay."""
         return usual if self.gripped else replace(usual, average_s=_SWING_S, attempts=_SWING_ATTEMPTS)
+
+    @property
+    def questions(self) -> tuple[str, ...]:
+        """Safety questions about it, before the arm moves."""
+        if self.gripped:
+            what = f"Does the gripper hold {self.mass_kg:g} kg firmly"
+            return (f"{what}, and does [tool] cylinders_mm describe that load too?",)
+        return (
+            f"A weight of {self.mass_kg:g} kg at {self.name} moves with the arm in the tour: a hazard. Is nothing and "
+            f"no one below and beside it, its string at most {1e3 * STRING_M:.0f} mm long, the weight at most "
+            f"{2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm high?",
+        )
 
     def __str__(self) -> str:
         return f"a load of {self.mass_kg:g} kg {'in the gripper' if self.gripped else f'at {self.name}'}"

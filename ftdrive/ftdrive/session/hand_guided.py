@@ -90,7 +90,7 @@ def take_by_hand(session: Session) -> Run:
     if run is None:
         run = session.new_run()
         cell.journal.keep_in(run)
-    if (load := session.options.load) is not None:
+    if (load := task.load) is not None:
         cell.note(f"{load} is on the tool in every pose. Keep clear of it, with nothing below it.", warning=True)
     book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
     with cell.journal.reporting_early_end(run):

@@ -2,21 +2,24 @@
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Protocol
 
 import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.model import Array
+from ftcalib.result import Method
 from ftcalib.routine import PoseRecord
 from ftdrive.cell.config import CellConfig
-from ftdrive.errors import Declined, SupervisorGone
+from ftdrive.errors import ConfigError, Declined, SupervisorGone
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
-from ftdrive.runs.run import IN_MOTION, Run
+from ftdrive.runs.load import Load
+from ftdrive.runs.run import IN_MOTION, Mode, Run
 from ftdrive.session.events import (
     Asked,
     Compared,
@@ -31,13 +34,80 @@ from ftdrive.session.events import (
     Question,
     RunOpened,
 )
-from ftdrive.session.guards import Limits
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.guards import Guard, Limits, RangeGuard
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import ForceTorqueSensor, FtSamples, RobotArm
 
 log = logging.getLogger(__name__)
+
+_BY_HAND: Final = ("manual", "listen", "passive")
+
+
+@dataclass(frozen=True, slots=True)
+class SessionOptions:
+    """Options of a session, as the operator gave them."""
+
+    runs: Path
+    name: str = "calibrate"
+    poses: int = 24
+    sets: str | None = None
+    """Sets of Yu's Fig. 6 instead of that many poses, such as A+E."""
+    method: Method = "ml"
+    """Method that solves the poses of a calibration."""
+    mode: Mode = "auto"
+    """With `resume`, "auto" means the mode of that run."""
+    dry_run: bool = False
+    fast: bool = False
+    """Move at the plan's speeds if it has run to its end slowly before."""
+    plan: Path | None = None
+    output: Path | None = None
+    """Save the plan as a new file."""
+    png: Path | None = None
+    """Draw it."""
+    watch: Callable[[Certifier, RangeGuard], Guard] | None = None
+    """Called before any question; the guard that it returns looks on beside the others, and never trips."""
+    resume: Path | None = None
+    redo: tuple[int, ...] = ()
+    real: bool = True
+    """Whether a real arm moves. An emulated cell needs no typed word and no slow first run."""
+    questions: bool = True
+    yes: bool = False
+    """Answer the safety questions automatically, never the first motion."""
+    seconds: float = 20.0
+    """Duration of a sweep at the planned speed; the longest of a passive calibration."""
+    description: Mapping[str, Any] = field(default_factory=dict)
+    """Goes into run.json."""
+
+    @property
+    def by_hand(self) -> bool:
+        """Whether the operator or a program on the pendant moves the arm."""
+        return self.mode in _BY_HAND
+
+    def with_recorded_mode(self) -> "SessionOptions":
+        """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
+        begun = self.mode if self.resume is None else Run(self.resume).mode
+        if self.resume is not None and begun == "sweep":
+            raise ConfigError(f"{self.resume} is a sweep, which is not continued: start again with --sweep")
+        if self.mode != "auto" and (begun in _BY_HAND) != self.by_hand:
+            way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
+            raise ConfigError(f"{self.resume} was started {way} and only continues so: leave out --{self.mode}")
+        options = replace(self, mode=begun if self.mode == "auto" else self.mode)
+        if options.redo and options.resume is None:
+            raise ConfigError("--redo needs a run: name the run with --resume RUN")
+        if not options.by_hand:
+            return options
+        given = {
+            "--plan": options.plan,
+            "--fast": options.fast,
+            "--dry-run": options.dry_run,
+            "--redo": options.redo,
+            "--output": options.output,
+            "--png": options.png,
+        }
+        if wrong := [name for name, value in given.items() if value]:
+            raise ConfigError(f"with --{options.mode} ftdrive neither plans nor moves: leave out {' and '.join(wrong)}")
+        return options
 
 
 class Journal:
@@ -211,6 +281,10 @@ class Task(Protocol):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What the operator should know before a pose is taken."""
+
+    @property
+    def load(self) -> Load | None:
+        """A weighed load on the tool; `cell` counts it as part of the tool."""
 
     @property
     def goal(self) -> str:

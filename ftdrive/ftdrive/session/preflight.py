@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from ftcalib.data.dwell_mean import LEAST_SAMPLES, noise_level
 from ftcalib.judge import described_cell
 from ftcalib.model import Array
 from ftdrive.cell.config import CellConfig
@@ -25,10 +26,9 @@ from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import WRIST_6_RAD
-from ftdrive.runs.load import Load
 from ftdrive.session.events import Checked
 from ftdrive.session.guards import Limits, ModelGuard, Tripped
-from ftdrive.session.open_session import OpenCell
+from ftdrive.session.open_session import OpenCell, Task
 from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 
@@ -56,8 +56,12 @@ class Before:
     """`LISTEN_S` of the sensor at rest."""
     resumed: bool
     """Whether a part of the plan has run before."""
-    load: Load | None = None
-    """A weighed load that the tool carries in the tour; `config` counts it as part of the tool."""
+    task: Task
+
+    def quiet_std(self, average_s: float) -> Array:
+        """Return the standard deviation (6,) of the samples of the resting sensor, as in an average of this length."""
+        share = min(1.0, average_s / LISTEN_S)
+        return noise_level(self.quiet.wrench, max(LEAST_SAMPLES, int(len(self.quiet) * share)))
 
     @property
     def sensor_range(self) -> Array | None:
@@ -106,10 +110,10 @@ def _check_model(before: Before) -> Check:
 def check_payload(before: Before) -> Check:
     """Check the payload that is set in the controller; with a load it is the total, which the arm must carry."""
     status, tool, sensor_kg = before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg
-    check = of_arm.check_payload(status, tool, sensor_kg)
-    if before.load is None:
+    check, load = of_arm.check_payload(status, tool, sensor_kg), before.task.load
+    if load is None:
         return check
-    least_kg = (tool.mass_kg or before.load.mass_kg) + (sensor_kg or 0.0)
+    least_kg = (tool.mass_kg or load.mass_kg) + (sensor_kg or 0.0)
     rated_kg = RATED_KG.get(before.certifier.arm.name)
     if rated_kg is not None and least_kg > rated_kg:
         found = f"sensor, tool and load are {least_kg:.2f} kg or more, the arm carries {rated_kg:g} kg"
@@ -118,7 +122,7 @@ def check_payload(before: Before) -> Check:
     if check.state == "failed" or too_little:
         total = f"{least_kg:.2f} kg" if tool.mass_kg else f"the mass of sensor, tool and load, above {least_kg:.2f} kg"
         fix = f"set the payload to {total} and its centre at the pendant before the load hangs"
-        return Check(check.name, "failed", f"{check.found}, for {before.load}", fix)
+        return Check(check.name, "failed", f"{check.found}, for {load}", fix)
     return check
 
 

@@ -18,7 +18,7 @@ from ftdrive.planning.geometry.arm_model import STRING_M
 from ftdrive.runs.load import Load
 from ftdrive.runs.source import Outcome
 from ftdrive.session.events import Event, Key, Operator, Question
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import calibrate
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, cast, get_args
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from ftcalib import CalibrationResult
 from ftcalib.model import Array
 from ftcalib.poses.information import predicted_sigma
 from ftcalib.published.methods import SPECIAL
+from ftcalib.result import Method
 from ftcalib.rounding import to_place_of
 from ftdrive.cell.config import CellConfig, SensorConfig
 from ftdrive.cell.devices import build_arm, build_sensor
@@ -19,21 +20,20 @@ from ftdrive.errors import ConfigError, Declined, PlanRefused
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.planning.plan import Plan
-from ftdrive.planning.planner import NUMBERS, guess_of, plan_for, sweep_for
+from ftdrive.planning.planner import NUMBERS, guess_of, plan_for
 from ftdrive.planning.search.nodes import from_usual_wrist
 from ftdrive.runs.load import Load
 from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome, solve_and_save
 from ftdrive.session import preflight
-from ftdrive.session.along_plan import take_along_plan
 from ftdrive.session.events import Operator, State, StateChanged, rms_sigma
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.live_fit import RunningFit
-from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, Task
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, SessionOptions, Task
 from ftdrive.session.passive import take_passively
-from ftdrive.session.sweep import on_script_path
+from ftdrive.session.sweep import on_script_path, take_sweep
+from ftdrive.session.tour import take_tour
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
@@ -103,12 +103,11 @@ class Calibrating:
     warnings: ClassVar[tuple[str, ...]] = ()
     cell: CellConfig
     options: SessionOptions
+    load: Load | None = None
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a sweep or a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
+        """Return a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
         options = self.options
-        if options.mode == "sweep":
-            return sweep_for(self.cell, certifier, q_rad, options.seconds)
         # From a tour of one hook, the wrist has no approach to another turn of itself.
         q_rad = q_rad if certifier.arm.hung else from_usual_wrist(certifier, q_rad)
         plan = plan_for(self.cell, certifier, q_rad, poses, sets=options.sets)
@@ -128,11 +127,11 @@ class Calibrating:
     def judge(self, *, by_hand: bool) -> Judge:
         """Return the running fit."""
         down_base = down_of(self.cell.workcell.mounting)
-        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.options.load)
+        return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.load)
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
         """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
-        if plan.kind == "tool" or self.options.load is not None:
+        if plan.kind == "tool" or self.load is not None:
             return ""
         force_N, torque_Nm = rms_sigma(sigma)
         guess = replace(guess_of(certifier, self.cell), sigma_force_N=force_N, sigma_torque_Nm=torque_Nm)
@@ -146,25 +145,24 @@ class Calibrating:
         )
 
 
-def loaded(cell: CellConfig, load: Load) -> CellConfig:
-    """Return the cell with the load as part of its tool, where the mass of the tool is configured."""
-    if cell.tool.mass_kg is None:
-        return cell
-    return replace(cell, tool=replace(cell.tool, mass_kg=cell.tool.mass_kg + load.mass_kg))
+def calibrate(
+    cell: CellConfig, operator: Operator, options: SessionOptions, load: Load | None = None
+) -> Outcome | None:
+    """Guide the operator through a calibration, with a load on the tool; None after a dry run. Raises as `take_poses`.
 
-
-def calibrate(cell: CellConfig, operator: Operator, options: SessionOptions) -> Outcome | None:
-    """Guide the operator through a calibration; None after a dry run. Raises as `take_poses`."""
+    A resumed run has the load that it was begun with.
+    """
     if options.resume is not None:
-        options = replace(options, load=Load.of_header(Run(options.resume).header()))
-    if (load := options.load) is not None:
+        load = Load.of_header(Run(options.resume).header())
+    if load is not None:
         # The run keeps the cell as it is configured; checks and guards count the load as part of the tool.
         options = replace(
             options, description={**options.description, "config": cell.to_dict(), "load": load.to_dict()}
         )
-        cell = loaded(cell, load)
+        if cell.tool.mass_kg is not None:
+            cell = replace(cell, tool=replace(cell.tool, mass_kg=cell.tool.mass_kg + load.mass_kg))
     cell = on_script_path(cell) if options.mode == "sweep" else cell
-    run = take_poses(Calibrating(cell, options), operator, options)
+    run = take_poses(Calibrating(cell, options, load), operator, options)
     return None if run is None else solve_and_save(run)
 
 
@@ -242,9 +240,9 @@ def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
 def _take(session: Session) -> Run | None:
     """Take the poses or the recording of a session in its mode; None after a dry run."""
     by_mode: Mapping[Mode, Callable[[Session], Run | None]] = {
-        "auto": take_along_plan,
-        "step": take_along_plan,
-        "sweep": take_along_plan,
+        "auto": take_tour,
+        "step": take_tour,
+        "sweep": take_sweep,
         "manual": take_by_hand,
         "listen": take_by_hand,
         "passive": take_passively,
@@ -263,3 +261,15 @@ def description_of(task: Task, options: SessionOptions, connected: Mapping[str, 
         **({"station": {}} if task.cell.is_emulated else {}),  # of another process: nothing more is known
         **options.description,
     }
+
+
+def method_of_poses(name: str) -> Method:
+    """Return a method by its name, if poses suffice for it. Raises `ConfigError`."""
+    if name not in get_args(Method):
+        raise ConfigError(f"there is no method '{name}': choose one of {', '.join(get_args(Method))}")
+    if name == "carlson-cayley":
+        raise ConfigError(
+            "carlson-cayley needs the mass on the sensor: take the poses without --method, then "
+            "`ftdrive solve RUN --method carlson-cayley --mass-kg KG`"
+        )
+    return cast(Method, name)

@@ -1,4 +1,4 @@
-"""A sweep: its speed, its state machine, and what its guards know about the tool."""
+"""A sweep: the free tool recorded along a smooth curve, at the speed of the slider; and what it teaches the guards."""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -7,15 +7,32 @@ from typing import Final
 import numpy as np
 
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
+from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig
 from ftdrive.errors import ConfigError, NotAccepted
+from ftdrive.planning.planner import sweep_for
 from ftdrive.runs.motion import MotionRecording
+from ftdrive.runs.run import Run
+from ftdrive.session.along_plan import AlongPlan
+from ftdrive.session.drive import APPROACH_RAD_S, SLOW, STOPS, Drive
 from ftdrive.session.events import MotionRecorded, State
 from ftdrive.session.guards import Guard, Seen
+from ftdrive.session.open_session import Session
 from ftdrive.session.preflight import Before
-from ftdrive.session.tour import APPROACH_RAD_S, SLOW, Tour
 from ftdrivers.sweep import Sweep
 
+# Recorded before the sweep and after it.
+REST_S: Final = 2.0
+# Between two points of the curve that the guards compare with.
+CURVE_S: Final = 0.01
+_READ_S: Final = 1.0
+# Share of the planned speed in the first run of a plan.
+FIRST_SHARE: Final = 0.5
+LEAST_SLIDER: Final = 0.5
+# Length of the averages of the resting sensor that the guards compare with.
+_QUIET_S: Final = 1.0
+# The mass of the tool where [tool] mass_kg is not set.
+_HEAVIEST_KG: Final = 5.0
 # The motion teaches so long before anything is predicted.
 KNOWN_S: Final = 3.0
 # The newest looks do not teach: a contact that grows must not pass for weight.
@@ -26,8 +43,102 @@ _NOISE_N: Final = 2.0
 _UNSURE_N: Final = 2.5
 
 
+def take_sweep(session: Session) -> Run | None:
+    """Record the free tool along a smooth curve of the wrist, planned where the arm stands; None after a dry run."""
+    task, options = session.task, session.options
+    along = AlongPlan(session, lambda certifier, q_rad: sweep_for(task.cell, certifier, q_rad, options.seconds))
+    driven, sweep = _choose_speed(along.before, slow=options.real and not along.before.known)
+    if options.dry_run:
+        along.end_dry_run()
+        return None
+    # No pose shows what the tool weighs while it moves.
+    tool = FreeToolPrediction(driven.certifier.scene.down_base, task.cell.tool.mass_kg or _HEAVIEST_KG)
+    with along.guarding(driven, driven.quiet_std(_QUIET_S), tool.predict, tool) as (guarded, book):
+        drive = Drive(guarded, driven, options, [None], lambda _: "")
+        _repeat_until_recorded(drive, sweep, driven.config.sampling, book.run)
+    along.judge_completed()
+    return book.run
+
+
+def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
+    """Take the arm to the centre of a sweep, along it, and back; start again after a stop. Raises as `Tour.run`."""
+    now = drive.now
+    now.todo = [1]
+    drive.watcher.begin()
+    while now.todo:
+        try:
+            now.under_way = None
+            drive.obey_keys()
+            now.under_way = 1
+            if now.at is None:
+                if drive.approach(0, 1):
+                    drive.confirm(_begin_words(sweep))
+                now.arrive(0)
+            drive.obey_keys()
+            _record(drive, sweep, sampling, run)
+            now.todo.clear()
+        except STOPS as error:
+            drive.hold(error, _choices)
+    drive.guarded.show_new()
+    drive.show_state(State.CLOSE)
+
+
+def _record(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
+    """Follow the curve from its centre, where the arm stands, and keep the recording."""
+    (centre,), clock = drive.nodes_rad, drive.watcher.clock
+    curve = sweep.at(np.arange(0.0, sweep.duration_s + CURVE_S, CURVE_S))
+    with drive.sensor.follow() as wrench, drive.arm.follow() as poses:
+        _rest(drive, sampling.still_timeout_s)
+        if not drive.now.confirmed:
+            drive.confirm(_begin_words(sweep))
+        drive.require_at(centre)
+        drive.show_state(State.SWEEP, 1, f"{sweep.duration_s:.0f} s along the curve of the plan")
+        drive.now.standing = False
+        began_s = clock.now_s()
+        with drive.watcher.watching(centre, centre, moving=True, curve_rad=curve):
+            drive.arm.sweep(sweep, guard=drive.between_looks)
+        duration_s = clock.now_s() - began_s
+        drive.now.standing = True
+        _rest(drive, sampling.still_timeout_s)
+        rate_Hz = drive.sensor.health().nominal_rate_Hz
+        recording = MotionRecording(wrench.read(_READ_S), poses.read(_READ_S), rate_Hz)
+    drive.guarded.load.judge(recording.samples.wrench)
+    path = run.new_path("motion", ".npz")
+    recording.save(path)
+    drive.guarded.show_new()
+    drive.journal.show(
+        MotionRecorded(
+            file=path.name,
+            duration_s=duration_s,
+            samples=len(recording.samples),
+            states=len(recording.states),
+            temperature_C=drive.sensor.temperature_C(),
+        ),
+        sync=True,
+    )
+
+
+def _rest(drive: Drive, still_timeout_s: float) -> None:
+    (centre,), clock = drive.nodes_rad, drive.watcher.clock
+    drive.arm.wait_until_still(timeout_s=still_timeout_s, guard=drive.between_looks)
+    with drive.watcher.watching(centre, centre, moving=False):
+        for _ in clock.looks(REST_S):
+            drive.between_looks()
+            clock.sleep(0.02)
+
+
+def _begin_words(sweep: Sweep) -> str:
+    return f"The arm stands where the sweep of {sweep.duration_s:.0f} s begins. Begin?"
+
+
+def _choices(_: int | None, fixed: str) -> tuple[str, dict[str, str]]:
+    """Return what is kept, and the answers in a hold with their effects; see `Drive.hold`."""
+    ways = {"resume": f"sweep again from the start{fixed}", "quit": "stop; the next session starts again"}
+    return "A sweep that was stopped is not kept.", ways
+
+
 @dataclass
-class FreeTool(Guard):
+class FreeToolPrediction(Guard):
     """Recursive least squares of the wrench as a linear function of the direction of gravity in the flange.
 
     Force and torque are linear in it, whatever mounting, weight, centre of mass and bias are. It looks as a guard, but
@@ -84,88 +195,6 @@ class FreeTool(Guard):
         return np.append(self.down_base @ R_base_flange, 1.0)
 
 
-# Recorded before the sweep and after it.
-REST_S: Final = 2.0
-# Between two points of the curve that the guards compare with.
-CURVE_S: Final = 0.01
-_READ_S: Final = 1.0
-
-
-class SweepTour(Tour):
-    """Takes the arm to the centre of a sweep, along it, and back; after a stop it starts again."""
-
-    recorded = False
-    """Whether the whole sweep is on disk."""
-
-    @property
-    def undriven(self) -> list[int]:
-        """The only stop, unless the whole sweep was driven."""
-        return [] if self.recorded else [1]
-
-    @property
-    def _curve(self) -> Sweep:
-        sweep = self._plan.sweep
-        if sweep is None:
-            raise TypeError(f"a plan of kind {self._plan.kind} has no sweep")
-        return sweep
-
-    @property
-    def _begin_words(self) -> str:
-        return f"The arm stands where the sweep of {self._curve.duration_s:.0f} s begins. Begin?"
-
-    def _choices(self, fixed: str) -> tuple[str, dict[str, str], str]:
-        ways = {"resume": f"sweep again from the start{fixed}"}
-        return "A sweep that was stopped is not kept.", ways, "stop; the next session starts again"
-
-    def _take(self, stop: int, index: int) -> None:
-        sweep, clock = self._curve, self._watcher.clock
-        centre = self._nodes[index]
-        curve = sweep.at(np.arange(0.0, sweep.duration_s + CURVE_S, CURVE_S))
-        with self._sensor.follow() as wrench, self._arm.follow() as poses:
-            self._rest(centre)
-            if not self._now.confirmed:
-                self._confirm(self._begin_words)
-            self._require_at(centre)
-            self._show_state(State.SWEEP, stop, f"{sweep.duration_s:.0f} s along the curve of the plan")
-            self._now.standing = False
-            began_s = clock.now_s()
-            with self._watcher.watching(centre, centre, moving=True, curve_rad=curve):
-                self._arm.sweep(sweep, guard=self._between_looks)
-            duration_s = clock.now_s() - began_s
-            self._now.standing = True
-            self._rest(centre)
-            rate_Hz = self._sensor.health().nominal_rate_Hz
-            recording = MotionRecording(wrench.read(_READ_S), poses.read(_READ_S), rate_Hz)
-        self._guarded.load.judge(recording.samples.wrench)
-        path = self._book.run.new_path("motion", ".npz")
-        recording.save(path)
-        self.recorded = True
-        self._guarded.show_new()
-        self._journal.show(
-            MotionRecorded(
-                file=path.name,
-                duration_s=duration_s,
-                samples=len(recording.samples),
-                states=len(recording.states),
-                temperature_C=self._sensor.temperature_C(),
-            ),
-            sync=True,
-        )
-
-    def _rest(self, centre: np.ndarray) -> None:
-        clock = self._watcher.clock
-        self._arm.wait_until_still(timeout_s=self._config.sampling.still_timeout_s, guard=self._between_looks)
-        with self._watcher.watching(centre, centre, moving=False):
-            for _ in clock.looks(REST_S):
-                self._between_looks()
-                clock.sleep(0.02)
-
-
-# Share of the planned speed in the first run of a plan.
-FIRST_SHARE: Final = 0.5
-LEAST_SLIDER: Final = 0.5
-
-
 def on_script_path(cell: CellConfig) -> CellConfig:
     """Return the cell with the control path that follows a curve; raises `ConfigError` if another one is set."""
     # Only our own program evaluates the curve and stops with its heartbeat.
@@ -177,8 +206,8 @@ def on_script_path(cell: CellConfig) -> CellConfig:
     return replace(cell, robot=replace(cell.robot, control="script"))
 
 
-def choose_sweep_speed(before: Before, *, slow: bool) -> Before:
-    """Return the plan at the speed of the sweep, on which the slider does not act while it runs, and show that.
+def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
+    """Return the plan at the speed of the slider, which does not act on a sweep while it runs, and its curve.
 
     Raises `NotAccepted` if the slider is too low.
     """
@@ -198,4 +227,4 @@ def choose_sweep_speed(before: Before, *, slow: bool) -> Before:
         f"sweep of {plan.sweep.duration_s:.0f} s at {100 * share:.0f} % of the planned speed ({why}), at most "
         f"{np.degrees(plan.top_speed_rad_s):.0f} °/s: about {total_s:.0f} s of motion"
     )
-    return replace(before, plan=plan)
+    return replace(before, plan=plan), plan.sweep

@@ -25,8 +25,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, fitted_dataset, save_update, verify_run
 from ftdrive.session.events import Compared, Operator, Question
 from ftdrive.session.live_fit import free_wrench
-from ftdrive.session.open_session import Judge
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import Judge, SessionOptions
 from ftdrive.session.session import take_poses
 
 Answer = Literal["ask", "no", "yes"]
@@ -45,6 +44,7 @@ class Verifying:
     """A verification."""
 
     command: ClassVar[str] = "verify"
+    load: ClassVar[None] = None
     cell: CellConfig
     calibration: CalibrationResult
     path: Path

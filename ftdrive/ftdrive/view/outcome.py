@@ -12,7 +12,7 @@ from ftcalib.rounding import to_place_of
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.runs.verification import Verified
 from ftdrive.session.events import Operator
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.view.page import Page
 from ftdrive.view.parts import BAD, GOOD, WARN, number
 from ftdrive.view.session_page import SessionPage, conclude

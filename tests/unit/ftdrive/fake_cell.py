@@ -20,14 +20,14 @@ from ftdrive.planning.geometry.certify import Certificate, Certifier
 from ftdrive.planning.geometry.kinematics import Frames
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
+from ftdrive.runs.load import Load
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import Outcome
 from ftdrive.session import along_plan, session
 from ftdrive.session.along_plan import remember_completed
 from ftdrive.session.events import Event, Key, Noted, PoseTaken, Question, State, StateChanged
 from ftdrive.session.guards import Limits
-from ftdrive.session.open_session import Journal, OpenCell
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import Journal, OpenCell, SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.clock import Clock
@@ -429,13 +429,13 @@ class Lab:
     def _options(self, **options: Any) -> SessionOptions:
         return SessionOptions(self.folder / "runs", poses=6, **options)
 
-    def calibrate(self, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, self._options(**options))
+    def calibrate(self, load: Load | None = None, **options: Any) -> Outcome | None:
+        return session.calibrate(self.cell, self.operator, self._options(**options), load)
 
-    def take_poses(self, **options: Any) -> Run | None:
+    def take_poses(self, load: Load | None = None, **options: Any) -> Run | None:
         """As `calibrate`, for a test that does not ask what the poses give."""
         chosen = self._options(**options)
-        return session.take_poses(Calibrating(self.cell, chosen), self.operator, chosen)
+        return session.take_poses(Calibrating(self.cell, chosen, load), self.operator, chosen)
 
     def trust(self) -> Path:
         """Let the plan of this cell count as completed; return its file."""

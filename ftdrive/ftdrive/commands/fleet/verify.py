@@ -16,7 +16,7 @@ from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.verification import NO_LIMITS, Verified
 from ftdrive.session.events import Question
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.verifying import POSES, Verifying, save_wanted_update
 from ftdrive.store import index_run, store_url
 from ftdrive.store.records import StoredCell

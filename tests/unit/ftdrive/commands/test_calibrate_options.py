@@ -17,9 +17,10 @@ from ftdrive.cell.emulated import REAL_PACE, Station
 from ftdrive.cli import cli
 from ftdrive.commands.options import Headed
 from ftdrive.errors import ConfigError
+from ftdrive.runs.load import Load
 from ftdrive.runs.run import Run
 from ftdrive.session import session
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import Calibrating
 from tests.edited_files import edit
 
@@ -47,8 +48,8 @@ def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellCon
     """What the session would begin with."""
     found = list[tuple[CellConfig, SessionOptions]]()
 
-    def guide(cell: CellConfig, operator: object, options: SessionOptions) -> None:
-        del operator
+    def guide(cell: CellConfig, operator: object, options: SessionOptions, load: Load | None) -> None:
+        del operator, load
         found.append((cell, options))
         raise Opened
 

@@ -15,7 +15,7 @@ from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.verifying import Verifying, save_wanted_update
 from ftdrive.words.result import _verdict_in_words
 from tests.unit.ftdrive.recorded import calibration

@@ -14,7 +14,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import HUNG_POSES, USUAL_POSTURE_RAD, certifier_for, plan_for
 from ftdrive.planning.search.nodes import WRIST_6_RAD
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrivers.ur.kinematics import MODELS, Array
 

@@ -14,8 +14,8 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_verification
-from ftdrive.session.along_plan import moves_s
-from ftdrive.session.tour import SLOW
+from ftdrive.session.drive import SLOW
+from ftdrive.session.tour import moves_s
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
 FITTED = special(range(1, 25))

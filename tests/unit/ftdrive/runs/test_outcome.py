@@ -14,7 +14,7 @@ from ftdrive.runs.pose_hints import hints
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of, solve_records
 from ftdrive.session.events import Noted, PoseTaken, Weighed
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.preflight import Before, check_payload
 from ftdrive.session.session import Calibrating, description_of
 from ftdrivers.clock import REAL
@@ -39,7 +39,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
     nothing: Any = None
-    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7)
+    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7, Calibrating(lab.cell, SessionOptions(lab.folder)))
     assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 

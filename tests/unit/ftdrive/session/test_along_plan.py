@@ -11,8 +11,8 @@ from ftdrive.planning.geometry.scene import BASE_PLANE, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_tour, speeds_of
-from ftdrive.session.along_plan import moves_s
-from ftdrive.session.tour import APPROACH_RAD_S, SLOW
+from ftdrive.session.drive import APPROACH_RAD_S, SLOW
+from ftdrive.session.tour import moves_s
 
 
 @pytest.fixture(scope="module")

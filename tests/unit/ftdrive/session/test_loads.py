@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from ftdrive.commands.calibrate import refuse_contradictions
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.load import Load
 from ftdrive.session.events import Noted
-from ftdrive.session.options import refuse_contradictions
 from tests.unit.ftdrive.fake_cell import Lab
 
 GRIPPED = Load.of("2.0", None, gripped=True)

@@ -14,7 +14,7 @@ from ftdrive.report.subject import read_subject
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import SolveOptions, read_dataset
-from ftdrive.session.options import method_of_poses
+from ftdrive.session.session import method_of_poses
 from tests.unit.ftdrive.fake_cell import Lab
 
 

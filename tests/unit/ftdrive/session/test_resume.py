@@ -15,7 +15,7 @@ from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
-from ftdrive.session import session, tour
+from ftdrive.session import drive, session
 from ftdrive.session.events import (
     Checked,
     Estimated,
@@ -237,7 +237,7 @@ def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     lab.operator.asked.clear()
     lab.operator.answers["Pose 3 of 7"] = ["s"] * 2
     lab.take_poses(mode="step")
-    monkeypatch.setattr(tour, "_NEAR_RAD", np.pi)
+    monkeypatch.setattr(drive, "_NEAR_RAD", np.pi)
     lab.take_poses(mode="step")
     ways = [question for question in lab.operator.asked if "Approach to pose 4" in question.text]
     assert ["skipped pose 3" in question.text for question in ways] == [False, True]
@@ -324,9 +324,9 @@ def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
         lab.take_poses()
     lab.arm.moves.clear()
     lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
-    for options in ({}, {"redo": (1,)}):
+    for redo in ((), (1,)):
         with pytest.raises(NotAccepted, match="another tool"):
-            lab.take_poses(resume=lab.run().folder, **options)
+            lab.take_poses(resume=lab.run().folder, redo=redo)
     assert lab.arm.moves == []
 
 

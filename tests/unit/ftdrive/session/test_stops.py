@@ -16,7 +16,7 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.runs.run import Run
-from ftdrive.session import tour
+from ftdrive.session import drive
 from ftdrive.session.events import Checked, Event, GuardTripped, Key, Noted, PoseTaken, State, StateChanged
 from ftdrive.session.preflight import Before
 from ftdrivers.errors import DeviceFault, DeviceTimeout, StreamBroken
@@ -371,7 +371,7 @@ def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
         move_to(*args, **kwargs)
         lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 1.0, 0])
 
-    monkeypatch.setattr(tour, "plan_approach", in_two)
+    monkeypatch.setattr(drive, "plan_approach", in_two)
     monkeypatch.setattr(lab.arm, "move_to", past_it)
     with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° from"):
         lab.take_poses()

@@ -15,11 +15,11 @@ from ftdrive.planning import sweep_planner
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import certifier_for, sweep_for
 from ftdrive.runs.motion import MotionRecording
-from ftdrive.session import session
+from ftdrive.session import sweep
 from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
-from ftdrive.session.options import SessionOptions
-from ftdrive.session.sweep import FreeTool, on_script_path
+from ftdrive.session.open_session import SessionOptions
+from ftdrive.session.sweep import FreeToolPrediction, on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import STATUS, Lab
@@ -42,7 +42,7 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
     def planned_once(cell: CellConfig, _: object, q_rad: Array, seconds: float) -> Plan:
         return planned(tuple(q_rad.tolist()), replace(cell, clock=REAL), seconds)
 
-    monkeypatch.setattr(session, "sweep_for", planned_once)
+    monkeypatch.setattr(sweep, "sweep_for", planned_once)
 
 
 @pytest.mark.slow
@@ -150,6 +150,15 @@ def test_q_ends_a_sweep(lab: Lab) -> None:
     assert "was not completed" in lab.said()
 
 
+def test_a_sweep_has_no_pose_to_skip_so_s_stops_it_and_it_starts_again(lab: Lab) -> None:
+    lab.arm.at_sweep_s[1] = 1.0, lambda: lab.operator.keys.append(Key.SKIP)
+    lab.operator.answers["resume:"] = ["resume"]
+    run = lab.sweep(real=False)
+    assert run is not None
+    assert run.in_motion
+    assert lab.holds() == [("resume", "quit")]
+
+
 def test_the_other_control_path_is_refused_at_once(lab: Lab) -> None:
     cell = replace(lab.cell, robot=replace(lab.cell.robot, control="ur-rtde"))
     with pytest.raises(ConfigError, match="--control script"):
@@ -164,7 +173,7 @@ def seen(t_s: float, R: Array, wrench: Array, sample: int, curve: Array | None) 
 
 
 def test_the_weight_is_learned_from_three_seconds_on(orientation: Callable[[float], Array]) -> None:
-    tool, rng = FreeTool(np.array([0, 0, -1.0]), 5.0), np.random.default_rng(0)
+    tool, rng = FreeToolPrediction(np.array([0, 0, -1.0]), 5.0), np.random.default_rng(0)
     curve = np.zeros((2, 6))
 
     def wrench(R: Array) -> Array:

@@ -18,9 +18,9 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of, plan_tour
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
+from ftdrive.session.drive import Progress
 from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, RunOpened, State, StateChanged
 from ftdrive.session.guards import Guard, Limits, RangeGuard, Seen, StallGuard
-from ftdrive.session.tour import Progress
 from ftdrive.words.session import SessionText, in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo

@@ -21,7 +21,7 @@ from ftdrive.runs.run import Reading, Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified, save_update, verification_near, verify_run
 from ftdrive.session.along_plan import has_completed
 from ftdrive.session.events import Checked, Compared, Noted, PoseTaken, RunOpened, State
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import take_poses
 from ftdrive.session.verifying import RunningComparison, Verifying
 from ftdrivers.interfaces import DeviceInfo

@@ -30,7 +30,7 @@ from ftdrive.session.events import (
     StateChanged,
 )
 from ftdrive.session.guards import ExpectedMotion, Limits, RangeGuard, Seen
-from ftdrive.session.options import SessionOptions
+from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.session import Calibrating
 from ftdrive.session.verifying import Verifying
 from ftdrive.view import session_page

@@ -1,0 +1,462 @@
+"""An arm on its way between the poses of a plan: certified moves only; after an error STOP, then HOLD.
+
+The arm moves along the plan from one pose to the next or back, or along an approach that is planned from where the arm
+stands, shown and confirmed. `GuardedCell` leads from a stop back to motion: it finds what stopped the arm, and whether
+the cause is gone.
+"""
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from ftcalib.errors import TooFewSamples
+from ftcalib.model import Array
+from ftdrive.checks.arm import SLOWEST_SLIDER
+from ftdrive.errors import Declined, NotAccepted, PlanRefused, SupervisorGone
+from ftdrive.planning.approach import plan_approach
+from ftdrive.planning.motion import Speeds, arm_moves, move_duration_s
+from ftdrive.planning.plan import way_in_words
+from ftdrive.session.events import GuardTripped, Hazard, Key, Question, SensorEvents, State, StateChanged
+from ftdrive.session.guards import ContactGuard, RangeGuard, Tripped, arm_lost, by_safety, fault
+from ftdrive.session.open_session import OpenCell, SessionOptions
+from ftdrive.session.preflight import Before, forbidden
+from ftdrive.session.watchdog import Watcher
+from ftdrivers.errors import DeviceError, DeviceFault
+
+log = logging.getLogger(__name__)
+
+APPROACH_RAD_S: Final = float(np.radians(15))
+# Speed back to the previous pose, after a stop between two poses.
+BACK_RAD_S: Final = float(np.radians(10))
+SLOW: Final = Speeds.first_run()
+AT_RAD: Final = float(np.radians(0.5))
+# An approach that comes closer than this to a skipped posture passes it.
+_NEAR_RAD: Final = float(np.radians(10))
+# How long the guards look at a resting arm before it moves on after a stop.
+_LOOK_AGAIN_S: Final = 0.4
+_FIRST_WORD: Final = "MOVE"
+
+
+@dataclass(slots=True)
+class Progress:
+    """State of a tour between two steps.
+
+    A stop counts from 1 to `poses + 1`, the return to the first pose. An index counts the poses of the plan from 0.
+    """
+
+    poses: int
+    todo: list[int] = field(default_factory=list)
+    """Stops left, in order."""
+    stood_at: int | None = None
+    """Index of the pose where the arm stood last; None where it was moved from there by something else."""
+    standing: bool = False
+    """Whether the arm still stands there."""
+    under_way: int | None = None
+    """Stop that the arm moves to or measures."""
+    back: tuple[int, str] | None = None
+    """Index of the pose to return to, and what stopped the arm."""
+    confirmed: bool = False
+    """Whether the operator has typed the word for the first motion."""
+    taken_last: int | None = None
+    """Stop of the newest pose."""
+    skipped: set[int] = field(default_factory=set)
+    """Indices of postures that the arm should avoid."""
+    reopened: set[int] = field(default_factory=set)
+    """Stops at which the sensor was reopened."""
+    driven: set[int] = field(default_factory=set)
+    """Indices of poses whose move to the next pose was completed."""
+    payload_kg: float | None = None
+    """Payload reported by the controller when it was last compared."""
+
+    @property
+    def stops(self) -> int:
+        """Number of stops, the return included."""
+        return self.poses + 1
+
+    @property
+    def at(self) -> int | None:
+        """Index of the pose where the arm stands; None between poses."""
+        return self.stood_at if self.standing else None
+
+    @property
+    def moving(self) -> bool:
+        """Whether the arm is on its way to a stop."""
+        return self.under_way is not None and not self.standing
+
+    @property
+    def came_from(self) -> int | None:
+        """Index of the pose to which the arm can return, where it was stopped on its way to another."""
+        gone = {self.index(self.todo[0]), *self.skipped}
+        return None if self.standing or self.stood_at in gone else self.stood_at
+
+    @property
+    def undriven(self) -> list[int]:
+        """Poses, from 1, whose planned move to the next pose was replaced by an approach or left out."""
+        return [index + 1 for index in range(self.poses) if index not in self.driven]
+
+    def index(self, stop: int) -> int:
+        """Index of the pose of a stop."""
+        return (stop - 1) % self.poses
+
+    def lose_place(self) -> None:
+        """Forget where the arm stood: something else has moved it."""
+        self.standing, self.stood_at = False, None
+
+    def arrive(self, index: int, *, driven_from: int | None = None) -> None:
+        """Stand at a pose; `driven_from` is the index where its planned move began."""
+        self.stood_at, self.standing = index, True
+        if driven_from is not None:
+            self.driven.add(driven_from)
+
+    def redo(self, stop: int) -> None:
+        """Put a stop that was taken in front of the others."""
+        self.todo.insert(0, stop)
+        self.skipped.discard(self.index(stop))
+
+    def skip(self) -> list[int]:
+        """Leave out the next pose, and the return to it; return the dropped stops."""
+        index = self.index(self.todo[0])
+        dropped = [stop for stop in self.todo if self.index(stop) == index]
+        self.todo = [stop for stop in self.todo if stop not in dropped]
+        self.skipped.add(index)
+        return dropped
+
+
+class _OperatorStop(Exception):
+    """The operator paused, stopped, sent the arm back or answered no; the arm holds until the operator decides."""
+
+    def __init__(self, words: str, *, for_good: bool = False) -> None:
+        super().__init__(words)
+        self.for_good = for_good
+
+
+STOPS: Final = (Tripped, DeviceError, OSError, _OperatorStop, TooFewSamples, NotAccepted, SupervisorGone)
+"""What stops the arm, and holds it until the operator decides."""
+
+
+class GuardedCell:
+    """A cell under control with its guards, and what leads from a stop back to motion.
+
+    Of the guards, `contact` accepts the zero of a reopened sensor, and `load` judges every sample of a pose. `recheck`
+    repeats the checks, with True the safety questions too; it raises if the arm may not go on.
+    """
+
+    def __init__(
+        self,
+        cell: OpenCell,
+        watcher: Watcher,
+        *,
+        contact: ContactGuard,
+        load: RangeGuard,
+        recheck: Callable[[bool], None],
+    ) -> None:
+        self.cell, self.watcher, self.load = cell, watcher, load
+        self._contact, self._recheck = contact, recheck
+        self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
+        self._cause: Tripped | None = None  # why the arm is held
+        self._answered: Tripped | None = None  # last stop of row 11 whose questions were answered
+
+    def show_new(self) -> None:
+        """Show new events of the sensor."""
+        self._sensor_events.show_new()
+
+    def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
+        """Return the trip behind an error: that of a guard, or the row of the table that the error belongs to."""
+        self.watcher.unseen = False
+        self._cause = self._row_of(error, moving=moving)
+        if self._cause is not None:
+            self.watcher.keep(self._cause)
+        return self._cause
+
+    def require_answers(self) -> None:
+        """Raise a stop of row 11, however short, until its questions are answered."""
+        self.watcher.look_aside()
+        stop = self.watcher.safety_stop
+        if stop is not None and stop is not self._answered:
+            raise stop
+
+    def reopen(self) -> None:
+        """Raise unless the cause is gone. Only the operator clears a stop of the safety system."""
+        self.watcher.look_aside()
+        unseen = self.watcher.unseen
+        try:
+            self.cell.arm.open(control=True)
+        except DeviceError:
+            with suppress(DeviceError):
+                self.cell.arm.open()  # to see an emergency stop that is pressed meanwhile
+            raise
+        try:
+            self.cell.sensor.check()
+        except DeviceError:
+            self._sensor_events.show_new()
+            self.cell.sensor.close()
+            self.cell.sensor.open()
+            self._contact.forget()
+            self._sensor_events = SensorEvents(self.cell.sensor, self.cell.journal.show)
+        stop = self.watcher.safety_stop
+        if stop is not None and stop not in {self._answered, self._cause}:  # pressed while the arm was already held
+            self._cause = stop
+            self.cell.journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
+        elif unseen:
+            words = "the arm was out of sight: its emergency stop may have been pressed meanwhile"
+            self.cell.note(words, warning=True)
+        self._recheck(unseen or stop is not self._answered)
+        self._answered = stop
+        self.watcher.begin()
+        q = self.cell.arm.state().q_rad
+        with self.watcher.watching(q, q, moving=False):  # raises if the cause is still there
+            self.watcher.clock.sleep(_LOOK_AGAIN_S)
+        self.require_answers()
+
+    def _row_of(self, error: Exception, *, moving: bool) -> Tripped | None:
+        if isinstance(error, Tripped):
+            return error
+        if isinstance(error, SupervisorGone):
+            return Tripped(Hazard.SUPERVISOR_GONE, error)
+        if isinstance(error, OSError) and not isinstance(error, DeviceError):
+            return Tripped(Hazard.DISK_FULL, error)
+        if not isinstance(error, DeviceError):
+            return None
+        if (trip := self.watcher.tripped(wait_s=0.3)) is not None:
+            reported = error.__cause__
+            if trip.hazard is Hazard.OTHER_CLIENT and isinstance(reported, DeviceFault):
+                # A guard sees only that the program has ended; the arm may know why.
+                return Tripped(trip.hazard, type(reported)(reported.found, reported.fix))
+            return trip
+        try:
+            self.cell.sensor.check()
+        except DeviceError:
+            return Tripped(Hazard.SENSOR_LOST, error)
+        try:
+            status = self.cell.arm.status()
+        except DeviceError:
+            return arm_lost(error, moving=moving)
+        if status.fault is not None:
+            return by_safety(status, str(error))
+        return Tripped(Hazard.OTHER_CLIENT if isinstance(error, DeviceFault) else Hazard.CONTROLLER_LOST, error)
+
+
+class Drive:
+    """An arm under guard between the poses of a plan, each move certified and each approach confirmed.
+
+    Parameters
+    ----------
+    guarded : GuardedCell
+    driven : Before
+        With the speeds of this session.
+    options : SessionOptions
+    numbers : sequence of int or None
+        Orientation of each pose, as events show it.
+    obey : callable
+        What a key means that neither pauses nor stops: returns a note, or raises. Called before another pose is shown.
+    """
+
+    def __init__(
+        self,
+        guarded: GuardedCell,
+        driven: Before,
+        options: SessionOptions,
+        numbers: Sequence[int | None],
+        obey: Callable[[Key], str],
+    ) -> None:
+        self.guarded, self.watcher = guarded, guarded.watcher
+        self.arm, self.sensor, self.journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
+        self.note = guarded.cell.note
+        self.certifier = driven.certifier
+        """For the tool as it is now: an approach is planned with it."""
+        # Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated.
+        self.trusted = driven.known
+        self.nodes_rad = driven.plan.nodes_rad
+        self.now = Progress(len(self.nodes_rad))
+        self._options, self._numbers, self._obey = options, numbers, obey
+
+    def obey_keys(self) -> None:
+        """Obey the keys pressed: r refers to the last pose taken, s to the one under way, as on the screen.
+
+        Every key stops an arm in motion; what it means is done after the stop. Called between two looks, so before
+        another pose is shown.
+        """
+        while (key := self.journal.pressed()) is not None:
+            if key is Key.STOP:
+                raise _OperatorStop(f"stopped by {self.journal.pressed_by}", for_good=True)
+            note = self._obey(key)
+            if key is Key.PAUSE or self.now.moving:
+                raise _OperatorStop("paused by the operator" if key is Key.PAUSE else "stopped by a key")
+            if note:
+                self.note(note)
+
+    def approach(self, index: int, stop: int, *, back: bool = False) -> bool:
+        """Move the arm to a pose from where it stands, along moves that are not in the plan; False if it is there.
+
+        They are proven, shown and confirmed by themselves.
+        """
+        q = self.arm.state().q_rad
+        approach = plan_approach(self.certifier, q, self.nodes_rad[index], SLOW)
+        if not len(approach.q_rad):
+            return False
+        way = approach.way_rad
+        if words := forbidden(self.arm, way):
+            raise PlanRefused(words)
+        passed = self._passed(way, index)
+        most_rad_s = BACK_RAD_S if back else APPROACH_RAD_S
+        words = (
+            f"{'back ' if back else ''}to pose {stop}, at most {np.degrees(most_rad_s):.0f} °/s: "
+            f"{way_in_words(way, approach.clearance_m)}"
+        )
+        if passed:
+            words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
+        self.show_state(State.APPROACH, stop, words)
+        self.confirm(f"Approach {words}.", by_operator=back or bool(passed) or arm_moves(way))
+        for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
+            self.move(q, goal, min(float(speed), most_rad_s), SLOW.joint_rad_s2)
+            q = goal
+        return True
+
+    def go_back(self, index: int, why: str) -> None:
+        """Return to the previous pose, then hold: the operator decides again."""
+        self.now.back, self.now.under_way = None, self.now.todo[0]
+        self.approach(index, index + 1, back=True)
+        self.now.arrive(index)
+        raise _OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
+
+    def _passed(self, way: Array, goal: int) -> list[str]:
+        """Return the skipped poses that an approach (k, 6) to another pose comes close to."""
+        share = np.linspace(0.0, 1.0, 181)[:, None]
+        points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
+        return [
+            str(index + 1)
+            for index in sorted(self.now.skipped - {goal})
+            if np.abs(points - self.nodes_rad[index]).max(axis=1).min() < _NEAR_RAD
+        ]
+
+    def confirm(self, text: str, *, by_operator: bool = False) -> None:
+        """Ask before a motion; the first motion needs a typed word."""
+        if not self._options.questions:
+            return
+        trusted = self.trusted and not by_operator
+        if self.now.confirmed:
+            if self.journal.ask(Question(text, assumed="yes" if trusted else None)) != "yes":
+                raise _OperatorStop(f"not confirmed: {text}")
+            return
+        assumed = _FIRST_WORD if trusted else None
+        question = Question(f"{text} Hand on the emergency stop. Type {_FIRST_WORD}", (_FIRST_WORD,), assumed)
+        if self.journal.ask(question) != _FIRST_WORD:
+            raise Declined(f"{_FIRST_WORD} was not typed: nothing moves")
+        self.now.confirmed = True
+
+    def move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Make one certified move, only from where it was certified to begin."""
+        self.require_at(start)
+        turn = np.abs(goal - start).max()
+        duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
+        self.now.standing = False
+        with self.watcher.watching(start, goal, moving=True):
+            self.arm.move_to(
+                goal.tolist(),
+                # `StallGuard` sees an arm that stands still.
+                timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,
+                guard=self.between_looks,
+                speed_rad_s=speed_rad_s,
+                acceleration_rad_s2=acceleration_rad_s2,
+            )
+
+    def require_at(self, start: Array) -> None:
+        """Raise unless the first motion is confirmed, every question is answered, and the arm stands at `start`."""
+        if not self.now.confirmed:
+            self.confirm("The arm begins the tour.")
+        self.guarded.require_answers()
+        off_rad = np.abs(self.arm.state().q_rad - start)
+        if off_rad.max() > AT_RAD:
+            self.now.lose_place()
+            raise fault(
+                Hazard.OTHER_CLIENT,
+                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
+                "something else has moved the arm; stop that, then resume",
+            )
+
+    def between_looks(self) -> None:
+        """Raise what a guard or a key stops the arm for."""
+        self.watcher.check()
+        self.obey_keys()
+
+    def hold(self, error: Exception, choices: Callable[[int | None, str], tuple[str, Mapping[str, str]]]) -> str:
+        """Show why the arm has stopped, and wait for the operator; returns the answer when the arm may go on.
+
+        Of the pose to which the arm can return and the words for the cause, `choices` says what is kept, and the
+        answers with their effects.
+        """
+        # The arm stops first, whatever the cause is.
+        self.arm.stop()
+        if isinstance(error, _OperatorStop) and error.for_good:
+            self.show_state(State.STOP, words=str(error))
+            raise Declined(str(error))
+        trip = self.guarded.cause(error, moving=not self.now.standing)
+        if trip is not None and trip.hazard == Hazard.SUPERVISOR_GONE:
+            self.show_state(State.STOP, words=str(trip))
+            raise trip.error
+        if trip is not None and self._reopened_sensor(trip):
+            return "resume"
+        back = self.now.came_from
+        self.now.standing = False
+        words = str(error if trip is None else trip)
+        reported, report_error = self.watcher.tripped(wait_s=0.0), self.watcher.report_error
+        if trip is not None and (trip is not reported or report_error is not None):
+            self.journal.show(GuardTripped(hazard=trip.hazard, words=words))
+        if report_error is not None:
+            self.note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
+        self.show_state(State.STOP, words=words)
+        self.guarded.show_new()
+        self.show_state(State.HOLD, words=words)
+        by_operator = isinstance(error, _OperatorStop)
+        end = Declined(words) if by_operator else error if trip is None else trip.error
+        if trip is not None and trip.error is not error and trip is not error and trip.error.__cause__ is None:
+            end.__cause__ = error  # which a guard may have overtaken: an arm that fails ends its own program
+        kept, ways = choices(back, "" if by_operator else " after fixing the cause")
+        effects = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
+        question = Question(f"{kept} {effects}", tuple(ways))
+        while True:
+            answer = self._choose(question, end)
+            try:
+                self.guarded.reopen()
+            except (Tripped, DeviceError, NotAccepted, Declined) as again:
+                self.note(f"not yet: {again}", warning=True)
+                continue
+            if answer == "back" and back is not None:
+                self.now.back = (back, words)
+            return answer
+
+    def _choose(self, question: Question, end: Exception) -> str:
+        """Ask how to go on; raise `end`, the first cause, if the operator quits or does not answer."""
+        try:
+            answer = self.journal.ask(question)
+        except SupervisorGone as gone:
+            raise (gone if isinstance(end, Declined) else end) from gone
+        except Declined:
+            raise end from end.__cause__
+        if answer == "quit":
+            raise end
+        return answer
+
+    def _reopened_sensor(self, trip: Tripped) -> bool:
+        """Reopen a sensor that failed while the arm stood at a pose, once for each pose; the pose is restarted."""
+        stop = self.now.todo[0]
+        if trip.hazard != Hazard.SENSOR_LOST or not self.now.standing or stop in self.now.reopened:
+            return False
+        self.now.reopened.add(stop)
+        try:
+            self.guarded.reopen()
+        except (Tripped, DeviceError, NotAccepted, Declined) as error:
+            log.info("the sensor cannot be reopened: %s", error)
+            return False
+        self.note(f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True)
+        return True
+
+    def show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
+        """Show what the arm does, and at which stop."""
+        number = None if stop is None else self._numbers[self.now.index(stop)]
+        self.journal.show(StateChanged(state=state, stop=stop, stops=self.now.stops, number=number, words=words))
