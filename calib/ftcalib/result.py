@@ -35,12 +35,10 @@ from ftcalib.rounding import counted
 from ftcalib.sensor_matrix import (
     SIZE,
     SQUARES,
+    Calibrated,
     ContactResponse,
     Response,
     SensorMatrix,
-    expected_error,
-    joint_covariance,
-    predicted_covariance,
 )
 from ftcalib.shown import Estimate, estimates_of, figure_of, frame_of, rows_of
 
@@ -124,7 +122,7 @@ class MotionResult(Displayed):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class CalibrationResult(Displayed):
+class CalibrationResult(Displayed, Calibrated):
     """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
 
     Examples
@@ -214,7 +212,7 @@ class CalibrationResult(Displayed):
             if not (0 < mass_kg < np.inf and 0 <= sigma_kg < np.inf):
                 raise ValueError(f"weighed_kg must be a mass and its sigma, not {list(self.weighed_kg)}")
             object.__setattr__(self, "weighed_kg", (float(mass_kg), float(sigma_kg)))
-        require_positive_definite(joint_covariance(self.covariance, self.response))
+        require_positive_definite(self.joint_covariance)
         object.__setattr__(self, "components", MappingProxyType({k: float(v) for k, v in self.components.items()}))
         object.__setattr__(self, "findings", tuple(self.findings))
         for name in ("provenance", "quality"):
@@ -454,23 +452,6 @@ class CalibrationResult(Displayed):
     def compensator(self) -> Compensator:
         """The fast form of `compensate`: one sample, into a buffer, or a recording."""
         return Compensator(self.parameters, response=self.response, decoder=self.contact.decoder)
-
-    def wrench_covariance(self, R_base_flange: Array) -> Array:
-        """Covariance of the predicted wrench due to the uncertainty of the estimates.
-
-        Parameters
-        ----------
-        R_base_flange : array, shape (..., 3, 3)
-
-        Returns
-        -------
-        array, shape (..., 6, 6)
-        """
-        return predicted_covariance(self.parameters, self.covariance, self.response, np.asarray(R_base_flange, float))
-
-    def predicted_error(self) -> tuple[float, float]:
-        """Expected root mean square error of `compensate` over all orientations, N and N·m, from noise alone."""
-        return expected_error(self.parameters, self.covariance, self.response)
 
     @property
     def noise_explains(self) -> bool:

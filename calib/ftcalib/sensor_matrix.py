@@ -151,43 +151,68 @@ class Response:
         }
 
 
-def joint_covariance(covariance: Array, response: Response | None) -> Array:
-    """(15, 15) of the parameters, or (26, 26) with gain and cross-talk where they were found."""
-    return covariance if response is None else response.covariance
-
-
-def joint_jacobian(parameters: Parameters, response: Response | None, R_base_flange: Array) -> Array:
-    """Derivative (..., 6, 15 or 26) of the wrench by what `joint_covariance` has."""
-    J = jacobian(parameters, R_base_flange)
-    return J if response is None else np.concatenate([J, response_columns(parameters, R_base_flange)], axis=-1)
-
-
-def with_covariance(response: Response | None, joint: Array) -> Response | None:
-    """Keep gain and cross-talk, if there are any, with another joint covariance."""
-    return None if response is None else Response(response.coefficients, joint)
-
-
 def shown_gain(response: Response | None) -> Array:
     """(6, 3) force and torque read beyond the true ones for a force at the centre of mass; 0 where none were found."""
     return np.zeros((6, 3)) if response is None else np.concatenate([response.force_gain, response.cross_talk_m])
 
 
-def predicted_covariance(
-    parameters: Parameters, covariance: Array, response: Response | None, R_base_flange: Array
-) -> Array:
-    """Covariance (..., 6, 6) of the predicted wrench that the uncertainty of all estimates, (15, 15), causes."""
-    J = joint_jacobian(parameters, response, R_base_flange)
-    return np.asarray(J @ joint_covariance(covariance, response) @ np.swapaxes(J, -1, -2))
+class Calibrated:
+    """A fit, a calibration, or an update of it: estimates of tool and sensor, and the covariance of their errors.
 
-
-def expected_error(parameters: Parameters, covariance: Array, response: Response | None = None) -> tuple[float, float]:
-    """Root mean square error of the predicted wrench over all orientations, N and N·m.
-
-    It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+    The errors are the 15 coordinates `PARAMETER_NAMES` and, where a response was found, its 11 coefficients.
     """
-    over = predicted_covariance(parameters, covariance, response, np.swapaxes(SPECIAL_R_flange_base, 1, 2))
-    variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
-    return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
+
+    parameters: Parameters
+    covariance: Array
+    """(15, 15) of the parameters alone."""
+    response: Response | None
+    """Gain and cross-talk of the sensor; None where none were found."""
+
+    def __init__(self, parameters: Parameters, covariance: Array, response: Response | None = None) -> None:
+        self.parameters, self.covariance, self.response = parameters, covariance, response
+
+    @property
+    def joint_covariance(self) -> Array:
+        """(15, 15) of the parameters, or (26, 26) with gain and cross-talk where they were found."""
+        return self.covariance if self.response is None else self.response.covariance
+
+    @property
+    def shown_response(self) -> Response | None:
+        """Gain and cross-talk as found; of a calibration without them zero, with what the fit leaves of the prior."""
+        return self.response
+
+    def with_joint(self, covariance: Array) -> Response | None:
+        """Keep gain and cross-talk, if there are any, with another joint covariance."""
+        return None if self.response is None else Response(self.response.coefficients, covariance)
+
+    def jacobian(self, R_base_flange: Array, parameters: Parameters | None = None) -> Array:
+        """Derivative (..., 6, 15 or 26) of the wrench by what `joint_covariance` has, at these or other parameters."""
+        p = self.parameters if parameters is None else parameters
+        J = jacobian(p, R_base_flange)
+        return J if self.response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=-1)
+
+    def wrench_covariance(self, R_base_flange: Array) -> Array:
+        """Covariance of the predicted wrench due to the uncertainty of the estimates.
+
+        Parameters
+        ----------
+        R_base_flange : array, shape (..., 3, 3)
+
+        Returns
+        -------
+        array, shape (..., 6, 6)
+        """
+        J = self.jacobian(np.asarray(R_base_flange, dtype=np.float64))
+        return np.asarray(J @ self.joint_covariance @ np.swapaxes(J, -1, -2))
+
+    def predicted_error(self) -> tuple[float, float]:
+        """Root mean square error of the predicted wrench over all orientations, N and N·m, from noise alone.
+
+        It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+        """
+        over = self.wrench_covariance(np.swapaxes(SPECIAL_R_flange_base, 1, 2))
+        variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
+        return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
 # What of the gain depends on the load.

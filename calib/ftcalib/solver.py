@@ -32,7 +32,7 @@ from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array, Paramet
 from ftcalib.published.methods import BASELINES, PUBLISHED, SPECIAL, Estimator, published, require_printed_form
 from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_numbers
 from ftcalib.result import CalibrationResult, Method, require_positive_definite
-from ftcalib.sensor_matrix import SensorMatrix, joint_covariance
+from ftcalib.sensor_matrix import SensorMatrix
 
 SIMULATIONS = 400
 # No sensor resolves smaller differences of force.
@@ -236,7 +236,7 @@ def _judge(case: Case, measured_sigma: Array | None) -> Quality:
     """Judge estimates, with what explains the data better, the simplest first; `measured_sigma` (6,) is of a pose."""
     try:
         require_positive_definite(case.found.covariance)
-        require_positive_definite(joint_covariance(case.found.covariance, case.found.response))
+        require_positive_definite(case.found.joint_covariance)
     except ValueError as exc:
         raise NotObservable(f"{exc}. Add poses with other orientations.") from exc
     quality = statistics(case)

@@ -24,7 +24,7 @@ from ftcalib.likelihood import fit as likelihood
 from ftcalib.model import UP_IN_BASE, Array, SPECIAL_R_flange_base, predict
 from ftcalib.published.methods import published
 from ftcalib.published.yu import lrom, srom
-from ftcalib.sensor_matrix import predicted_covariance
+from ftcalib.sensor_matrix import Calibrated
 from ftdrive import read_dataset
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run
@@ -75,7 +75,7 @@ def fit_run(seed: int, name: str, snr: float, starts: int = 0) -> dict[str, obje
     e, C = sim.error(truth, fit.parameters), fit.covariance
     R_test = Rotation.random(25, rng=rng).as_matrix()
     free = sim.readings(truth, R_test) + s * rng.normal(size=(25, 6))
-    total = np.diag(s**2) + predicted_covariance(fit.parameters, C, None, R_test)
+    total = np.diag(s**2) + Calibrated(fit.parameters, C).wrench_covariance(R_test)
     distance = (likelihood.standardize(free - predict(fit.parameters, R_test), total) ** 2).sum(axis=1)
     record: dict[str, object] = {
         "square": sim.blocks(e**2),

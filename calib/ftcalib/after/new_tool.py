@@ -26,8 +26,6 @@ from ftcalib.sensor_matrix import (
     LOAD,
     SIZE,
     Response,
-    joint_covariance,
-    joint_jacobian,
     response_columns,
     sensor_error_columns,
 )
@@ -55,7 +53,7 @@ class CellPrior:
         self.earlier, gain = earlier, earlier.response
         self.coefficients = np.zeros(0) if gain is None else np.array(gain.coefficients)
         """(11,) of gain and cross-talk, or none."""
-        self._covariance = np.array(joint_covariance(earlier.covariance, gain))
+        self._covariance = np.array(earlier.joint_covariance)
         self._across = np.linalg.svd(skew(earlier.parameters.gravity_force_base_N))[0][:, :2]  # gravity
 
     @property
@@ -211,7 +209,7 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
         errors = sensor_error_columns(prior.earlier.parameters, seen, new, R_base_flange)
         if not k:
             errors = np.concatenate([errors, response_columns(new, R_base_flange) * sigma], axis=2)
-        J = np.concatenate([joint_jacobian(new, prior.earlier.response, R_base_flange), errors], axis=2)
+        J = np.concatenate([prior.earlier.jacobian(R_base_flange, new), errors], axis=2)
         left = wrench - predict(new, R_base_flange) - J[..., 15:] @ np.concatenate([coefficients, unseen])
         known, of_known = prior.rows(new, coefficients, kept)
         A = block_diag(known, np.eye(len(unseen)))

@@ -6,14 +6,13 @@ all readings, both in the weights (generalised least squares) and in the covaria
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 
-from ftcalib.after.series import Estimated
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.data.dwell_mean import is_stationary, mean_and_covariance
@@ -21,7 +20,7 @@ from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding
 from ftcalib.model import BIASES, Array, Parameters, read_only, skew
 from ftcalib.result import CalibrationResult
-from ftcalib.sensor_matrix import Response, joint_covariance, joint_jacobian, predicted_covariance, with_covariance
+from ftcalib.sensor_matrix import Calibrated, Response
 
 SIGNIFICANT_SIGMAS = 5.0
 # Squared step in standard deviations at which the iteration ends.
@@ -44,24 +43,8 @@ BLOCKS: Mapping[str, tuple[Block, ...]] = {
 }
 
 
-class Calibrated(Estimated, Protocol):
-    """A calibration, or an earlier update of it."""
-
-    @property
-    def response(self) -> Response | None:
-        """Gain and cross-talk of the sensor."""
-
-
-def known_response(known: Calibrated) -> Response | None:
-    """Return gain and cross-talk as found, or of a calibration without them zero with what the fit leaves of the prior.
-
-    None for an update of a calibration that has none.
-    """
-    return known.shown_response if isinstance(known, CalibrationResult) else known.response
-
-
 @dataclass(frozen=True, slots=True, eq=False)
-class Update:
+class Update(Calibrated):
     """Parameters after an update, which can be updated again."""
 
     parameters: Parameters
@@ -102,9 +85,9 @@ def with_bias_change(calibration: Calibrated, change: Array, variance: Array, *,
         covariance[BIASES, BIASES] += variance
         return covariance
 
-    p, response = calibration.parameters, calibration.response
+    p = calibration.parameters
     new = replace(p, force_bias_N=p.force_bias_N + change[:3], torque_bias_Nm=p.torque_bias_Nm + change[3:])
-    response = with_covariance(response, changed(joint_covariance(calibration.covariance, response)))
+    response = calibration.with_joint(changed(calibration.joint_covariance))
     return Update(new, changed(calibration.covariance), 0.0, 0, "bias", response=response)
 
 
@@ -120,13 +103,13 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
     R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
-    C = joint_covariance(calibration.covariance, response)
+    C = calibration.joint_covariance
     if not old.gravity_force_base_N.any() and kind != "bias":
         raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
     new = old
     for _ in range(MOST_STEPS):
         estimated, kept = _directions(new, BLOCKS[kind]), _kept(old, new, BLOCKS[kind], len(C))
-        J = joint_jacobian(new, response, R_base_flange)
+        J = calibration.jacobian(R_base_flange, new)
         K = J.reshape(6 * n, -1) @ kept
         H = J[..., :15].reshape(6 * n, 15) @ estimated
         S = noise + K @ C @ K.T
@@ -156,7 +139,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     # The old error of a kept parameter goes into the new ones, so both are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
-    joint, dof = with_covariance(response, covariance), 6 * n - len(x)
+    joint, dof = calibration.with_joint(covariance), 6 * n - len(x)
     return Update(new, covariance[:15, :15], chi2, dof, kind, left.reshape(n, 6), joint)
 
 
@@ -305,7 +288,7 @@ def compare_with_prediction(
     p, response = calibration.parameters, calibration.response
     change = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
     drift = np.diag(np.repeat([drift_N**2, drift_Nm**2], 3))
-    S = wrench_cov + drift + predicted_covariance(p, calibration.covariance, response, R_base_flange)
+    S = wrench_cov + drift + calibration.wrench_covariance(R_base_flange)
     return change, np.sqrt(np.einsum("ni,ni->n", change, np.linalg.solve(S, change[..., None])[..., 0]))
 
 
@@ -360,8 +343,7 @@ def tare(
             "changed."
         )
     # What the fit does not know of the sensor acts on a part that is weighed after the tare.
-    shown = known_response(calibration)
-    known = Update(calibration.parameters, calibration.covariance, 0.0, 0, response=shown)
+    known = Calibrated(calibration.parameters, calibration.covariance, calibration.shown_response)
     update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):
         raise BadDataset(

@@ -47,7 +47,7 @@ from ftcalib.model import (
     skew,
 )
 from ftcalib.result import CalibrationResult
-from ftcalib.sensor_matrix import SIZE, USUAL, joint_covariance, joint_jacobian, response_columns, with_covariance
+from ftcalib.sensor_matrix import SIZE, USUAL, response_columns
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
 
@@ -112,10 +112,8 @@ class Expected:
 
     def common(self, R_base_flange: Array) -> Array:
         """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
-        p, response = self.calibration.parameters, self.calibration.response
-        C = joint_covariance(self.calibration.covariance, response)
-        K = joint_jacobian(p, response, R_base_flange).reshape(6 * len(R_base_flange), -1)
-        return np.asarray(K @ C @ K.T)
+        K = self.calibration.jacobian(R_base_flange).reshape(6 * len(R_base_flange), -1)
+        return np.asarray(K @ self.calibration.joint_covariance @ K.T)
 
     def p_value(self, chi2: float, dof: int) -> float:
         """Probability of a larger chi2."""
@@ -209,7 +207,7 @@ def expected_with_smooth_errors(
     Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
     part, or its poses turn the wrist alone and cannot.
     """
-    p, response = calibration.parameters, calibration.response
+    p = calibration.parameters
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
     complete = calibration.method == "ml" and calibration.dof == 6 * int(kept.sum()) - 15
     if not complete or fitted.wrench_cov is None:
@@ -224,8 +222,8 @@ def expected_with_smooth_errors(
     alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
     coefficients = calibration.shown_response.coefficients
-    stored = joint_jacobian(p, response, R_base_flange).reshape(len(J_new), -1)
-    stored = stored @ joint_covariance(calibration.covariance, response) @ stored.T
+    stored = calibration.jacobian(R_base_flange).reshape(len(J_new), -1)
+    stored = stored @ calibration.joint_covariance @ stored.T
     explanations, likelihood = [], []
     for share, of_gain, *of_kinds in product((0.0, _OTHER_JOINTS), _USUAL_GAINS, _USUAL_SMOOTH, _USUAL_SMOOTH):
         square = np.square(of_kinds)
@@ -254,7 +252,7 @@ def expected_with_smooth_errors(
         total += B @ C @ B.T + np.outer(off, off) / factor
         value, vector = np.linalg.eigh(total - stored / factor)
         noise = (vector * np.maximum(value, 1e-6 * value[-1])) @ vector.T
-        joint = with_covariance(response, joint_covariance(calibration.covariance, response) / factor)
+        joint = calibration.with_joint(calibration.joint_covariance / factor)
         update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
         explanations.append(Expected(update, noise, dof, factor))
     weights = np.exp(np.array(likelihood) - max(likelihood))

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import chdtrc as chi2_sf
 
-from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Calibrated, Update, known_response
+from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Update
 from ftcalib.compensation import Compensator
 from ftcalib.data.dataset import finite
 from ftcalib.display import Displayed, Row, Summary
@@ -30,14 +30,12 @@ from ftcalib.result import CalibrationResult
 from ftcalib.rounding import to_place_of, with_sigma
 from ftcalib.sensor_matrix import (
     LOAD,
+    Calibrated,
     ContactResponse,
-    joint_covariance,
-    joint_jacobian,
     ranges,
     response_columns,
     sensor_error_columns,
     shown_gain,
-    with_covariance,
 )
 
 # A part is held so near to the given point, one standard deviation an axis.
@@ -171,8 +169,8 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
     n = len(wrench)
     R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
     wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
-    tool, response = reference.parameters, known_response(reference)
-    weight_N = tool.weight_N
+    tool, response = reference.parameters, reference.shown_response
+    known, weight_N = Calibrated(tool, reference.covariance, response), tool.weight_N
     if not weight_N > 0:
         raise BadDataset("the calibrated tool has no weight, so the direction of gravity is unknown: calibrate again.")
     left = np.asarray(Compensator(tool, response=response).batch(wrench, R_base_flange), dtype=np.float64)
@@ -183,7 +181,7 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
     A[:, 3:, 0] += u @ cross_talk_m.T
 
     def covariance_of(x: Array, *, sensor: bool = True) -> Array:
-        return _covariance(reference, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
+        return _covariance(known, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
 
     fit = _fit(left, A, covariance_of, p_sensor_near_m)
     x, S, dof = fit.x, fit.S, 6 * n - 1
@@ -323,7 +321,7 @@ def _misfit(y: Array, A: Array, S: Array) -> float:
 
 
 def _covariance(
-    reference: Calibrated,
+    known: Calibrated,
     x_N: Array,
     R_base_flange: Array,
     noise: Array,
@@ -336,15 +334,15 @@ def _covariance(
 
     Without `sensor` the sensor has no errors of its own for the part.
     """
-    tool, response = reference.parameters, known_response(reference)
+    tool, response = known.parameters, known.response
     n, held = len(noise), _part(tool, x_N)
-    J, part = joint_jacobian(tool, response, R_base_flange), jacobian(held, R_base_flange)
+    J, part = known.jacobian(R_base_flange), jacobian(held, R_base_flange)
     across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)
     J[..., :3] += part[..., :3]
     J[..., 3:6] += part[..., 3:6] @ across
     turn = J[..., :3]
     single = noise + orientation_sigma_rad**2 * (turn @ np.swapaxes(turn, -1, -2))
-    C = np.array(joint_covariance(reference.covariance, response))
+    C = np.array(known.joint_covariance)
     C[range(6, 9), range(6, 9)] += drift[:3] ** 2
     C[range(12, 15), range(12, 15)] += drift[3:] ** 2
     of_sensor = np.zeros((6 * n, 6 * n))
@@ -371,13 +369,13 @@ def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Update:
 
     The error of the weighing counts as independent of that of the calibration.
     """
-    tool, response = empty.parameters, empty.response
+    tool = empty.parameters
     x, cov = weight.moment
     x_N, cov_N = x * g_m_s2, cov * g_m_s2**2
     W_N = tool.weight_N
     along, total_N = tool.down, W_N + float(x_N[0])
     com_m = (W_N * tool.p_sensor_com_m + x_N[1:]) / total_N
-    C = joint_covariance(empty.covariance, response)
+    C = empty.joint_covariance
     T, B = np.eye(len(C)), np.zeros((len(C), 4))
     T[3:6, 3:6] += x_N[0] / W_N * _across(along)
     T[9:12, 9:12] *= W_N / total_N
@@ -385,4 +383,4 @@ def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Update:
     B[3:6, 0], B[9:12, 0], B[9:12, 1:] = along, -com_m / total_N, np.eye(3) / total_N
     covariance = T @ C @ T.T + B @ cov_N @ B.T
     joined = Parameters(tool.R_flange_sensor, total_N * along, tool.force_bias_N, com_m, tool.torque_bias_Nm)
-    return Update(joined, covariance[:15, :15], 0.0, 0, response=with_covariance(response, covariance))
+    return Update(joined, covariance[:15, :15], 0.0, 0, response=empty.with_joint(covariance))

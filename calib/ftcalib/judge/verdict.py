@@ -27,7 +27,7 @@ from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONS
 from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
 from ftcalib.likelihood.variance_components import FORCE, TORQUE, component
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array
-from ftcalib.sensor_matrix import Response, expected_error
+from ftcalib.sensor_matrix import Response
 
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
@@ -324,7 +324,7 @@ def _errors_of_uses(case: Case, quality: Quality) -> dict[str, JSON]:
     """
     found, few_rejected, more = case.found, _few_rejected(quality.used), np.zeros(2)
     if quality.fits_measured_noise and few_rejected:
-        error = expected_error(found.parameters, found.covariance, found.response)
+        error = found.predicted_error()
     else:
         error = _left_out_rms(found, quality.used if few_rejected else np.ones_like(quality.used))
         more = np.maximum(found.elsewhere.reshape(2, 3).sum(axis=1), 0.0)
@@ -438,7 +438,7 @@ def _errors(found: Estimate, used: NDArray[np.bool_], *, few: bool) -> tuple[flo
     poses the cross-validated error limits the use of a result, and does not reject it.
     """
     weight_N, lever_m = found.parameters.weight_N, _lever_m(found)
-    expected = expected_error(found.parameters, found.covariance, found.response)
+    expected = found.predicted_error()
     left_out = _left_out_rms(found, used)
     largest, findings = 0.0, []
     for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
@@ -524,7 +524,7 @@ def _left_out_rms(found: Estimate, poses: NDArray[np.bool_]) -> tuple[float, flo
     """Root mean square error of predicting these poses from the others; over all orientations if they cannot."""
     checked = poses & ~_is_unchecked(found)
     if not checked.any():
-        return expected_error(found.parameters, found.covariance, found.response)
+        return found.predicted_error()
     return _rms(found.left_out_residuals[checked, :3]), _rms(found.left_out_residuals[checked, 3:])
 
 

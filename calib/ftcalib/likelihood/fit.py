@@ -35,7 +35,7 @@ from ftcalib.likelihood.variance_components import (
     squared_length,
 )
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
-from ftcalib.sensor_matrix import SIZE, Response, joint_covariance, sensor_columns, with_covariance
+from ftcalib.sensor_matrix import SIZE, Calibrated, Response, sensor_columns
 
 # From this difference of the criterion on the data show a structure: real ones have 250 and more in 24 poses.
 _SURE = 40.0
@@ -48,7 +48,7 @@ UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Estimate:
+class Estimate(Calibrated):
     """Estimates by any method, and what they leave of each pose. Rejected poses count only in arrays with n rows.
 
     A pose is off by its own noise alone; a `Fit` may have found more.
@@ -321,9 +321,9 @@ def _beside(found: Fit, other: Fit) -> Fit:
     value, vector = np.linalg.eigh(more / np.outer(scale, scale))
     root = Z @ (scale[:, None] * vector * np.sqrt(np.maximum(value, 0.0)))
     more = root @ root.T
-    joint = joint_covariance(found.covariance, found.response).copy()
+    joint = found.joint_covariance.copy()
     joint[:15, :15] += more
-    response = with_covariance(found.response, joint)
+    response = found.with_joint(joint)
     bends = any(name.startswith("load") for name in other.components)  # and adds to the bias
     return replace(found, covariance=found.covariance + more, response=response, may_bend=bends)
 

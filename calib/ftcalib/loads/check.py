@@ -5,13 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ftcalib.after.state import Calibrated
 from ftcalib.compensation import Compensator
 from ftcalib.files import JSON
 from ftcalib.loads.model import KnownLoad
 from ftcalib.model import Array, cross
 from ftcalib.result import CalibrationResult
-from ftcalib.sensor_matrix import predicted_covariance
+from ftcalib.sensor_matrix import Calibrated
 
 # So many sigmas of what the sensor promises are within it.
 _WITHIN = 2.0
@@ -85,7 +84,7 @@ def check_load(
     expected_N = load.mass_kg * calibration.g_m_s2
     read_N = float(np.mean(np.sum(force * down, axis=1)))
     # The error of the bias is the same in all poses.
-    common = predicted_covariance(tool, reference.covariance, reference.response, R_base_flange) + np.diag(drift**2)
+    common = reference.wrench_covariance(R_base_flange) + np.diag(drift**2)
 
     def along(C: Array) -> float:
         return float(np.mean(np.einsum("ni,nij,nj->n", down, C[:, :3, :3], down)))

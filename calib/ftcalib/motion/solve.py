@@ -38,7 +38,7 @@ from ftcalib.motion.mistakes import (
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
 from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, interpolation_error_rad, require_seconds, rows_of
 from ftcalib.result import CalibrationResult, MotionResult
-from ftcalib.sensor_matrix import Response, expected_error
+from ftcalib.sensor_matrix import Calibrated, Response
 
 LEAST_S = 5.0
 # Largest delay that is found.
@@ -453,7 +453,8 @@ def _other_wrench(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Fi
 def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
     """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
-    error = expected_error(best.load.static, best.covariance[:15, :15])[0] / max(best.load.static.weight_N, 1e-9)
+    error = Calibrated(best.load.static, best.covariance[:15, :15]).predicted_error()[0]
+    error /= max(best.load.static.weight_N, 1e-9)
     if range_deg >= NARROW_DEG and (explained or error < USABLE_SHARE):
         return []
     severity: Severity = "reject" if error > REJECTED_SHARE else "limit"

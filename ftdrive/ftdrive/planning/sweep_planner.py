@@ -18,7 +18,7 @@ from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
 from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.samples import Motion
 from ftcalib.poses.information import Guess
-from ftcalib.sensor_matrix import expected_error
+from ftcalib.sensor_matrix import Calibrated
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
@@ -203,7 +203,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     # What the motion does not show stays finite.
     weight[:15] = 1e-6 / guess.scale**2
     covariance = np.linalg.inv(J.T @ J + np.diag(weight))
-    force_N, torque_Nm = expected_error(guess.parameters, covariance[:15, :15])
+    force_N, torque_Nm = Calibrated(guess.parameters, covariance[:15, :15]).predicted_error()
     return force_N, torque_Nm, float(np.sqrt(np.diag(covariance)[INERTIA].max()))
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, fdtri
 
-from ftcalib.after.state import Calibrated
 from ftcalib.files import JSON
 from ftcalib.model import Array
-from ftcalib.sensor_matrix import predicted_covariance
+from ftcalib.sensor_matrix import Calibrated
 from ftdrive.stream.free_tool import Following
 from ftdrive.stream.noise import (
     GYRATION_M,
@@ -166,7 +165,7 @@ class ContactTest:
         if known is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
             return
         self._R = R_base_flange
-        predicted = predicted_covariance(known.parameters, known.covariance, known.response, R_base_flange)
+        predicted = known.wrench_covariance(R_base_flange)
         self.uncertainty = predicted + self._beyond
         self._whitening = None
 

@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.after.series import BiasTemperature
-from ftcalib.after.state import Calibrated, Update, with_bias_change
+from ftcalib.after.state import Update, with_bias_change
 from ftcalib.after.weighing import Weight
 from ftcalib.files import JSON
+from ftcalib.sensor_matrix import Calibrated
 from ftdrive.errors import ConfigError
 from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.stream.free_tool import NOTHING_KG, Following, weight_of

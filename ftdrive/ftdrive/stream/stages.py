@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftcalib.after.series import BiasTemperature
-from ftcalib.after.state import Calibrated, Update, compare_with_prediction, tare, with_bias_change
+from ftcalib.after.state import Update, compare_with_prediction, tare, with_bias_change
 from ftcalib.after.weighing import Weight, holding
 from ftcalib.compensation import Compensator, MovedLoad
 from ftcalib.data.dwell_mean import LEAST_SAMPLES, is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON
+from ftcalib.sensor_matrix import Calibrated
 from ftdrive.errors import ConfigError
 from ftdrive.stream.noise import REST, MotionTracker
 from ftdrive.stream.samples import FrameTransform, Paired, Stages, StreamInfo, WrenchFrame

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, SensorMatrix, solve
 from ftcalib.after.new_tool import _beyond, new_tool, together
-from ftcalib.after.state import known_response
 from ftcalib.data.dataset import pooled_covariance
 from ftcalib.errors import NotObservable
 from ftcalib.model import Array, Parameters, predict
@@ -137,7 +136,7 @@ def test_the_covariance_of_a_new_tool_is_that_of_first_order(gain: bool) -> None
     dataset = replace(poses(now, R, 0), wrench=y)
     assert dataset.wrench_cov is not None
     noise = block_diag(*(pooled_covariance(dataset.wrench_cov, dataset.n_samples) + np.diag(_beyond(earlier, now))))
-    known = known_response(earlier)
+    known = earlier.shown_response
     assert known is not None
     sensor = sensor_error_columns(p, known, now, R).reshape(24, -1)
     if response is None:

@@ -8,12 +8,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import solve
-from ftcalib.after.state import Calibrated, tare
+from ftcalib.after.state import tare
 from ftcalib.after.weighing import Weight, drift_since, holding, true_tool, weigh
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters, predict
-from ftcalib.sensor_matrix import Response, SensorMatrix, predicted_covariance, ranges, sensor_error_columns
+from ftcalib.sensor_matrix import Calibrated, Response, SensorMatrix, ranges, sensor_error_columns
 from tests.first_order import assert_same, propagated
 from tests.loaded_sensor import LEVER_M, TIP_M, TOOL, TOOL_COM_M, TOOL_KG, LoadedSensor
 from tests.loaded_sensor import NOISE as LOAD_NOISE
@@ -170,24 +170,16 @@ def rough(seed: int = 1, *, gain: bool = False) -> tuple[Parameters, Array, Resp
     return TRUTH, C, Response(0.01 * rng.normal(size=11), C) if gain else None
 
 
-class Known:
-    """A calibration of given parameters."""
-
-    def __init__(self, parameters: Parameters, covariance: Array, response: Response | None) -> None:
-        self.parameters, self.covariance, self.response = parameters, covariance[:15, :15], response
-
-
-def moved(known: Known, error: Array) -> Known:
-    response, C = known.response, known.covariance
-    if response is not None:
-        C, response = response.covariance, Response(response.coefficients + error[15:], response.covariance)
-    return Known(known.parameters.moved(error[:15]), C, response)
+def moved(known: Calibrated, error: Array) -> Calibrated:
+    C = known.joint_covariance
+    response = None if known.response is None else Response(known.response.coefficients + error[15:], C)
+    return Calibrated(known.parameters.moved(error[:15]), C[:15, :15], response)
 
 
 @pytest.mark.parametrize("gain", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -> None:
     gripper, (tool, C, response) = Gripper(5), rough(gain=gain)
-    reference = Known(tool, C, response)
+    reference = Calibrated(tool, C[:15, :15], response)
     R = np.array([gripper.turn() for _ in range(3)])
     part = np.array([gripper.part(one) for one in R])
     y = predict(tool, R) + part
@@ -201,7 +193,7 @@ def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -
         4e-3,
     )
 
-    def weighed(y: Array, reference: Known = reference, R: Array = R) -> Weight:
+    def weighed(y: Array, reference: Calibrated = reference, R: Array = R) -> Weight:
         options: dict[str, Any] = {"drift": drift, "g_m_s2": G, "orientation_sigma_rad": turn_rad}
         return weigh(reference, R, y, noise, p_sensor_near_m=gripper.com_m, **options)
 
@@ -233,7 +225,7 @@ def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -
 @pytest.mark.parametrize("gain", [False, True])
 def test_the_covariance_of_a_tool_with_a_part_has_the_errors_of_both(gain: bool) -> None:
     tool, C, response = rough(2, gain=gain)
-    empty = Known(tool, C, response)
+    empty = Calibrated(tool, C[:15, :15], response)
     rng = np.random.default_rng(3)
     root = np.array([0.02, 1e-3, 1e-3, 1e-3])[:, None] * (np.eye(4) + 0.3 * rng.normal(size=(4, 4)))
     x, x_cov = np.array([0.8, 0.01, -0.02, 0.09]), root @ root.T
@@ -271,7 +263,7 @@ def test_a_tool_with_a_part_predicts_both() -> None:
         load = holding(empty, weight, G)
         R = gripper.turn()
         off = predict(load.parameters, R) - predict(TRUTH, R) - gripper.part(R)
-        C = predicted_covariance(load.parameters, load.covariance, load.response, R)
+        C = load.wrench_covariance(R)
         z2.append(off @ np.linalg.solve(C, off) / 6)
     assert 0.4 < np.mean(z2) < 1.3
 

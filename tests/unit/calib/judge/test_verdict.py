@@ -33,7 +33,7 @@ from ftcalib.judge.verdict import (
 )
 from ftcalib.likelihood.fit import Estimate, standardize
 from ftcalib.model import Array, DriftResult, SPECIAL_R_flange_base, jacobian, predict
-from ftcalib.sensor_matrix import SIZE, Response, expected_error, predicted_covariance
+from ftcalib.sensor_matrix import SIZE, Calibrated, Response
 from ftcalib.solver import _judge
 from ftdrive import read_dataset
 from tests.known_cells import SIGMA, white
@@ -175,7 +175,7 @@ def test_the_expected_error_is_the_mean_over_all_orientations() -> None:
     f = fit(R24[:9], noisy(np.random.default_rng(5), R24[:9]), white(9))
     J = jacobian(f.parameters, Rotation.random(20000, rng=np.random.default_rng(6)).as_matrix())
     variance = np.einsum("nki,ij,nkj->k", J, f.covariance, J) / len(J)
-    force_N, torque_Nm = expected_error(f.parameters, f.covariance)
+    force_N, torque_Nm = f.predicted_error()
     assert force_N == pytest.approx(np.sqrt(variance[:3].sum()), rel=0.02)
     assert torque_Nm == pytest.approx(np.sqrt(variance[3:].sum()), rel=0.02)
 
@@ -233,7 +233,7 @@ def test_readings_of_a_free_tool_scatter_by_noise_and_calibration(n: int, alone:
         found = TRUTH.moved(np.linalg.cholesky(covariance) @ rng.normal(size=15))
         there = Rotation.random(120, rng=rng).as_matrix()
         residual, noise = noisy(rng, there) - predict(found, there), white(len(there))
-        total = noise + predicted_covariance(found, covariance, None, there)
+        total = noise + Calibrated(found, covariance).wrench_covariance(there)
         push = 12 * SIGMA * np.array([0, 0, 1, 0, 0, 0])
         for found_by, e, cov in (
             (alarms, residual, total),
@@ -589,7 +589,7 @@ def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
 def test_the_next_use_has_the_noise_that_explains_the_residuals_or_else_those_of_left_out_poses() -> None:
     wrench = noisy(np.random.default_rng(32), R24)
     measured, unknown = fit(R24, wrench, white(24)), fit(R24, wrench)
-    expected = expected_error(measured.parameters, measured.covariance)
+    expected = measured.predicted_error()
     quality, other = judge(measured), judge(unknown)
     names = "next_use_force_rms_N", "next_use_torque_rms_Nm"
     assert [quality.uses[name] for name in names] == pytest.approx([*expected])

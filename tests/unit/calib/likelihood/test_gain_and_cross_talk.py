@@ -17,7 +17,7 @@ from ftcalib.likelihood.session import Session
 from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
 from ftcalib.result import require_positive_definite
-from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN, Response, predicted_covariance, response_columns
+from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN, Response, response_columns
 
 SIGMA = np.repeat([0.05, 0.00125], 3)
 WHITE = np.diag(SIGMA**2)
@@ -145,7 +145,7 @@ def test_few_poses_do_not_show_it_and_it_counts_as_that_of_usual_sensors() -> No
         assert best.response is not None
         elsewhere = np.asarray(Rotation.random(1, rng=rng).as_matrix())
         e = (predicted(best, elsewhere) - read(p, elsewhere, M, L))[0]
-        S = predicted_covariance(best.parameters, best.covariance, best.response, elsewhere)[0]
+        S = best.wrench_covariance(elsewhere)[0]
         distances.append(e @ np.linalg.solve(S, e))
     assert 3 < np.mean(distances) < 12
     assert fit(R, wrench, WHITE, gain_sigma=0.0).response is None

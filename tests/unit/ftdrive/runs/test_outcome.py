@@ -38,8 +38,10 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
         tool=ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),), mass_kg=1.7),
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
-    nothing: Any = None
-    before = Before(lab.open_cell(), lab.cell, *[nothing] * 7, Calibrating(lab.cell, SessionOptions(lab.folder)))
+    others = ("certifier", "plan", "approach", "runs", "known", "quiet", "resumed")
+    nothing: dict[str, Any] = dict.fromkeys(others)
+    task = Calibrating(lab.cell, SessionOptions(lab.folder))
+    before = Before(cell=lab.open_cell(), config=lab.cell, task=task, **nothing)
     assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 

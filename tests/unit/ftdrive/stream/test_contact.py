@@ -8,7 +8,6 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftcalib.sensor_matrix import predicted_covariance
 from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
@@ -63,7 +62,7 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
     reading = residual[SIZE:].mean(axis=0)
     np.testing.assert_allclose(readings[-1], reading, atol=1e-12)
     calibration = calibrated()
-    uncertainty = predicted_covariance(calibration.parameters, calibration.covariance, calibration.response, R)
+    uncertainty = calibration.wrench_covariance(R)
     covariance = uncertainty + np.diag(BEYOND) + NOISE.reading + NOISE.wander
     if state:
         tool_kg_m2 = MASS_KG * 0.08**2
