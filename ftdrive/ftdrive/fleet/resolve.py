@@ -16,10 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from ftcalib import CalibrationDataset, CalibrationResult, Finding, Setup, solve
+from ftcalib import CalibrationDataset, CalibrationResult, Finding, solve
 from ftcalib.after.series import difference
 from ftcalib.errors import BadCalibration, BadDataset
-from ftcalib.files import read_file, write_new
+from ftcalib.files import read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
 from ftcalib.rounding import counted
 from ftdrive import __version__
@@ -38,8 +38,8 @@ from ftdrive.runs.run import IN_MOTION, Run
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
-# Files of a run in motion from which its result is made.
-_IN_MOTION: Final = ("run.json", "events.ndjson", "motion*.npz", "motion/*.npz")
+# Files of a run from which its result is made.
+_FILES: Final = ("run.json", "events.ndjson", "dataset*.json", "calibration*.json", "motion*.npz", "motion/*.npz")
 
 
 def solved_path(folder: Path) -> Path:
@@ -83,67 +83,37 @@ def _how_to_finish(folder: Path) -> str:
     return "`ftdrive calibrate --resume RUN` finishes one"
 
 
-def task_of(folder: Path) -> tuple[bytes, bytes]:
-    """Return the newest dataset of a run as its file has it, and what else `solved` needs, as JSON.
+def solve_run(folder: Path, version: str) -> bytes:
+    """Return the calibration file of a run: a pure function of its files and of the installed versions.
 
-    Raises `BadDataset`, `BadCalibration` or `OSError` for a file of the run that is damaged or missing.
+    Raises `OtherVersion` in a worker of another version, `BadDataset`, `BadCalibration` or `OSError` for a file of the
+    run that is damaged or missing, and `NotObservable`.
     """
+    require_version(version)
     run = Run(folder)
-    found = circumstances_of(run)
-    own = CalibrationResult.load(run.calibration_path).provenance if run.calibration_path.is_file() else run.header()
-    given = {
-        "version": __version__,
-        "method": run.method,
-        "g_m_s2": found.g_m_s2,
-        "setup": asdict(found.setup),
-        "provenance": {"created_utc": own.get("created_utc"), **found.origin},
-    }
-    return read_file(run.dataset_path), json.dumps(given).encode()
+    same = {name: found for name, found in versions().items() if name in SAME}
+    if run.in_motion:
+        result, created_utc = solve_in_motion(run), run.header().get("created_utc")
+        kept = {name: value for name, value in result.provenance.items() if name != "argv"}
+        result = replace(result, provenance={**kept, "created_utc": created_utc, "versions": same})
+    else:
+        found, own = circumstances_of(run), run.header()
+        if run.calibration_path.is_file():
+            own = CalibrationResult.load(run.calibration_path).provenance
+        provenance = {"created_utc": own.get("created_utc"), **found.origin, "versions": same}
+        poses = CalibrationDataset.from_dict(read_object(run.dataset_path, BadDataset))
+        result = solve(poses, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
+    return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
 
 
-def solve_task(dataset: bytes, task: bytes) -> bytes:
-    """Return the calibration file of a task: a pure function of its bytes and of the installed versions.
-
-    Raises `OtherVersion` for a task that was made by another version, else `BadDataset` or `NotObservable`.
-    """
-    given: dict[str, Any] = json.loads(task)
-    require_version(given["version"])
-    try:
-        document = json.loads(dataset)
-    except ValueError as error:
-        raise BadDataset(f"the dataset is not valid JSON ({error}): the file is damaged") from error
-    provenance = {**given["provenance"], "versions": _versions()}
-    poses, g_m_s2, setup = CalibrationDataset.from_dict(document), given["g_m_s2"], Setup(**given["setup"])
-    return _content(solve(poses, given["method"], g_m_s2=g_m_s2, setup=setup, provenance=provenance))
-
-
-def _solved_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
-    """Return the calibration file of a run in motion: a pure function as `solved`."""
+def _solve_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
+    """Solve a run on another computer, as `solve_run`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
         for path, content in files.items():
             file = Path(place, name, path)
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
-        return _solved_motion(Path(place, name), version)
-
-
-def _solved_motion(folder: Path, version: str) -> bytes:
-    """Return the calibration file of a run in motion, from its folder; raises as `solved`, and `OSError`."""
-    require_version(version)
-    run = Run(folder)
-    result = solve_in_motion(run)
-    provenance = {name: value for name, value in result.provenance.items() if name != "argv"}
-    provenance |= {"created_utc": run.header().get("created_utc"), "versions": _versions()}
-    return _content(replace(result, provenance=provenance))
-
-
-def _versions() -> dict[str, str]:
-    """Return the versions on which the last digits depend."""
-    return {name: found for name, found in versions().items() if name in SAME}
-
-
-def _content(result: CalibrationResult) -> bytes:
-    return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
+        return solve_run(Path(place, name), version)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,13 +156,12 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
             rest.append(folder)
 
     def call_of(folder: Path) -> Call:
-        if not Run(folder).in_motion:
-            return solve_task, *task_of(folder)
         if workers.share_files:
-            return _solved_motion, folder, __version__
-        found = {file for pattern in _IN_MOTION for file in folder.glob(pattern)}
+            return solve_run, folder, __version__
+        circumstances_of(Run(folder))  # damage is reported here, because the worker has another path
+        found = {file for pattern in _FILES for file in folder.glob(pattern)}
         files = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
-        return _solved_files, folder.name, files, __version__  # for another computer
+        return _solve_files, folder.name, files, __version__
 
     for folder, answer in answers(call_of, rest, workers):
         if isinstance(answer, OtherVersion):

@@ -1,6 +1,5 @@
 """Runs solved again, in this process."""
 
-import json
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future
 from dataclasses import replace
@@ -12,8 +11,9 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult, Finding
+from ftdrive import __version__
 from ftdrive.errors import ConfigError
-from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_task, solved_path, task_of
+from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_run, solved_path
 from ftdrive.fleet.workers import Workers
 from ftdrive.runs import run_folders
 from tests.calibrated_runs import FIRST, calibrated_run, dataset, swept_run
@@ -51,7 +51,7 @@ def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> N
     assert new.provenance == {**own.provenance, "created_utc": FIRST.isoformat(), "run": "run"}
     assert new.provenance["setup"]["tool"] == "gripper"
     assert (folder / "calibration.json").read_bytes() == before
-    assert solved_path(folder).read_bytes() == solve_task(*task_of(folder))
+    assert solved_path(folder).read_bytes() == solve_run(folder, __version__)
 
 
 def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp_path: Path) -> None:
@@ -128,10 +128,8 @@ def test_an_unexpected_error_is_named(tmp_path: Path) -> None:
 
 def test_a_worker_of_another_version_ends_it(tmp_path: Path) -> None:
     folder = calibrated_run(tmp_path, "run")
-    data, task = task_of(folder)
-    other = json.dumps(json.loads(task) | {"version": "0.0.1"}).encode()
     with pytest.raises(ConfigError, match=r"ftdrive 0\.0\.1: install the same"):
-        again(folder, submit=lambda function, *_: at_once(function, data, other))
+        again(folder, submit=lambda *_: at_once(solve_run, folder, "0.0.1"))
     assert not solved_path(folder).exists()
 
 
