@@ -17,13 +17,14 @@ import pytest
 from ftcalib import CalibrationResult
 from ftcalib.motion.samples import measured_s
 from ftdrive.cell.emulated import REAL_PACE, Station
-from ftdrive.runs.motion import MotionRecording
+from ftdrive.runs.motion import MotionRecording, files_of
 from ftdrive.runs.run import Run
 from ftdrive.stream.samples import Block
 from ftdrive.stream.sources import CellSource
 from ftdrive.stream.stream import Stream
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceError, DeviceTimeout, NoRos2, StreamBroken
+from ftdrivers.interfaces import ArmStates, FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.ros2.arm import Ros2Arm
 from tests.ros2.seven_joints import TRUTH, URDF
@@ -92,10 +93,11 @@ def test_a_passive_calibration_by_topics_gives_the_load_and_the_offset_of_the_cl
     result = CalibrationResult.load(path)
     assert result.motion is not None
     assert max(off_in_sigmas(result).values()) < 3.5  # the largest of ten
-    recording = MotionRecording.load(Run(path.parent).motion_path)
+    parts = list(map(MotionRecording.load, files_of(Run(path.parent).motion_path)))
+    samples = FtSamples.concatenate([part.samples for part in parts])
+    states = ArmStates.concatenate([part.states for part in parts])
     laid_s = [
-        float(np.mean(measured_s(one.t_device_s, one.t_host_ns, 0) - one.t_device_s))
-        for one in (recording.samples, recording.states)
+        float(np.mean(measured_s(one.t_device_s, one.t_host_ns, 0) - one.t_device_s)) for one in (samples, states)
     ]  # the clocks of the headers, on that of this computer
     assert abs(result.motion.delay_s - (laid_s[0] - laid_s[1]) - 0.04) < 1e-3
 

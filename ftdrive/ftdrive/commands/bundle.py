@@ -1,7 +1,6 @@
 """`ftdrive bundle`: a run in one file for a bug report, without addresses and names."""
 
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 
 import click
@@ -54,13 +53,13 @@ def bundle(
             require_new(path)
         except OSError as error:
             raise ConfigError(f"{error} with --output") from error
-        bundled = write_bundle(folder, path, transcripts)
+        redacted, left_out = write_bundle(folder, path, transcripts)
     if as_json:
-        write_json({"schema_version": 1, "file": str(path), **asdict(bundled)})
+        write_json({"schema_version": 1, "file": str(path), "redacted": redacted, "left_out": left_out})
     say = beside(as_json)
-    counted = ", ".join(f"{count} {kind}" for kind, count in bundled.redacted.items()) or "nothing found"
+    counted = ", ".join(f"{count} {kind}" for kind, count in redacted.items()) or "nothing found"
     say.print(hanging(" redacted: ", counted, say))
-    if bundled.left_out:
-        words = f"{', '.join(bundled.left_out)} (neither text nor a pose, or above 200 MB)"
+    if left_out:
+        words = f"{', '.join(left_out)} (neither text nor a pose, or above 200 MB)"
         say.print(hanging(" left out: ", words, say))
     say.print(f" Saved {path}")

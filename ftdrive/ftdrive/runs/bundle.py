@@ -17,7 +17,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import UTC, datetime
 from errno import EINVAL
 from functools import partial
@@ -221,20 +221,12 @@ MOST_FILES: Final = 20_000
 _COPY_AGAIN: Final = "copy the bundle again, or ask for a new one"
 
 
-@dataclass(frozen=True, slots=True)
-class Bundled:
-    """What `write_bundle` did."""
-
-    redacted: dict[str, int]
-    """Different values of each kind."""
-    left_out: list[str]
-    """Files of the run that are neither text nor poses, which cannot be redacted."""
-
-
-def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> Bundled:
+def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> tuple[dict[str, int], list[str]]:
     """Write a run folder, transcripts and the sensor's matrix to a new zip file, complete or not at all.
 
-    Raises `BadDataset` if the folder is no run folder, `OSError` if `path` exists or cannot be written.
+    Returns how many different values of each kind were redacted, and the files of the run that are neither text nor
+    poses, which are left out because they cannot be redacted. Raises `BadDataset` if the folder is no run folder,
+    `OSError` if `path` exists or cannot be written.
     """
     folder = folder.resolve()
     if not is_run(folder):
@@ -263,13 +255,13 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     for text in texts.values():
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
-    bundled = Bundled(redaction.counts, left_out)
     about = {
         "format": FORMAT,
         "created_utc": datetime.now(UTC).isoformat(),
         "run": folder.name,
         "emulated": _is_emulated(folder),
-        **asdict(bundled),
+        "redacted": redaction.counts,
+        "left_out": left_out,
     }
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -279,7 +271,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         for name, content in poses.items():  # compressed already
             archive.writestr(name, content, zipfile.ZIP_STORED)
     write_new(path, buffer.getvalue())
-    return bundled
+    return redaction.counts, left_out
 
 
 @contextmanager

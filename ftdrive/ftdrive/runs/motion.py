@@ -46,14 +46,7 @@ class MotionRecording:
 
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
-        """Read a file, or the files of a folder; raises `BadDataset`."""
-        parts = list(map(cls.load_one, files_of(path)))
-        samples = FtSamples.concatenate([one.samples for one in parts])
-        return cls(samples, ArmStates.concatenate([one.states for one in parts]), parts[0].nominal_rate_Hz)
-
-    @classmethod
-    def load_one(cls, path: Path) -> "MotionRecording":
-        """Read one file; raises `BadDataset`."""
+        """Read a file; raises `BadDataset`."""
         try:
             data = read_arrays(path)
             if str(data.get("format")) != FORMAT:
@@ -83,7 +76,7 @@ def means_of(path: Path) -> tuple[Means, Means]:
     files = files_of(path)  # once, because a recording goes on while it is read
     times = [
         (one.samples.t_host_ns, one.count, one.states.t_host_ns, one.states.t_device_s)
-        for one in map(MotionRecording.load_one, files)
+        for one in map(MotionRecording.load, files)
     ]
     wrench_ns, counts, poses_ns, poses_s = (list(column) for column in zip(*times, strict=True))
     received = [np.concatenate(each) for each in (wrench_ns, poses_ns)]
@@ -98,7 +91,7 @@ def means_of(path: Path) -> tuple[Means, Means]:
     wrench, poses = Means(), Means()
     ends = np.cumsum([[len(one), len(other)] for one, other in zip(wrench_ns, poses_ns, strict=True)], axis=0)
     for one, t_w, t_p in zip(
-        map(MotionRecording.load_one, files),
+        map(MotionRecording.load, files),
         np.split(wrench_s, ends[:-1, 0]),
         np.split(pose_s, ends[:-1, 1]),
         strict=True,

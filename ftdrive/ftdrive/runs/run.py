@@ -25,6 +25,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from itertools import count
 from pathlib import Path
 from typing import Any, Final, Literal, Self, get_args
 
@@ -146,21 +147,14 @@ class Run(Displayed):
         made = made_now()
         now = datetime.fromisoformat(made["created_utc"])
         folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
-        number = 1
-        while True:
+        for number in count(2):
             try:
                 folder.mkdir(parents=True)
                 break
             except FileExistsError:
-                number += 1
                 folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}-{number}"
         (folder / "poses").mkdir()
-        header = {
-            "format": RUN_FORMAT,
-            **made,
-            "created_host_ns": clock.now_ns(),
-            **description,
-        }
+        header = {"format": RUN_FORMAT, **made, "created_host_ns": clock.now_ns(), **description}
         write_object(folder / "run.json", header, allow_nan=True)
         return cls(folder, clock)
 
@@ -386,25 +380,21 @@ def _read_record(path: Path) -> PoseRecord:
         found = str(data.get("format"))
         if found != RECORDING_FORMAT:
             raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
-        return _record(data)
+        before, after = (
+            Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
+            for when in ("before", "after")
+        )
+        return PoseRecord(
+            stop=int(data["stop"]),
+            pose=TourPose(int(data["number"]), data["q_target_rad"]),
+            before=before,
+            after=after,
+            samples=FtSamples(*(data[name] for name in _SAMPLE_COLUMNS)),
+            steady=bool(data["steady"]),
+            clock_offset_ns=int(data.get("clock_offset_ns", 0)),
+            swings=bool(data.get("swings", False)),
+        )
     except DAMAGE as error:
         raise BadDataset(
             f"{path} is not a recording of a pose ({error}): {_RESTORE}, or move it away and --resume the run"
         ) from error
-
-
-def _record(data: Mapping[str, Any]) -> PoseRecord:
-    before, after = (
-        Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
-        for when in ("before", "after")
-    )
-    return PoseRecord(
-        stop=int(data["stop"]),
-        pose=TourPose(int(data["number"]), data["q_target_rad"]),
-        before=before,
-        after=after,
-        samples=FtSamples(*(data[name] for name in _SAMPLE_COLUMNS)),
-        steady=bool(data["steady"]),
-        clock_offset_ns=int(data.get("clock_offset_ns", 0)),
-        swings=bool(data.get("swings", False)),
-    )

@@ -11,7 +11,7 @@ import pytest
 from ftcalib.errors import BadDataset
 from ftcalib.motion.samples import measured_s
 from ftdrive.runs import motion, numbers
-from ftdrive.runs.motion import MotionRecording, means_of
+from ftdrive.runs.motion import MotionRecording, files_of, means_of
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 
@@ -83,7 +83,8 @@ def test_parts_are_read_like_one_file_and_an_incomplete_one_is_ignored(tmp_path:
         rows = slice(start, start + 45)
         MotionRecording(whole.samples.rows(rows), whole.states.rows(rows), 100.0).save(folder / f"{number}.npz")
     (folder / "13.npz.partial").write_bytes(b"PK")
-    assert np.array_equal(MotionRecording.load(folder).samples.seq, whole.samples.seq)
+    parts = map(MotionRecording.load, files_of(folder))
+    assert np.array_equal(np.concatenate([one.samples.seq for one in parts]), whole.samples.seq)
     for one, other in zip(means_of(folder), means_of(tmp_path / "motion.npz"), strict=True):
         for found, expected in zip(one.result(), other.result(), strict=True):
             np.testing.assert_allclose(found, expected, atol=1e-9)

@@ -102,8 +102,8 @@ def test_it_ends_by_itself_when_the_result_is_good(free: Recorded, tmp_path: Pat
     run = passively(cell, tmp_path, SECONDS)
     duration_s = cell.shown[-1].duration_s
     assert 10 < duration_s < SECONDS - 2 * STEP_S
-    recording = MotionRecording.load(run.motion_path)
-    assert len(recording.samples) == pytest.approx(500 * duration_s, rel=0.05)
+    parts = map(MotionRecording.load, files_of(run.motion_path))
+    assert sum(len(one.samples) for one in parts) == pytest.approx(500 * duration_s, rel=0.05)
 
 
 def test_q_and_the_time_end_it_and_too_little_is_not_kept(free: Recorded, tmp_path: Path) -> None:
@@ -129,14 +129,14 @@ def test_what_was_recorded_before_a_failure_is_kept_and_solved(
     assert fit.startswith("10 s")  # and no fit after the loss
     assert "unplugged" in lost
     assert run.solve_command in kept
-    assert MotionRecording.load(run.motion_path).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
+    assert MotionRecording.load(files_of(run.motion_path)[-1]).samples.seq[-1] >= 500 * (13.0 - STEP_S) - 1
     monkeypatch.setattr(source, "circumstances_of", lambda _: Circumstances(9.80665, Setup(), {}))
     assert source.solve_in_motion(run).verdict in {"good", "usable"}
 
 
 def test_memory_holds_one_part_at_a_time(free: Recorded, tmp_path: Path) -> None:
     run = passively(FakeCell(free), tmp_path, 8.0)
-    assert max(len(one.samples) for one in map(MotionRecording.load_one, files_of(run.motion_path))) <= 500 * (
+    assert max(len(one.samples) for one in map(MotionRecording.load, files_of(run.motion_path))) <= 500 * (
         PART_S + STEP_S
     )
 
