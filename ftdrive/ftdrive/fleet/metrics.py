@@ -5,7 +5,7 @@ from datetime import datetime
 from typing import Any, Final
 
 from ftdrive.errors import BadStore, ConfigError
-from ftdrive.fleet.state import CellState, FleetReading
+from ftdrive.fleet.state import CellState, Fleet
 from ftdrive.servers.http_gate import PassingGate, hidden_host
 from ftdrive.words.text import visible
 from ftdrivers.installation import missing_extra
@@ -86,7 +86,7 @@ NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STA
 
 
 class MetricsServer(Collector):
-    """Serves the newest reading at /metrics, without a process or platform metric beside it.
+    """Serves the newest state at /metrics, without a process or platform metric beside it.
 
     Port 0 lets the system choose; see `port`. `page` returns the page of the fleet, which is served at / and made for
     each load; it may raise `BadStore`. Raises `ConfigError` for an address that cannot be used.
@@ -94,7 +94,7 @@ class MetricsServer(Collector):
 
     def __init__(self, host: str, port: int, page: Callable[[], str] | None = None) -> None:
         self._page = page
-        self._reading: FleetReading | None = None
+        self._newest: tuple[Fleet, datetime, bool] | None = None
         registry = CollectorRegistry()
         registry.register(self)
         behind = hidden_host()
@@ -111,9 +111,9 @@ class MetricsServer(Collector):
             self._server.set_app(self._answer)
         self.port = self._gate.port
 
-    def update(self, reading: FleetReading) -> None:
-        """Serve this reading from now on."""
-        self._reading = reading
+    def update(self, fleet: Fleet, read: datetime, store_up: bool) -> None:
+        """Serve this state from now on, which was read at `read`, UTC."""
+        self._newest = fleet, read, store_up
 
     def _answer(self, request: dict[str, Any], start: Any) -> Any:
         if self._page is None or request["PATH_INFO"] not in {"", "/"}:
@@ -138,12 +138,12 @@ class MetricsServer(Collector):
     def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         """Yield the metrics; called by a thread for each scrape."""
         # The server may set another one meanwhile.
-        reading = self._reading
-        if reading is None:
+        if (newest := self._newest) is None:
             return
-        yield GaugeMetricFamily(STORE_UP, "1 if the store could be read, else 0.", value=reading.store_up)
-        yield GaugeMetricFamily(STATE_TIME, "When the state was read from the store.", value=reading.read.timestamp())
-        cells = reading.fleet.cells
+        fleet, read, store_up = newest
+        yield GaugeMetricFamily(STORE_UP, "1 if the store could be read, else 0.", value=store_up)
+        yield GaugeMetricFamily(STATE_TIME, "When the state was read from the store.", value=read.timestamp())
+        cells = fleet.cells
         info = GaugeMetricFamily(CELL_INFO, "1 for each tool of each cell.", labels=CELL_INFO_LABELS)
         for one in cells:
             about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
@@ -166,6 +166,6 @@ class MetricsServer(Collector):
         yield weighings
         yield refusals
         finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))
-        for kind, cell in sorted({(one.kind, cell) for one in reading.fleet.findings for cell in one.cells}):
+        for kind, cell in sorted({(one.kind, cell) for one in fleet.findings for cell in one.cells}):
             finding.add_metric(_labels(kind, cell), 1)
         yield finding

@@ -6,9 +6,8 @@ import numpy as np
 
 from ftdrive import __version__
 from ftdrive.fleet.cells import WINDOW, Changes, Observed
-from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
+from ftdrive.fleet.state import Fleet, attention, summary, times_in_words
 from ftdrive.report.page import templates, with_code
-from ftdrive.runs.verification import age_in_words
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
 # Half the height of a plot, unless the bias has changed by more.
@@ -25,7 +24,8 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     for state in fleet.cells:
         changes = observed.changes.get(state.calibration_id or "")
         drawn = "" if changes is None or state.calibrated is None else _plot(changes, state.calibrated, observed.now)
-        rows.append({"state": state, "plot": Markup(drawn), **_words(state, observed.now)})
+        drift = "-" if state.drift is None else f"{state.drift.level_sigmas:.1f} σ"
+        rows.append({"state": state, "plot": Markup(drawn), "drift": drift, **times_in_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
         rows=rows,
         summary=summary(fleet, observed.now),
@@ -62,14 +62,3 @@ def _plot(changes: Changes, start: datetime, now: datetime) -> str:
         f'{band}<path class="zero" d="M0 {middle}H{WIDTH}"/>{lines}'
         f'<text x="{WIDTH + 6}" y="{middle + 3}">±{most:.0f} σ</text></svg>'
     )
-
-
-def _words(state: CellState, now: datetime) -> dict[str, str]:
-    drift = state.drift
-    return {
-        "age": "-" if state.calibrated is None else age_in_words(now - state.calibrated),
-        "verified": verified_in_words(state, now),
-        "due": due_in_words(state.due, now),
-        "weighed": weighed_in_words(state, now),
-        "drift": "-" if drift is None else f"{drift.level_sigmas:.1f} σ",
-    }

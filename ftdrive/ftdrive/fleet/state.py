@@ -1,7 +1,7 @@
 """The state of a fleet, its words, and the loop of its server: what the status, its page and the metrics show."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Final, Literal
 
@@ -120,29 +120,27 @@ def list_names(names: Sequence[str]) -> str:
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
 
 
-def due_in_words(due: datetime | None, now: datetime) -> str:
-    """Write when a verification is due, such as "in 5 d", "now" or "3 d ago"."""
-    if due is None:
-        return "now"
-    if due > now:
-        return f"in {age_in_words(due - now)}"
-    days = (now - due).days
-    return f"{days} d ago" if days else "now"
+def times_in_words(state: CellState, now: datetime) -> dict[str, str]:
+    """Write what the columns of a table have that change with time.
 
-
-def verified_in_words(state: CellState, now: datetime) -> str:
-    """Write outcome and age of the last verification, such as "2 d" or "FAILED 3 h"."""
-    if state.verified is None:
-        return "-"
-    return f"{'' if state.passed else 'FAILED '}{age_in_words(now - state.verified)}"
-
-
-def weighed_in_words(state: CellState, now: datetime) -> str:
-    """Write mass and age of the last weighing, such as "0.250 kg 3 h"."""
-    found = state.weighings
-    if found is None or found.mass_kg is None or found.last_utc is None:
-        return "-"
-    return f"{found.mass_kg:.3f} kg {age_in_words(now - datetime.fromisoformat(found.last_utc))}"
+    They are the age of the calibration, outcome and age of the last verification, such as "FAILED 3 h", when the next
+    one is due, such as "in 5 d", "now" or "3 d ago", and mass and age of the last weighing, such as "0.250 kg 3 h".
+    """
+    due, found = "now", state.weighings
+    if state.due is not None and state.due > now:
+        due = f"in {age_in_words(state.due - now)}"
+    elif state.due is not None and (days := (now - state.due).days):
+        due = f"{days} d ago"
+    weighed = "-"
+    if found is not None and found.mass_kg is not None and found.last_utc is not None:
+        weighed = f"{found.mass_kg:.3f} kg {age_in_words(now - datetime.fromisoformat(found.last_utc))}"
+    outcome = "" if state.passed else "FAILED "
+    return {
+        "age": "-" if state.calibrated is None else age_in_words(now - state.calibrated),
+        "verified": "-" if state.verified is None else f"{outcome}{age_in_words(now - state.verified)}",
+        "due": due,
+        "weighed": weighed,
+    }
 
 
 def summary(fleet: Fleet, now: datetime) -> str:
@@ -181,42 +179,33 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
 EVERY_S: Final = 60.0
 
 
-@dataclass(frozen=True, slots=True)
-class FleetReading:
-    """The state of a fleet as it was read last."""
-
-    fleet: Fleet
-    read: datetime
-    """When it was read from the store, UTC."""
-    store_up: bool = True
-
-
 def serve(
     fleet_at: Callable[[datetime], Fleet],
-    update: Callable[[FleetReading], None],
+    update: Callable[[Fleet, datetime, bool], None],
     clock: Clock,
     *,
     say: Callable[[str], None],
     now: Callable[[], datetime] = lambda: datetime.now(UTC),
 ) -> None:
-    """Read the state by `fleet_at` and pass it on to `update` until an exception ends it, such as `KeyboardInterrupt`.
+    """Read the state by `fleet_at` until an exception ends it, such as `KeyboardInterrupt`.
 
-    A store that cannot be read later than at the start ends nothing: the last state stays, with its age, and `say`
-    takes a sentence for the operator. `clock` times the period. Raises `BadStore` at the start.
+    `update` takes the state, when it was read (UTC), and whether the store could be read now. A store that cannot be
+    read later than at the start ends nothing: the last state stays, with its age, and `say` takes a sentence for the
+    operator. `clock` times the period. Raises `BadStore` at the start.
     """
     # A store that cannot be read at the start ends the server, so that a wrong address is noticed at once.
-    time = now()
-    reading = FleetReading(fleet_at(time), time)
+    read, is_up = now(), True
+    fleet = fleet_at(read)
     while True:
-        update(reading)
+        update(fleet, read, is_up)
         clock.sleep(EVERY_S)
-        was_up, time = reading.store_up, now()
+        was_up, time = is_up, now()
         try:
-            reading = FleetReading(fleet_at(time), time)
+            fleet, read, is_up = fleet_at(time), time, True
         except BadStore as error:
-            reading = replace(reading, store_up=False)
+            is_up = False
             if was_up:
-                say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - reading.read)} old.")
+                say(f"{error}. The last state is served meanwhile. It is {age_in_words(time - read)} old.")
         else:
             if not was_up:
                 say("The store can be read again.")

@@ -6,7 +6,6 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -14,10 +13,9 @@ from ftcalib.files import write_new
 from ftdrive.commands.options import JSON, STORE, NewFile, require_extra, write_json
 from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.metrics import MetricsServer
-from ftdrive.fleet.state import CellState, Fleet, attention, due_in_words, summary, verified_in_words, weighed_in_words
+from ftdrive.fleet.state import CellState, attention, summary, times_in_words
 from ftdrive.fleet.state import serve as serve_fleet
 from ftdrive.fleet.status import fleet_of, fleet_state
-from ftdrive.runs.verification import age_in_words
 from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
 from ftdrive.store import open_store
 from ftdrive.store.store import Store
@@ -53,7 +51,8 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         write_new(page_path, page(fleet, observed, found.name))
         beside(as_json).print(f" Saved {page_path}")
     if as_json:
-        write_json(_as_json(fleet, found.name, now))
+        states = {"cells": [one.to_dict(now) for one in fleet.cells], "findings": [*map(asdict, fleet.findings)]}
+        write_json({"schema_version": 1, "store": found.name, "now": now.isoformat(), **states})
     elif not fleet.cells:
         messages.print("No cells. `ftdrive fleet add cells.toml` adds them.")
     elif page_path is None:
@@ -69,26 +68,8 @@ def _row(one: CellState, now: datetime) -> tuple[str, ...]:
     drift = "-"
     if one.drift is not None:
         drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
-    return (
-        one.cell,
-        one.tool_in_words,
-        one.verdict or "none",
-        "-" if one.calibrated is None else age_in_words(now - one.calibrated),
-        verified_in_words(one, now),
-        drift,
-        due_in_words(one.due, now),
-        weighed_in_words(one, now),
-    )
-
-
-def _as_json(fleet: Fleet, name: str, now: datetime) -> dict[str, Any]:
-    return {
-        "schema_version": 1,
-        "store": name,
-        "now": now.isoformat(),
-        "cells": [one.to_dict(now) for one in fleet.cells],
-        "findings": [asdict(one) for one in fleet.findings],
-    }
+    age, verified, due, weighed = times_in_words(one, now).values()
+    return (one.cell, one.tool_in_words, one.verdict or "none", age, verified, drift, due, weighed)
 
 
 # Prometheus has assigned all ports from 9100 to 9999.

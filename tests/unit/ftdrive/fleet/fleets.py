@@ -3,7 +3,7 @@
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, FleetReading
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 CALM = BiasDrift(0.8, found=False, words="")
@@ -40,6 +40,8 @@ def fleet(*cells: CellState, findings: tuple[FleetFinding, ...] = ()) -> Fleet:
     return Fleet(cells, findings)
 
 
-def reading(*cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True) -> FleetReading:
+def reading(
+    *cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True
+) -> tuple[Fleet, datetime, bool]:
     """A reading of a moment ago."""
-    return FleetReading(Fleet(cells, findings), NOW, store_up)
+    return Fleet(cells, findings), NOW, store_up

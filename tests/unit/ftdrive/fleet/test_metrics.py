@@ -63,7 +63,7 @@ def test_the_page_is_made_for_each_load() -> None:
                 assert (answer.read().decode(), answer.headers["Cache-Control"]) == (text, "no-store")
         with pytest.raises(urllib.error.HTTPError, match="503"):
             urllib.request.urlopen(f"{address}/", timeout=30)
-        server.update(reading(cell("A")))
+        server.update(*reading(cell("A")))
         assert "ftdrive_cell_info" in scraped(server)
 
 
@@ -71,7 +71,7 @@ def test_every_field_of_a_cell_is_a_metric_and_what_is_unknown_is_absent(server:
     warm = cell("A", passed=False, drift=DRIFTING, temperature_C=31.5)
     silent = cell("B", drift=None, verified=None, passed=None)
     base = FleetFinding("base", ("B",), "…")
-    server.update(reading(warm, silent, never_calibrated("C"), findings=(base, base), store_up=False))
+    server.update(*reading(warm, silent, never_calibrated("C"), findings=(base, base), store_up=False))
     assert samples(server) == {
         ("ftdrive_store_up", ""): 0,
         ("ftdrive_state_timestamp_seconds", ""): NOW.timestamp(),
@@ -94,7 +94,7 @@ def test_weighings_are_a_mass_a_time_and_counters(server: MetricsServer) -> None
     at = NOW - timedelta(hours=1)
     some = weighed("A", 0, weighings=40, refusals={"cable": 3, "contact": 1}, last_utc=at.isoformat())
     none = weighed("A", 0, weighings=0, refusals={"cable": 5}, last_utc=None, mass_kg=None, mass_sigma_kg=None)
-    server.update(reading(cell("A", weighings=some), cell("B", weighings=none), cell("C")))
+    server.update(*reading(cell("A", weighings=some), cell("B", weighings=none), cell("C")))
     found = samples(server)
     assert {name: value for name, value in found.items() if name[0].startswith("ftdrive_weighing_")} == {
         ("ftdrive_weighing_mass_kilograms", "A"): 0.25,
@@ -110,15 +110,15 @@ def test_weighings_are_a_mass_a_time_and_counters(server: MetricsServer) -> None
 
 def test_a_cell_that_disappears_disappears(server: MetricsServer) -> None:
     assert samples(server) == {}
-    server.update(reading(cell("A"), cell("B")))
+    server.update(*reading(cell("A"), cell("B")))
     assert {name for _, name in samples(server)} == {"", "A", "B"}
-    server.update(reading(cell("B")))
+    server.update(*reading(cell("B")))
     assert {name for _, name in samples(server)} == {"", "B"}
 
 
 def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: MetricsServer) -> None:
     name = 'Zelle "7"\\ü\n'
-    server.update(reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0, emulated=True)))
+    server.update(*reading(cell(name, "gripper"), cell(name, "drill", mass_kg=2.0, emulated=True)))
     families = {one.name: one for one in text_string_to_metric_families(scraped(server))}
     marks = {tuple(one.labels[key] for key in ("tool", "emulated")) for one in families["ftdrive_cell_info"].samples}
     assert marks == {("gripper", "false"), ("drill", "true")}
@@ -130,7 +130,7 @@ def test_tools_of_a_cell_are_distinguished_and_any_name_is_escaped(server: Metri
 
 
 def test_labels_have_no_control_characters(server: MetricsServer) -> None:
-    server.update(reading(replace(cell("a", "grip\x1b[2Jper"), sensor_model="ATI\x07")))
+    server.update(*reading(replace(cell("a", "grip\x1b[2Jper"), sensor_model="ATI\x07")))
     text = scraped(server)
     assert not set(text) & set(map(chr, [*range(10), *range(11, 32), 127]))
     assert 'tool="grip\\\\x1b[2Jper"' in text
@@ -141,7 +141,7 @@ def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) ->
     if promtool is None:
         pytest.skip("promtool is not installed")
     weighings = weighed("A", 0, weighings=40, refusals={"cable": 3}, last_utc=NOW.isoformat())
-    server.update(reading(cell("A", temperature_C=30.0, weighings=weighings)))
+    server.update(*reading(cell("A", temperature_C=30.0, weighings=weighings)))
     command = [promtool, "check", "metrics"]
     checked = subprocess.run(command, input=scraped(server), capture_output=True, text=True, check=False)
     assert checked.stdout == ""

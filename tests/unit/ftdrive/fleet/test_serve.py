@@ -5,7 +5,7 @@ from datetime import datetime, timedelta
 import pytest
 
 from ftdrive.errors import BadStore
-from ftdrive.fleet.state import EVERY_S, Fleet, FleetReading, serve
+from ftdrive.fleet.state import EVERY_S, Fleet, serve
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
 
@@ -15,7 +15,7 @@ class Served:
 
     def __init__(self, *answers: Fleet | Exception) -> None:
         self.clock = FakeClock()
-        self.readings: list[tuple[float, FleetReading]] = []
+        self.readings: list[tuple[float, Fleet, datetime, bool]] = []
         self.said: list[str] = []
         self._answers = [*answers, KeyboardInterrupt()]
         self._start_s = self.clock.now_s()
@@ -24,8 +24,8 @@ class Served:
     def t_s(self) -> float:
         return self.clock.now_s() - self._start_s
 
-    def update(self, reading: FleetReading) -> None:
-        self.readings.append((self.t_s, reading))
+    def update(self, fleet: Fleet, read: datetime, store_up: bool) -> None:
+        self.readings.append((self.t_s, fleet, read, store_up))
 
     def run(self) -> None:
         def now() -> datetime:
@@ -44,9 +44,10 @@ def test_the_state_is_read_every_minute_until_ctrl_c() -> None:
     served = Served(fleet(cell("A")), fleet(cell("A"), cell("B")))
     with pytest.raises(KeyboardInterrupt):
         served.run()
-    assert [t_s for t_s, _ in served.readings] == [0, EVERY_S]
-    assert [len(one.fleet.cells) for _, one in served.readings] == [1, 2]
-    assert [one.read for _, one in served.readings] == [NOW, NOW + timedelta(seconds=EVERY_S)]
+    times, fleets, read, _ = zip(*served.readings, strict=True)
+    assert times == (0, EVERY_S)
+    assert [len(one.cells) for one in fleets] == [1, 2]
+    assert read == (NOW, NOW + timedelta(seconds=EVERY_S))
     assert served.t_s == 2 * EVERY_S
     assert not served.said
 
@@ -55,10 +56,10 @@ def test_an_outage_keeps_the_last_state_with_its_age_and_is_said_once() -> None:
     served = Served(fleet(cell("A")), *[BadStore("the store db cannot be read (gone)")] * 3, fleet(cell("B")))
     with pytest.raises(KeyboardInterrupt):
         served.run()
-    found = [one for _, one in served.readings]
-    assert [one.store_up for one in found] == [True, False, False, False, True]
-    assert [one.fleet.cells[0].cell for one in found] == ["A", "A", "A", "A", "B"]
-    ages = [NOW + timedelta(seconds=t_s) - one.read for t_s, one in served.readings]
+    times, fleets, read, is_up = zip(*served.readings, strict=True)
+    assert is_up == (True, False, False, False, True)
+    assert [one.cells[0].cell for one in fleets] == ["A", "A", "A", "A", "B"]
+    ages = [NOW + timedelta(seconds=t_s) - then for t_s, then in zip(times, read, strict=True)]
     assert [age / timedelta(seconds=EVERY_S) for age in ages] == [0, 1, 2, 3, 0]
     assert served.said == [
         "the store db cannot be read (gone). The last state is served meanwhile. It is 1 min old.",

@@ -4,7 +4,7 @@ from datetime import timedelta
 
 import numpy as np
 
-from ftdrive.fleet.state import attention, summary, weighed_in_words
+from ftdrive.fleet.state import attention, summary, times_in_words
 from ftdrive.fleet.status import fleet_state
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.fleet.fleet_records import NOW, cell, check, daily, fleet, result, time, weighed
@@ -170,4 +170,4 @@ def test_the_last_weighing_is_that_of_the_same_cell_tool_and_kind_of_cell() -> N
         "mass_kg": 0.25,
         "mass_sigma_kg": 1e-3,
     }
-    assert [weighed_in_words(one, NOW) for one in states] == ["-", "0.250 kg 2 d", "0.400 kg 0 min", "-"]
+    assert [times_in_words(one, NOW)["weighed"] for one in states] == ["-", "0.250 kg 2 d", "0.400 kg 0 min", "-"]
