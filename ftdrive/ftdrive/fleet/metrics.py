@@ -92,7 +92,7 @@ class MetricsServer(Collector):
     each load; it may raise `BadStore`. Raises `ConfigError` for an address that cannot be used.
     """
 
-    def __init__(self, host: str, port: int, page: Callable[[], str] | None = None) -> None:
+    def __init__(self, host: str, port: int, page: Callable[[], str]) -> None:
         self._page = page
         self._newest: tuple[Fleet, datetime, bool] | None = None
         registry = CollectorRegistry()
@@ -107,8 +107,7 @@ class MetricsServer(Collector):
                 f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another"
             ) from None
         self._metrics = self._server.get_app()
-        if page is not None:
-            self._server.set_app(self._answer)
+        self._server.set_app(self._answer)
         self.port = self._gate.port
 
     def update(self, fleet: Fleet, read: datetime, store_up: bool) -> None:
@@ -116,7 +115,7 @@ class MetricsServer(Collector):
         self._newest = fleet, read, store_up
 
     def _answer(self, request: dict[str, Any], start: Any) -> Any:
-        if self._page is None or request["PATH_INFO"] not in {"", "/"}:
+        if request["PATH_INFO"] not in {"", "/"}:
             return self._metrics(request, start)  # type: ignore[misc]  # set by start_http_server
         try:
             status, text, kind = "200 OK", self._page(), "html"

@@ -7,6 +7,7 @@ solved-<version>.json   ftdrive.calibration/2, in the run folder: the result of 
 import json
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from datetime import datetime
 from math import isfinite
@@ -66,21 +67,16 @@ def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[
     for run in found:
         if is_calibration(run, since):
             if run.is_dir() and not (Run(run).dataset_path.exists() or Run(run).in_motion):
-                unfinished[_how_to_finish(run)] += 1
+                finish = "`ftdrive calibrate --resume RUN` finishes one"
+                with suppress(BadDataset, OSError):
+                    if (mode := Run(run).mode) in IN_MOTION:
+                        finish = f"start again with `ftdrive calibrate --{mode}`"
+                unfinished[finish] += 1
             else:
                 runs.append(run)
     for words, count in unfinished.items():
         say(f"Left out, because they have no data to solve: {count} runs; {words}.")
     return runs
-
-
-def _how_to_finish(folder: Path) -> str:
-    try:
-        if (mode := Run(folder).mode) in IN_MOTION:
-            return f"start again with `ftdrive calibrate --{mode}`"
-    except (BadDataset, OSError):
-        pass
-    return "`ftdrive calibrate --resume RUN` finishes one"
 
 
 def solve_run(folder: Path, version: str) -> bytes:

@@ -29,13 +29,7 @@ COMPONENTS: Final = tuple(f"{name} bias {axis}" for name in ("force", "torque") 
 
 
 def fleet_state(store: Store, now: datetime) -> Fleet:
-    """Return the state of all cells of a store, and what they show together.
-
-    Raises
-    ------
-    BadStore
-        The store cannot be read.
-    """
+    """Return the state of all cells of a store, and what they show together; raises `BadStore`."""
     return fleet_of(Observed.read(store, now), store)
 
 

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,18 +37,6 @@ _OUTLIER_SIGMAS = 4.0
 _LEAST_READINGS = 20
 
 
-class Compensated(NamedTuple):
-    """The result of `compensate_recording`."""
-
-    numbers: dict[str, Any]
-    """Samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and torque in
-    N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction; `bias_change`, if it
-    was estimated; axes, about; calibration, the name, and its marks; `cut`, why it ends early; `delay_s`, the last one
-    that the recording names, with value and sigma."""
-    failure: BaseException | None = None
-    """What ended the recording early: damage, or Ctrl-C; the numbers and the file hold what was before."""
-
-
 def source_to_compensate(
     path: Path,
     options: SolveOptions,
@@ -65,7 +53,7 @@ def source_to_compensate(
     `say` takes what was recognised in tables.
     """
     try:
-        tables = tables_of(path, options.table, options.pair, options.topics)
+        tables = tables_of(path, options)
     except (BadDataset, ConfigError) as error:
         if calibration is None:
             raise type(error)(f"{error}. Give --calibration PATH too") from error
@@ -95,12 +83,18 @@ def compensate_recording(
     *,
     estimate_bias: bool = False,
     show: Callable[[str], object] = lambda _: None,
-) -> Compensated:
+) -> tuple[dict[str, Any], BaseException | None]:
     """Compensate a recording of any length with the calibration of its header, bias and gravity subtracted.
 
     It is read once, after its beginning was read for the noise; for `estimated_bias` it is read once more before.
     `frame` is that of the result. `output` is a new recording for it, and for those events of the old one that still
     hold. `show` gets what is done and how much of it, in words.
+
+    Returns samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and
+    torque in N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction;
+    `bias_change`, if it was estimated; axes, about; calibration, the name, and its marks; `cut`, why it ends early;
+    `delay_s`, the last one that the recording names, with value and sigma. With them it returns what ended the
+    recording early, damage or Ctrl-C: the numbers and the file hold what was before.
 
     Raises `ConfigError` for a frame that needs what is not configured, `BadDataset` for a recording that is too short
     for an estimate, `BadRecording` if its first block is damaged, and `OSError` if the result cannot be written, which
@@ -137,7 +131,7 @@ def compensate_recording(
         "marks": list(info.marks),
         "cut": source.cut if failure is None else str(failure) or "interrupted",
     }
-    return Compensated(numbers, failure)
+    return numbers, failure
 
 
 class _Blocks(SampleSource):

@@ -26,16 +26,17 @@ from ftdrive.tables.table import Table
 Moving = Run | Path | tuple[Table, Table]
 
 
-def _moving(place: Path, options: SolveOptions) -> Moving | None:
-    return Run(place) if place.is_dir() and Run(place).in_motion else moving_source(place, options)
-
-
 def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
     """Return a recording in motion, which is read when it is solved, or poses. Raises as `read_source`."""
     if any(options.topics) and (options.pair is not None or not is_bag(place)):
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
-    # A bag is read whole, so it is not read to say this.
-    moving = place if is_bag(place) and options.method != "ml" else _moving(place, options)
+    moving: Moving | None
+    if is_bag(place) and options.method != "ml":
+        moving = place  # a bag is read whole, so it is not read to say this
+    elif place.is_dir() and Run(place).in_motion:
+        moving = Run(place)
+    else:
+        moving = moving_source(place, options)
     if moving is not None and options.method != "ml":
         raise ConfigError(f"--method {options.method} is for poses at rest: leave it out for a recording")
     return read_source(place, options) if moving is None else moving

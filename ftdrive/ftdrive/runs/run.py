@@ -231,13 +231,7 @@ class Run(Displayed):
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Read events.ndjson; a last line cut off by a power failure is ignored.
-
-        Raises
-        ------
-        BadDataset
-            A line is damaged.
-        """
+        """Read events.ndjson; a last line cut off by a power failure is ignored. Raises `BadDataset` for any other."""
         path = self._events_path
         text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")

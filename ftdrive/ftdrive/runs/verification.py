@@ -9,7 +9,8 @@ in the run folders beside that of the calibration, in those in `runs` beside the
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -37,11 +38,8 @@ Limits = tuple[float | None, float | None]
 NO_LIMITS: Final = None, None
 # Share of verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
-# Fields of a verification that streams and recordings keep.
-RECORDED: Final = (
-    *("path", "calibration_id", "created_utc", "passed", "change", "reason"),
-    *("force_max_N", "torque_max_Nm"),
-)
+# A recording keeps so many fields of a verification, the first ones.
+_RECORDED: Final = 8
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
 
@@ -90,7 +88,7 @@ class VerificationRecord(NamedTuple):
         bias = (numbers_at(document, 6, "bias_change", name) for name in ("value", "sigma", "calibration_sigma"))
         record = cls.from_dict({**document, "path": str(path), "calibration_id": at(document, "calibration", "id")})
         digest, temperature_C = hashlib.sha256(content).hexdigest(), number_at(document, "temperature_C")
-        return cls(*record[:8], digest[:12], temperature_C, *bias)
+        return cls(*record[:_RECORDED], digest[:12], temperature_C, *bias)
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
@@ -105,10 +103,10 @@ class VerificationRecord(NamedTuple):
         made, change = time_at(document, "created_utc"), text_at(document, "change")
         return cls(path, calibration_id, made, passed, change, text_at(document, "reason"), *largest)
 
-    def to_dict(self, names: Sequence[str] = RECORDED) -> dict[str, Any]:
+    def to_dict(self, names: Sequence[str] = ()) -> dict[str, Any]:
         """Return fields as JSON, by default those of streams and recordings; `run` may be one of them."""
         values = {**self._asdict(), "run": self.run}
-        return {name: values[name] for name in names}
+        return {name: values[name] for name in names or self._fields[:_RECORDED]}
 
     def in_words(self, now: datetime | None) -> str:
         """Return the result and its age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
@@ -125,7 +123,12 @@ def verification_near(place: Path, calibration_id: str) -> VerificationRecord | 
     `place` is a calibration file, which need not be there, or its run folder.
     """
     # Searched by the id of the calibration: a run folder that is complete gets no more files.
-    return newest(record for record in _records_near(place) if record.calibration_id == calibration_id)
+    folder, found = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
+    for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
+        for file in sorted(parent.glob("*/verification*.json")):
+            with suppress(BadCalibration, OSError):
+                found.append(VerificationRecord.load(file))
+    return newest(record for record in found if record.calibration_id == calibration_id)
 
 
 def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
@@ -134,25 +137,13 @@ def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
     return max(timed, key=lambda record: record.created_utc or "", default=None)
 
 
-def _records_near(place: Path) -> Iterator[VerificationRecord]:
-    folder = place.absolute() if place.is_dir() else place.absolute().parent
-    for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
-        for file in sorted(parent.glob("*/verification*.json")):
-            try:
-                yield VerificationRecord.load(file)
-            except (BadCalibration, OSError):
-                continue
-
-
 def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "CalibrationDataset | None":
     """Read the poses of a calibration, of which `place` is the file or its folder; None if they are not there."""
     for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
-        try:
+        with suppress(BadDataset, OSError):
             dataset = ftcalib.CalibrationDataset.load(path)
-        except (BadDataset, OSError):
-            continue
-        if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
-            return dataset
+            if dataset.sha256() == calibration.provenance.get("dataset_sha256"):
+                return dataset
     return None
 
 

@@ -8,7 +8,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Column, Connection, Row, Select, Table, bindparam, delete, func, select
+from sqlalchemy import Column, ColumnElement, Connection, Row, Select, Table, bindparam, delete, func, select
 
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import FILES, REFUSALS, WeighingDay, sum_up
@@ -115,10 +115,8 @@ class Store:
 
     def results(self, tool: str | None = None) -> list[StoredResult]:
         """Return all results, or those of a tool, the oldest first."""
-        query = _oldest_first(database.results)
-        if tool is not None:
-            query = query.where(database.results.c.tool == tool)
-        return self._read(query, _to_result)
+        table = database.results
+        return self._read(_oldest_first(table).where(*_is(table.c.tool, tool)), _to_result)
 
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
@@ -127,10 +125,8 @@ class Store:
 
     def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
         """Return all verifications, or those of a calibration, the oldest first."""
-        query = _oldest_first(database.verifications)
-        if calibration_id is not None:
-            query = query.where(database.verifications.c.calibration_id == calibration_id)
-        return self._read(query, _to_verification)
+        table = database.verifications
+        return self._read(_oldest_first(table).where(*_is(table.c.calibration_id, calibration_id)), _to_verification)
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
         """Return the newest verification of a calibration, if there is one."""
@@ -139,9 +135,8 @@ class Store:
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
         """Return the last days with weighings, or those of a tool, the oldest first."""
         table = database.weighings
-        query = select(table).order_by(table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id).limit(most)
-        if tool is not None:
-            query = query.where(table.c.tool == tool)
+        newest_first = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
+        query = select(table).where(*_is(table.c.tool, tool)).order_by(*newest_first).limit(most)
         return self._read(query, _to_weighings)[::-1]
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[WeighingDay]:
@@ -200,6 +195,10 @@ def _paths_where(connection: Connection, table: Table, column: Column[Any], valu
         yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
 
+def _is(column: Column[Any], value: str | None) -> list[ColumnElement[bool]]:
+    return [] if value is None else [column == value]
+
+
 def _oldest_first(table: Table) -> Select[Any]:
     return select(table).order_by(table.c.created_utc.nulls_first(), table.c.id)
 
@@ -207,11 +206,10 @@ def _oldest_first(table: Table) -> Select[Any]:
 def _newest_accepted(most: int) -> Select[Any]:
     table = database.results
     one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
-    rank = func.row_number().over(partition_by=one, order_by=(table.c.created_utc.desc(), table.c.id.desc()))
-    ranked = select(table.c.id, rank.label("rank")).where(
-        table.c.verdict != "rejected", table.c.created_utc.is_not(None)
-    )
-    found = ranked.subquery()
+    newest_first = (table.c.created_utc.desc(), table.c.id.desc())
+    rank = func.row_number().over(partition_by=one, order_by=newest_first).label("rank")
+    accepted = (table.c.verdict != "rejected", table.c.created_utc.is_not(None))
+    found = select(table.c.id, rank).where(*accepted).subquery()
     return _oldest_first(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank <= most)))
 
 
@@ -220,10 +218,7 @@ def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
     table = database.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
     rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
-    ranked = select(table.c.id, rank).where(table.c.day >= since_day)
-    if tool is not None:
-        ranked = ranked.where(table.c.tool == tool)
-    found = ranked.subquery()
+    found = select(table.c.id, rank).where(table.c.day >= since_day, *_is(table.c.tool, tool)).subquery()
     return select(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank == 1)))
 
 

@@ -25,7 +25,7 @@ Samples = dict[tuple[str, str], float]
 
 @pytest.fixture
 def server() -> Iterator[MetricsServer]:
-    with closing(MetricsServer("127.0.0.1", 0)) as server:
+    with closing(MetricsServer("127.0.0.1", 0, str)) as server:
         yield server
 
 
@@ -154,4 +154,4 @@ def test_names_and_units_are_those_prometheus_asks_for(server: MetricsServer) ->
 @pytest.mark.parametrize("host", ["127.0.0.1", "203.0.113.7"])
 def test_an_address_that_cannot_be_used_is_one_sentence(host: str, server: MetricsServer) -> None:
     with pytest.raises(ConfigError, match=rf"/metrics cannot be served at {host}:{server.port} \(.+\): choose"):
-        MetricsServer(host, server.port)
+        MetricsServer(host, server.port, str)
