@@ -79,23 +79,21 @@ def history(
     _print_left_out(left_out)
     now = datetime.now(UTC)
     found, advice = drifts(results), list(warnings(results, checks, now))
-    warmth: dict[Any, Any] = {}
-    moved = list[dict[str, Any]]()
+    warmth, moved = list[Any](), list[dict[str, Any]]()
     if len(results) + len(checks) >= _FEWEST_RUNS or any(one.temperature_C is not None for one in results):
-        from ftdrive.store.trends import hour_changes, temperatures
+        from ftdrive.store.trends import sensor_biases
 
-        warmth = temperatures(results, checks)
-        mounted = (
-            dict(zip(_MOUNTED, key, strict=True)) | {"force_N": float(change[0]), "torque_Nm": float(change[3])}
-            for key, change in hour_changes(results, checks).items()
-        )
-        moved = [*mounted]
+        for key, (fit, change) in sensor_biases(results, checks).items():
+            mounted = dict(zip(_MOUNTED, key, strict=True))
+            warmth += [] if fit is None else [(mounted, fit)]
+            if change is not None:
+                moved.append(mounted | {"force_N": float(change[0]), "torque_Nm": float(change[3])})
     last = {check.calibration_id: check for check in checks}
     if as_json:
         rows = [one.to_dict(age_days(one.created_utc, now), last.get(one.id)) for one in results]
         about = {
             "trends": [one.to_dict() for one in found],
-            "temperature": [dict(zip(_MOUNTED, key, strict=True)) | _as_json(fit) for key, fit in warmth.items()],
+            "temperature": [mounted | _as_json(fit) for mounted, fit in warmth],
             "hour_changes": moved,
             "warnings": advice,
             "last_weighings": [asdict(one) for one in weighed],
@@ -110,7 +108,7 @@ def history(
     titles, shown = result_table(results, last, now)
     print_table(titles, shown, folding={"arm", "tool", "verified", "run", "parent"})
     trend_lines = (f"trend: {drift}" for drift in found)
-    warmth_lines = (line for (serial, *_), fit in warmth.items() for line in temperature_lines(serial, fit))
+    warmth_lines = (line for mounted, fit in warmth for line in temperature_lines(mounted["sensor_serial"], fit))
     weighing_lines = (f"last weighing: {last_weighing_in_words(one)}" for one in weighed if one.mass_kg is not None)
     for line in (*trend_lines, *warmth_lines, *map(_HOUR.format_map, moved), *weighing_lines):
         echo(line)

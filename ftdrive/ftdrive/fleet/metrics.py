@@ -18,8 +18,9 @@ except ImportError:
     raise ConfigError(missing_extra("`fleet serve`", "prometheus-client", "fleet")) from None
 
 
-def _seconds(time: datetime | None) -> float | None:
+def _seconds(time: datetime | str | None) -> float | None:
     # A time and not an age: an age would stand still when the server does.
+    time = datetime.fromisoformat(time) if isinstance(time, str) else time
     return None if time is None else time.timestamp()
 
 
@@ -66,11 +67,7 @@ OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = 
     ),
     "ftdrive_weighing_timestamp_seconds": (
         "When that part was weighed.",
-        lambda one: (
-            None
-            if one.weighings is None or one.weighings.last_utc is None
-            else datetime.fromisoformat(one.weighings.last_utc).timestamp()
-        ),
+        lambda one: _seconds(None if one.weighings is None else one.weighings.last_utc),
     ),
 }
 TOOL: Final = ("cell", "tool")

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file, read_lines
@@ -107,16 +107,10 @@ class WeighingDay:
                     raise BadDataset(f"line {number} of the weighings is damaged: take the file from a copy")
                 if number == 1:
                     check_format(content, FORMAT, BadDataset)
-                    found = replace(
-                        found,
-                        day=text_at(content, "day") or "",
-                        tool=text_at(content, "tool"),
-                        arm_serial=text_at(content, "arm_serial"),
-                        sensor_serial=text_at(content, "sensor_serial"),
-                        robot_host=text_at(content, "robot_host"),
-                        calibration_id=text_at(content, "calibration_id"),
-                        emulated=content.get("emulated") is True,
-                    )
+                    names = ("tool", "arm_serial", "sensor_serial", "robot_host", "calibration_id")
+                    origin: dict[str, Any] = {name: text_at(content, name) for name in names}
+                    day, emulated = text_at(content, "day") or "", content.get("emulated") is True
+                    found = replace(found, day=day, emulated=emulated, **origin)
                 elif (code := content.get("refused")) is not None:
                     refusals[code if code in refusals else "other"] += 1
                 elif content.get("is_something"):

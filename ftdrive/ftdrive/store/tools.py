@@ -12,7 +12,7 @@ from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.calibration import with_sensor
 from ftdrive.store.records import StoredResult, read_records, record_paths
 from ftdrive.store.store import Store
-from ftdrive.store.trends import hour_changes, temperatures
+from ftdrive.store.trends import sensor_biases
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
 # Searched beside the store, so that a run that is not indexed yet counts too.
@@ -99,9 +99,9 @@ def _of_sensor(
         checks = [check for each in alike for check in store.verifications(each.id)]
     except BadStore:
         return None, None
-    fits = temperatures(alike, checks).values() if one.temperature_C is not None else ()
-    temperature = next((fit for fit in fits if any(fit.predicts)), None)
-    return temperature, next(iter(hour_changes(alike, checks).values()), None)
+    fit, hour_change = next(iter(sensor_biases(alike, checks).values()), (None, None))
+    is_known = one.temperature_C is not None and fit is not None and any(fit.predicts)
+    return fit if is_known else None, hour_change
 
 
 def _failed(store: Store, one: StoredResult) -> Iterator[str]:

@@ -122,39 +122,37 @@ class _Run(NamedTuple):
     sigma: Array
 
 
-def temperatures(
+def sensor_biases(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
-) -> dict[Mounted, BiasTemperature]:
-    """Fit the bias of each sensor against its temperature, where it has runs enough."""
-    found = dict[Mounted, BiasTemperature]()
-    for mounted, runs in _runs(results, verifications).items():
-        known = [run for run in runs if run.temperature_C is not None]
-        days = [(run.created_utc - known[0].created_utc).total_seconds() / 86400 for run in known]
-        columns = (np.array([getattr(run, name) for run in known]) for name in ("temperature_C", "bias", "sigma"))
-        if known and (fit := bias_temperature(np.array(days), *columns)) is not None:
-            found[mounted] = fit
-    return found
+) -> dict[Mounted, tuple[BiasTemperature | None, Array | None]]:
+    """Return how the bias of each sensor follows its temperature, and how far it moves in an hour; None without data.
 
-
-def hour_changes(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, Array]:
-    """Return how far the bias of each sensor moves in an hour (6,), one standard deviation, N and N·m.
-
-    It is that of a random walk between successive runs of one tool within a quarter of an hour to six hours. The median
-    counts, over the axes of force and torque each, so that a moved cable does not. Sensors with fewer than three such
-    pairs are left out.
+    The latter is (6,) one standard deviation, N and N·m, of a random walk between successive runs of one tool within a
+    quarter of an hour to six hours. The median counts, over the axes of force and torque each, so that a moved cable
+    does not. It takes three such pairs.
     """
-    found = dict[Mounted, Array]()
-    for mounted, runs in _runs(results, verifications).items():
-        squares, noise = list[Array](), list[Array]()
-        for before, after in pairwise(runs):
-            hours = (after.created_utc - before.created_utc).total_seconds() / 3600
-            if before.tool == after.tool and _NEAR_H[0] <= hours <= _NEAR_H[1]:
-                squares.append((after.bias - before.bias) ** 2 / hours)
-                noise.append((before.sigma**2 + after.sigma**2) / hours)
-        if len(squares) >= _FEWEST_PAIRS:
-            usual, known = (np.median(np.reshape(part, (-1, 2, 3)), axis=(0, 2)) for part in (squares, noise))
-            found[mounted] = np.repeat(np.sqrt(np.maximum(usual / _MEDIAN - known, 0.0)), 3)
-    return found
+    runs = _runs(results, verifications)
+    return {mounted: (_temperature(found), _hour_change(found)) for mounted, found in runs.items()}
+
+
+def _temperature(runs: Sequence[_Run]) -> BiasTemperature | None:
+    known = [run for run in runs if run.temperature_C is not None]
+    days = [(run.created_utc - known[0].created_utc).total_seconds() / 86400 for run in known]
+    columns = (np.array([getattr(run, name) for run in known]) for name in ("temperature_C", "bias", "sigma"))
+    return bias_temperature(np.array(days), *columns) if known else None
+
+
+def _hour_change(runs: Sequence[_Run]) -> Array | None:
+    squares, noise = list[Array](), list[Array]()
+    for before, after in pairwise(runs):
+        hours = (after.created_utc - before.created_utc).total_seconds() / 3600
+        if before.tool == after.tool and _NEAR_H[0] <= hours <= _NEAR_H[1]:
+            squares.append((after.bias - before.bias) ** 2 / hours)
+            noise.append((before.sigma**2 + after.sigma**2) / hours)
+    if len(squares) < _FEWEST_PAIRS:
+        return None
+    usual, known = (np.median(np.reshape(part, (-1, 2, 3)), axis=(0, 2)) for part in (squares, noise))
+    return np.repeat(np.sqrt(np.maximum(usual / _MEDIAN - known, 0.0)), 3)
 
 
 def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, list[_Run]]:

@@ -11,7 +11,7 @@ from ftcalib.model import BIASES, Array
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
-from ftdrive.store.trends import QuantityTrend, hour_changes, temperatures
+from ftdrive.store.trends import QuantityTrend, sensor_biases
 from ftdrive.words.history import temperature_lines
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
 from tests.unit.ftdrive.stream.simulated import calibrated
@@ -152,8 +152,9 @@ def test_the_temperature_of_a_sensor_is_fitted_over_calibrations_and_verificatio
     step[BIASES] = 10 * slope
     new_run(tmp_path, "warm", result(8, step, temperature_C=35.0))
     verified(folder, "of no known calibration", 9, temperature_C=60.0)
-    ((mounted, fit),) = temperatures(*records(tmp_path)).items()
+    ((mounted, (fit, _)),) = sensor_biases(*records(tmp_path)).items()
     assert mounted == ("ft-1", "arm-1", None)
+    assert fit is not None
     assert (fit.n, fit.coldest_C, fit.warmest_C) == (8, 22.0, 36.0)
     assert np.abs((fit.slope - slope) / fit.sigma).max() < 4
     assert fit.predicts == (True, True)
@@ -174,6 +175,7 @@ def test_runs_within_hours_show_how_far_the_bias_moves(tmp_path: Path) -> None:
         change = change + np.sqrt(hours) * sigma * rng.normal(size=6) + (2.0 if k == 5 else 0.0)
         values = {"value": change.tolist(), "sigma": [0.01] * 3 + [3e-4] * 3, "calibration_sigma": [1e-3] * 6}
         verified(new_run(tmp_path, f"check-{k}"), first.id, day, bias_change=values)
-    ((_, found),) = hour_changes(*records(tmp_path)).items()
+    ((_, (_, found)),) = sensor_biases(*records(tmp_path)).items()
+    assert found is not None
     assert ((found > 0.6 * sigma) & (found < 1.6 * sigma)).all()
-    assert hour_changes(records(tmp_path)[0], []) == {}
+    assert sensor_biases(records(tmp_path)[0], []) == {("ft-1", "arm-1", None): (None, None)}
