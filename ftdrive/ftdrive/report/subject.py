@@ -16,7 +16,7 @@ from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs import is_run
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedData, SolveOptions, read_source, solve_in_motion
-from ftdrive.runs.verification import age_of, newest, verification_near
+from ftdrive.runs.verification import age_and_check, newest, verification_near
 
 # If a store cannot be read: why.
 MAY_BE_MISSING = "a later verification may be missing, because {}"
@@ -38,11 +38,10 @@ def trust(
         last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
     except (BadStore, ConfigError) as unreadable:
         error = str(unreadable)
-    words = ", ".join([*age_of(result, now), "not verified" if last is None else last.in_words(now)])
     found = None
     if last is not None:
         found = last.to_dict(("created_utc", "passed", "change", "reason", "path")) | {"reason": last.reason or ""}
-    return {"words": words, "last_verification": found, "store_error": error}
+    return {"words": age_and_check(result, last, now), "last_verification": found, "store_error": error}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -153,23 +153,11 @@ def age_in_words(age: timedelta) -> str:
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
 
-def age_of(calibration: "CalibrationResult", now: datetime) -> list[str]:
-    """Return the age of a calibration, such as ["2 h old"]; empty if its file does not say when it was made."""
+def age_and_check(calibration: "CalibrationResult", last: VerificationRecord | None, now: datetime) -> str:
+    """Return the age of a calibration, if its file says when it was made, and the result of its last verification."""
     created = calibration.provenance.get("created_utc")
-    return [f"{age_in_words(now - datetime.fromisoformat(created))} old"] if isinstance(created, str) else []
-
-
-def calibration_in_words(
-    calibration: "CalibrationResult",
-    verification: VerificationRecord | None,
-    now: datetime,
-    marks: Sequence[str] | None = None,
-) -> str:
-    """Return id, verdict, age and marks of a calibration, by default its own, and its last verification's result."""
-    verified = "not verified" if verification is None else verification.in_words(now)
-    found = marks_of(calibration) if marks is None else marks
-    words = [f"calibration {calibration.id[:6]}", calibration.verdict, *found, *age_of(calibration, now), verified]
-    return ", ".join(words)
+    age = f"{age_in_words(now - datetime.fromisoformat(created))} old, " if isinstance(created, str) else ""
+    return age + ("not verified" if last is None else last.in_words(now))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

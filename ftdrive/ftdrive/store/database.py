@@ -1,14 +1,15 @@
 """The database behind a store: its address, its lock, its tables and their version, and its errors in words.
 
-A change of a column of results, verifications or weighings raises `SCHEMA`: an older index is then built again from
-its files.
+The columns are the fields of the records. A change of those of results, verifications or weighings raises `SCHEMA`:
+an older index is then built again from its files.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from types import UnionType
+from typing import Any, Final, get_args, get_type_hints
 
 from sqlalchemy import (
     JSON,
@@ -37,7 +38,7 @@ from ftdrive.cell.config import user_folder
 from ftdrive.errors import BadStore, ConfigError
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import REFUSALS, WeighingDay
-from ftdrive.store.records import Record, StoredResult
+from ftdrive.store.records import Record, StoredCell, StoredResult
 from ftdrivers.installation import missing_extra
 
 # Version of the index, kept in the database.
@@ -49,60 +50,46 @@ WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
 schema: Final = Table("ftdrive_schema", metadata, Column("version", Integer, primary_key=True, autoincrement=False))
-results: Final = Table(
+_TYPES: Final = {str: String, int: Integer, float: Float, bool: Boolean}
+
+
+def _table(
+    name: str, record: type, *more: Column[Any], key: str = "id", index: Collection[str] = (), without: Collection[str]
+) -> Table:
+    """Make a table with the fields of a record, as JSON where no type of a database fits, and `more` columns."""
+    columns = list[Column[Any]]()
+    for field, hint in get_type_hints(record).items():
+        is_optional = isinstance(hint, UnionType)
+        kind = _TYPES.get(get_args(hint)[0] if is_optional else hint, JSON(none_as_null=True))
+        if field not in without:
+            column = Column(field, kind, primary_key=field == key, index=field in index, nullable=is_optional)
+            columns.append(column)
+    return Table(name, metadata, *columns, *more)
+
+
+results: Final = _table(
     "ftdrive_results",
-    metadata,
-    Column("id", String, primary_key=True),
-    Column("path", String, nullable=False),
-    Column("run", String, nullable=False),
-    Column("created_utc", String, index=True),
-    *(Column(name, String) for name in ("tool", "arm_serial", "sensor_serial", "mount")),
-    Column("verdict", String, nullable=False),
-    Column("n_poses", Integer, nullable=False),
-    *(Column(name, Float, nullable=False) for name in ("mass_kg", "g_m_s2")),
-    Column("numbers", JSON, nullable=False),
-    *(Column(name, String) for name in ("dataset_sha256", "parent", "update")),
-    Column("temperature_C", Float),
-    *(Column(name, String) for name in ("arm_model", "sensor_model", "robot_host")),
-    Column("payload_kg", Float),
-    Column("payload_com_m", JSON(none_as_null=True)),
+    StoredResult,
     Column("emulated", Boolean, nullable=False, server_default=false()),
+    index=["created_utc"],
+    without=["emulated"],
 )
-verifications: Final = Table(
+verifications: Final = _table(
     "ftdrive_verifications",
-    metadata,
-    Column("id", String, primary_key=True),
-    Column("path", String, nullable=False),
-    Column("run", String, nullable=False),
-    Column("calibration_id", String, nullable=False, index=True),
-    Column("created_utc", String, index=True),
-    Column("passed", Boolean, nullable=False),
-    *(Column(name, String) for name in ("change", "reason")),
-    Column("temperature_C", Float),
+    VerificationRecord,
     *(Column(f"{name}_{axis}", Float) for name in WRENCHES for axis in AXES),
+    Column("run", String, nullable=False),
+    index=["calibration_id", "created_utc"],
+    without=[*WRENCHES, "force_max_N", "torque_max_Nm"],
 )
-weighings: Final = Table(
+weighings: Final = _table(
     "ftdrive_weighings",
-    metadata,
-    Column("id", String, primary_key=True),
-    Column("path", String, nullable=False),
-    Column("day", String, nullable=False, index=True),
-    *(Column(name, String) for name in ("tool", "arm_serial", "sensor_serial", "robot_host", "calibration_id")),
-    Column("emulated", Boolean, nullable=False),
-    Column("size", Integer, nullable=False),
-    Column("weighings", Integer, nullable=False),
+    WeighingDay,
     *(Column(f"refused_{code}", Integer, nullable=False) for code in REFUSALS),
-    Column("last_utc", String),
-    *(Column(name, Float) for name in ("mass_kg", "mass_sigma_kg")),
+    index=["day"],
+    without=["refusals"],
 )
-cells: Final = Table(
-    "ftdrive_cells",
-    metadata,
-    Column("name", String, primary_key=True),
-    Column("config", String, nullable=False),
-    Column("verify_every_days", Float, nullable=False),
-    *(Column(name, String) for name in ("arm_serial", "robot_host", "sensor_url", "tool")),
-)
+cells: Final = _table("ftdrive_cells", StoredCell, key="name", without=[])
 RECORDS: Final[Mapping[type[Record], Table]] = {
     StoredResult: results,
     VerificationRecord: verifications,

@@ -35,11 +35,8 @@ class Store:
 
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
         self._database = Database(url, wait_s)
-
-    @property
-    def name(self) -> str:
+        self.name = self._database.name
         """The file, or the address without its password."""
-        return self._database.name
 
     @cached_property
     def _current(self) -> Database:
@@ -241,9 +238,8 @@ def _to_cell(row: Row[Any]) -> StoredCell:
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
     # By place, because a name takes as long as all the rest.
-    id_, path, _, *outcome = row[:8]  # without the name of the run
-    wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (9, 15, 21)]
-    return VerificationRecord._make((path, *outcome, None, None, id_, row[8], *wrenches))
+    wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (8, 14, 20)]
+    return VerificationRecord._make((*row[:6], None, None, *row[6:8], *wrenches))
 
 
 def _to_weighings(row: Row[Any]) -> WeighingDay:

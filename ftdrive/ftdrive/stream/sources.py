@@ -23,7 +23,7 @@ from ftdrive.cell.emulated import Station
 from ftdrive.checks.check import compare_devices
 from ftdrive.errors import ConfigError
 from ftdrive.runs.calibration import marks_of, versions
-from ftdrive.runs.verification import VerificationRecord, calibration_in_words, verification_near
+from ftdrive.runs.verification import VerificationRecord, age_and_check, verification_near
 from ftdrive.stream.pairing import DelayEstimator, Pairing
 from ftdrive.stream.samples import Links, LinkStatus, Paired, StreamEvent, StreamInfo, mean_rate_Hz, sensor_origin_m
 from ftdrivers.clock import REAL, Clock
@@ -498,4 +498,5 @@ def _trusted(
     """Return the last verification of a calibration, and what is said of its age and of that."""
     path = Path(name)
     verification = verification_near(path, calibration.id) if path.name and path.exists() else None
-    return verification, calibration_in_words(calibration, verification, datetime.now(UTC), marks)
+    state = age_and_check(calibration, verification, datetime.now(UTC))
+    return verification, ", ".join([f"calibration {calibration.id[:6]}", calibration.verdict, *marks, state])

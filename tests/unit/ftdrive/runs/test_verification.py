@@ -13,8 +13,8 @@ from ftcalib import CalibrationDataset, CalibrationResult
 from ftdrive.runs.verification import (
     FORMAT,
     VerificationRecord,
+    age_and_check,
     age_in_words,
-    calibration_in_words,
     fitted_dataset,
     verification_near,
 )
@@ -91,14 +91,13 @@ def test_ages(hours: float, words: str) -> None:
     assert age_in_words(timedelta(hours=hours)) == words
 
 
-def test_the_state_of_a_calibration_in_words(tmp_path: Path) -> None:
+def test_the_state_of_a_age_and_check(tmp_path: Path) -> None:
     made = replace(calibration(), provenance={"created_utc": (NOW - timedelta(days=3)).isoformat()})
-    words = f"calibration {made.id[:6]}, {made.verdict}, 3 d old, "
-    assert calibration_in_words(made, None, NOW) == words + "not verified"
+    assert age_and_check(made, None, NOW) == "3 d old, not verified"
     record = VerificationRecord.load(verify(tmp_path / "a", 2.0))
-    assert calibration_in_words(made, record, NOW) == words + "verified 2 h ago"
+    assert age_and_check(made, record, NOW) == "3 d old, verified 2 h ago"
     failed = VerificationRecord.load(verify(tmp_path / "b", 2.0, passed=False, change="bias"))
-    assert calibration_in_words(made, failed, NOW) == words + "VERIFICATION FAILED 2 h ago (bias)"
+    assert age_and_check(made, failed, NOW) == "3 d old, VERIFICATION FAILED 2 h ago (bias)"
 
 
 def test_the_poses_of_a_calibration_are_found_by_their_hash(tmp_path: Path) -> None:
