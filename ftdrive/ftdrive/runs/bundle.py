@@ -255,11 +255,14 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     for text in texts.values():
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
+    emulated = None
+    with suppress(BadDataset):  # a damaged run is worth a report too
+        emulated = Run(folder).header().get("station") is not None
     about = {
         "format": FORMAT,
         "created_utc": datetime.now(UTC).isoformat(),
         "run": folder.name,
-        "emulated": _is_emulated(folder),
+        "emulated": emulated,
         "redacted": redaction.counts,
         "left_out": left_out,
     }
@@ -336,14 +339,6 @@ def _text(content: bytes) -> str | None:
     except UnicodeDecodeError:
         return None
     return None if "\0" in text else text
-
-
-def _is_emulated(folder: Path) -> bool | None:
-    try:
-        return Run(folder).header().get("station") is not None
-    # A damaged run is worth a report too.
-    except BadDataset:
-        return None
 
 
 def _environment(folder: Path) -> dict[str, Any]:

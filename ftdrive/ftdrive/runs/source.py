@@ -436,17 +436,14 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
     """
     if earlier.verdict == "rejected":
         raise ConfigError(f"--from: result {earlier.id} is rejected: take an accepted one")
-    before, now = earlier.provenance, provenance
-    for device in ("sensor", "arm"):
-        serials = [at(one, "devices", device, "serial") for one in (before, now)]
-        if all(serials) and serials[0] != serials[1]:
-            raise ConfigError(
-                f"--from: result {earlier.id} is of {device} {serials[0]}, the new data of {serials[1]}: take one of "
-                f"the same {device}"
-            )
-    mounts = [at(one, "setup", "mount") for one in (before, now)]
-    if all(mounts) and mounts[0] != mounts[1]:
-        raise ConfigError(f"--from: result {earlier.id} is of mount {mounts[0]}, the new data of {mounts[1]}")
+    for what, *place, fix in (
+        ("sensor", "devices", "sensor", "serial", ": take one of the same sensor"),
+        ("arm", "devices", "arm", "serial", ": take one of the same arm"),
+        ("mount", "setup", "mount", ""),
+    ):
+        before, now = at(earlier.provenance, *place), at(provenance, *place)
+        if before and now and before != now:
+            raise ConfigError(f"--from: result {earlier.id} is of {what} {before}, the new data of {now}{fix}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -113,12 +113,12 @@ class Store:
     def results(self, tool: str | None = None) -> list[StoredResult]:
         """Return all results, or those of a tool, the oldest first."""
         table = database.results
-        return self._read(_oldest_first(table).where(*_is(table.c.tool, tool)), _to_result)
+        return self._read(_oldest_first(table).where(*_is(table.c.tool, tool)), _by_name(StoredResult))
 
     def find(self, start: str) -> list[StoredResult]:
         """Return the results whose id begins so."""
         query = select(database.results).where(database.results.c.id.startswith(start, autoescape=True))
-        return self._read(query, _to_result)
+        return self._read(query, _by_name(StoredResult))
 
     def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
         """Return all verifications, or those of a calibration, the oldest first."""
@@ -142,7 +142,7 @@ class Store:
 
     def cells(self) -> list[StoredCell]:
         """Return all cells by name."""
-        return sorted(self._read(select(database.cells), _to_cell), key=lambda cell: cell.name)
+        return sorted(self._read(select(database.cells), _by_name(StoredCell)), key=lambda cell: cell.name)
 
     def fleet(
         self, newest: int, since: datetime
@@ -155,8 +155,8 @@ class Store:
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(database.verifications).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
-            cells = _rows(connection, select(database.cells), _to_cell)
-            results = _rows(connection, _newest_accepted(newest), _to_result)
+            cells = _rows(connection, select(database.cells), _by_name(StoredCell))
+            results = _rows(connection, _newest_accepted(newest), _by_name(StoredResult))
             found = _rows(connection, checks, _to_verification)
             weighings = _rows(connection, _last_weighings(start[:10]), _to_weighings)
         cells.sort(key=lambda cell: cell.name)
@@ -228,12 +228,8 @@ def _to_row(record: Record | StoredCell) -> dict[str, Any]:
     return row
 
 
-def _to_result(row: Row[Any]) -> StoredResult:
-    return StoredResult(**row._asdict())
-
-
-def _to_cell(row: Row[Any]) -> StoredCell:
-    return StoredCell(**row._asdict())
+def _by_name(kind: Callable[..., _Stored]) -> Callable[[Row[Any]], _Stored]:
+    return lambda row: kind(**row._asdict())
 
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
