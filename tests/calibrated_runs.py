@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters
 from ftcalib.errors import NotObservable
 from ftcalib.model import predict
-from ftdrive import __version__
 from ftdrive.fleet.resolve import solve_run
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.runs.run import RUN_FORMAT
@@ -94,5 +93,5 @@ _solved = dict[tuple[int, int], CalibrationResult]()
 
 def _own(folder: Path, seed: int, poses: int) -> CalibrationResult:
     if (seed, poses) not in _solved:
-        _solved[seed, poses] = CalibrationResult.from_dict(json.loads(solve_run(folder, __version__)))
+        _solved[seed, poses] = CalibrationResult.from_dict(json.loads(solve_run(folder)))
     return _solved[seed, poses]

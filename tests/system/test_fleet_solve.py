@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from ftdrive import __version__
 from ftdrive.fleet.resolve import solve_again, solve_run, solved_path
 from ftdrive.fleet.workers import WorkerDied, Workers, answers, cluster_workers, local_workers
 from ftdrivers.errors import Unreachable
@@ -40,7 +39,7 @@ def solved_by(workers: Workers, runs: list[Path], *, kill: bool = False) -> list
 
 def test_processes_give_the_same_bytes_also_if_one_is_killed(runs: list[Path]) -> None:
     with local_workers(2) as workers:
-        assert solved_by(workers, runs, kill=True) == [solve_run(run, __version__) for run in runs]
+        assert solved_by(workers, runs, kill=True) == [solve_run(run) for run in runs]
 
 
 def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Path]) -> None:
@@ -52,7 +51,7 @@ def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Pa
         cluster.start_worker()
         cluster.start_worker()
         found = solved_on(cluster.address, runs, timeout_s=60, kill=True)
-    assert found == [solve_run(run, __version__) for run in runs]
+    assert found == [solve_run(run) for run in runs]
 
 
 def solved_on(address: str, runs: list[Path], *, timeout_s: float = 0.1, kill: bool = False) -> list[bytes]:
@@ -90,4 +89,4 @@ def test_ctrl_c_keeps_what_is_solved_and_the_command_continues(runs: list[Path],
     assert 2 <= before < 8
     found = ftdrive.json("fleet", "solve", kept, "--workers", "1")
     assert (found["runs"], found["solved_before"], found["unchanged"]) == (8, before, 8)
-    assert [solved_path(run).read_bytes() for run in runs] == [solve_run(run, __version__) for run in runs]
+    assert [solved_path(run).read_bytes() for run in runs] == [solve_run(run) for run in runs]

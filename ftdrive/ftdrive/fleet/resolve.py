@@ -79,7 +79,7 @@ def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[
     return runs
 
 
-def solve_run(folder: Path, version: str) -> bytes:
+def solve_run(folder: Path, version: str = __version__) -> bytes:
     """Return the calibration file of a run: a pure function of its files and of the installed versions.
 
     Raises `OtherVersion` in a worker of another version, `BadDataset`, `BadCalibration` or `OSError` for a file of the

@@ -40,8 +40,6 @@ def fleet(*cells: CellState, findings: tuple[FleetFinding, ...] = ()) -> Fleet:
     return Fleet(cells, findings)
 
 
-def reading(
-    *cells: CellState, findings: tuple[FleetFinding, ...] = (), store_up: bool = True
-) -> tuple[Fleet, datetime, bool]:
+def reading(*cells: CellState, findings: Any = (), store_up: bool = True) -> tuple[Fleet, datetime, bool]:
     """A reading of a moment ago."""
     return Fleet(cells, findings), NOW, store_up

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from ftcalib import CalibrationResult, Finding
-from ftdrive import __version__
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.resolve import Comparison, is_calibration, solve_again, solve_run, solved_path
 from ftdrive.fleet.workers import Workers
@@ -51,7 +50,7 @@ def test_the_result_is_that_of_the_run_and_replaces_nothing(tmp_path: Path) -> N
     assert new.provenance == {**own.provenance, "created_utc": FIRST.isoformat(), "run": "run"}
     assert new.provenance["setup"]["tool"] == "gripper"
     assert (folder / "calibration.json").read_bytes() == before
-    assert solved_path(folder).read_bytes() == solve_run(folder, __version__)
+    assert solved_path(folder).read_bytes() == solve_run(folder)
 
 
 def test_a_run_in_motion_is_solved_here_and_from_its_files_to_the_same_bytes(tmp_path: Path) -> None:

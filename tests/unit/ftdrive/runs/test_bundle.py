@@ -43,9 +43,6 @@ CONFIG = {
 DEVICES = {"arm": {"serial": "20235501234", "firmware": "5.15.0.17"}, "sensor": {"serial": "FT12345"}}
 
 
-Bundled = tuple[Path, dict[str, int]]
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A solved one of 8 poses; its files give away hosts and a person."""
@@ -67,10 +64,12 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def bundled(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Bundled:
-    """Its bundle, and what was done for it."""
+def bundled(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its bundle, which names what was redacted."""
     path = tmp_path_factory.mktemp("bundle") / "a.zip"
-    return path, write_bundle(run.folder, path)[0]
+    redacted, _ = write_bundle(run.folder, path)
+    assert json.loads(contents(path)["bundle.json"])["redacted"] == redacted
+    return path
 
 
 def contents(path: Path) -> dict[str, bytes]:
@@ -78,34 +77,32 @@ def contents(path: Path) -> dict[str, bytes]:
         return {name: archive.read(name) for name in archive.namelist()}
 
 
-def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(run: Run, bundled: Bundled) -> None:
-    path, done = bundled
-    files = contents(path)
+def test_no_text_of_a_bundle_has_an_address_or_a_name_and_serial_numbers_stay(run: Run, bundled: Path) -> None:
+    files = contents(bundled)
     texts = {name: content.decode() for name, content in files.items() if not name.endswith(".npz")}
     assert not [(name, secret) for name, text in texts.items() for secret in SECRETS if secret in text]
     everything = "".join(texts.values())
     for kept in (SERIAL_PORT, "FT12345", "20235501234", "5.15.0.17", "127.0.0.1", "12:30:45", "ati-netft://<ip-1>?"):
         assert kept in everything, kept
+    done = json.loads(files["bundle.json"])["redacted"]
     assert done["home"] == done["mac"] == 1
-    assert json.loads(files["bundle.json"])["redacted"] == done
     header = json.loads(texts[f"{run.folder.name}/run.json"])
     assert header["config"]["robot"]["host"].startswith("<host-")
     assert header["said"]["config"].startswith("<home-1>/")
     assert json.loads(texts["environment.json"])["packages"]["numpy"] == np.__version__
 
 
-def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundled: Bundled) -> None:
-    path, _ = bundled
+def test_a_bundle_gives_the_result_of_its_run_to_the_last_digit(run: Run, bundled: Path) -> None:
     saved = CalibrationResult.load(run.calibration_path)
     for command in ("replay", "solve"):
-        answer = CliRunner().invoke(cli, [command, str(path), "--json"])
+        answer = CliRunner().invoke(cli, [command, str(bundled), "--json"])
         assert answer.exit_code == 0, answer.output
         again = json.loads(answer.stdout)
         expected = json.loads(json.dumps(saved.to_dict()))
         assert {key: again[key] for key in expected if key != "provenance"} == {
             key: value for key, value in expected.items() if key != "provenance"
         }
-    with unpack(path) as folder:
+    with unpack(bundled) as folder:
         assert len(Run(folder).records()) == 8
     assert not folder.exists()
 
@@ -250,9 +247,9 @@ def test_a_bundle_without_end_is_refused(tmp_path: Path, capfd: pytest.CaptureFi
 
 
 def test_a_cut_off_bundle_and_another_file_are_named(
-    bundled: Bundled, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    bundled: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    whole = bundled[0].read_bytes()
+    whole = bundled.read_bytes()
     for number, content in enumerate((whole[: len(whole) // 2], b"hello", b"")):
         path = tmp_path / f"{number}.zip"
         path.write_bytes(content)
@@ -266,8 +263,8 @@ def test_a_cut_off_bundle_and_another_file_are_named(
     assert run_command(["replay", str(tmp_path / "b.zip")]) == 6
 
 
-def test_a_flipped_bit_is_refused_or_changes_no_number(run: Run, bundled: Bundled, tmp_path: Path) -> None:
-    path, content = tmp_path / "a.zip", bundled[0].read_bytes()
+def test_a_flipped_bit_is_refused_or_changes_no_number(run: Run, bundled: Path, tmp_path: Path) -> None:
+    path, content = tmp_path / "a.zip", bundled.read_bytes()
     rng, refused = np.random.default_rng(2), 0
     wrenches = [record.samples.wrench for record in run.records()]
     for place in rng.integers(0, len(content), 40).tolist():

@@ -91,7 +91,7 @@ def test_ages(hours: float, words: str) -> None:
     assert age_in_words(timedelta(hours=hours)) == words
 
 
-def test_the_state_of_a_age_and_check(tmp_path: Path) -> None:
+def test_the_state_of_a_calibration_in_words(tmp_path: Path) -> None:
     made = replace(calibration(), provenance={"created_utc": (NOW - timedelta(days=3)).isoformat()})
     assert age_and_check(made, None, NOW) == "3 d old, not verified"
     record = VerificationRecord.load(verify(tmp_path / "a", 2.0))

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from ftdrive import __version__
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.fleet.resolve import solve_run
@@ -30,7 +29,7 @@ def test_the_run_keeps_its_method_and_every_solve_uses_it(lab: Lab) -> None:
     assert outcome.result.method == "lrom"
     assert Run(outcome.run.folder).method == "lrom"
     assert outcome.run.solve_command.endswith(" --method lrom")
-    again = json.loads(solve_run(outcome.run.folder, __version__))  # as a fleet does
+    again = json.loads(solve_run(outcome.run.folder))  # as a fleet does
     assert again["method"] == "lrom"
     outcome.run.calibration_path.unlink()
     subject = read_subject(outcome.run.folder, SolveOptions())  # as a report does

@@ -37,8 +37,7 @@ CELL = StoredCell(
 def test_what_the_files_say_comes_back(runs: Path, store_url: str) -> None:
     store = Store(store_url)
     records, unreadable = store.index(runs)
-    assert Counter(map(type, records)) == {StoredResult: 4, VerificationRecord: 2}
-    assert unreadable == ()
+    assert (Counter(map(type, records)), unreadable) == ({StoredResult: 4, VerificationRecord: 2}, ())
     found = store.results()
     assert [one.run for one in found] == [
         "2026-03-01-calibrate",
