@@ -70,7 +70,7 @@ def history(
         store = open_store(url)
         name = store.name
         if index or rebuild:
-            _, left_out = store.rebuild(*index) if rebuild else store.index(*index)
+            left_out = (store.rebuild(*index) if rebuild else store.index(*index)).unreadable
         if weighings:
             _show_weighings(store.weighings(_MOST_DAYS, tool), name, left_out, as_json)
             return

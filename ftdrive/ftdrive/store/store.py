@@ -1,7 +1,7 @@
 """The store itself: results, verifications and cells, written from run folders and rebuilt from them at any time."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from operator import attrgetter
@@ -22,6 +22,18 @@ WAIT_S = 5.0
 _MOST = 5000
 
 _Stored = TypeVar("_Stored")
+
+
+@dataclass(frozen=True, slots=True)
+class Indexed:
+    """What one call of `Store.index` has read."""
+
+    results: int
+    verifications: int
+    weighings: int
+    """Files, each of one day."""
+    unreadable: tuple[str, ...]
+    """Files that were left out, each with the reason."""
 
 
 class Store:
@@ -49,8 +61,8 @@ class Store:
 
     # -------------------------------------------------------------------------------------------------------- writing
 
-    def index(self, *folders: Path) -> tuple[list[Record], tuple[str, ...]]:
-        """Add what is new in these run folders, or in the run folders that they contain; returns as `read_records`.
+    def index(self, *folders: Path) -> Indexed:
+        """Add what is new in these run folders, or in the run folders that they contain.
 
         A file that is known by its path is not read again, because no file of a run is ever overwritten. One of
         weighings is, if it has grown.
@@ -60,8 +72,8 @@ class Store:
             known = set() if connection is None else _known(connection, paths)
         return self._add(path for path in paths if str(path) not in known)
 
-    def rebuild(self, *folders: Path) -> tuple[list[Record], tuple[str, ...]]:
-        """Read these folders and all that were indexed before again, and forget deleted runs; returns as `index`.
+    def rebuild(self, *folders: Path) -> Indexed:
+        """Read these folders and all that were indexed before again, and forget runs that were deleted.
 
         Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
         """
@@ -89,12 +101,14 @@ class Store:
             for name in names:
                 connection.execute(by_name, {"cell": name})
 
-    def _add(self, paths: Iterable[Path], forget: Sequence[str] = ()) -> tuple[list[Record], tuple[str, ...]]:
+    def _add(self, paths: Iterable[Path], forget: Sequence[str] = ()) -> Indexed:
         records, unreadable = read_records(paths)
         if records or forget:
             with self._current.writing() as connection:
                 self._write(connection, records, forget)
-        return records, unreadable
+        kinds = (StoredResult, VerificationRecord, WeighingDay)
+        results, verifications, weighings = (sum(isinstance(one, kind) for one in records) for kind in kinds)
+        return Indexed(results, verifications, weighings, unreadable)
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
         """Insert records; of two files with the same content the first by path counts, whatever the order."""

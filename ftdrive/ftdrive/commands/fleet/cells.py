@@ -1,6 +1,5 @@
 """`ftdrive fleet add`, `remove` and `index`: which cells and runs the store has."""
 
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,10 +10,8 @@ from ftdrive.commands.options import FILE, FOLDER, STORE
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.cells import Owners, read_cells, refuse_ambiguous
 from ftdrive.fleet.state import list_names
-from ftdrive.runs.verification import VerificationRecord
-from ftdrive.runs.weighings import WeighingDay
 from ftdrive.store import open_store
-from ftdrive.store.records import StoredResult, record_paths
+from ftdrive.store.records import record_paths
 from ftdrive.terminal.console import answer, hanging, messages
 
 
@@ -61,13 +58,12 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     If cells were added, arms that belong to none of them are listed.
     """
     found = open_store(url)
-    records, unreadable = found.index(*folders)
-    for words in unreadable:
+    indexed = found.index(*folders)
+    for words in indexed.unreadable:
         messages.print(hanging(" left out: ", words))
-    new = Counter(map(type, records))
-    added = f"{counted(new[StoredResult], 'result')} and {counted(new[VerificationRecord], 'verification')}"
-    if new[WeighingDay]:
-        added += f" and {counted(new[WeighingDay], 'day')} of weighings"
+    added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
+    if indexed.weighings:
+        added += f" and {counted(indexed.weighings, 'day')} of weighings"
     answer.print(f" {added} added to {found.name}")
     for folder in folders:
         if not record_paths([folder]):

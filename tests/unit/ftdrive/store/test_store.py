@@ -4,7 +4,6 @@ import json
 import shutil
 import subprocess
 import sys
-from collections import Counter
 from dataclasses import replace
 from datetime import timedelta, timezone
 from pathlib import Path
@@ -14,9 +13,8 @@ import pytest
 from sqlalchemy import text
 
 from ftdrive.errors import ConfigError
-from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.database import default_file
-from ftdrive.store.records import StoredCell, StoredResult
+from ftdrive.store.records import StoredCell
 from ftdrive.store.store import Store
 from tests.edited_files import edit
 from tests.postgres import Server
@@ -36,8 +34,8 @@ CELL = StoredCell(
 
 def test_what_the_files_say_comes_back(runs: Path, store_url: str) -> None:
     store = Store(store_url)
-    records, unreadable = store.index(runs)
-    assert (Counter(map(type, records)), unreadable) == ({StoredResult: 4, VerificationRecord: 2}, ())
+    indexed = store.index(runs)
+    assert (indexed.results, indexed.verifications, indexed.unreadable) == (4, 2, ())
     found = store.results()
     assert [one.run for one in found] == [
         "2026-03-01-calibrate",
@@ -126,14 +124,14 @@ def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, store_url: st
     (runs / "2026-04-02-verify" / "verification.json").write_text('{"format": "ftdrive.verification/9"}')
     verified(runs / "2026-03-03-calibrate", "", 3)
     store = Store(store_url)
-    records, unreadable = store.index(runs)
-    assert Counter(map(type, records)) == {StoredResult: 3, VerificationRecord: 2}
+    indexed = store.index(runs)
+    assert (indexed.results, indexed.verifications) == (3, 2)
     assert store.verifications("abc")[0].reason == "a \ufffd and half a ? pair"
-    assert ["calibration.json" in unreadable[0], len(unreadable)] == [True, 3]
-    assert "version '9'" in unreadable[2]
+    assert ["calibration.json" in indexed.unreadable[0], len(indexed.unreadable)] == [True, 3]
+    assert "version '9'" in indexed.unreadable[2]
     (runs / "2026-03-01-calibrate" / "calibration.json").unlink()
     result(0).save(runs / "2026-03-01-calibrate" / "calibration.json")
-    assert len(store.index(runs)[0]) == 1
+    assert store.index(runs).results == 1
 
 
 @pytest.mark.parametrize(
