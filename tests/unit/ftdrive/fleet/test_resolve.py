@@ -103,14 +103,16 @@ def test_a_run_without_a_result_of_its_newest_poses_has_another_verdict(tmp_path
 
 def test_a_failure_has_its_reason_and_concerns_one_run(tmp_path: Path) -> None:
     few = calibrated_run(tmp_path, "few", poses=3)
-    damaged = calibrated_run(tmp_path, "damaged")
+    damaged, edited = (calibrated_run(tmp_path, name) for name in ("damaged", "edited"))
     (damaged / "dataset.json").write_text('{"format": "ftdrive.data')
+    (edited / "dataset.json").write_text((edited / "dataset.json").read_text().replace("200", "201", 1))
     lost = calibrated_run(tmp_path, "lost")
     (lost / "run.json").unlink()
     fine = calibrated_run(tmp_path, "fine")
-    found = again(few, damaged, lost, fine)
+    found = again(few, damaged, edited, lost, fine)
     assert "3 poses are too few" in str(found[few])
     assert "not valid JSON" in str(found[damaged])
+    assert "differs from its checksum" in str(found[edited])
     assert "no run.json" in str(found[lost])
     assert isinstance(found[fine], Comparison)
     assert [one.name for one in tmp_path.glob("*/solved-*")] == [solved_path(fine).name]
