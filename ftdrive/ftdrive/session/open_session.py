@@ -87,8 +87,9 @@ class SessionOptions:
     def with_recorded_mode(self) -> "SessionOptions":
         """Return options with the mode of the resumed run; raises `ConfigError` for options that exclude each other."""
         begun = self.mode if self.resume is None else Run(self.resume).mode
-        if self.resume is not None and begun == "sweep":
-            raise ConfigError(f"{self.resume} is a sweep, which is not continued: start again with --sweep")
+        if self.resume is not None and begun in IN_MOTION:
+            what = "a sweep" if begun == "sweep" else "a passive calibration"
+            raise ConfigError(f"{self.resume} is {what}, which is not continued: start again with --{begun}")
         if self.mode != "auto" and (begun in _BY_HAND) != self.by_hand:
             way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
             raise ConfigError(f"{self.resume} was started {way} and only continues so: leave out --{self.mode}")

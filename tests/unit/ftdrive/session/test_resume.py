@@ -519,6 +519,9 @@ def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab
         lab.take_poses(redo=(3,))
     with pytest.raises(ConfigError, match="poses 1 to 7"):
         lab.take_poses(resume=run.folder, redo=(7, 8))
+    passive = Run.create(lab.folder, "passive", {"mode": "passive"}).folder
+    with pytest.raises(ConfigError, match="start again with --passive"):
+        lab.take_poses(resume=passive)
     damaged = lab.folder / "damaged.json"
     damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
     with pytest.raises(PlanRefused):
