@@ -16,6 +16,7 @@ then backward elimination) and rejected poses are improved in turn until nothing
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtr as chi2_cdf
@@ -318,7 +319,7 @@ class Explanation:
 def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
     """Find the likeliest explanation, its minima in ascending order, and chi2 without components on the same poses."""
     weights = inverses(session.cov if session.measured else np.broadcast_to(white(1.0, LEVER_M), session.cov.shape))
-    minima = session.descent.minima(weights)
+    minima = session.once("minima", lambda: session.descent.minima(weights))
     plain = Explanation(minima[0].parameters, session.everything)
     if session.lacks_rank(minima[0]):
         return plain, minima, minima[0].chi2
@@ -336,7 +337,9 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         chosen = _with_expected_noise(session, min(_explanations(session, minima, weights), key=lambda e: e.criterion))
     else:
         chosen = _of_all_poses(session, of_some)
-    static = minima if chosen.kept.all() else session.descent.minima(weights * chosen.kept[:, None, None])
+    static, of_kept = minima, weights * chosen.kept[:, None, None]
+    if not chosen.kept.all():
+        static = session.once(chosen.kept.tobytes(), lambda: session.descent.minima(of_kept))
     for _ in range(len(static)):
         found = _with_all_minima(session, chosen, static)
         if session.descent.same(found[0].parameters, chosen.parameters):
@@ -417,16 +420,9 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
     p = minima[0].parameters
     found = [_improve(session, p, session.everything)]
     if found[0].noticed:
-        starts = [m.parameters for m in minima]
-        problem, always = session.linearise(p, session.everything), session.always()
-        at = maximise(problem, always, session.start(problem, always))
-        if not session.measured:
-            weights = np.asarray(at.own.W, dtype=np.float64)
-        distances = squared_length(*at.left_out())
         tried = [(p, session.everything), (found[0].parameters, found[0].kept)]
-        for scaled in (False, True):
-            robust = _find_agreeing(session, weights, starts, distances, scaled=scaled)
-            if robust is None or any(session.descent.same(robust[0], q) and (robust[1] == k).all() for q, k in tried):
+        for robust in session.once("agreeing", lambda: _find_agreeing(session, weights, minima)):
+            if any(session.descent.same(robust[0], q) and (robust[1] == k).all() for q, k in tried):
                 continue
             found.append(_improve(session, *robust))
             tried += [robust, (found[-1].parameters, found[-1].kept)]
@@ -436,31 +432,14 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
 def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
     always, candidates, structure = session.always(), session.candidates(), session.structure()
-    problem = session.linearise(p, kept)
-    at = select(problem, always, session.start(problem, always), candidates, len(always))
-    best, tried = Explanation(p, kept), not structure
+    best, problem, at = session.once((p, kept.tobytes()), lambda: _begin(session, p, kept))
+    tried = not structure
     for _ in range(ROUNDS):
         chosen = set(at.components)
-        at = _with_response_instead(problem, at, candidates, len(always))
-        if session.drift == "auto":
-            at = with_walks_instead(problem, at, candidates, len(always))
-            at = with_slopes_instead(problem, at, len(always))
-        p, problem, at = _settle(session, p, kept, problem, at)
-        distances = squared_length(*at.left_out())
-        criterion = _criterion(session, at, distances)
-        if criterion < best.criterion - 1e-3:
-            # Many poses distributed as the noise would have them hide no bumped one.
-            if kept.all() and _are_gaussian(session, distances):
-                return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise)
-            noise_found = {"white", "rotation"} & {c.kind for c in at.components[len(always) :]}
-            noticed = session.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or _stand_out(session, distances))
-            best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
-            kept = _membership(session, kept, distances, at)
-            if not (kept == best.kept).all():
-                problem = session.linearise(p, kept)
-                at = select(problem, at.components, at.theta, (), len(always))
-                continue
-        if tried and set(at.components) == chosen:  # all others have been tried
+        best, p, problem, at, ends = session.once((best, at), partial(_improve_once, session, best, p, problem, at))
+        if ends is False:
+            continue
+        if ends or (tried and set(at.components) == chosen):  # all others have been tried
             break
         # What compensation knows has been tried first: structured errors would take its place.
         tried = True
@@ -469,6 +448,40 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
             break
         at = again
     return best
+
+
+def _begin(session: Session, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
+    """Choose the first components."""
+    problem, always = session.linearise(p, kept), session.always()
+    at = select(problem, always, session.start(problem, always), session.candidates(), len(always))
+    return Explanation(p, kept), problem, at
+
+
+def _improve_once(
+    session: Session, best: Explanation, p: Parameters, problem: Linearised, at: Point
+) -> tuple[Explanation, Parameters, Linearised, Point, bool | None]:
+    """Improve all but the choice of further components; the last value is whether no round follows, None if one may."""
+    candidates, needed, kept = session.candidates(), len(session.always()), problem.kept
+    at = _with_response_instead(problem, at, candidates, needed)
+    if session.drift == "auto":
+        at = with_walks_instead(problem, at, candidates, needed)
+        at = with_slopes_instead(problem, at, needed)
+    p, problem, at = _settle(session, p, kept, problem, at)
+    distances = squared_length(*at.left_out())
+    criterion = _criterion(session, at, distances)
+    if not criterion < best.criterion - 1e-3:
+        return best, p, problem, at, None
+    # Many poses distributed as the noise would have them hide no bumped one.
+    if kept.all() and _are_gaussian(session, distances):
+        return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise), p, problem, at, True
+    noise_found = {"white", "rotation"} & {c.kind for c in at.components[needed:]}
+    noticed = session.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or _stand_out(session, distances))
+    best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
+    kept = _membership(session, kept, distances, at)
+    if (kept == best.kept).all():
+        return best, p, problem, at, None
+    problem = session.linearise(p, kept)
+    return best, p, problem, select(problem, at.components, at.theta, (), needed), False
 
 
 def _settle(
@@ -556,22 +569,23 @@ def _stand_out(session: Session, distances: Array) -> bool:
     return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / session.n)) or tail < LIGHT_TAIL
 
 
-def _find_agreeing(
-    session: Session, weights: Array, starts: list[Parameters], distances: Array, *, scaled: bool
-) -> tuple[Parameters, Kept] | None:
-    """Find poses that agree within the noise, or within one that fits half of all poses."""
-    if not scaled:
-        return agreeing_poses(session.descent, weights, starts) if session.measured else None
-    scale = float(np.median(distances)) / MEDIAN_DISTANCE
-    found = None
+def _find_agreeing(session: Session, weights: Array, minima: list[Minimum]) -> list[tuple[Parameters, Kept]]:
+    """Find poses that agree within the noise, and those that agree within one that fits half of all poses."""
+    starts = [m.parameters for m in minima]
+    problem, always = session.linearise(starts[0], session.everything), session.always()
+    at = maximise(problem, always, session.start(problem, always))
+    found = [agreeing_poses(session.descent, weights, starts)] if session.measured else []
+    if not session.measured:
+        weights = np.asarray(at.own.W, dtype=np.float64)
+    scale, robust = float(np.median(squared_length(*at.left_out()))) / MEDIAN_DISTANCE, None
     for _ in range(4):
-        robust = agreeing_poses(session.descent, weights / scale, starts)
-        if robust is None:
+        agreeing = agreeing_poses(session.descent, weights / scale, starts)
+        if agreeing is None:
             break
-        found = robust
+        robust = agreeing
         e = session.wrench - predict(robust[0], session.R)
         d2 = np.einsum("ni,nij,nj->n", e, weights, e, optimize=True)
         before, scale = scale, float(np.median(d2)) / MEDIAN_DISTANCE * session.n / (session.n - 2.5)
         if scale > 0.7 * before:
             break
-    return found
+    return [one for one in (*found, robust) if one is not None]

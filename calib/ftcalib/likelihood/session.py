@@ -13,8 +13,8 @@ and its derivative J_i, pose i at time t_i leaves
 D_i is the measured covariance of the mean; where it was not measured, white noise is a component too.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 
@@ -100,6 +100,14 @@ class Session:
         self.cov = np.broadcast_to(cov, (self.n, 6, 6)) if cov.ndim == 2 else cov if ordered else cov[self.order]
         self.descent = Descent(self.R, self.wrench, constraints)
         self.everything = np.ones(self.n, bool)
+        self._done = dict[object, Any]()
+
+    def once(self, key: object, call: Callable[[], Any]) -> Any:
+        """Return what a call gives, kept where the explanation without structure may have to repeat it."""
+        value = self._done[key] if key in self._done else call()
+        if self.structure():
+            self._done[key] = value
+        return value
 
     def dof(self, kept: Kept) -> int:
         """Degrees of freedom of chi2, from the poses that count."""
