@@ -337,9 +337,8 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
         chosen = _with_expected_noise(session, min(_explanations(session, minima, weights), key=lambda e: e.criterion))
     else:
         chosen = _of_all_poses(session, of_some)
-    static, of_kept = minima, weights * chosen.kept[:, None, None]
-    if not chosen.kept.all():
-        static = session.once(chosen.kept.tobytes(), lambda: session.descent.minima(of_kept))
+    of_kept, key = weights * chosen.kept[:, None, None], chosen.kept.tobytes()
+    static = minima if chosen.kept.all() else session.once(key, lambda: session.descent.minima(of_kept))
     for _ in range(len(static)):
         found = _with_all_minima(session, chosen, static)
         if session.descent.same(found[0].parameters, chosen.parameters):

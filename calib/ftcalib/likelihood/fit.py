@@ -376,7 +376,8 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
-    if hidden := found.keys() & {*UNCOMPENSATED}:
+    # In the order of the components: a sum over a set would differ in the last digit from process to process.
+    if hidden := [c for c in found if c in UNCOMPENSATED]:
         lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
         for c in hidden:
             T = problem.X[..., problem.columns(c)]

@@ -14,7 +14,7 @@ D_i is the measured covariance of the mean; where it was not measured, white noi
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -38,6 +38,7 @@ from ftcalib.likelihood.variance_components import (
 from ftcalib.model import Array, Parameters, jacobian, predict
 from ftcalib.sensor_matrix import GAIN, own_variances, sensor_columns, shown_by
 
+_T = TypeVar("_T")
 Drift = Literal["auto", "none", "linear", "random-walk"]
 
 RANK_TOLERANCE = 1e-9
@@ -102,9 +103,9 @@ class Session:
         self.everything = np.ones(self.n, bool)
         self._done = dict[object, Any]()
 
-    def once(self, key: object, call: Callable[[], Any]) -> Any:
+    def once(self, key: object, call: Callable[[], _T]) -> _T:
         """Return what a call gives, kept where the explanation without structure may have to repeat it."""
-        value = self._done[key] if key in self._done else call()
+        value: _T = self._done[key] if key in self._done else call()
         if self.structure():
             self._done[key] = value
         return value
