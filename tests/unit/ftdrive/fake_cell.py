@@ -445,8 +445,7 @@ class Lab:
         return path
 
     def sweep(self, **options: Any) -> Run | None:
-        chosen = SessionOptions(self.folder / "runs", mode="sweep", seconds=10.0, **options)
-        return session.take_poses(Calibrating(self.cell, chosen), self.operator, chosen)
+        return self.take_poses(mode="sweep", seconds=10.0, **options)
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

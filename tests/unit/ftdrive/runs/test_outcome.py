@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of, solve_records
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.open_session import SessionOptions
-from ftdrive.session.preflight import Before, check_payload
+from ftdrive.session.preflight import check_payload
 from ftdrive.session.session import Calibrating, description_of
 from ftdrivers.clock import REAL
 from tests.edited_files import edit
@@ -38,10 +39,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
         tool=ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),), mass_kg=1.7),
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
-    others = ("certifier", "plan", "approach", "runs", "known", "quiet", "resumed")
-    nothing: dict[str, Any] = dict.fromkeys(others)
-    task = Calibrating(lab.cell, SessionOptions(lab.folder))
-    before = Before(cell=lab.open_cell(), config=lab.cell, task=task, **nothing)
+    before: Any = SimpleNamespace(cell=lab.open_cell(), config=lab.cell, task=SimpleNamespace(load=None))
     assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 
