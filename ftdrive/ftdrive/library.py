@@ -164,7 +164,7 @@ def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableO
     """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
     if calibration is None:
         raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
-    tables = tables_of(source, SolveOptions(table=table))
+    tables = tables_of(source, table)
     if tables is None:
         raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
     pair = TablePair(*tables, calibration, "", None)

@@ -199,7 +199,7 @@ def _show_result(
     if not isinstance(data, RecordedData):
         _print_table(result.provenance)
     if as_json:
-        found = [one.to_dict() for one in hints(result, records)]
+        found = [one.to_dict() for one in hints(result, records)] if records else []
         write_json({"source": str(source), "hints": found, **result.to_dict()})
     else:
         print_result(result, drift=drift_check(records) if records else None, records=records, every=every)

@@ -53,7 +53,7 @@ def source_to_compensate(
     `say` takes what was recognised in tables.
     """
     try:
-        tables = tables_of(path, options)
+        tables = tables_of(path, options.table, options.pair, options.topics)
     except (BadDataset, ConfigError) as error:
         if calibration is None:
             raise type(error)(f"{error}. Give --calibration PATH too") from error

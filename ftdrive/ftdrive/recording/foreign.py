@@ -27,7 +27,7 @@ from ftdrive.runs.calibration import versions
 from ftdrive.runs.source import SolveOptions
 from ftdrive.stream.pairing import DelayEstimator, pair_blocks
 from ftdrive.stream.samples import Stages, StreamInfo, WrenchFrame
-from ftdrive.tables.table import Table
+from ftdrive.tables.table import Table, TableOptions
 from ftdrivers.errors import ProtocolError
 from ftdrivers.installation import missing_extra
 from ftdrivers.interfaces import NOT_REPORTED, ArmStates, Array, DeviceInfo, FtSamples
@@ -85,19 +85,24 @@ def is_bag(path: Path) -> bool:
     return start.startswith(MAGIC) and not start[25 + profile : 25 + profile + library].startswith(b"ftdrive")
 
 
-def tables_of(source: Any, options: SolveOptions) -> tuple[Table, Table] | None:
+def tables_of(
+    source: Any,
+    options: TableOptions | None = None,
+    pair: tuple[Path, Path] | None = None,
+    topics: tuple[str | None, str | None] = (None, None),
+) -> tuple[Table, Table] | None:
     """Return wrench and poses of another program, which may be one table; None for a recording of ours.
 
     `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
     """
-    if options.pair is not None:
-        return Table(options.pair[0], options.table), Table(options.pair[1], options.table)
+    if pair is not None:
+        return Table(pair[0], options), Table(pair[1], options)
     if isinstance(source, Path):
         if is_recording(source):
             return None
         if is_bag(source):
-            return read_bag(source, *options.topics)
-    table = Table(source, options.table)
+            return read_bag(source, *topics)
+    table = Table(source, options)
     return table, table
 
 
@@ -108,7 +113,7 @@ def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Tab
         has_poses = source.is_dir() or source.suffix == ".json"
         if has_poses and not is_bag(source):
             return None
-    tables = tables_of(source, options)
+    tables = tables_of(source, options.table, options.pair, options.topics)
     if tables is None:
         return Path(source)
     # One table has both streams or poses at rest.

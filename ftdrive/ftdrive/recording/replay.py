@@ -16,7 +16,6 @@ from ftdrive.recording.foreign import TablePair, tables_of
 from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.calibration import read_calibration
 from ftdrive.runs.run import Run
-from ftdrive.runs.source import SolveOptions
 from ftdrive.stream.samples import Paired, StreamInfo, WrenchFrame, sensor_origin_m
 from ftdrive.stream.sources import RecordingSource
 from ftdrive.stream.stream import Stream
@@ -30,7 +29,7 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
     """
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     is_run = is_run_folder(path)
-    tables = None if is_run else tables_of(path, SolveOptions())
+    tables = None if is_run else tables_of(path)
     if tables is None and not is_run:
         recording = read_recording(path)
         header = recording.header
