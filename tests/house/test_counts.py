@@ -16,10 +16,10 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 70587,
+    "product lines": 70524,
     "files": 308,
-    "dataclasses": 231,
-    "public functions and classes": 1428,
+    "dataclasses": 229,
+    "public functions and classes": 1414,
     "import statements inside functions": 108,
     "test lines": 81508,
 }

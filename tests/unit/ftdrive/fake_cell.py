@@ -444,8 +444,10 @@ class Lab:
         remember_completed("A1", Plan.load(path).sha256)
         return path
 
-    def sweep(self, **options: Any) -> Run | None:
-        return self.take_poses(mode="sweep", seconds=10.0, **options)
+    def sweep(self, **options: Any) -> Run:
+        run = self.take_poses(mode="sweep", seconds=10.0, **options)
+        assert run is not None
+        return run
 
     def run(self) -> Run:
         (folder,) = (self.folder / "runs").iterdir()

@@ -18,7 +18,6 @@ from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import sweep
 from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
 from ftdrive.session.guards import ExpectedMotion, Seen
-from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.sweep import FreeToolPrediction, on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
@@ -48,7 +47,7 @@ def _short_search(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.slow
 def test_the_first_run_is_slow_and_the_second_is_not(lab: Lab) -> None:
     for _ in range(2):
-        assert lab.sweep() is not None
+        lab.sweep()
     first, second = lab.arm.sweeps
     assert first.duration_s == pytest.approx(2 * second.duration_s)
     assert second.duration_s == 10.0
@@ -59,7 +58,6 @@ def test_the_first_run_is_slow_and_the_second_is_not(lab: Lab) -> None:
 
 def test_everything_is_kept_in_one_file_and_a_sweep_is_not_continued(lab: Lab) -> None:
     run = lab.sweep(real=False)
-    assert run is not None
     assert run.in_motion
     assert run.stops() == []
     (event,) = lab.operator.of(MotionRecorded)
@@ -68,12 +66,11 @@ def test_everything_is_kept_in_one_file_and_a_sweep_is_not_continued(lab: Lab) -
     assert recording.nominal_rate_Hz != recording.nominal_rate_Hz
     assert State.SWEEP in lab.operator.states()
     with pytest.raises(ConfigError, match="start again with --sweep"):
-        SessionOptions(lab.folder, resume=run.folder).with_recorded_mode()
+        lab.take_poses(resume=run.folder)
 
 
 def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
     run = lab.sweep(real=False)
-    assert run is not None
     sweeps = len(lab.arm.sweeps)
     with pytest.raises(ConfigError, match="is the plan of a sweep: leave out --plan"):
         lab.take_poses(plan=run.plan_path)
@@ -94,9 +91,7 @@ def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, la
 
     lab.operator.on_event = on_event
     lab.operator.answers["resume:"] = ["resume"]
-    run = lab.sweep(real=False)
-    assert run is not None
-    assert run.in_motion
+    assert lab.sweep(real=False).in_motion
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [hazard]
     assert len(lab.arm.sweeps) == 2
     assert lab.holds() == [("resume", "quit")]
@@ -153,9 +148,7 @@ def test_q_ends_a_sweep(lab: Lab) -> None:
 def test_a_sweep_has_no_pose_to_skip_so_s_stops_it_and_it_starts_again(lab: Lab) -> None:
     lab.arm.at_sweep_s[1] = 1.0, lambda: lab.operator.keys.append(Key.SKIP)
     lab.operator.answers["resume:"] = ["resume"]
-    run = lab.sweep(real=False)
-    assert run is not None
-    assert run.in_motion
+    assert lab.sweep(real=False).in_motion
     assert lab.holds() == [("resume", "quit")]
 
 
