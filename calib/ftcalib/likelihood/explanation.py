@@ -434,9 +434,9 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
     best, problem, at = session.once((p, kept.tobytes()), lambda: _begin(session, p, kept))
     tried = not structure
     for _ in range(ROUNDS):
-        chosen = set(at.components)
+        chosen, kept = set(at.components), problem.kept
         best, p, problem, at, ends = session.once((best, at), partial(_improve_once, session, best, p, problem, at))
-        if ends is False:
+        if (problem.kept != kept).any():
             continue
         if ends or (tried and set(at.components) == chosen):  # all others have been tried
             break
@@ -458,8 +458,8 @@ def _begin(session: Session, p: Parameters, kept: Kept) -> tuple[Explanation, Li
 
 def _improve_once(
     session: Session, best: Explanation, p: Parameters, problem: Linearised, at: Point
-) -> tuple[Explanation, Parameters, Linearised, Point, bool | None]:
-    """Improve all but the choice of further components; the last value is whether no round follows, None if one may."""
+) -> tuple[Explanation, Parameters, Linearised, Point, bool]:
+    """Improve all but the choice of further components; the last value says that nothing else needs to be tried."""
     candidates, needed, kept = session.candidates(), len(session.always()), problem.kept
     at = _with_response_instead(problem, at, candidates, needed)
     if session.drift == "auto":
@@ -469,7 +469,7 @@ def _improve_once(
     distances = squared_length(*at.left_out())
     criterion = _criterion(session, at, distances)
     if not criterion < best.criterion - 1e-3:
-        return best, p, problem, at, None
+        return best, p, problem, at, False
     # Many poses distributed as the noise would have them hide no bumped one.
     if kept.all() and _are_gaussian(session, distances):
         return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise), p, problem, at, True
@@ -477,10 +477,10 @@ def _improve_once(
     noticed = session.n >= FEWEST_TO_REJECT_FROM and (bool(noise_found) or _stand_out(session, distances))
     best = Explanation(p, kept, at.components, at.theta, criterion, noticed, at.noise)
     kept = _membership(session, kept, distances, at)
-    if (kept == best.kept).all():
-        return best, p, problem, at, None
-    problem = session.linearise(p, kept)
-    return best, p, problem, select(problem, at.components, at.theta, (), needed), False
+    if (kept != best.kept).any():
+        problem = session.linearise(p, kept)
+        at = select(problem, at.components, at.theta, (), needed)
+    return best, p, problem, at, False
 
 
 def _settle(
