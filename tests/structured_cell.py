@@ -1,4 +1,4 @@
-"""A simulated cell with errors that have a structure: an arm with joints, a load, a sensor, dwells and motion.
+"""A simulated cell with errors that have a structure: an arm with joints, a load, a sensor, dwells.
 
 Independent of the estimator: nothing of it is used. The errors are functions of joints, load and time. Sizes are those
 of `Sizes` at 1:
@@ -12,21 +12,16 @@ hum           a line of 0.2 N and 4 mN·m, whose alias is slow
 coloured      noise with time constants of 0.02, 0.3 and 5 s
 temperature   bias goes 0.5 N and 20 mN·m away, exponentially in about 20 min
 hysteresis    play of 0.02 N and 0.5 mN·m in each channel, backlash of 0.01° in each joint
-
-What no session can separate from a parameter belongs to it, see `Cell.truth`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from itertools import combinations_with_replacement
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
-
-from tests.moving_load import Recorded
 
 Array = NDArray[np.float64]
 Generator = np.random.Generator
@@ -55,14 +50,12 @@ LINK_COM_M = np.array(
 
 RATE_HZ, DWELL_S, POSE_S = 125.0, 1.0, 10.0
 """Samples of a dwell, its length, and the time from pose to pose."""
-MOTION_HZ = 500.0
 NOISE = np.repeat([0.08, 3e-3], 3)
 """White noise of a sample, N and N·m."""
 COLOURS = ((0.02, 0.05), (0.3, 0.03), (5.0, 0.02))
 """Time constant, s, and standard deviation, N; torques have it times `LEVER_M`."""
 LEVER_M = 0.02
 _PER_N = np.repeat([1.0, LEVER_M], 3)
-_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -90,11 +83,6 @@ CELLS: Mapping[str, Sizes] = {
 def turned(v: Array) -> Array:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3)."""
     return np.asarray(Rotation.from_rotvec(v).as_matrix())
-
-
-def vector_of(R: Array) -> Array:
-    """Rotation vectors (..., 3) of rotation matrices."""
-    return np.asarray(Rotation.from_matrix(R).as_rotvec())
 
 
 def unit(rng: Generator, n: int = 3) -> Array:
@@ -148,16 +136,6 @@ def dwell_times(n: int, start_s: float) -> Array:
 
 
 @dataclass(frozen=True)
-class Truth:
-    """What a perfect session would find."""
-
-    R_flange_sensor: Array
-    gravity_force_base_N: Array
-    bias: Array
-    p_sensor_com_m: Array
-
-
-@dataclass(frozen=True)
 class Load:
     """Mass, kg, centre of mass in sensor axes, m, and inertia about it, kg m²."""
 
@@ -179,14 +157,6 @@ class Load:
         """Return the load with a point mass."""
         total = self.kg + kg
         return Load(total, (self.kg * self.p_sensor_com_m + kg * p_sensor_m) / total, self.inertia_kg_m2)
-
-    def points(self) -> tuple[Array, Array]:
-        """Masses (7,) and their places (7, 3) with this mass, centre and inertia."""
-        second = np.trace(self.inertia_kg_m2) / 2 * np.eye(3) - self.inertia_kg_m2
-        moments, axes = np.linalg.eigh(second)
-        share = 0.1 * self.kg
-        out = axes.T * np.sqrt(np.maximum(moments, 0) / (2 * share))[:, None]
-        return np.r_[self.kg - 6 * share, np.full(6, share)], self.p_sensor_com_m + np.vstack([np.zeros(3), out, -out])
 
 
 class _Polynomial:
@@ -334,116 +304,3 @@ class Cell:
         rng = np.random.default_rng([*self._seed, 1000 + kind])
         shared = self.readings(q, load)[:, None] + self.bias + moving
         return t[:, 0], shared + self.noise(rng, gaps, t.shape[1], RATE_HZ)
-
-    def truth(self, q_region: Array, t_s: Array) -> Truth:
-        """What a perfect session in a region would find: bias as the mean over times, gain and load as without error.
-
-        Of the error of the orientations, a turn that is constant in flange axes is part of the mounting, and one that
-        is constant in base is part of the direction of gravity. The mean pull of the cable is part of the bias.
-        """
-        R = flange(q_region)
-        error = vector_of(np.swapaxes(R, 1, 2) @ self.axes(q_region, self.load) @ self.R_flange_sensor.T)
-        A = np.concatenate([np.broadcast_to(np.eye(3), R.shape), np.swapaxes(R, 1, 2)], axis=2).reshape(-1, 6)
-        turns = np.linalg.lstsq(A, error.ravel(), rcond=None)[0]
-        return Truth(
-            turned(turns[:3]) @ self.R_flange_sensor,
-            turned(-turns[3:]) @ (self.load.kg * self.gravity_m_s2),
-            self.bias + (self.warmed(t_s) + self.hum(t_s)).mean(axis=0) + self.cable(q_region).mean(axis=0),
-            self.load.p_sensor_com_m,
-        )
-
-    # -- in motion -----------------------------------------------------------------------------------------------------
-
-    def wrench(self, joints: "Joints", t: Array) -> Array:
-        """Wrench (n, 6) of the moving load on the sensor, from the paths of its point masses."""
-        masses, points = self.load.points()
-        at_flange = points @ self.R_flange_sensor.T + [0, 0, self.height_m]
-
-        def places(t: Array) -> tuple[Array, Array]:
-            R, p = self.frames(joints(t), self.load)
-            spread: Array = np.einsum("nij,kj->nki", R, at_flange)
-            return np.asarray(p[:, None] + spread), np.asarray(p + self.height_m * R[:, :, 2])
-
-        before, now, after = places(t - _STEP_S), places(t), places(t + _STEP_S)
-        pulls = masses[:, None] * (self.gravity_m_s2 - (before[0] - 2 * now[0] + after[0]) / _STEP_S**2)
-        R = self.axes(joints(t), self.load)
-        force, torque = pulls.sum(axis=1), np.cross(now[0] - now[1][:, None], pulls).sum(axis=1)
-        return np.hstack([np.einsum("nji,nj->ni", R, force), np.einsum("nji,nj->ni", R, torque)])
-
-    def record(self, joints: "Joints", seconds: float) -> Recorded:
-        """Record sensor and arm in motion, each with its own clock phase."""
-        rng = np.random.default_rng([*self._seed, 2000])
-        t, t_pose = (
-            np.arange(round(seconds * MOTION_HZ)) / MOTION_HZ + rng.uniform(0, 1) / MOTION_HZ for _ in range(2)
-        )
-        q = joints(t_pose) + 2e-5 * rng.standard_normal((len(t_pose), 6))
-        R, p = chain(q)
-        happened = t - self.delay_s
-        y = self._with_play(self.sensed(self.wrench(joints, happened)) + self.cable(joints(happened)))
-        speed = np.linalg.norm(joints(happened + _STEP_S) - joints(happened - _STEP_S), axis=1) / (2 * _STEP_S)
-        # Gears shake the tool while the arm moves, between 8 and 15 Hz.
-        shaken = rng.standard_normal((len(t), 6))
-        shaken = gaussian_filter1d(shaken, 6, axis=0) - gaussian_filter1d(shaken, 14, axis=0)
-        y += 0.2 * np.minimum(speed, 1.5)[:, None] * _PER_N * shaken / shaken.std(axis=0)
-        y += self.bias + self.warmed(t) + self.hum(t) + self.noise(rng, [0], len(t), MOTION_HZ)[0]
-        return Recorded(t, y, t_pose, R[:, 6], p[:, 6])
-
-
-Joints = Callable[[Array], Array]
-"""From times (n,) to joints (n, 6)."""
-
-
-def _eased(x: Array) -> Array:
-    x = np.clip(x, 0, 1)
-    return np.asarray(x**3 * (10 - 15 * x + 6 * x**2))
-
-
-def sweep(rng: Generator, seconds: float) -> Joints:
-    """Sines of the three wrist joints, from rest to rest."""
-    hz, phase = rng.uniform([0.1, 0.17, 0.25], [0.15, 0.24, 0.34]), rng.uniform(0, 2 * np.pi, 3)
-    wide = rng.uniform(65, 85, 3) * DEG
-
-    def joints(t: Array) -> Array:
-        swing = wide * np.sin(2 * np.pi * np.outer(t, hz) + phase)
-        return np.asarray(
-            HOME + np.hstack([np.zeros((len(t), 3)), _eased(np.minimum(t, seconds - t))[:, None] * swing])
-        )
-
-    return joints
-
-
-def pick(rng: Generator, seconds: float) -> Joints:
-    """Cycles between a shelf and places that differ, with stops."""
-    knots, at, q = [(0.0, HOME)], 0.0, HOME
-    shelf = HOME + np.array([0.5, -0.2, 0.2, 0.4, 0.3, 0.8]) * rng.uniform(0.5, 1.2, 6)
-    while at < seconds + 1:
-        at += rng.uniform(0.3, 0.9)
-        knots.append((at, q))
-        place = HOME + rng.uniform(-1, 1, 6) * [0.6, 0.25, 0.25, 1.0, 1.1, 1.4]
-        q = place if q is shelf else shelf
-        at += max(1.2, 1.9 * float(np.abs(q - knots[-1][1]).max()) / 1.6)
-        knots.append((at, q))
-    times, stops = np.array([k[0] for k in knots]), np.array([k[1] for k in knots])
-
-    def joints(t: Array) -> Array:
-        k = np.clip(np.searchsorted(times, t, side="right") - 1, 0, len(times) - 2)
-        x = _eased((t - times[k]) / (times[k + 1] - times[k]))
-        return np.asarray(stops[k] + (stops[k + 1] - stops[k]) * x[:, None])
-
-    return joints
-
-
-def freedrive(rng: Generator, seconds: float) -> Joints:
-    """The arm is led by hand: smooth, irregular, all joints, within the hand's reach."""
-    hz = np.exp(rng.uniform(np.log(0.04), np.log(0.45), (8, 6)))
-    phase = rng.uniform(0, 2 * np.pi, (8, 6))
-    size = rng.standard_normal((8, 6)) / np.sqrt(4 + 8 * hz / 0.2) * [0.35, 0.2, 0.25, 1.0, 1.0, 1.3]
-
-    def joints(t: Array) -> Array:
-        led = np.sum(size * np.sin(2 * np.pi * hz * t[:, None, None] + phase), axis=1)
-        return np.asarray(HOME + _eased(np.minimum(t, seconds - t))[:, None] * led)
-
-    return joints
-
-
-MOTIONS: Mapping[str, Callable[[Generator, float], Joints]] = {"sweep": sweep, "pick": pick, "freedrive": freedrive}

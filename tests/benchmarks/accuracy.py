@@ -28,7 +28,6 @@ from ftcalib.sensor_matrix import Calibrated
 from ftdrive import read_dataset
 from tests.benchmarks import scenarios as sim
 from tests.benchmarks.common import Lab, Record, Row, all_within, band, most, run
-from tests.benchmarks.mistakes import mistakes
 
 GROSS_RAD = np.deg2rad(20.0)
 RANDOM_STARTS = 12
@@ -433,7 +432,6 @@ SECTIONS: dict[str, Callable[[Lab], Iterator[Row]]] = {
     "drift": drift,
     "outliers": outliers,
     "side": side_by_side,
-    "mistakes": mistakes,
     "real": real_data,
 }
 

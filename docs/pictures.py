@@ -1,4 +1,4 @@
-"""Draw the pictures of the documentation: `uv run python -m tests.benchmarks.pictures [NAME]...`, all without a name.
+"""Draw the pictures of the documentation: `uv run python -m docs.pictures [NAME]...`, all without a name.
 
 demo      runs `ftdrive demo` in tmux at 80x40, copies its screen about once a second, and animates the screens as SVG
 live      draws the screen of `ftdrive live` with a stream without devices, one SVG for each of its states
@@ -37,7 +37,7 @@ from tests.unit.ftdrive.terminal.fake_stream import INFO, Scenario
 from tests.unit.ftdrive.terminal.test_live_screen import Screen
 from tests.unit.ftdrive.terminal.test_weigh_screen import PART, FakeWeighing, Scale
 
-FOLDER = Path(__file__).parents[2] / "docs/pictures"
+FOLDER = Path(__file__).parent / "pictures"
 COLUMNS, ROWS, DEMO_ROWS = 80, 24, 40
 CELL_PX, ROW_PX = 12.2, 24.4
 """Of rich's SVG, whose characters are 20 px high."""
