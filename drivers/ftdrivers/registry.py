@@ -21,19 +21,9 @@ from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import BadUrl
 from ftdrivers.installation import install_command
 from ftdrivers.interfaces import Fact, ForceTorqueSensor, RobotArm
+from ftdrivers.sensors import SENSORS
 from ftdrivers.streaming.sensor import StreamingSensor
 
-SENSORS: Mapping[str, str] = {
-    "ati-can": "ftdrivers.ati.can:AtiCanSensor",
-    "ati-serial": "ftdrivers.ati.serial:AtiSerialSensor",
-    "ati-netft": "ftdrivers.ati.netft:NetFtSensor",
-    "bota": "ftdrivers.bota.sensor:BotaSensor",
-    "robotiq-ft300": "ftdrivers.robotiq.sensor:RobotiqFt300",
-    "robotous-can": "ftdrivers.robotous.can:RobotousCan",
-    "robotous-serial": "ftdrivers.robotous.sensor:RobotousSerial",
-    "ros2": "ftdrivers.ros2.sensor:Ros2Sensor",
-    "ur-ft": "ftdrivers.ur.sensor:UrWristSensor",
-}
 ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
 # The optional part of ftdrive that installs a library.
@@ -165,6 +155,12 @@ def in_url(address: str) -> str:
     return quote(address, safe="/:@")
 
 
+def join_url(scheme: str, address: str, options: Mapping[str, str]) -> str:
+    """Return the address of a sensor with these options."""
+    query = "&".join(f"{key}={value}" for key, value in options.items())
+    return f"{scheme}://{in_url(address)}" + (f"?{query}" if query else "")
+
+
 def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTorqueSensor:
     """Build the sensor that an address names, without opening it.
 
@@ -184,9 +180,10 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
         Unknown scheme or option, a value out of range, no device, or a driver that cannot be imported.
     """
     parts = split_url(url)
-    entry = _find("ftdrive.sensors", SENSORS, parts.scheme)
+    own = {scheme: kind.driver for scheme, kind in SENSORS.items()}
+    entry = _find("ftdrive.sensors", own, parts.scheme)
     if entry is None:
-        known = ", ".join(names := _names("ftdrive.sensors", SENSORS))
+        known = ", ".join(names := _names("ftdrive.sensors", own))
         if not parts.scheme:
             raise BadUrl(f"{url} is no address of a sensor: write it like {', '.join(_EXAMPLES)}")
         close = [f"did you mean {name}://?" for name in get_close_matches(parts.scheme, names, 1)]

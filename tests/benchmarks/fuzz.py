@@ -29,10 +29,11 @@ from ftdrivers.ati import modbus
 from ftdrivers.ati.netft import transformation_in
 from ftdrivers.bota import codec as bota
 from ftdrivers.errors import BadTranscript, BadUrl, ProtocolError
-from ftdrivers.registry import SENSORS, sensor_from_url
+from ftdrivers.registry import sensor_from_url
 from ftdrivers.robotiq import codec as robotiq
 from ftdrivers.robotous import codec as robotous
 from ftdrivers.robotous.can import Halves
+from ftdrivers.sensors import SENSORS
 from ftdrivers.transcript import FORMAT, Transcript
 from ftdrivers.ur import rtde
 from ftdrivers.wires.framing import crc16_modbus, crc16_x25
@@ -150,8 +151,8 @@ def targets() -> list[Target]:
     bota_frame = bota.HEADER + with_crc(crc16_x25, bytes(34))
     frame = robotous.encode_frame(sample)
     recipe = b"\1DOUBLE,VECTOR6D"
-    for driver in SENSORS.values():
-        import_module(driver.split(":")[0])  # a first use that takes half a second is no hang
+    for kind in SENSORS.values():
+        import_module(kind.driver.split(":")[0])  # a first use that takes half a second is no hang
 
     def keep(data: bytes) -> object:
         return modbus.keep_records(modbus.decode_records(data).intact)

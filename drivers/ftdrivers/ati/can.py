@@ -9,6 +9,7 @@ not report saturation. A reset selects calibration slot 0. The driver checks all
 
 import contextlib
 import logging
+from collections.abc import Sequence
 from typing import Literal, Self
 
 import numpy as np
@@ -18,9 +19,9 @@ from ftdrivers.ati.codec import NEWTON, NEWTON_METRE, Calibration, Op, parse_uni
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import Array, DeviceInfo, FtSamples
-from ftdrivers.registry import Options
+from ftdrivers.registry import Options, join_url
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
-from ftdrivers.wires.can_bus import CanBus
+from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames, request_message
 from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
@@ -287,3 +288,40 @@ class AtiCanSensor(StreamingSensor):
 def _scale_text(counts: tuple[int, int], unit_codes: tuple[int, int]) -> str:
     force, torque = unit_names(unit_codes)
     return f"{counts[0]} counts per {force} and {counts[1]} per {torque}"
+
+
+# Nodes of CANopen. On their bus every lower identifier may be a command, also one that nobody sends at the moment.
+_HEARTBEATS = frozenset(range(0x701, 0x780))
+
+
+def can_probe(channel: str, interface: str, bitrate: int | None, base: int) -> CanProbe:
+    """Return how to recognize a NETCANOEM with this base identifier; the parameters are those of `probe_can`."""
+    first = base << 4
+    own = frozenset(range(first, first + 16))
+    options = {} if interface == "socketcan" else {"interface": interface}
+    options |= {"bitrate": str(bitrate)} if bitrate else {}
+    options |= {"base": f"0x{base:02X}"} if base != 0x20 else {}
+
+    def replies(op: Op) -> dict[int, int]:
+        return {first | opcode: size for opcode, size in codec.REPLIES[op].items()}
+
+    def recognize(heard: Sequence[CanFrame]) -> str | None:
+        request = (first | Op.GAUGES, b"")
+        ours = [frame for frame in heard if frame[0] in own and frame != request]
+        return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= 5 else None
+
+    def ask(bus: CanBus, clock: Clock) -> str | None:
+        serial = request_message(bus, clock, first | Op.SERIAL, b"", replies(Op.SERIAL))
+        firmware = serial and request_message(bus, clock, first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
+        if serial is None or firmware is None:
+            return None
+        major, minor, build = codec.decode_firmware(firmware)
+        return f"ATI NETCANOEM, serial {codec.decode_serial(serial)}, firmware {major}.{minor} build {build}"
+
+    return CanProbe(
+        f"an ATI NETCANOEM at base 0x{base:02X}",
+        join_url("ati-can", channel, options),
+        own | _HEARTBEATS if first < min(_HEARTBEATS) else own,
+        recognize,
+        ask,
+    )

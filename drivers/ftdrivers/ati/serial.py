@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from ftdrivers.ati import modbus
-from ftdrivers.ati.codec import Calibration, refuse_saturated, units
+from ftdrivers.ati.codec import Calibration, decode_text, refuse_saturated, units
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import UNUSABLE, DeviceFault, DeviceTimeout, ProtocolError, StreamBroken
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
@@ -24,7 +24,7 @@ from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import StreamingSensor, scale_facts
 from ftdrivers.wires.framing import describe_status
 from ftdrivers.wires.modbus import ask
-from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 
 log = logging.getLogger(__name__)
 
@@ -242,3 +242,27 @@ class AtiSerialSensor(StreamingSensor):
             raise StreamBroken(f"{self.name}: the sensor has reset itself and lost its gains", "open it again")
         if new:
             log.warning("%s: status %s; measuring continues", self.name, text)
+
+
+def _streams(data: bytes) -> bool:
+    """Require a right checksum in 20 records or more, because they have neither header nor number."""
+    data = data[-100 * modbus.RECORD_SIZE :]
+    if not data.strip(b"\0"):
+        return False
+    for start in range(modbus.RECORD_SIZE):
+        whole = (len(data) - start) // modbus.RECORD_SIZE * modbus.RECORD_SIZE
+        if whole >= 20 * modbus.RECORD_SIZE and modbus.decode_records(data[start : start + whole]).intact.all():
+            return True
+    return False
+
+
+# Serial and part number of the first stored calibration.
+_IDENTITY_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
+
+
+def _identify(data: bytes) -> str:
+    registers = modbus.check_reply(_IDENTITY_REQUEST, data[: modbus.reply_size(_IDENTITY_REQUEST)])
+    return f"ATI Digital F/T {decode_text(registers[8:])}, serial {decode_text(registers[:8])}"
+
+
+SERIAL_PROBES = (SerialProbe("ati-serial://{port}", _BAUD, _streams, _IDENTITY_REQUEST, _identify, even_parity=True),)

@@ -23,8 +23,8 @@ from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBro
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
-from ftdrivers.wires.framing import describe_status
-from ftdrivers.wires.serial_port import SerialPort, other_baud
+from ftdrivers.wires.framing import describe_status, is_stream
+from ftdrivers.wires.serial_port import SerialPort, SerialProbe, other_baud
 
 log = logging.getLogger(__name__)
 
@@ -219,3 +219,14 @@ class BotaSensor(StreamingSensor):
         if new := status & ~self._seen_status:
             log.warning("%s: status %s; measuring continues", self.name, describe_status(new, codec.STATUS_BITS))
             self._seen_status |= new
+
+
+def _boot_url(data: bytes) -> str | None:
+    baud = codec.find_baud(data)
+    return None if baud is None else f"bota://{{port}}?baud={baud}"
+
+
+SERIAL_PROBES = (
+    SerialProbe("bota://{port}?baud=460800", 460_800, is_stream(codec.deframer)),
+    SerialProbe("bota://{port}?baud=230400", 230_400, is_stream(codec.deframer), boot_url=_boot_url),
+)

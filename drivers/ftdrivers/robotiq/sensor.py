@@ -23,8 +23,9 @@ from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.robotiq import codec
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
+from ftdrivers.wires.framing import is_stream
 from ftdrivers.wires.modbus import ask
-from ftdrivers.wires.serial_port import SerialPort
+from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 
 PORT = 63351
 _CONNECT_S = 2.0
@@ -240,3 +241,16 @@ class RobotiqFt300(StreamingSensor):
             "reduce the 16 ms latency of the USB adapter: "
             "echo 1 | sudo tee /sys/bus/usb-serial/devices/ttyUSB0/latency_timer (with the name of your port)"
         )
+
+
+_SERIAL_NUMBER_REQUEST = codec.read_registers(codec.SERIAL, 4)
+
+
+def _identify(data: bytes) -> str:
+    registers = codec.check_reply(_SERIAL_NUMBER_REQUEST, data[: codec.reply_size(_SERIAL_NUMBER_REQUEST)])
+    return f"Robotiq FT 300, serial {codec.decode_serial(registers)}"
+
+
+SERIAL_PROBES = (
+    SerialProbe("robotiq-ft300://{port}", _BAUD, is_stream(codec.deframer), _SERIAL_NUMBER_REQUEST, _identify),
+)

@@ -13,13 +13,14 @@ from typing import Self
 import numpy as np
 
 from ftdrivers.clock import REAL, Clock
-from ftdrivers.errors import DeviceFault, DeviceTimeout
+from ftdrivers.errors import DeviceFault, DeviceTimeout, ProtocolError
 from ftdrivers.interfaces import DeviceInfo, FtSamples
 from ftdrivers.registry import Options
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
-from ftdrivers.wires.serial_port import SerialPort, other_baud
+from ftdrivers.wires.framing import is_stream
+from ftdrivers.wires.serial_port import SerialPort, SerialProbe, other_baud
 
 _REPLY_S = 0.15
 _ATTEMPTS = 3
@@ -216,3 +217,16 @@ class RobotousSerial(RobotousSensor):
     def _damaged(self) -> int:
         # Frames carry no number: only damaged ones are counted, and one lost as a whole shows in the rate.
         return self._frames.damaged
+
+
+def _identify(data: bytes) -> str:
+    for _, frame in codec.deframer().feed(data):
+        if frame[1] == Command.MODEL:
+            return f"Robotous {codec.decode_text(frame[1:-2])}"
+    raise ProtocolError("no reply of a Robotous sensor")
+
+
+SERIAL_PROBES = tuple(
+    SerialProbe(url, baud, is_stream(codec.deframer), codec.encode_frame(codec.encode(Command.MODEL)), _identify)
+    for url, baud in (("robotous-serial://{port}", 115_200), ("robotous-serial://{port}?baud=921600", 921_600))
+)

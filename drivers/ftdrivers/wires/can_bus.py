@@ -3,7 +3,9 @@
 import contextlib
 import fcntl
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
 from typing import Any
 
 import can
@@ -165,3 +167,58 @@ class CanBus:
 
     def _broken(self, exc: Exception) -> StreamBroken:
         return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc})", "plug it in and open it again")
+
+
+CanFrame = tuple[int, bytes]
+"""Identifier and data."""
+
+
+@dataclass(frozen=True, slots=True)
+class CanProbe:
+    """How to recognize one kind of sensor on a CAN bus."""
+
+    name: str
+    url: str
+    must_be_silent: AbstractSet[int]
+    """Identifiers that no device may send before the sensor is asked, because they may be commands to other devices."""
+    recognize: Callable[[Sequence[CanFrame]], str | None]
+    """Returns what received frames show about the sensor; None if they are not its stream."""
+    ask: Callable[[CanBus, Clock], str | None]
+    """Sends read requests and returns what the sensor reports about itself; None without an answer."""
+
+
+def request_message(
+    bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping[int, int], timeout_s: float = 0.25
+) -> bytes | None:
+    """Send a request and return the first whole message, see `join_frames`; None if none arrives in time."""
+    bus.send(identifier, data)
+    frames: list[CanFrame] = []
+    for left_s in clock.looks(timeout_s):
+        frame = bus.look(min(left_s, clock.poll_s))
+        if frame and len(frame[1]) == parts.get(frame[0]):
+            frames.append(frame)
+            if replies := join_frames(frames, parts):
+                return replies[0]
+    return None
+
+
+def join_frames(frames: Sequence[CanFrame], parts: Mapping[int, int]) -> list[bytes]:
+    """Join frames to whole messages; an empty list if a frame is out of order or of the wrong length.
+
+    Parameters
+    ----------
+    parts : mapping
+        Identifier and length in bytes of each frame of one message, in their order.
+    """
+    order = list(parts)
+    if not frames or frames[0][0] not in order:
+        return []
+    begun = order.index(frames[0][0])
+    for number, (identifier, data) in enumerate(frames, start=begun):
+        if identifier != order[number % len(order)] or len(data) != parts[identifier]:
+            return []
+    whole = frames[-begun % len(order) :]
+    return [
+        b"".join(data for _, data in whole[start : start + len(order)])
+        for start in range(0, len(whole) - len(order) + 1, len(order))
+    ]

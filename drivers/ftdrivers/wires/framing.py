@@ -106,6 +106,11 @@ class Deframer:
         return self.number
 
 
+def is_stream(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
+    """Build the test whether received bytes hold five intact frames or more, which identify a stream."""
+    return lambda data: len(deframer().feed(data)) >= 5
+
+
 def describe_status(status: int, bits: Mapping[int, str], width: int = 16) -> str:
     """Describe a status word of `width` bits, such as ``0x0040 (bit 6: no valid calibration in the active slot)``."""
     words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(width) if status >> n & 1]

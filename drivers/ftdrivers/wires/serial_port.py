@@ -12,7 +12,8 @@ import re
 import shlex
 import sys
 import termios
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Final
 
 import serial
@@ -229,3 +230,21 @@ class SerialPort:
             yield self._port
         except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
             raise StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again") from exc
+
+
+@dataclass(frozen=True, slots=True)
+class SerialProbe:
+    """How to recognize one kind of sensor on a serial port with one setting."""
+
+    url: str
+    """Address of the sensor, with ``{port}`` for the port."""
+    baud: int
+    streams: Callable[[bytes], bool]
+    """Returns whether received bytes are the stream of this sensor."""
+    request: bytes = b""
+    """A read request; empty if the sensor is recognized by listening only."""
+    identify: Callable[[bytes], str] | None = None
+    """Returns what the reply reports about the sensor. Raises `ProtocolError`."""
+    even_parity: bool = False
+    boot_url: Callable[[bytes], str | None] | None = None
+    """Returns the address, with ``{port}``, if received bytes are printed by this sensor while it boots."""

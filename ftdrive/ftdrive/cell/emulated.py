@@ -13,6 +13,7 @@ from typing import Any, Self
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, ToolConfig, WorkcellConfig, check_value, settings
 from ftdrive.errors import ConfigError
+from ftdrivers import sensors
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
 
@@ -23,17 +24,7 @@ REAL_PACE = ("--time-scale", "1")
 _PERFECT = ("--gain", "0", "--cross-talk", "0")
 
 # Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm.
-SENSORS = {
-    "can": "ATI sensor on CAN",
-    "serial": "ATI sensor on RS-485",
-    "robotous-can": "Robotous sensor on CAN",
-    "robotous-serial": "Robotous sensor on a serial port",
-    "robotiq": "Robotiq sensor",
-    "robotiq-urcap": "Robotiq sensor on the controller",
-    "bota": "Bota sensor",
-    "netft": "ATI Net F/T",
-    "ur-ft": "sensor of its own",
-}
+SENSORS = {name: text for kind in sensors.SENSORS.values() for name, text in kind.emulated.items()}
 EMULATED = "emulated://"
 # How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words.
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {

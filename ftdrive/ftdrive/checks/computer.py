@@ -21,6 +21,7 @@ from ftcalib.rounding import counted
 from ftdrive.checks.check import Check, State
 from ftdrive.errors import ConfigError
 from ftdrivers.registry import in_url, split_url
+from ftdrivers.sensors import SENSORS
 
 if TYPE_CHECKING:
     from ftdrive.cell.config import CellConfig
@@ -30,8 +31,6 @@ DEV = Path("/dev")
 
 # ARPHRD_CAN, in /sys/class/net/*/type.
 _CAN_INTERFACE = "280"
-_ON_SERIAL = ("ati-serial", "bota", "robotiq-ft300", "robotous-serial")
-_ON_ETHERNET = ("ati-netft", "ur-ft")
 _LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
 
 
@@ -50,12 +49,17 @@ class SensorAddress:
         return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
 
     @property
+    def _wire(self) -> str | None:
+        kind = SENSORS.get(self.scheme)
+        return kind.wire if kind else None
+
+    @property
     def serial_port(self) -> Path | None:
         """Its serial port, also that of an slcan adapter."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
         is_path = self.address.startswith("/") and self.scheme != "ros2"
-        return Path(self.address) if (self.scheme in _ON_SERIAL and self.host is None) or is_path else None
+        return Path(self.address) if (self._wire == "serial" and self.host is None) or is_path else None
 
     @property
     def can_interface(self) -> str | None:
@@ -68,7 +72,7 @@ class SensorAddress:
         """The host that sends its samples over Ethernet."""
         if self.scheme == "robotiq-ft300" and not self.address.startswith("/"):
             return re.sub(r":\d+$", "", self.address).strip("[]")
-        return self.address.partition("/")[0] if self.scheme in _ON_ETHERNET else None
+        return self.address.partition("/")[0] if self._wire == "ethernet" else None
 
     @property
     def place(self) -> str | None:
@@ -83,9 +87,8 @@ class SensorAddress:
     @property
     def bitrate(self) -> int:
         """Required bit rate of its bus, bit/s."""
-        if self.scheme == "robotous-can":
-            return 1_000_000
-        return int(self.options.get("bitrate", "250000"), 0)
+        kind = SENSORS.get(self.scheme)
+        return int(self.options.get("bitrate", str(kind.bitrate if kind else 250_000)), 0)
 
 
 def check_disk(folder: Path) -> Check:

@@ -113,7 +113,7 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
     ("url", "message"),
     [
         ("can0", "write it like ati-can://can0"),
-        ("kms40://dev", "unknown sensor 'kms40': install .* one of ati-can, ati-serial"),
+        ("kms40://dev", "unknown sensor 'kms40': install .* one of ati-can, robotous-can"),
         ("ati-cam://dev", "unknown sensor 'ati-cam': did you mean ati-can://?"),
         ("ati-can://", "names no device"),
         ("ati-can:can0", "names no device"),

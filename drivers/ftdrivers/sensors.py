@@ -1,0 +1,40 @@
+"""The sensors of this project: driver, wire and emulators of each. It imports no driver, so that commands start fast."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True, slots=True)
+class SensorKind:
+    """One kind of sensor: what is known before its driver is imported."""
+
+    driver: str
+    """Module and class. The class has `from_url`; the module has `SERIAL_PROBES` or `can_probe` on these two wires."""
+    wire: Literal["can", "serial", "ethernet", "topic"]
+    emulated: Mapping[str, str] = field(default_factory=dict)
+    """Names of its emulators in a station, and how they are described to the user."""
+    bitrate: int = 250_000
+    """Default bit rate of its CAN bus, bit/s."""
+
+
+# By the scheme of the address. A probe tries the sensors on a serial port in this order.
+SENSORS: Mapping[str, SensorKind] = {
+    "ati-can": SensorKind("ftdrivers.ati.can:AtiCanSensor", "can", {"can": "ATI sensor on CAN"}),
+    "robotous-can": SensorKind(
+        "ftdrivers.robotous.can:RobotousCan", "can", {"robotous-can": "Robotous sensor on CAN"}, bitrate=1_000_000
+    ),
+    "bota": SensorKind("ftdrivers.bota.sensor:BotaSensor", "serial", {"bota": "Bota sensor"}),
+    "robotiq-ft300": SensorKind(
+        "ftdrivers.robotiq.sensor:RobotiqFt300",
+        "serial",
+        {"robotiq": "Robotiq sensor", "robotiq-urcap": "Robotiq sensor on the controller"},
+    ),
+    "robotous-serial": SensorKind(
+        "ftdrivers.robotous.sensor:RobotousSerial", "serial", {"robotous-serial": "Robotous sensor on a serial port"}
+    ),
+    "ati-serial": SensorKind("ftdrivers.ati.serial:AtiSerialSensor", "serial", {"serial": "ATI sensor on RS-485"}),
+    "ati-netft": SensorKind("ftdrivers.ati.netft:NetFtSensor", "ethernet", {"netft": "ATI Net F/T"}),
+    "ur-ft": SensorKind("ftdrivers.ur.sensor:UrWristSensor", "ethernet", {"ur-ft": "sensor of its own"}),
+    "ros2": SensorKind("ftdrivers.ros2.sensor:Ros2Sensor", "topic"),
+}

@@ -1,0 +1,69 @@
+"""Every sensor has what docs/how-to/add-a-sensor.md asks for; what is missing is named."""
+
+from collections.abc import Iterator
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from ftdrivers.sensors import SENSORS, SensorKind
+from ftmocks.sensors.catalogue import KINDS, WRIST
+
+ROOT = Path(__file__).parents[3]
+SCHEMES = {WRIST: WRIST} | {name: kind.scheme for name, kind in KINDS.items()}
+
+
+def missing(scheme: str, kind: SensorKind) -> Iterator[str]:
+    """Name what a sensor lacks, with the file that has to have it."""
+    module, _, name = kind.driver.partition(":")
+    if find_spec(module.rpartition(".")[0]) is None or find_spec(module) is None:
+        yield f"{module}: the module of the driver"
+    else:
+        driver = import_module(module)
+        if not hasattr(getattr(driver, name, None), "from_url"):
+            yield f"{module}: the class {name} with from_url"
+        probe = {"serial": "SERIAL_PROBES", "can": "can_probe"}.get(kind.wire)
+        if probe and not hasattr(driver, probe):
+            yield f"{module}: {probe}, by which `devices --probe` finds the sensor"
+    package = module.split(".")[1]
+    if not list((ROOT / "tests/unit/drivers" / package).glob("test_*.py")):
+        yield f"tests/unit/drivers/{package}: a test of the codec with the bytes that the vendor's document prints"
+    if not kind.emulated and kind.wire != "topic":
+        yield "drivers/ftdrivers/sensors.py: the names of its emulators"
+    for emulator in kind.emulated:
+        if SCHEMES.get(emulator) != scheme:
+            yield f"mocks/ftmocks/sensors/catalogue.py: the emulator {emulator}"
+    if f"| `{scheme}:" not in (ROOT / "docs/reference/sensors.md").read_text(encoding="utf-8"):
+        yield "docs/reference/sensors.md: a row with its address"
+
+
+@pytest.mark.parametrize("scheme", SENSORS)
+def test_a_sensor_has_all_that_it_needs(scheme: str) -> None:
+    assert list(missing(scheme, SENSORS[scheme])) == []
+
+
+def test_every_emulated_sensor_has_a_driver() -> None:
+    assert {name: scheme for scheme, kind in SENSORS.items() for name in kind.emulated} == SCHEMES
+
+
+@pytest.mark.parametrize(
+    ("kind", "files"),
+    [
+        (
+            SensorKind("ftdrivers.acme.sensor:AcmeSensor", "serial"),
+            [
+                "ftdrivers.acme.sensor",
+                "tests/unit/drivers/acme",
+                "drivers/ftdrivers/sensors.py",
+                "docs/reference/sensors.md",
+            ],
+        ),
+        (
+            SensorKind("ftdrivers.ati.netft:NetFtSensor", "serial", {"acme": "Acme sensor"}),
+            ["ftdrivers.ati.netft", "mocks/ftmocks/sensors/catalogue.py", "docs/reference/sensors.md"],
+        ),
+    ],
+)
+def test_what_a_new_sensor_lacks_is_named(kind: SensorKind, files: list[str]) -> None:
+    assert [what.partition(":")[0] for what in missing("acme-usb", kind)] == files
