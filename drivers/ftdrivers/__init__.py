@@ -1,11 +1,11 @@
 """Adapters for arms and force/torque sensors behind two abstract interfaces.
 
-The names are what a driver of your own needs. They are imported at their first use.
+The exported names are what a driver in another package needs. Each is imported at its first use.
 """
 
 from importlib import import_module
 
-# Type checkers take it for that of `typing`.
+# Type checkers treat this name like `typing.TYPE_CHECKING`.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ftdrivers.interfaces import ArmState, DeviceInfo, ForceTorqueSensor, FtSamples, ReadOnlyArm, RobotArm

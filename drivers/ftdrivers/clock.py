@@ -1,7 +1,7 @@
-"""The clock of the drivers: one object, passed to everything that waits or judges an age.
+"""The clock of the drivers: one object, passed to all code that waits or computes the age of a sample.
 
-`REAL` is the computer's own clock. The clock of an emulated cell waits for a starved reader. The clock of a test moves
-only when the test moves it. No module of `drivers` calls `time.monotonic` or `time.sleep` itself.
+`REAL` is the clock of the computer. The clock of an emulated cell waits for a reader that gets no processor time. The
+clock of a test moves only when the test advances it. Drivers never call `time.monotonic` or `time.sleep`.
 """
 
 import sys
@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Final, Protocol, TypeVar
 
 Heard = TypeVar("Heard")
-# After a wait that ends this late the computer was busy, and something may have arrived meanwhile.
+# If a wait ends later than planned by more than this, the computer was busy and data may have arrived meanwhile.
 _OVERSLEPT_S: Final = 0.002
 
 
@@ -21,24 +21,25 @@ class Waitable(Protocol):
     """A `threading.Condition` whose lock is held, or a `threading.Event`."""
 
     def wait(self, timeout: float | None = None, /) -> bool:
-        """Return whether it was notified or set within `timeout` seconds."""
+        """Wait up to `timeout` seconds; return whether the condition was notified or the event was set."""
 
 
 class Clock(ABC):
     """A monotonic clock and the ways to wait on it. Every method may be called from any thread.
 
-    What differs in an emulated cell is here, as limits and methods; no driver knows which clock it has.
+    All differences between a real and an emulated cell are limits and methods of this class, so that a driver need not
+    know which clock it uses.
     """
 
     poll_s = 0.05
-    """The longest that one read may block, in real time; the time of an emulated cell stands still meanwhile."""
+    """Longest time for which one read may block, s of real time. The time of an emulated cell stops meanwhile."""
     lead_s = 0.0
-    """The most that a device may be behind this clock, as one in another process is that starves."""
+    """Largest lag of a device behind this clock, s: an emulator in another process may get no processor time."""
     can_be_held = False
-    """Whether time stands still in a `held` block."""
+    """Whether time stops during a `held` block."""
 
     def patience_s(self, limit_s: float) -> float:
-        """Return a limit on another process in real time: a long one in an emulated cell, where it may starve."""
+        """Return a time-out for another process, s of real time. It is long in an emulated cell."""
         return limit_s
 
     @abstractmethod
@@ -50,17 +51,17 @@ class Clock(ABC):
         return self.now_ns() / 1e9
 
     def awake_s(self) -> float:
-        """Return seconds of a clock that also counts while the computer sleeps. It measures silence."""
+        """Return the time of a clock that also runs while the computer is suspended, s. Silence is measured with it."""
         return self.now_s()
 
     @abstractmethod
     def sleep(self, duration_s: float) -> None:
-        """Return after `duration_s` seconds, or at once where that is not positive."""
+        """Return after `duration_s` seconds, or at once if `duration_s` is not positive."""
 
     def looks(self, duration_s: float) -> Iterator[float]:
-        """Yield how many seconds of `duration_s` are left, and finally 0.
+        """Yield the time left of `duration_s`, s, and finally 0.
 
-        The last turn finds what arrived in time, however late this thread is.
+        Because of this last turn, data that arrived in time are read even if this thread is late.
         """
         end_ns = self.now_ns() + round(duration_s * 1e9)
         while (left_ns := end_ns - self.now_ns()) > 0:
@@ -69,24 +70,24 @@ class Clock(ABC):
 
     @abstractmethod
     def wait(self, waitable: Waitable, timeout_s: float) -> bool:
-        """Wait until `waitable` is notified or set, at most `timeout_s` seconds; return whether it was."""
+        """Wait up to `timeout_s` seconds until `waitable` is notified or set; return whether that happened."""
 
     def keeping_up(self) -> AbstractContextManager[object]:
-        """Mark a block whose thread must see time pass in small steps, such as the loop that reads a stream.
+        """Mark a block whose thread must see time advance in small steps, such as the loop that reads a stream.
 
-        Between two calls of this clock in this thread, the time of an emulated cell advances by some milliseconds at
-        most. A real clock waits for no thread.
+        Between two calls of this clock in this thread, the time of an emulated cell advances by a few milliseconds at
+        most. The real clock waits for no thread.
         """
         return nullcontext()
 
     def held(self) -> AbstractContextManager[object]:
-        """Mark a block in which the time of an emulated cell does not go on, so that its devices send no more."""
+        """Mark a block in which the time of an emulated cell stops, so that its devices send nothing."""
         return nullcontext()
 
     def hear(self, look: Callable[[float], Heard | None], silence_s: float) -> Heard | None:
-        """Return what `look` finds within `silence_s`, called in a `held` block; None for a silence.
+        """Call `look` in a `held` block and return its result; None if nothing arrived for `silence_s`.
 
-        A silence counts if this thread was awake to hear it. Where time stands still, nothing more arrives.
+        `look` is called again if this thread did not run in time, because data may have arrived meanwhile.
         """
         wait_s, begin_s = 0.0 if self.can_be_held else silence_s, self.now_s()
         found = look(wait_s)
@@ -95,9 +96,9 @@ class Clock(ABC):
         return found
 
     def away(self) -> AbstractContextManager[object]:
-        """Mark a block in which a thread that keeps up waits for something else, such as the answer of a web server.
+        """Mark a block in which a thread that otherwise keeps up waits for something else, such as a web server.
 
-        The time of an emulated cell does not wait for the thread meanwhile.
+        During the block, the time of an emulated cell does not wait for the thread.
         """
         return nullcontext()
 
@@ -107,7 +108,7 @@ class _RealClock(Clock):
         return time.monotonic_ns()
 
     def awake_s(self) -> float:
-        """Return CLOCK_BOOTTIME in seconds, where the system has it."""
+        """Return CLOCK_BOOTTIME in seconds if the system has this clock, else CLOCK_MONOTONIC."""
         if sys.platform == "linux":
             return time.clock_gettime(time.CLOCK_BOOTTIME)
         return time.monotonic()
@@ -123,10 +124,10 @@ REAL = _RealClock()
 
 
 class Follower(threading.Thread):
-    """A daemon thread whose `work` keeps up with `clock`.
+    """A daemon thread that calls `work` in a `keeping_up` block of `clock`.
 
-    `start` returns once an emulated cell's time waits for the thread, so that nothing is timed before. It raises what
-    `Clock.keeping_up` raises.
+    `start` returns as soon as the time of an emulated cell waits for the thread, so that no limit expires before. It
+    raises the exceptions of `Clock.keeping_up`.
     """
 
     def __init__(self, clock: Clock, work: Callable[[], None], name: str) -> None:
@@ -137,15 +138,15 @@ class Follower(threading.Thread):
         self._refusal: Exception | None = None
 
     def start(self) -> None:
-        """Start the thread and wait until it keeps up."""
-        # An emulated cell waits for this thread, so a busy computer makes the cell slow, never late.
+        """Start the thread and wait until it has entered its `keeping_up` block."""
+        # An emulated cell waits for this thread: a busy computer slows the cell down, but no sample is late.
         super().start()
         self._decided.wait()
         if self._refusal is not None:
             raise self._refusal
 
     def run(self) -> None:
-        """Keep up and work; called in the thread."""
+        """Call `work` in a `keeping_up` block; called in the thread."""
         with ExitStack() as stack:
             try:
                 stack.enter_context(self._clock.keeping_up())

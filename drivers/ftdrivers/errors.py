@@ -1,7 +1,7 @@
-"""What can go wrong with a device. All are a `DeviceError` with `found` and `fix`, but an address that cannot be used.
+"""Errors of devices. Each `DeviceError` has `found`, what happened, and `fix`, what to do.
 
 DeviceError
-├── ConnectError      the device could not be opened, or is not what it should be
+├── ConnectError      the device could not be opened, or is not the expected one
 │   ├── PortInUse
 │   ├── Unreachable
 │   ├── ModelUnknown
@@ -45,35 +45,35 @@ UNUSABLE: Final = "discard its data, check load, supply and cable, then power it
 
 
 class ConnectError(DeviceError):
-    """The device could not be opened, or is not what it should be."""
+    """The device could not be opened, or is not the expected one."""
 
 
 class PortInUse(ConnectError):
-    """Another program has the port of the device."""
+    """Another program uses the port of the device."""
 
 
 class Unreachable(ConnectError):
-    """Nothing answers at the address of the device."""
+    """No device answers at the address."""
 
 
 class ModelUnknown(ConnectError):
-    """An arm does not report its model, and none is configured."""
+    """The arm does not report its model, and no model is configured."""
 
 
 class NoDashboard(ConnectError):
-    """The dashboard server of an arm, or its Robot API, does not answer or refuses."""
+    """The dashboard server or the Robot API of an arm does not answer, or refuses a request."""
 
 
 class StreamBroken(DeviceError):
-    """The connection was lost after it had worked."""
+    """An established connection was lost."""
 
 
 class DeviceTimeout(DeviceError):
-    """Nothing arrived in time."""
+    """No data arrived within a time-out."""
 
 
 class ProtocolError(DeviceError):
-    """Bytes arrived that the device's document does not allow."""
+    """Received bytes violate the documented protocol of the device."""
 
 
 class DeviceFault(DeviceError):
@@ -81,16 +81,16 @@ class DeviceFault(DeviceError):
 
 
 class Frozen(DeviceFault):
-    """A sensor repeats one reading, although a sensor that measures has noise."""
+    """A sensor repeats one reading; a sensor that measures has noise."""
 
 
 class BadUrl(UsageError):
-    """An address that no driver understands: an error in the configuration, not in the device."""
+    """The address of a device is invalid: an error in the configuration, not in the device."""
 
 
 class NoRos2(UsageError):
-    """rclpy, or messages that are needed, cannot be imported, or the arguments of ROS cannot be read."""
+    """rclpy or its message packages cannot be imported, or ROS rejects its arguments."""
 
 
 class BadTranscript(DataError):
-    """A file is not a transcript that this version can play."""
+    """A file is not a transcript, or has a format that this version cannot play."""

@@ -1,4 +1,4 @@
-"""Reading a stream without gaps: what every follower of a device shares."""
+"""Reading every sample of a stream without gaps: classes that all devices share."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -10,7 +10,7 @@ Item = TypeVar("Item")
 
 
 class Follow(Generic[Samples]):
-    """Reads every sample of a device, as long as `with device.follow() as follow:` lasts."""
+    """Reads every sample of a device within a block `with device.follow() as follow:`."""
 
     def __init__(self, read: Callable[[float], Samples]) -> None:
         self._read = read
@@ -33,14 +33,14 @@ class Follow(Generic[Samples]):
 
 
 class Unread(Generic[Item]):
-    """What one follower has not read yet, in order. The lock of the stream protects it.
+    """Queue of the samples that one follower has not read yet. The lock of the stream protects it.
 
     Parameters
     ----------
     name
-        The device; begins the error message.
+        Name of the device, for the error message.
     most
-        The most samples that may wait. More is an error, never a dropped sample.
+        Largest number of samples in the queue. If there are more, `check` raises; no sample is dropped silently.
     """
 
     def __init__(self, name: str, most: int) -> None:
@@ -50,7 +50,7 @@ class Unread(Generic[Item]):
         self._samples = 0
 
     def put(self, item: Item, samples: int = 1) -> None:
-        """Add an item of so many samples."""
+        """Add an item that holds this number of samples."""
         self._samples += samples
         if self._samples <= self._most:
             self._items.append(item)
@@ -61,12 +61,12 @@ class Unread(Generic[Item]):
         """Raise `StreamBroken` if too many samples were not read."""
         if self._samples > self._most:
             raise StreamBroken(
-                f"{self._name}: {self._samples} samples have not been read, {self._most} may wait",
+                f"{self._name}: {self._samples} samples are waiting to be read, and the limit is {self._most}",
                 "read more often, or collect in shorter pieces",
             )
 
     def take(self) -> list[Item]:
-        """Return what waits, and empty the queue. Raises as `check`."""
+        """Return the items of the queue and empty it. Raises like `check`."""
         self.check()
         items, self._items, self._samples = self._items, [], 0
         return items

@@ -1,4 +1,4 @@
-"""How this ftdrive was installed, and therefore the command that adds one of its extras."""
+"""The command that adds an extra to this installation of ftdrive."""
 
 import json
 import os
@@ -17,23 +17,14 @@ _NAME = "ftdrive"
 
 
 def missing_extra(what: str, package: str, extra: str) -> str:
-    """Return the sentence of an error: what needs a package that is not installed, and the command that installs it.
-
-    Parameters
-    ----------
-    what : str
-        Such as "--png".
-    package : str
-    extra : str
-        Of ftdrive, that has the package.
-    """
+    """Return an error message: `what`, such as "--png", needs this package, and the command that installs the extra."""
     return f"{what} needs {package}, of the extra {extra}: install it with `{install_command(extra)}`"
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to this installation, and keeps those it has.
+    """Return the command that adds an extra to this installation and keeps the installed extras.
 
-    It is that of `uv tool`, of pipx, of a clone that uv manages, or else of pip for this interpreter.
+    The command is one of `uv tool`, of pipx, of uv in a clone, or else of pip for this interpreter.
     """
     prefix = Path(sys.prefix)
     with suppress(OSError, ValueError, KeyError, StopIteration):
@@ -56,7 +47,7 @@ def install_command(extra: str) -> str:
 
 
 def _with(name: str, extras: Iterable[str]) -> str:
-    """Return a requirement with these extras, each once."""
+
     return f"{name}[{','.join(sorted({each.strip() for each in extras} - {''}))}]"
 
 
@@ -74,7 +65,7 @@ def _of_uv_tool(requirements: list[dict[str, Any]], extra: str) -> str:
 
 
 def _clone() -> Path | None:
-    """Return the folder of a clone with the lock file of uv from which this is installed; None where there is none."""
+    """Return the folder of the clone that is installed in editable mode and has a lock file of uv; None without one."""
     try:
         about = json.loads(distribution(_NAME).read_text("direct_url.json") or "{}")
     except (PackageNotFoundError, ValueError):

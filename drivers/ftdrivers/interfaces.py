@@ -1,7 +1,7 @@
-"""The two devices of a cell: an arm and a wrist force/torque sensor.
+"""Interfaces of the two devices of a cell: an arm and a wrist force/torque sensor.
 
-A constructor only stores the configuration. `open` connects to the device. `close` is safe at any time, twice, and
-after the device is gone. Every wait has a time-out. Stale data is an error and is never returned.
+A constructor only stores the configuration. `open` connects to the device. `close` may be called at any time, twice, or
+after the device was lost. Every wait has a time-out. Stale data raise an error and are never returned.
 """
 
 import math
@@ -22,27 +22,27 @@ from ftdrivers.sweep import Sweep
 Array = NDArray[np.float64]
 
 Guard = Callable[[], None]
-"""Called between two samples of the arm; raises when the motion must not go on."""
+"""Called between two samples of the arm. It raises if the motion must not go on."""
 
 
 NOT_REPORTED: Final = "not reported"
-"""Stands for a serial number or a firmware version that a device does not report."""
+"""Placeholder for a serial number or firmware version that a device does not report."""
 WRIST_SENSOR: Final = "UR e-Series wrist sensor (ft_raw_wrench)"
-"""Model of the sensor in the wrist of an arm, which feels the friction of the last joint."""
+"""Model name of the sensor in the wrist of a UR arm, whose readings contain the friction of the last joint."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """A property of a device, and its source."""
+    """A property of a device, and the source of its value."""
 
     value: float | str | tuple[float, ...]
     source: Literal["device", "documented", "configured", "assumed"]
-    """Reported by the device, fixed by its manual, set by the user, or assumed: check it."""
+    """Reported by the device, fixed by its manual, set by the user, or assumed (to be checked)."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceInfo:
-    """What a device reports about itself, and what is known about it otherwise.
+    """Model, serial number and firmware of a device, and further facts about it.
 
     Examples
     --------
@@ -55,37 +55,37 @@ class DeviceInfo:
     serial: str
     firmware: str
     facts: dict[str, Fact] = field(default_factory=dict)
-    """Of a sensor, as far as known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the device's numbers;
-    `range`, (6,) the largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1;
-    `software_bias`, which the device subtracts, in its own unit; `tool_transformation` of the device, which the driver
-    undoes; `zero`, "arbitrary" where it is. Of an arm: `control`, by what it is moved and why; `kinematics`, theta, a,
-    d and alpha (24,) of its joints, as measured."""
+    """Keys of a sensor, each only if known: `serial`; `counts_per_N` and `counts_per_Nm`, the scale of the raw values;
+    `range`, (6,) largest force in N and torque in N·m on each axis, in both directions; `sign`, 1 or -1;
+    `software_bias`, which the device subtracts, in its own unit; `tool_transformation`, which the device applies and
+    the driver undoes; `zero`, "arbitrary" if the reading without load may have any value. Keys of an arm: `control`,
+    the control path and the reason for it; `kinematics`, (24,) theta, a, d and alpha of its joints, as measured."""
 
     @property
     def has_arbitrary_zero(self) -> bool:
-        """Whether a sensor without load may read anything, so that its range holds for changes of the reading."""
+        """Whether the reading without load may have any value; the range then limits changes of the reading."""
         return "zero" in self.facts
 
 
 class Columns:
-    """n consecutive samples, one array for each quantity, one row for each sample."""
+    """n consecutive samples: one array per quantity, one row per sample."""
 
     __slots__ = ()
-    # Fields that are no arrays by rows: one value for all of them, and of joined blocks that of the last.
+    # Fields with one value for all rows. When blocks are joined, the value of the last block is kept.
     _COMMON: ClassVar[frozenset[str]] = frozenset()
     t_host_ns: NDArray[np.int64]
 
     def __len__(self) -> int:
-        """Count the rows."""
+        """Return the number of rows."""
         return len(self.t_host_ns)
 
     def columns(self) -> dict[str, Any]:
-        """Return the fields, for samples that have further ones."""
+        """Return the fields by name, for a subclass with further fields."""
         return {name: getattr(self, name) for name in self._names()}
 
     @classmethod
     def concatenate(cls, blocks: Sequence[Self]) -> Self:
-        """Join blocks in the order given."""
+        """Return one block with the rows of all blocks, in their order."""
         if len(blocks) == 1:
             return blocks[0]
         last = blocks[-1]
@@ -99,7 +99,7 @@ class Columns:
         )
 
     def rows(self, which: slice | NDArray[np.bool_]) -> Self:
-        """Select samples."""
+        """Return a block with the selected rows."""
         return type(self)(
             *(getattr(self, name) if name in self._COMMON else getattr(self, name)[which] for name in self._names())
         )
@@ -114,7 +114,7 @@ class Columns:
 class FtSamples(Columns):
     """n consecutive samples of one sensor, one row each, as measured: no bias, tare or filter applied.
 
-    The wrench is exerted on the sensor by what hangs on it or pushes on it, in the sensor frame, about its origin.
+    The wrench is exerted on the sensor by its load and by contacts, in sensor axes, about the sensor's origin.
 
     Examples
     --------
@@ -127,11 +127,11 @@ class FtSamples(Columns):
     t_host_ns: NDArray[np.int64]
     """(n,) `Clock.now_ns()` of the driver at receipt."""
     t_device_s: Array
-    """(n,) the device's own clock, own epoch; NaN where it has none. Never subtract it from host time."""
+    """(n,) time on the device's own clock, s; NaN if it has none. Its epoch differs from that of host time."""
     seq: NDArray[np.int64]
-    """(n,) numbers every sample that the device sent or was polled for, so that gaps are visible."""
+    """(n,) sequence number. Every sample that the device sent or was polled for has one, so that gaps are visible."""
     counts: NDArray[np.int32]
-    """(n, k) raw device counts; k = 0 where the device reports physical units."""
+    """(n, k) raw counts of the device; k = 0 if the device reports physical units."""
     wrench: Array
     """(n, 6) force in N, then torque in N·m."""
     status: NDArray[np.uint32]
@@ -148,7 +148,7 @@ class FtSamples(Columns):
         t_device_s: ArrayLike = math.nan,
         status: ArrayLike = 0,
     ) -> Self:
-        """Build n samples from `wrench` (n, 6). Where all rows share a value, it may be a single number."""
+        """Build n samples from `wrench` (n, 6). A value that all rows share may be a single number."""
         n = len(wrench := np.asarray(wrench, np.float64))
         return cls(
             t_host_ns=np.full(n, t_host_ns, np.int64),
@@ -162,35 +162,35 @@ class FtSamples(Columns):
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """Counters of a stream since it was opened."""
+    """Statistics of a stream since it was opened."""
 
     received: int
     lost: int
-    """Samples that the device sent or was polled for and that never arrived, or arrived too late."""
+    """Number of samples that the device sent or was polled for, and that never arrived or arrived too late."""
     malformed: int
-    """Frames that arrived damaged and were dropped."""
+    """Number of damaged frames, which were dropped."""
     rate_Hz: float
-    """Mean rate over the last second."""
+    """Mean sample rate over the last second, Hz."""
     age_s: float
-    """Time since the newest sample."""
+    """Time since the newest sample, s."""
     duplicated: int = 0
-    """Frames or samples that arrived twice; one of them was kept."""
+    """Number of frames or samples that arrived a second time and were dropped."""
     out_of_order: int = 0
-    """Samples that arrived after a newer one and were dropped; `lost` counts them too."""
+    """Number of samples that arrived after a newer one and were dropped. They are part of `lost`."""
     stale: int = 0
-    """Silences longer than the stream allows, after which samples came again; also while the driver did not read."""
+    """Number of silences longer than `StreamLimits.stale_s` after which samples arrived again."""
     reconnects: int = 0
-    """Interruptions after which the driver reconnected by itself; only with `recover`."""
+    """Number of interruptions after which the driver has reconnected, see `StreamingSensor.recover`."""
     nominal_rate_Hz: float = math.nan
-    """The rate that the device reports or its manual fixes; NaN where unknown."""
+    """Rate that the device reports or its manual states, Hz; NaN if unknown."""
     events: tuple[tuple[int, str], ...] = ()
-    """(`t_host_ns`, what happened): interruptions, reconnections, pauses of the reader, late samples, start and end of
-    a wrong rate. A recording stores them."""
+    """Pairs of `t_host_ns` and a phrase: interruption, reconnection, pause of the reader, late samples, begin and end
+    of a wrong rate. A recording stores them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmState:
-    """One sample of the arm. The flange is the mechanical flange, whatever TCP is active.
+    """One sample of the arm. The flange is the mechanical flange and does not depend on the active TCP.
 
     Examples
     --------
@@ -214,17 +214,17 @@ class ArmState:
     R_base_flange: Array
     """(3, 3) maps flange coordinates to base coordinates."""
     p_base_flange_m: Array
-    """(3,)"""
+    """(3,) position of the flange in base coordinates, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmStates(Columns):
-    """n consecutive samples of the arm, one row each. The flange is the mechanical flange, whatever TCP is active."""
+    """n consecutive samples of the arm, one row each. The flange does not depend on the active TCP."""
 
     t_host_ns: NDArray[np.int64]
     """(n,) `Clock.now_ns()` of the driver at receipt."""
     t_device_s: Array
-    """(n,) the controller's own clock, own epoch. Never subtract it from host time."""
+    """(n,) time on the controller's own clock, s. Its epoch differs from that of host time."""
     q_rad: Array
     """(n, 6) actual joint angles."""
     qd_rad_s: Array
@@ -232,59 +232,59 @@ class ArmStates(Columns):
     R_base_flange: Array
     """(n, 3, 3) maps flange coordinates to base coordinates."""
     p_base_flange_m: Array
-    """(n, 3)"""
+    """(n, 3) position of the flange in base coordinates, m."""
 
     @classmethod
     def of(cls, states: Sequence[ArmState]) -> Self:
-        """Join at least one state."""
+        """Build samples from one state or more."""
         return cls(*(np.array([getattr(state, name) for state in states]) for name in cls._names()))
 
 
 @dataclass(frozen=True, slots=True)
 class ArmStatus:
-    """What a controller reports about itself in one sample. None where it does not report a value."""
+    """Modes and settings that a controller reports. A value that it does not report is None."""
 
     t_host_ns: int
     t_device_s: float
     robot_mode: str
-    """Such as "running", "idle", "power off"."""
+    """Mode of the robot, such as "running", "idle" or "power off"."""
     safety_mode: str
-    """Such as "normal", "reduced", "protective stop"."""
+    """Safety mode, such as "normal", "reduced" or "protective stop"."""
     program: str
-    """"stopped", "playing", "paused", or a transition to one of them. Our control program plays too."""
+    """State of the program: "stopped", "playing", "paused", or a transition. The control program of ftdrive counts."""
     fault: DeviceFault | None
-    """Why the arm may not move, and what the operator has to do; None where it may. Returned, not raised."""
+    """Reason why the arm may not move, and what the operator has to do; None if it may move."""
     speed_slider: float
-    """0 to 1, as set at the pendant or by a program."""
+    """Speed slider, 0 to 1, as set at the pendant or by a program."""
     speed_scaling: float
-    """0 to 1, the fraction of the programmed speed that the controller allows now."""
+    """Fraction of the programmed speed that the controller allows at the moment, 0 to 1."""
     payload_kg: float | None
-    """The payload that is configured in the controller."""
+    """Mass of the payload that is configured in the controller, kg."""
     p_flange_payload_m: tuple[float, ...] | None
-    """(3,) centre of mass of that payload."""
+    """(3,) centre of mass of the configured payload in flange coordinates, m."""
     tcp_offset: tuple[float, ...] | None
-    """(6,) active TCP in the flange: m, then a rotation vector in rad."""
+    """(6,) pose of the active TCP in the flange: position in m, then rotation vector in rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class ControllerSettings:
-    """What a controller assumes about its load and about gravity. None where it does not report a value."""
+    """Load and gravity that a controller assumes. A value that it does not report is None."""
 
     mass_kg: float | None = None
     p_flange_com_m: tuple[float, ...] | None = None
-    """(3,) centre of mass of everything below the flange."""
+    """(3,) centre of mass of all that is mounted on the flange, in flange coordinates, m."""
     inertia_kg_m2: tuple[float, ...] | None = None
-    """(6,) Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass, along the flange axes."""
+    """(6,) Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass, in flange axes, kg·m²."""
     up_base_m_s2: tuple[float, ...] | None = None
-    """(3,) acceleration away from the earth, in base axes: (0, 0, 9.82) on a level floor."""
+    """(3,) gravitational acceleration with reversed sign, in base axes: (0, 0, 9.82) on a level floor."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """A check that a driver makes of its own device, beyond what every device of its kind reports."""
+    """Result of a check that only one driver has, because only its device has what is checked."""
 
     name: str
-    """What was checked, such as "registers"."""
+    """Name of the check, such as "registers"."""
     passed: bool
     found: str
     fix: str = ""
@@ -297,16 +297,16 @@ class _Device(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Disconnect. Idempotent; never raises on a lost device."""
+        """Disconnect. Idempotent. Never raises if the device was lost."""
 
     @abstractmethod
     def identify(self) -> DeviceInfo:
         """Return model, serial number and firmware, as read when the device was opened."""
 
     def diagnose(self) -> list[Diagnosis]:
-        """Check what only this kind of device has and a program needs, such as the ports of a controller.
+        """Run the checks that only this driver has, such as the ports of a controller. They only read.
 
-        Only reads. The default has nothing to check.
+        The default returns an empty list.
         """
         return []
 
@@ -319,7 +319,7 @@ class _Device(ABC):
 
 
 class ForceTorqueSensor(_Device):
-    """A streaming six-axis force/torque sensor. `StreamingSensor` is the base of a driver.
+    """A streaming six-axis force/torque sensor. `StreamingSensor` is the base class of drivers.
 
     Examples
     --------
@@ -336,43 +336,43 @@ class ForceTorqueSensor(_Device):
     def open(self) -> None:
         """Connect and start the stream. Raises `ConnectError`.
 
-        Does nothing while there is a stream; reopens one that has ended.
+        Does nothing while the stream runs. Reopens a stream that has ended.
         """
 
     @abstractmethod
     def collect(self, duration_s: float) -> FtSamples:
-        """Return every sample received in the `duration_s` seconds that begin with this call.
+        """Return every sample received within `duration_s` seconds from this call.
 
-        Raises `StreamBroken`, `DeviceTimeout` or `DeviceFault` as soon as the stream fails, at most 0.5 s after the
-        end. A result never has missing time.
+        If the stream fails meanwhile, `StreamBroken`, `DeviceTimeout` or `DeviceFault` is raised at once, at the latest
+        0.5 s after the end. A result never has an undetected interruption.
         """
 
     @abstractmethod
     def follow(self) -> AbstractContextManager[Follow[FtSamples]]:
-        """Read every sample from now on; see `Follow`. Any number of followers, each from any thread.
+        """Read every sample from now on, see `Follow`. There may be any number of followers, in any thread.
 
-        A lost sample is a gap in `seq`. After the stream has reconnected by itself, the same follower reads on.
+        A lost sample is a gap in `seq`. If the driver reconnects, the follower continues with the new samples.
         """
 
     @abstractmethod
     def latest(self, *, timeout_s: float) -> FtSamples:
-        """Return the newest sample (one row); wait up to `timeout_s` for one that is not stale."""
+        """Return the newest sample (one row). If it is stale, wait up to `timeout_s` for another one."""
 
     @abstractmethod
     def check(self) -> None:
-        """Raise the stream's failure, if it has one: broken, stale, or a critical device status."""
+        """Raise the failure of the stream if it is broken or stale, or if the status of the device is critical."""
 
     @abstractmethod
     def health(self) -> Health:
-        """Return the counters since `open`."""
+        """Return the statistics since `open`."""
 
     def temperature_C(self) -> float | None:
-        """Return the sensor's temperature, as it came with its newest sample; None where a sensor reports none."""
+        """Return the temperature that came with the newest sample, °C; None if the sensor reports none."""
         return None
 
 
 class RobotArm(_Device):
-    """A six-joint arm. `with arm:` opens it for reading. `ReadOnlyArm` is the base of a driver that only reads.
+    """A six-joint arm. `with arm:` opens it for reading. `ReadOnlyArm` is the base class of drivers that only read.
 
     Examples
     --------
@@ -386,20 +386,21 @@ class RobotArm(_Device):
     def open(self, *, control: bool = False) -> None:
         """Connect, read-only unless `control` is requested. Idempotent. Raises `ConnectError`.
 
-        It never stops a program of another client: while one is on the controller, taking control is a `ConnectError`.
+        It never stops the program of another client. While one runs on the controller, requesting control raises
+        `ConnectError`.
         """
 
     @abstractmethod
     def state(self) -> ArmState:
-        """Read a new, consistent state; raises `DeviceTimeout` when the controller's clock stands still.
+        """Read a new, consistent state. Raises `DeviceTimeout` if the controller's clock stands still.
 
-        From any thread, also while `move_to` runs in another.
+        May be called from any thread, also while `move_to` runs in another thread.
         """
 
     def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
-        """Read every state from now on; see `Follow`. Any number of followers, each from any thread.
+        """Read every state from now on, see `Follow`. There may be any number of followers, in any thread.
 
-        The default calls `state()` once a read, so its rate is that of the reads.
+        The default calls `state()` once per read.
         """
 
         def read(_: float) -> ArmStates:
@@ -409,15 +410,16 @@ class RobotArm(_Device):
 
     @abstractmethod
     def status(self) -> ArmStatus:
-        """Return the controller's modes and settings. Quick; from any thread, whatever the arm does in another.
+        """Return the modes and settings of the controller without delay. May be called from any thread at any time.
 
-        Never older than 0.1 s; otherwise raises `DeviceTimeout` or `StreamBroken`. Raises `ConnectError` while closed.
+        Raises `DeviceTimeout` or `StreamBroken` if the newest status is older than 0.1 s, and `ConnectError` if the arm
+        is closed.
         """
 
     def controller_settings(self) -> ControllerSettings:
-        """Read the load and the gravity that the controller assumes. Needs no control.
+        """Read the load and the gravity that the controller assumes. Control is not needed.
 
-        The default knows what `status` reports.
+        The default returns the values that `status` reports.
         """
         status = self.status()
         return ControllerSettings(status.payload_kg, status.p_flange_payload_m)
@@ -425,24 +427,25 @@ class RobotArm(_Device):
     def set_payload(
         self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
     ) -> None:
-        """Set the payload in the controller; read it back with `controller_settings`. Needs control and an arm at rest.
+        """Set the payload in the controller. Needs control and an arm at rest.
 
-        Parameters as in `ControllerSettings`; an inertia of zeros is a point mass. The default raises `DeviceFault`.
+        The parameters are those of `ControllerSettings`; an inertia of zeros is a point mass. The default raises
+        `DeviceFault`.
         """
         payload = f"a payload of {mass_kg:g} kg at {[*p_flange_com_m]} m with the inertia {[*inertia_kg_m2]} kg·m²"
         raise DeviceFault(f"the driver of this arm cannot set {payload}", "set it at the controller")
 
     def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
-        """Set the direction of gravity in the controller, as in `ControllerSettings`; otherwise as `set_payload`."""
+        """Set gravity in the controller, see `ControllerSettings`. Needs control. The default raises `DeviceFault`."""
         gravity = f"a gravity of {[*up_base_m_s2]} m/s²"
         raise DeviceFault(f"the driver of this arm cannot set {gravity}", "set the mounting at the controller")
 
     def in_remote_control(self) -> bool | None:
-        """Return whether the controller accepts programs from the network; None where it has no such switch."""
+        """Return whether the controller accepts programs from the network; None if it has no such switch."""
         return None
 
     def reported_program(self) -> str | None:
-        """Return the program that runs, as the controller reports it; None where it does not."""
+        """Return the name of the running program; None if the controller does not report it."""
         return None
 
     @abstractmethod
@@ -461,15 +464,15 @@ class RobotArm(_Device):
     ) -> None:
         """Move all joints to `q_rad` (6,) and return when they have arrived.
 
-        Speed and acceleration are those of the leading joint; None takes those of the constructor. `guard` is called at
-        least 20 times a second while the arm moves. Whatever ends the wait early (an exception of the guard, a fault,
-        the time-out, Ctrl-C) stops the arm first and is raised afterwards.
+        Speed and acceleration are those of the leading joint; None selects the values of the constructor. `guard` is
+        called at least 20 times per second while the arm moves. An exception of the guard, a fault, the time-out or
+        Ctrl-C stops the arm first and is raised afterwards.
         """
 
     def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
-        """Follow a sweep from the posture where it begins, and return when the arm stands there again. Needs control.
+        """Follow a sweep from its first posture, and return when the arm rests there again. Needs control.
 
-        `guard` and early ends as in `move_to`. The default raises `DeviceFault`.
+        `guard` and exceptions are those of `move_to`. The default raises `DeviceFault`.
         """
         guard()
         raise DeviceFault(
@@ -478,20 +481,20 @@ class RobotArm(_Device):
 
     @abstractmethod
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
-        """Return when the joints have been at rest long enough for the structure to stop ringing."""
+        """Return when the joints have been at rest for so long that vibrations of the structure have decayed."""
 
     @abstractmethod
     def stop(self) -> None:
-        """Stop the arm. From any thread, at any time; does nothing without control."""
+        """Stop the arm. May be called from any thread at any time. Does nothing without control."""
 
 
 _REFUSAL: Final = "the driver of this arm only reads it", "move the arm by hand, as calibrate --manual does"
 
 
 class ReadOnlyArm(RobotArm):
-    """An arm that is read and never moved: for a stream, a recording, or a calibration by hand.
+    """An arm that is only read: for a stream, a recording, or a calibration by hand.
 
-    A subclass implements `identify` and `state`, and what it needs of `open` and `close`.
+    A subclass implements `identify` and `state`, and `open` and `close` if it needs them.
 
     Examples
     --------
@@ -508,7 +511,7 @@ class ReadOnlyArm(RobotArm):
     """
 
     def open(self, *, control: bool = False) -> None:
-        """Do nothing; raises `ConnectError` if control is requested."""
+        """Do nothing, or raise `ConnectError` if control is requested."""
         if control:
             raise ConnectError(*_REFUSAL)
 
@@ -516,7 +519,7 @@ class ReadOnlyArm(RobotArm):
         """Do nothing."""
 
     def status(self) -> ArmStatus:
-        """Return what is known of an arm that reports only its state."""
+        """Return a status in which every value is not reported."""
         state = self.state()
         unknown = NOT_REPORTED, NOT_REPORTED, "stopped"
         return ArmStatus(state.t_host_ns, state.t_device_s, *unknown, None, 1.0, 1.0, None, None, None)

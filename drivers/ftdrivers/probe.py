@@ -1,7 +1,7 @@
 """Probe a serial port or a CAN bus for known sensors: listen first, then request their names.
 
-Only for ports and buses that the user names. Only read requests are sent, in the protocols of the sensors of
-`ftdrivers.sensors`; their effect on other devices is unknown. The drivers hold the requests and their sources.
+Only ports and buses that the user names are probed. Only read requests are sent, in the protocols of the sensors of
+`ftdrivers.sensors`; the effect of the requests on other devices is unknown.
 """
 
 from collections.abc import Iterator, Sequence
@@ -41,7 +41,7 @@ def _drivers(wire: str) -> Iterator[ModuleType]:
 
 
 def probe_serial(port: str, clock: Clock = REAL) -> Answer | None:
-    """Return the known sensor on this port, or None. Raises `ConnectError` if the port does not open."""
+    """Return the sensor that was found on this port, or None. Raises `ConnectError` if the port does not open."""
     probes = [probe for driver in _drivers("serial") for probe in driver.SERIAL_PROBES]
     with clock.keeping_up():
         for probe in probes:
@@ -80,7 +80,7 @@ def _receive_from_line(path: str, probe: SerialProbe, request: bytes, duration_s
 def probe_can(
     channel: str, *, interface: str, bitrate: int | None, base: int = 0x20, clock: Clock = REAL
 ) -> list[Answer]:
-    """Return the known sensors on a bus, and those that could not be asked.
+    """Return the sensors that were found on a bus, and those that could not be asked safely.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def probe_can(
     base : int
         Base identifier of an ATI sensor, 0x00 to 0x7F.
     clock : Clock
-        Measures the waits.
+        Clock of the time-outs.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""From the address of a sensor to its driver: ``ati-can://can0?bitrate=250000``.
+"""Builds drivers from addresses such as ``ati-can://can0?bitrate=250000``.
 
 The part before ``://`` selects the driver, which is imported only then. The middle is the port, bus or host of the
-device. The driver's options follow the question mark. Anything unknown is an error.
+device. The options of the driver follow the question mark. Unknown schemes and options are errors.
 
 Another package adds drivers by entry points: ``scheme = "package.module:Class"`` in the group ``ftdrive.sensors``,
 where the class has a `from_url` like those of this project, and ``name = "package.module:Class"`` in the group
@@ -26,7 +26,7 @@ from ftdrivers.streaming.sensor import StreamingSensor
 
 ARMS: Mapping[str, str] = {"ros2": "ftdrivers.ros2.arm:Ros2Arm", "ur": "ftdrivers.ur.arm:UrArm"}
 
-# The optional part of ftdrive that installs a library.
+# The extra of ftdrive that installs a library.
 _EXTRAS: Mapping[str, str] = {"pynetft": "netft"}
 
 _EXAMPLES = (
@@ -38,7 +38,7 @@ _EXAMPLES = (
 
 
 class Options:
-    """The options of one address; records which ones a driver has read."""
+    """The options of one address. It records which options a driver has read, so that others can be rejected."""
 
     def __init__(self, url: str, query: str) -> None:
         self._url = url
@@ -60,12 +60,12 @@ class Options:
         return value
 
     def optional(self, key: str) -> str | None:
-        """Return an option as text; None where it is not given."""
+        """Return an option as text, or None if the address does not have it."""
         self._asked.add(key)
         return self.text(key, "") if key in self._given else None
 
     def integer(self, key: str, default: int, lowest: int, highest: int) -> int:
-        """Return an option as a number, decimal or 0x hexadecimal."""
+        """Return an option as an integer, written as decimal or 0x hexadecimal number."""
         text = self.text(key, str(default))
         try:
             value = int(text, 0)
@@ -76,7 +76,7 @@ class Options:
         return value
 
     def counts(self) -> tuple[int, int] | None:
-        """Return the option `counts`, per unit of force and per unit of torque; None where it is not given."""
+        """Return the option `counts`: counts per unit of force and per unit of torque; None without this option."""
         if (text := self.optional("counts")) is None:
             return None
         force, _, torque = text.partition(",")
@@ -88,7 +88,7 @@ class Options:
         return int(force), int(torque)
 
     def positive(self, key: str, why: str) -> float:
-        """Return a required option as a positive number; the error ends with `why`, its source."""
+        """Return a required option as a positive number. The error message ends with `why`: where to find the value."""
         if key not in self._given:
             raise BadUrl(f"{self._url}: option '{key}' is missing: {why}")
         text = self.text(key, "")
@@ -101,7 +101,7 @@ class Options:
         return value
 
     def configured(self) -> dict[str, Fact]:
-        """Return what the user may configure for any sensor: `serial` and `range`."""
+        """Return the options `serial` and `range`, which every sensor has, as facts."""
         facts = {}
         if "serial" in self._given:
             facts["serial"] = Fact(self.text("serial", ""), "configured")
@@ -131,7 +131,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class _UrlParts:
-    """The parts of an address, not yet checked."""
+    """The parts of an address, before they are checked."""
 
     scheme: str
     address: str
@@ -151,7 +151,7 @@ def split_url(url: str) -> _UrlParts:
 
 
 def in_url(address: str) -> str:
-    """Quote a port, bus or host for an address: its name may contain a space or a question mark."""
+    """Quote the name of a port, bus or host for an address; it may contain a space or a question mark."""
     return quote(address, safe="/:@")
 
 
@@ -162,7 +162,7 @@ def join_url(scheme: str, address: str, options: Mapping[str, str]) -> str:
 
 
 def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTorqueSensor:
-    """Build the sensor that an address names, without opening it.
+    """Build the driver of the sensor at an address, without opening the device.
 
     Parameters
     ----------
@@ -172,12 +172,13 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
-        The clock of an emulated cell; a driver of another package gets none.
+        Clock of an emulated cell. A driver of another package gets no clock.
 
     Raises
     ------
     BadUrl
-        Unknown scheme or option, a value out of range, no device, or a driver that cannot be imported.
+        The scheme or an option is unknown, a value is out of range, the device is missing, or the driver cannot be
+        imported.
     """
     parts = split_url(url)
     own = {scheme: kind.driver for scheme, kind in SENSORS.items()}
@@ -185,7 +186,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
     if entry is None:
         known = ", ".join(names := _names("ftdrive.sensors", own))
         if not parts.scheme:
-            raise BadUrl(f"{url} is no address of a sensor: write it like {', '.join(_EXAMPLES)}")
+            raise BadUrl(f"{url} is not an address of a sensor: write it like {', '.join(_EXAMPLES)}")
         close = [f"did you mean {name}://?" for name in get_close_matches(parts.scheme, names, 1)]
         fix = close[0] if close else f"install the package of its driver, or give one of {known}"
         raise BadUrl(f"{url}: unknown sensor '{parts.scheme}': {fix}")
@@ -195,7 +196,7 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
         raise BadUrl(f"{url}: names no device; write it like {', '.join(examples)}")
     driver = _load(entry)
     if not hasattr(driver, "from_url"):
-        raise BadUrl(f"{url}: {entry.value} has no from_url, so it is no driver; reinstall {_package(entry)}")
+        raise BadUrl(f"{url}: {entry.value} has no from_url, so it is not a driver; reinstall {_package(entry)}")
     options = Options(url, parts.query)
     recover, configured = bool(options.integer("recover", 0, 0, 1)), options.configured()
     own_time = {} if clock is REAL else {"clock": clock}
@@ -212,15 +213,15 @@ def sensor_from_url(url: str, *, sign: int = 1, clock: Clock = REAL) -> ForceTor
 
 
 def arm_class(name: str = "ur") -> type[RobotArm]:
-    """Find the class of an arm by its name.
+    """Return the class of an arm by its name.
 
-    Its constructor takes these arguments of `ftdrivers.ur.arm.UrArm`: the host, and by keyword `model`, `speed_rad_s`
-    and `acceleration_rad_s2`.
+    The constructor of the class takes these arguments of `ftdrivers.ur.arm.UrArm`: the host, and as keywords `model`,
+    `speed_rad_s` and `acceleration_rad_s2`.
 
     Raises
     ------
     BadUrl
-        Unknown name, or a driver that cannot be imported.
+        The name is unknown, or the driver cannot be imported.
     """
     entry = _find("ftdrive.arms", ARMS, name)
     if entry is None:
@@ -229,7 +230,7 @@ def arm_class(name: str = "ur") -> type[RobotArm]:
 
 
 def _find(group: str, own: Mapping[str, str], name: str) -> EntryPoint | None:
-    """Look up a name in this project, then in other packages."""
+    """Look up the entry point of a name in this project, then in other packages; None if there is none."""
     if name in own:
         return EntryPoint(name, own[name], group)
     found = sorted(entry_points(group=group, name=name), key=lambda entry: entry.value)

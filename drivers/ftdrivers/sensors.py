@@ -1,4 +1,4 @@
-"""The sensors of this project: driver, wire and emulators of each. It imports no driver, so that commands start fast."""
+"""The sensors of this project: driver, wire and emulators of each. It imports no driver: commands must start fast."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -10,15 +10,16 @@ class SensorKind:
     """One kind of sensor: what is known before its driver is imported."""
 
     driver: str
-    """Module and class. The class has `from_url`; the module has `SERIAL_PROBES` or `can_probe` on these two wires."""
+    """Module and class of the driver. The class has `from_url`. On a serial port the module has `SERIAL_PROBES`, on CAN
+    `can_probe`."""
     wire: Literal["can", "serial", "ethernet", "topic"]
     emulated: Mapping[str, str] = field(default_factory=dict)
-    """Names of its emulators in a station, and how they are described to the user."""
+    """Name of each emulator of this sensor, and its description for the user."""
     bitrate: int = 250_000
-    """Default bit rate of its CAN bus, bit/s."""
+    """Default bit rate of the CAN bus, bit/s."""
 
 
-# By the scheme of the address. A probe tries the sensors on a serial port in this order.
+# Keys are schemes of addresses. A probe tries the sensors on a serial port in this order.
 SENSORS: Mapping[str, SensorKind] = {
     "ati-can": SensorKind("ftdrivers.ati.can:AtiCanSensor", "can", {"can": "ATI sensor on CAN"}),
     "robotous-can": SensorKind(

@@ -1,7 +1,7 @@
-"""A sweep: a smooth motion of the three wrist joints from a posture back to it, evaluated by controller and planner.
+"""A sweep: a smooth motion of the three wrist joints that begins and ends in one posture.
 
-Each wrist joint moves by a sum of sines in a window: ``q(t) = centre + w(t) sum(amplitude sin(frequency t + phase))``.
-The window is the polynomial of fifth degree, so speed and acceleration are zero at both ends.
+Each wrist joint moves by a windowed sum of sines: ``q(t) = centre + w(t) sum(amplitude sin(frequency t + phase))``.
+The ramps of the window ``w`` are quintic polynomials, so that speed and acceleration are zero at both ends.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,28 +15,28 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 WRISTS: Final = (3, 4, 5)
-"""Joints that move, from 0."""
+"""Indices of the joints that move, counted from 0."""
 WAVES: Final = 2
-"""Sines of each joint."""
+"""Number of sines per joint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sweep:
-    """A sweep, as planned.
+    """A planned sweep.
 
     Parameters
     ----------
     centre_rad : sequence of float
-        (6,) where it begins and ends.
+        (6,) posture at the begin and at the end.
     amplitude_rad, frequency_rad_s, phase_rad : array_like, shape (3, 2)
-        Of the sines of wrists 1 to 3.
+        Amplitude, angular frequency and phase of each sine of wrists 1 to 3.
     duration_s, ramp_s : float
-        Whole duration, and that of the window's rise and fall.
+        Duration of the sweep, and duration of the rise and of the fall of the window.
 
     Raises
     ------
     ValueError
-        A number is missing, or the ramps do not fit into the duration.
+        A number is missing or not finite, or the ramps do not fit into the duration.
     """
 
     centre_rad: Sequence[float]
@@ -62,7 +62,7 @@ class Sweep:
         return np.stack([self.amplitude_rad, self.frequency_rad_s, self.phase_rad], axis=-1)
 
     def at(self, t_s: ArrayLike, derivative: int = 0) -> Array:
-        """Return the joints (n, 6) at times (n,), or their first, second or third derivative; at rest outside."""
+        """Return the joint angles (n, 6) at times (n,), or a derivative of order 1 to 3; at rest before and after."""
         t = np.atleast_1d(np.asarray(t_s, dtype=np.float64))
         within = (t >= 0) & (t <= self.duration_s)
         side = np.where(t <= self.duration_s / 2, 1.0, -1.0)
@@ -79,7 +79,7 @@ class Sweep:
         return q + np.asarray(self.centre_rad) if derivative == 0 else q
 
     def bound(self, derivative: int) -> Array:
-        """Return a bound (6,) of the absolute value of a derivative, which no time exceeds."""
+        """Return an upper bound (6,) on the absolute value of a derivative over the whole sweep."""
         most = np.zeros(6)
         amplitude, frequency = np.abs(self.waves[..., 0]), np.abs(self.waves[..., 1])
         for k, binomial in enumerate(_binomials(derivative)):
@@ -88,12 +88,12 @@ class Sweep:
         return most
 
     def largest(self, derivative: int, step_s: float = 5e-3) -> Array:
-        """Return the largest absolute value (6,) of a derivative: samples, and what may lie between them."""
+        """Return the largest absolute value (6,) of a derivative: of samples, with a bound on values between them."""
         t = np.arange(0.0, self.duration_s + step_s, step_s)
         return np.asarray(np.abs(self.at(t, derivative)).max(axis=0) + self.bound(derivative + 1) * step_s / 2)
 
     def slower(self, share: float) -> Self:
-        """Return the same path at a share of the speed."""
+        """Return a sweep along the same path at this fraction of the speed."""
         return replace(
             self,
             frequency_rad_s=np.asarray(self.frequency_rad_s) * share,
@@ -102,11 +102,11 @@ class Sweep:
         )
 
     def smaller(self, share: ArrayLike) -> Self:
-        """Return it with a share of its amplitudes, one number or (3,) for the joints."""
+        """Return a sweep with this fraction of the amplitudes: one number, or (3,) with one number per joint."""
         return replace(self, amplitude_rad=np.asarray(self.amplitude_rad) * np.reshape(share, (-1, 1)))
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a plan has of it."""
+        """Return the sweep as a plan stores it."""
         return {
             "centre_rad": list(self.centre_rad),
             "amplitude_rad": np.asarray(self.amplitude_rad).tolist(),
@@ -118,12 +118,12 @@ class Sweep:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`; raises `KeyError`, `TypeError` or `ValueError`."""
+        """Build a sweep from the dictionary of `to_dict`. Raises `KeyError`, `TypeError` or `ValueError`."""
         return cls(**document)
 
 
 def _window(x: Array, derivative: int) -> Array:
-    """Return the window at shares (n,) of its rise, or a derivative by the share; those are 0 beyond the rise."""
+    """Return the rising ramp of the window at x (n,) from 0 to 1, or its derivative by x, which is 0 outside."""
     polynomial = np.polynomial.Polynomial((0.0, 0.0, 0.0, 10.0, -15.0, 6.0))
     value = np.asarray(polynomial.deriv(derivative)(x) if derivative else polynomial(x))
     return value if derivative == 0 else np.where(x < 1.0, value, 0.0)

@@ -1,18 +1,18 @@
-"""A file with the bytes on the wire of a sensor: `recording` records them, `Player` plays them to the driver.
+"""Transcripts: files with the bytes on the wire of a sensor. `recording` writes them, `Player` plays them to a driver.
 
-A transcript (``ftdrive.transcript/1``) is JSON lines. The first holds sensor, time and versions. The others have the
-time of the driver's clock as `t_ns`:
+A transcript (``ftdrive.transcript/1``) consists of JSON lines. The first holds sensor, time and versions. The others
+have the time of the driver's clock as `t_ns`:
 
 {"t_ns", "event": "open", "port", "baudrate", "bytesize", "parity", "stopbits", "parity_marks"}   a serial port
 {"t_ns", "event": "open", "port", "frames": true}                                                 a CAN interface
 {"t_ns", "dir": "tx", "hex"}    one write of the driver
-{"t_ns", "dir": "rx", "hex"}    what the driver read within 2 ms, stamped with its first byte
-{"t_ns", "event": "end", "error"}   the error at the end; without one, what the driver decoded: "identity", "samples",
-                                    "mean_force_N", "mean_torque_Nm" and more
+{"t_ns", "dir": "rx", "hex"}    bytes that the driver read within 2 ms, with the time of the first one
+{"t_ns", "event": "end", "error"}   the error at the end, or the decoded values: "identity", "samples", "mean_force_N",
+                                    "mean_torque_Nm" and more
 
-Where `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/serial_port.py`. An slcan
-adapter is recorded as a serial port. The frames of other CAN interfaces are written as lines of slcan, and an emulated
-slcan adapter plays them. Commands of python-can to that adapter are not compared.
+If `parity_marks` is true, received bytes contain the marks of `drivers/ftdrivers/wires/serial_port.py`. An slcan
+adapter is recorded as a serial port. Frames of other CAN interfaces are stored in the format of slcan and played by an
+emulated slcan adapter; the commands of python-can to this adapter are not compared.
 """
 
 import contextlib
@@ -42,28 +42,28 @@ from ftdrivers.wires.serial_port import leave_marks_to_far_side, marks_asked_for
 FORMAT: Final = "ftdrive.transcript/1"
 
 _TOGETHER_NS: Final = 2_000_000
-# A `collect` holds a million samples: 143 s of an ATI sensor on a serial port.
+# Duration of one `collect`, s. Its limit of a million samples is reached after 143 s at 7 kHz.
 _PIECE_S: Final = 60.0
-# Recorded beyond the duration, so that a replay which begins a little later still has enough.
+# Additional duration of a recording, s, because a playback may start slightly later.
 _TAIL_S: Final = 0.3
-# More than a serial port buffers, in hexadecimal.
+# Longest line, characters: longer than the hexadecimal form of all that a serial port can buffer.
 _LONGEST_LINE: Final = 16_000_000
 INTERRUPTED: Final = "interrupted"
-"""The error of a recording that the user has interrupted."""
-# A driver may send a request this much earlier than recorded; earlier data of the device is then sent at once.
+"""Value of `error` if the user interrupted the recording."""
+# A driver may send a request by this time earlier than recorded, s. Pending data of the device are then sent at once.
 _EARLY_S: Final = 0.05
 
 
 class Writer:
-    """Writes a transcript to `path` with the suffix ``.partial``; `end` renames it.
+    """Writes a transcript to `path` with the suffix ``.partial``; `end` removes the suffix.
 
-    `header` is the content of the first line. Raises `OSError` if the file or its ``.partial`` exists already, or
+    `header` is the content of the first line. Raises `OSError` if one of the two files exists already, or if the file
     cannot be written.
     """
 
     def __init__(self, path: Path, header: Mapping[str, Any], clock: Clock = REAL) -> None:
         self.has_port = False
-        """Whether any port was opened; without one there is nothing to play."""
+        """Whether a port was opened. Otherwise there is nothing to play."""
         self.is_saved = False
         self.clock = clock
         self._path = path
@@ -87,11 +87,11 @@ class Writer:
         self._entry(event=name, **content)
 
     def sent(self, data: bytes) -> None:
-        """Record one write of the driver."""
+        """Record the bytes of one write of the driver."""
         self._entry(dir="tx", hex=data.hex())
 
     def received(self, data: bytes) -> None:
-        """Record what the driver has read; reads within 2 ms become one line."""
+        """Record bytes that the driver has read. Reads within 2 ms are joined to one line."""
         if not data:
             return
         now_ns = self.clock.now_ns()
@@ -103,9 +103,9 @@ class Writer:
             self._received += data
 
     def record(self, device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
-        """Record a sensor from opening to closing, and return what its driver measures.
+        """Record a sensor from opening to closing; return the decoded values.
 
-        The file is kept if a port was opened or the driver has failed, whose error is then its end. Raises
+        The file is kept if a port was opened or if the driver failed; its error is then stored at the end. Raises
         `DeviceError`.
         """
         seen: dict[str, Any] = {"error": INTERRUPTED}
@@ -118,7 +118,7 @@ class Writer:
             seen = {"error": f"{type(error).__name__}: {error}"}
             raise
         finally:
-            # A port that does not open is worth a report.
+            # A failed attempt to open the port is kept, because its error may be worth a report.
             if not self.has_port and seen["error"] in {None, INTERRUPTED}:
                 self.discard()
             else:
@@ -165,11 +165,11 @@ class Writer:
 
 @dataclass(frozen=True, slots=True)
 class Passage:
-    """Bytes in one direction."""
+    """Bytes that were sent in one direction."""
 
     t_ns: int
     sent: bool
-    """Whether the driver sent them."""
+    """True if the driver sent the bytes, false if the device did."""
     data: bytes
 
 
@@ -179,14 +179,14 @@ class Transcript:
 
     header: Mapping[str, Any]
     opened_ns: int
-    """When the driver opened its port."""
+    """Time at which the driver opened its port, ns."""
     passages: tuple[Passage, ...]
     end: Mapping[str, Any]
-    """What the driver decoded; empty if the recording was interrupted."""
+    """Values that the driver decoded; empty if the recording was interrupted."""
     parity_marks: bool = False
     """Whether received bytes contain marks of wrong parity."""
     frames: bool = False
-    """Whether the passages are frames of a CAN interface, as lines of slcan."""
+    """Whether the passages are CAN frames in the format of slcan."""
 
     @property
     def is_broken_off(self) -> bool:
@@ -195,7 +195,7 @@ class Transcript:
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a file. Raises `BadTranscript`, or `OSError` when it cannot be read."""
+        """Read a transcript. Raises `BadTranscript`, or `OSError` if the file cannot be read."""
         header: Mapping[str, Any] = {}
         opened_ns: int | None = None
         parity_marks = frames = False
@@ -227,16 +227,16 @@ class Transcript:
         return cls(header, opened_ns, tuple(passages), end, parity_marks, frames)
 
     def url_at(self, port: str) -> str:
-        """Return the sensor's address with the port of a player in place of the device."""
+        """Return the address of the sensor with its port replaced by the port of a player."""
         parts = split_url(str(self.header["url"]))
         options = dict(parse_qsl(parts.query)) | ({"interface": "slcan"} if self.frames else {})
         return f"{parts.scheme}://{port}" + (f"?{urlencode(options)}" if options else "")
 
     def play(self, clock: Clock = REAL) -> dict[str, Any]:
-        """Play it to its driver, and return what that measures; what was interrupted is played to its end.
+        """Play the transcript to its driver, as far as it was recorded; return the decoded values.
 
-        Raises `ProtocolError` for a driver that sends what is not in it, `BadTranscript` if it was interrupted before
-        there was anything to measure, and what the driver raises.
+        Raises `ProtocolError` if the driver sends bytes that were not recorded, `BadTranscript` if the recording has no
+        samples, and the errors of the driver.
         """
         player = Player(self, clock)
         with player as port:
@@ -253,20 +253,20 @@ class Transcript:
                 silent = isinstance(error, ConnectError | DeviceTimeout)
                 if silent and self.is_broken_off and player.left_s < _TAIL_S:
                     raise BadTranscript(
-                        f"the recording was interrupted before there was anything to measure ({error}): record it again"
+                        f"the recording was interrupted before the first sample ({error}): record it again"
                     ) from error
                 raise
 
 
 def _watch(device: ForceTorqueSensor, duration_s: float) -> dict[str, Any]:
-    """Collect from an open sensor, in pieces because a `collect` is bounded; with the sensor's own sign."""
+    """Collect samples of an open sensor and return their statistics, with the sign as the device reports it."""
     pieces = math.ceil(duration_s / _PIECE_S)
     samples, total = 0, np.zeros(6)
     for _ in range(pieces):
         wrench = device.collect(duration_s / pieces).wrench
         samples, total = samples + len(wrench), total + wrench.sum(axis=0)
     if not samples:
-        raise DeviceTimeout(f"no sample came in {duration_s:g} s: record for longer, with --duration")
+        raise DeviceTimeout(f"no sample arrived in {duration_s:g} s: record for a longer time, with --duration")
     force_N, torque_Nm = np.split(total / samples, 2)
     return {
         "error": None,
@@ -313,7 +313,7 @@ def _time_ns(line: Mapping[str, Any]) -> int:
 
 @contextlib.contextmanager
 def _replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
-    """Put another object in the place of the one that a module has by this name, during the `with` block."""
+    """Replace an attribute of a module during the `with` block."""
     plain = getattr(module, name)
     setattr(module, name, other)
     try:
@@ -326,7 +326,7 @@ def _replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
 def recording(writer: Writer) -> Iterator[None]:
     """Record the bytes of all serial ports and CAN buses opened in the `with` block.
 
-    They keep the driver's settings, so the device sees no difference.
+    The ports keep the settings of the driver, so that the recording does not affect the device.
     """
     # Bytes are recorded inside pyserial: a pseudo-terminal in between would hide parity and latency settings from the
     # device.
@@ -342,7 +342,7 @@ def recording(writer: Writer) -> Iterator[None]:
             opened.append(self)
 
         def _note(self) -> None:
-            """Record the port's settings at its first use, because the driver sets the marks after opening."""
+            """Record the settings of the port at its first use, because the driver requests marks after opening."""
             if not self._noted:
                 self._noted = True
                 settings = {key: getattr(self, key) for key in ("baudrate", "bytesize", "parity", "stopbits")}
@@ -362,14 +362,14 @@ def recording(writer: Writer) -> Iterator[None]:
 
         def reset_input_buffer(self) -> None:
             self._note()
-            if waiting := self.in_waiting:  # they were on the wire although the driver drops them
+            if waiting := self.in_waiting:  # the bytes were on the wire, although the driver drops them
                 writer.received(super().read(waiting))
             super().reset_input_buffer()
 
     def recorded_bus(channel: str, **options: Any) -> can.BusABC:
         before = len(opened)
         bus = plain_bus(channel, **options)
-        if len(opened) > before:  # it is on a recorded serial port, like slcan
+        if len(opened) > before:  # the adapter is on a serial port, which is recorded
             return bus
         writer.event("open", port=channel, frames=True)
         receive, send = bus.recv, bus.send
@@ -391,8 +391,7 @@ def recording(writer: Writer) -> Iterator[None]:
 
 
 def _slcan_line(frame: can.Message) -> bytes:
-    """Write a frame as an slcan adapter does; empty for one that it cannot carry."""
-    # Frames of adapters without a serial port become lines of slcan, so one player serves both.
+    """Return a frame in the format of slcan; empty if an slcan adapter cannot transmit it."""
     if frame.is_error_frame or frame.is_fd:
         return b""
     kind, data = ("r", "") if frame.is_remote_frame else ("t", frame.data.hex().upper())
@@ -401,10 +400,10 @@ def _slcan_line(frame: can.Message) -> bytes:
 
 
 class Player:
-    """Replays a recorded device on a pseudo-terminal, to one driver that opens it once.
+    """Plays a recorded device on a pseudo-terminal, which one driver may open once.
 
-    Replies have the recorded delays, and unsolicited data the recorded timing. A request that is not in the rest of the
-    recording is a divergence: silence follows.
+    Replies have the recorded delay after their request, and other data the recorded timing. After a request that does
+    not follow in the recording, the player is silent and sets `divergence`.
     """
 
     def __init__(self, transcript: Transcript, clock: Clock = REAL) -> None:
@@ -412,22 +411,22 @@ class Player:
         self._passages = transcript.passages
         self._far = _Terminal(transcript)
         self._next = 0
-        self._t_ns = transcript.opened_ns  # of the recording, at `_t`
+        self._t_ns = transcript.opened_ns  # recorded time of the current position
         self._t = 0.0
         self._asked = bytearray()
         self._ended = threading.Event()
         self._thread: Follower | None = None
         self.divergence: str | None = None
-        """The request of the driver that is not in the recording."""
+        """Description of the request of the driver that was not recorded; None if there was none."""
 
     @property
     def left_s(self) -> float:
-        """How much of the recording is left, in its own time."""
+        """Duration of the rest of the recording, s."""
         left = self._passages[self._next :]
         return (left[-1].t_ns - left[0].t_ns) / 1e9 if left else 0.0
 
     def __enter__(self) -> str:
-        """Open the far side and return the path of its pseudo-terminal."""
+        """Start the player and return the path of its pseudo-terminal."""
         path = self._far.open()
         self._thread = Follower(self._clock, self._serve, f"player on {path}")
         self._thread.start()
@@ -441,7 +440,7 @@ class Player:
             self._far.close()
 
     def _serve(self) -> None:
-        while not self._far.is_awaited():  # nothing is sent before the driver is ready for it
+        while not self._far.is_awaited():  # wait until the driver is ready to receive
             if self._clock.wait(self._ended, 0.001):
                 return
         self._t = self._clock.now_s()
@@ -457,7 +456,7 @@ class Player:
                 self._listen()
 
     def _play(self) -> float:
-        """Send the data that is due; return the seconds until more may be."""
+        """Send the data that are due; return the time until the next data may be due, s."""
         if self._far.is_full:
             self._far.send(b"")
         while self._next < len(self._passages) and not self.divergence and not self._passages[self._next].sent:
@@ -476,7 +475,7 @@ class Player:
         """Compare what the driver writes with the next request of the recording."""
         while self._asked and not self.divergence:
             first = self._request_from(self._next)
-            if first is None:  # the driver is closing, or the recording was broken off
+            if first is None:  # the driver is closing the port, or the recording was interrupted
                 self._asked.clear()
                 return
             expected = self._passages[first].data
@@ -501,9 +500,9 @@ class Player:
         return next((i for i in range(start, len(self._passages)) if self._passages[i].sent), None)
 
 
-# Playing uses a pseudo-terminal, so the driver runs on the real pyserial.
+# A pseudo-terminal is used so that the driver runs with the real pyserial.
 class _Terminal:
-    """A pseudo-terminal; for CAN frames an slcan adapter on it, which accepts every command and does nothing."""
+    """A pseudo-terminal. For CAN frames it also acts as an slcan adapter that accepts every command."""
 
     def __init__(self, transcript: Transcript) -> None:
         self._parity_marks = transcript.parity_marks
@@ -516,7 +515,7 @@ class _Terminal:
         self._master, slave = os.openpty()
         path = os.ttyname(slave)
         tty.setraw(slave)
-        os.close(slave)  # so that the master shows when a driver opens and closes
+        os.close(slave)  # the master then shows whether a driver has the port open
         os.set_blocking(self._master, False)
         return path
 
@@ -524,7 +523,7 @@ class _Terminal:
         os.close(self._master)
 
     def is_awaited(self) -> bool:
-        """Whether the driver has opened the port, and asked for marks if there are any."""
+        """Return whether the driver has opened the port, and requested marks if the transcript has them."""
         poll = select.poll()
         poll.register(self._master, 0)
         if poll.poll(0):  # "hung up" until a driver has opened the other end
@@ -539,7 +538,7 @@ class _Terminal:
         return self._master
 
     def read(self) -> bytes | None:
-        """Return what the driver has sent; None when it has closed the port."""
+        """Return the bytes that the driver has sent; None if it has closed the port."""
         try:
             data = os.read(self._master, 4096)
         except OSError:
@@ -547,12 +546,12 @@ class _Terminal:
         return self._frames_of(data) if self._frames else data
 
     def _frames_of(self, data: bytes) -> bytes:
-        """Leave out commands to the adapter, because the recording was made with another one."""
+        """Return the CAN frames in the data, without the commands to the adapter, which were not recorded."""
         *lines, self._line = (self._line + data).split(b"\r")
         return b"".join(line + b"\r" for line in lines if line[:1] in {b"t", b"T", b"r", b"R"})
 
     def send(self, data: bytes) -> None:
-        """Send as much as the driver accepts; the next call sends the rest first."""
+        """Send as many bytes as the driver accepts. The next call sends the remaining bytes first."""
         data = self._unsent + data
         try:
             written = os.write(self._master, data)

@@ -104,7 +104,7 @@ def test_a_whole_recording_is_not_called_broken_off(recorded: list[str], tmp_pat
 def test_what_was_broken_off_too_early_says_so(recorded: list[str], tmp_path: Path) -> None:
     outcome = play(recorded[:8], tmp_path)
     assert isinstance(outcome.exception, BadTranscript)
-    assert "anything to measure" in str(outcome.exception)
+    assert "before the first sample" in str(outcome.exception)
 
 
 OWN_WIRE = """

@@ -1,4 +1,4 @@
-"""The base of every sensor driver; docs/how-to/add-a-sensor.md shows a driver in another package."""
+"""The base class of sensor drivers; docs/how-to/add-a-sensor.md shows a driver in another package."""
 
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, StreamLimits, scale_facts
 

@@ -1,4 +1,4 @@
-"""Plausibility of samples: frozen readings, the device's clock, the rate. Each check remembers earlier samples."""
+"""Plausibility checks of a stream: frozen readings, the clock of the device, the sample rate."""
 
 import logging
 import math
@@ -12,19 +12,19 @@ from ftdrivers.interfaces import Array, FtSamples
 log = logging.getLogger(__name__)
 
 _FROZEN_S = 0.2
-# White noise of 0.4 steps on every axis repeats a reading 20 times once in 10^12; at 0.3 steps once in 10^5.
-# A sensor is frozen after identical readings for this time, if they are as many as arrive in it, within these bounds.
+# With white noise of 0.4 quantization steps on every axis, 20 identical readings in a row have a probability of 1e-12,
+# with 0.3 steps of 1e-5. A sensor is frozen if all samples of 0.2 s are identical, at least 20 and at most 50 of them.
 # Reason: docs/decisions/sensors.md, 38.
 _FROZEN_SAMPLES = (20, 50)
-# The most that the device's clock may gain on ours between two blocks; a late block only makes it fall behind.
+# Largest amount, s, by which the device's clock may gain on ours between two blocks. A late block only makes it lose.
 _CLOCK_JUMP_S = 0.5
-# The device's clock may run slower than ours by this fraction; beyond it, its samples count as late.
+# The device's clock may run slower than ours by this fraction. Samples of a slower clock are treated as late.
 _CLOCK_DRIFT = 0.02
 _RATE_TOLERANCE, _RATE_WINDOW_S = 0.1, 2.0
 
 
 class Liveness:
-    """Checks that readings are finite and change."""
+    """Checks that readings are finite and that the sensor is not frozen."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -36,8 +36,8 @@ class Liveness:
         self._same_rows, self._same_since_ns = 0, 0
 
     def judge(self, samples: FtSamples, nominal_Hz: float) -> None:
-        """Raise when a wrench is not finite, or has not changed for too long."""
-        # A strong low-pass filter in the device could make healthy readings repeat; not checked on hardware.
+        """Raise `ProtocolError` if a wrench is not finite, and `Frozen` if it has not changed for too long."""
+        # Not checked on hardware: a strong low-pass filter in the device could repeat readings of a healthy sensor.
         wrench, t_host_ns = samples.wrench, samples.t_host_ns
         if not np.isfinite(wrench).all():
             raise ProtocolError(f"{self._name}: the sensor sends a wrench that is not finite", "power it off and on")
@@ -61,7 +61,7 @@ class Liveness:
 
 
 class DeviceClock:
-    """The device's clock against ours. Only durations are compared."""
+    """Compares durations on the device's clock with those on the host's clock."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -69,9 +69,9 @@ class DeviceClock:
         self._lead_s = 0.0
 
     def late_s(self, t_device_s: Array, heard_s: float) -> Array:
-        """Return how late each sample is, compared with the quickest so far; 0 where the device has no clock.
+        """Return the delay (n,) of each sample relative to the fastest one so far, s; zeros if the device has no clock.
 
-        Raises `StreamBroken` when the device's clock jumps back or ahead.
+        Raises `StreamBroken` if the device's clock jumps back or ahead.
         """
         newest_s = float(t_device_s[-1])
         if math.isnan(newest_s):
@@ -84,7 +84,7 @@ class DeviceClock:
         leads_s = (t_device_s - self._first[0]) - (heard_s - self._first[1])
         lead_s = float(leads_s[-1])
         step_s = lead_s - self._lead_s
-        # a slow clock falls behind steadily, and its samples are not late
+        # samples of a clock that is only slow fall behind steadily, and are not late
         self._lead_s = max(lead_s, self._lead_s - _CLOCK_DRIFT * (heard_s - heard_before_s))
         back_s = float((np.concatenate([[before_s], t_device_s[:-1]]) - t_device_s).max())
         if back_s > 0:
@@ -100,7 +100,7 @@ class DeviceClock:
 
 
 class Rate:
-    """Compares samples per second with the nominal rate; `fix` gives the fix for a wrong rate in Hz."""
+    """Compares the sample rate with the nominal rate; `fix` returns what to do about a measured rate in Hz."""
 
     def __init__(self, name: str, fix: Callable[[float], str]) -> None:
         self._name = name
@@ -113,7 +113,7 @@ class Rate:
         self._since_ns, self._samples = 0, 0
 
     def judge(self, samples: int, t_host_ns: int, nominal_Hz: float) -> str | None:
-        """Return a note when the rate becomes wrong, and when it is right again."""
+        """Return a note for the log when the rate becomes wrong, and when it is right again; otherwise None."""
         if math.isnan(nominal_Hz):
             return None
         self._samples += samples

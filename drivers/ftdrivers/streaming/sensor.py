@@ -1,4 +1,4 @@
-"""The base of every streaming sensor: one reader thread, whose every failure reaches the caller."""
+"""The base class of streaming sensors: one reader thread, all failures of which reach the caller."""
 
 import copy
 import logging
@@ -23,66 +23,67 @@ from ftdrivers.streaming.plausibility import DeviceClock, Liveness, Rate
 log = logging.getLogger(__name__)
 
 NOTHING = FtSamples.of([], [], np.zeros((0, 6)))
-"""What `_read_block` returns when no sample arrived in time."""
+"""Result of `_read_block` if no sample arrived in time."""
 
 
 def scale_facts(
     counts_per_N: float, counts_per_Nm: float, source: Literal["device", "documented", "configured", "assumed"]
 ) -> dict[str, Fact]:
-    """Return the scale of the device's own numbers, for `DeviceInfo.facts`."""
+    """Return the scale of the raw counts as entries of `DeviceInfo.facts`."""
     return {"counts_per_N": Fact(counts_per_N, source), "counts_per_Nm": Fact(counts_per_Nm, source)}
 
 
-# A busy computer delays everything by 0.1 s, so a stale stream is an error of the call and not final.
+# A busy computer may delay a sample by 0.1 s: a stale stream fails the call, but does not end the stream.
 @dataclass(frozen=True, slots=True)
 class StreamLimits:
-    """Every time limit of a stream, in seconds of its clock. The defaults are those of a real sensor."""
+    """Time-outs of a stream, in seconds of its clock. The defaults are those of a real sensor."""
 
     stale_s: float = 0.3
-    """The stream is stale after a longer silence."""
+    """Longest silence before the stream is stale."""
     first_sample_s: float = 1.0
-    """From the last answer of the device to its first sample."""
+    """Time-out from the last reply of the device to the first sample."""
     away_s: float = 0.3
-    """A longer pause between two reads makes what has accumulated too old; at least `stale_s`."""
+    """Longest pause between two reads, at least `stale_s`. After a longer one, the buffered samples are too old."""
     settle_s: float = 0.05
-    """After a pause: how long an adapter may deliver what it has buffered."""
+    """Time for which an adapter may deliver buffered samples after a pause."""
     waited_s: float = 0.001
-    """A read that takes longer waited for a new sample."""
+    """A read that takes longer had to wait for a new sample, so that the buffer is empty."""
     discard_s: float = 0.5
-    """After a pause: the longest search for a read that waits."""
+    """Time-out for emptying the buffer after a pause."""
     recover_s: float = 10.0
-    """From an interruption to the first sample after it."""
+    """Time-out from an interruption to the first sample after it."""
     retry_s: float = 0.2
-    """Between two attempts to reconnect."""
+    """Interval between two attempts to reconnect."""
     join_s: float = 0.6
-    """In real time: how long `close` waits for the reader before it closes the port."""
+    """Real time for which `close` waits for the reader thread before it closes the port."""
 
 
 _EVENTS = 1000
 
 
 class StreamingSensor(ForceTorqueSensor):
-    """A sensor whose samples a reader thread fetches.
+    """Base class of a sensor whose samples are read in a thread.
 
     A subclass connects, reads the next samples and disconnects. This class waits, checks and publishes. The first
-    exception in the reader thread ends the stream: every later call raises a copy of it, until `open` or `close`.
-    Samples that accumulated while this program or computer was suspended are dropped: they are old and look new.
+    exception in the reader thread ends the stream: each later call raises a copy of it, until `open` or `close`.
+    Samples that were buffered while this program or computer was suspended are dropped, because they are old although
+    they are received now.
 
     Parameters
     ----------
     name : str
-        The device as the user knows it; begins every error message.
+        Name of the device, with which every error message begins.
     sign : int
-        -1 for a sensor that reports the reaction. Applied here, once, to the wrench; counts stay raw.
+        -1 for a sensor that reports the reaction. The wrench is multiplied by it; counts stay raw.
     clock : Clock
-        Stamps the samples; every limit holds on it.
+        Clock of the time stamps and time-outs.
     limits : StreamLimits
-        Every time limit.
+        Time-outs.
     max_unread_samples : int
-        The most samples in one `collect`, or waiting for a follower; more is an error, never a dropped sample.
+        Largest number of samples in one `collect` or in the queue of a follower. More samples raise an error.
     recover : bool
-        Reconnect after an interruption or silence, for up to `recover_s`, instead of ending the stream. Calls made
-        meanwhile still fail, and so does a `collect` with an interruption inside. May be set until `open`.
+        Reconnect after an interruption or silence, for up to `recover_s`, instead of ending the stream. Calls during
+        the interruption still fail, as does a `collect` that contains one. It may be set before `open`.
 
     Examples
     --------
@@ -122,15 +123,15 @@ class StreamingSensor(ForceTorqueSensor):
         self._max_unread_samples = max_unread_samples
         self.recover = recover
         self.configured: dict[str, Fact] = {}
-        """`serial` and `range`, may be set until `open`. A device that reports another serial number is rejected; this
-        range replaces the one that the device reports."""
-        # A subclass that knows its rate sets it in `_connect`.
+        """Facts `serial` and `range` of the user; they may be set before `open`. A device that reports another serial
+        number is rejected. The range replaces the one that the device reports."""
+        # A subclass that knows the rate of its device sets this in `_connect`.
         self._nominal_Hz = math.nan
         self._thread: threading.Thread | None = None
         self._news = threading.Condition()
         self._info: DeviceInfo | None = None
         self._failure: Exception | None = None
-        # While it reconnects: the first error, and when to give up.
+        # Set while the driver reconnects: the first error, and the time at which it gives up.
         self._interruption: tuple[DeviceError, float] | None = None
         self._taps: list[Unread[FtSamples]] = []
         self._arrivals: deque[tuple[int, int]] = deque()
@@ -138,19 +139,19 @@ class StreamingSensor(ForceTorqueSensor):
 
     @abstractmethod
     def _connect(self) -> DeviceInfo:
-        """Open the port, do the whole start-up sequence and leave the stream running."""
+        """Open the port and run the start-up sequence. The stream runs afterwards."""
 
     @abstractmethod
     def _read_block(self) -> FtSamples:
-        """Return the next samples, or `NOTHING` after at most about 0.1 s. Raising ends the stream."""
+        """Return the next samples, or `NOTHING` after at most about 0.1 s. An exception ends the stream."""
 
     @abstractmethod
     def _disconnect(self) -> None:
-        """Stop the stream and free the port within 0.3 s; also after a failed `_connect` or on a lost device."""
+        """Stop the stream and close the port within 0.3 s, also after a failed `_connect` or if the device was lost."""
 
     def _discard_backlog(self) -> None:
-        """Drop what has accumulated in port or socket while the reader paused: read until a read waits."""
-        # Reads until one has to wait, because only then the port is empty.
+        """Drop the samples that port or socket buffered while the reader paused."""
+        # A read that has to wait shows that the buffer is empty.
         begin_s = self._turn_s
         while self._is_mine():
             rows = len(self._read_block())
@@ -166,15 +167,14 @@ class StreamingSensor(ForceTorqueSensor):
     def open(self) -> None:
         """Connect, start the stream and wait for its first sample.
 
-        Does nothing while the stream is open, or while the driver reconnects by itself (`recover`); reopens a stream
-        that has ended.
+        Does nothing while the stream is open or the driver reconnects (`recover`). Reopens a stream that has ended.
 
         Raises
         ------
         ConnectError
-            No connection, not the right device, or no sample.
+            The connection failed, another device answered, or no sample arrived.
         DeviceFault
-            Connected, but the device reports a fault.
+            The device reports a fault.
         """
         if self._thread is not None and not self._has_ended:
             return
@@ -197,7 +197,7 @@ class StreamingSensor(ForceTorqueSensor):
                 raise
 
     def close(self) -> None:
-        """Stop the stream, free port and thread within a second. Idempotent; never raises on a lost device."""
+        """Stop the stream and the reader thread within a second. Idempotent. Never raises if the device was lost."""
         with self._news:
             thread, self._thread = self._thread, None
             self._news.notify_all()
@@ -205,19 +205,19 @@ class StreamingSensor(ForceTorqueSensor):
             return
         thread.join(self._clock.patience_s(self._limits.join_s))
         if thread.is_alive():
-            log.warning("%s: the reader thread hangs in a read; closing its port", self.name)
+            log.warning("%s: the reader thread is blocked in a read; closing its port", self.name)
         self._let_go()
 
     def identify(self) -> DeviceInfo:
         """Return model, serial number, firmware and facts, as read by the last successful `open`."""
         if self._info is None:
-            raise ConnectError(f"{self.name}: not identified yet", "open it first")
+            raise ConnectError(f"{self.name}: the device has not been identified", "open it first")
         return self._info
 
     def collect(self, duration_s: float) -> FtSamples:
-        """Return every sample received in the `duration_s` seconds that begin with this call. See `ForceTorqueSensor`.
+        """Return every sample received within `duration_s` seconds from this call, see `ForceTorqueSensor`.
 
-        It returns with the first sample after the end, so the last one inside is never missed.
+        The call returns when the first sample after the end arrives, so that no sample before the end is missed.
         """
         if not duration_s > 0:
             raise ValueError(f"a duration of {duration_s} s collects nothing; give a positive one")
@@ -242,12 +242,12 @@ class StreamingSensor(ForceTorqueSensor):
 
     @contextmanager
     def follow(self) -> Iterator[Follow[FtSamples]]:
-        """Read every sample from now on; see `ForceTorqueSensor`. Raises at once what `check` raises."""
+        """Read every sample from now on, see `ForceTorqueSensor`. Raises the exceptions of `check` immediately."""
         with self._tap() as unread:
             yield Follow(partial(self._read_on, unread))
 
     def latest(self, *, timeout_s: float) -> FtSamples:
-        """Return the newest sample (one row); wait up to `timeout_s` for one that is not stale."""
+        """Return the newest sample (one row). If it is stale, wait up to `timeout_s` for another one."""
         with self._news:
             self._raise_failure()
             for left_s in self._clock.looks(timeout_s):
@@ -258,12 +258,12 @@ class StreamingSensor(ForceTorqueSensor):
             raise self._stale(self._age_s())
 
     def check(self) -> None:
-        """Raise the stream's failure, if it has one: broken, stale, or a critical device status."""
+        """Raise the failure of the stream if it is broken or stale, or if the status of the device is critical."""
         with self._news:
             self._check()
 
     def health(self) -> Health:
-        """Return the counters since `open`."""
+        """Return the statistics since `open`."""
         with self._news:
             now_ns = self._clock.now_ns()
             since_ns = max(now_ns - 1_000_000_000, self._opened_ns)
@@ -284,7 +284,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     @contextmanager
     def _tap(self) -> Iterator[Unread[FtSamples]]:
-        """Queue every sample from now on."""
+        """Yield a queue that receives every sample from now on."""
         unread: Unread[FtSamples] = Unread(self.name, self._max_unread_samples)
         with self._news:
             self._check()
@@ -296,7 +296,7 @@ class StreamingSensor(ForceTorqueSensor):
                 self._taps = [tap for tap in self._taps if tap is not unread]
 
     def _read_on(self, unread: Unread[FtSamples], timeout_s: float) -> FtSamples:
-        # What arrived before a failure is read before the failure is raised.
+        # Samples that arrived before a failure are returned before the failure is raised.
         with self._news:
             for left_s in self._clock.looks(timeout_s):
                 if blocks := unread.take():
@@ -311,7 +311,7 @@ class StreamingSensor(ForceTorqueSensor):
         return FtSamples.concatenate(blocks or [self._newest.rows(slice(0, 0))])
 
     def _connect_and_identify(self) -> DeviceInfo:
-        """Connect, and add the configured facts to those that the device reports."""
+        """Connect and return the facts that the device reports, merged with the configured facts."""
         info = self._connect()
         self._turn()
         reported = {} if info.serial == NOT_REPORTED else {"serial": Fact(info.serial, "device")}
@@ -330,7 +330,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._newest = NOTHING
         self._interruption = None
         self._opened_ns = self._newest_ns = self._clock.now_ns()
-        # When the newest sample arrived, and when a read last returned.
+        # Time of the newest sample, and time of the last completed read.
         self._heard_s = self._turn_s = self._clock.awake_s()
         self._pauses, self._pause, self._fresh_from_ns = 0, "", 0
         # Whether a sample has arrived since the last pause.
@@ -339,7 +339,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._arrivals.clear()
         self._received = self._duplicated = self._out_of_order = self._silences = self._reconnects = 0
         self._earlier_lost = self._earlier_malformed = 0
-        # Since the last `_connect`; a subclass may count or assign them.
+        # Counters since the last `_connect`, which a subclass increments or assigns.
         self._lost = self._malformed = 0
         self._events: deque[tuple[int, str]] = deque(maxlen=_EVENTS)
         self._rate = Rate(self.name, self._rate_fix)
@@ -353,8 +353,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _start_reader(self) -> None:
-        # The reader claims its slot of the clock before `open` continues, so no limit expires on a thread that has
-        # not started.
+        # `open` continues after the thread has started to keep up, so that no time-out expires before.
         self._thread = Follower(self._clock, self._run, f"reader of {self.name}")
         self._thread.start()
 
@@ -363,7 +362,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._take_turn()
 
     def _take_turn(self) -> None:
-        """Read once and publish, or reconnect; keep the error that ends the stream."""
+        """Read and publish one block, or try to reconnect; store an error that ends the stream."""
         try:
             try:
                 self._pump()
@@ -385,7 +384,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _pump(self) -> None:
         block = self._read_block()
-        turn_s = self._turn()  # after the read: a stamp is the time of the read, not of the measurement
+        turn_s = self._turn()  # after the read, because samples are stamped when they are read
         if self._was_away(turn_s):
             self._drop_backlog(turn_s, len(block))
         elif len(block):
@@ -396,22 +395,22 @@ class StreamingSensor(ForceTorqueSensor):
                 raise self._stale(self._age_s())
 
     def _turn(self) -> float:
-        """Return the time since the last call, including sleep of the computer."""
+        """Return the time since the last call, s, including the time for which the computer was suspended."""
         before_s, self._turn_s = self._turn_s, self._clock.awake_s()
         return self._turn_s - before_s
 
     def _was_away(self, turn_s: float) -> bool:
-        # After Ctrl-Z, sleep or a debugger the port holds old samples that look new; the clock that also counts sleep
-        # shows it.
+        # After Ctrl-Z, a suspended computer or a debugger, old samples are buffered and would look new. The clock that
+        # runs during the suspension shows the pause.
         return turn_s > max(self._limits.away_s, self._limits.stale_s)
 
     def _drop_backlog(self, away_s: float, rows: int) -> None:
-        """Drop `rows` samples just read, and all that wait, after a pause of the reader."""
+        """After a pause of the reader, drop the `rows` samples of the last read and all buffered samples."""
         with self._news:
             self._pauses += 1
             self._is_back = False
             self._pause = f"the reader paused for {away_s:.2f} s: this program or computer was suspended or too busy"
-            self._note(f"{self._pause}; accumulated samples are dropped")
+            self._note(f"{self._pause}; buffered samples are dropped")
             self._news.notify_all()
         self._earlier_lost += rows
         self._discard_backlog()
@@ -421,12 +420,12 @@ class StreamingSensor(ForceTorqueSensor):
             self._rate.forget()
 
     def _reconnect(self, error: DeviceError) -> None:
-        """Reconnect to the same device; the first sample then ends the failure."""
-        if self._interruption is None:  # else no sample has arrived since: it is not over yet
+        """Try to reconnect to the same device. The first sample ends the interruption."""
+        if self._interruption is None:  # otherwise the last interruption has not ended
             self._interruption = error, self._clock.now_s() + self._limits.recover_s
             self._note(str(error))
         first, deadline_s = self._interruption
-        self._fail(StreamBroken(f"{self.name}: interrupted, reconnecting ({error})"))
+        self._fail(StreamBroken(f"{self.name}: the stream was interrupted and the driver reconnects ({error})"))
         self._earlier_lost += self._lost
         self._earlier_malformed += self._malformed
         self._lost = self._malformed = 0
@@ -453,7 +452,7 @@ class StreamingSensor(ForceTorqueSensor):
             )
         with self._news:
             self._start_watching()
-            self._newest_ns, self._heard_s = self._clock.now_ns(), self._clock.awake_s()  # silence counts from now
+            self._newest_ns, self._heard_s = self._clock.now_ns(), self._clock.awake_s()  # silences begin now
 
     def _is_mine(self) -> bool:
         return self._thread is threading.current_thread()
@@ -469,7 +468,7 @@ class StreamingSensor(ForceTorqueSensor):
             block = self._newer_rows(block)
             if not len(block):
                 return
-            # one clock was read before, the other after: a pause between them makes the sample older, never newer
+            # a pause between the readings of the two clocks makes the sample older, never newer
             heard_s = self._turn_s - (self._clock.now_ns() - int(block.t_host_ns[-1])) / 1e9
             block = self._fresh_rows(block, heard_s)
             if not len(block):
@@ -487,7 +486,7 @@ class StreamingSensor(ForceTorqueSensor):
                 self._arrivals.popleft()
             self._newest, self._newest_ns = block if len(block) == 1 else block.rows(slice(-1, None)), t_ns
             if self._failure is not None:
-                # an interruption ends when the device measures, not when it answers
+                # an interruption ends with a sample, not with a reply of the device
                 self._failure = self._interruption = None
                 self._reconnects += 1
                 self._note("reconnected")
@@ -496,7 +495,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._news.notify_all()
 
     def _newer_rows(self, block: FtSamples) -> FtSamples:
-        """Apply the sign, continue `seq` after a reconnection, drop duplicates and samples out of order."""
+        """Apply the sign, continue `seq` after a reconnection, and drop duplicates and samples out of order."""
         seq = block.seq + self._seq_offset
         newest = int(self._newest.seq[-1]) if len(self._newest) else int(seq[0]) - 1
         if self._failure is not None and seq[0] <= newest:
@@ -515,8 +514,7 @@ class StreamingSensor(ForceTorqueSensor):
         return block.rows(newer)
 
     def _fresh_rows(self, block: FtSamples, heard_s: float) -> FtSamples:
-        """Drop samples that are stale by the device's clock, wherever they have waited."""
-        # Samples that lag by the device's own clock were waiting somewhere, however new their receipt is.
+        """Drop samples that are too late by the device's clock, because they were buffered on their way."""
         late_s = self._device_clock.late_s(block.t_device_s, heard_s)
         is_late = bool(late_s[-1] > self._limits.stale_s)
         if is_late and not self._is_late:
@@ -529,7 +527,7 @@ class StreamingSensor(ForceTorqueSensor):
         return block.rows(fresh)
 
     def _not_opened(self, error: DeviceError) -> ConnectError:
-        """Put the device's name before the error of a codec."""
+        """Return the error as `ConnectError` that begins with the name of the device."""
         found = error.found if error.found.startswith(self.name) else f"{self.name}: {error.found}"
         return ConnectError(found, error.fix)
 
@@ -570,16 +568,16 @@ class StreamingSensor(ForceTorqueSensor):
         return DeviceTimeout(found, self._silence_fix())
 
     def _silence_fix(self) -> str:
-        """Return what to do about a silence; a subclass may know more."""
+        """Return what the user should do about a silence; a subclass may be more specific."""
         return "check cable and supply"
 
     def _rate_fix(self, rate_Hz: float) -> str:
-        """Return what to do about a rate that is not the nominal one; a subclass may know more."""
+        """Return what the user should do if the rate is not nominal; a subclass may be more specific."""
         cause = "lost" if rate_Hz < self._nominal_Hz else "duplicated"
         return f"look at health() for {cause} samples, and check the rate that is set in the sensor"
 
     def _raise_failure(self) -> None:
-        # A copy for each call: every later call fails with the same cause until `open` or `close`.
+        # Each call raises a copy, because a raised exception accumulates its traceback.
         if self._failure is not None:
             raise copy.copy(self._failure) from self._failure
         if self._thread is None:

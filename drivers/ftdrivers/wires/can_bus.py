@@ -1,4 +1,4 @@
-"""A CAN bus on any adapter of python-can; it raises our errors."""
+"""A CAN bus on any adapter of python-can, with the errors of `ftdrivers.errors`."""
 
 import contextlib
 import fcntl
@@ -27,15 +27,15 @@ class CanBus:
     Parameters
     ----------
     owner : str
-        Name of the device; begins every error message.
+        Name of the device, with which every error message begins.
     channel, interface : str
-        As python-can names them: ``can0`` and ``socketcan``, or a serial port and ``slcan``.
+        Names of python-can: ``can0`` and ``socketcan``, or a serial port and ``slcan``.
     bitrate : int
-        Bit/s; not used on socketcan, where ``ip link`` sets it.
+        Bit rate, bit/s. It is ignored on socketcan, where ``ip link`` sets it.
     identifiers : iterable of int
-        Identifiers that the device sends; others are ignored. An empty one accepts all.
+        Identifiers that the device sends; frames with others are ignored. If it is empty, all frames are accepted.
     clock : Clock
-        Measures the waits.
+        Clock of the time-outs.
     """
 
     def __init__(
@@ -68,14 +68,14 @@ class CanBus:
         options: dict[str, Any] = {}
         tty = self._channel
         if self._interface == "slcan":
-            # python-can waits 2 s for adapters that reboot when their port is opened; a pseudo-terminal does not
+            # python-can waits 2 s for adapters that reboot when their port is opened; an emulator does not reboot
             tty = tty.split("@", maxsplit=1)[0]
             with contextlib.suppress(OSError):  # the link to an adapter may vanish meanwhile
                 tty = os.path.realpath(tty)
             if not os.access(tty, os.R_OK | os.W_OK):
                 raise ConnectError(
-                    f"{self._owner}: {self._channel} does not exist, or may not be read and written",
-                    "plug the adapter in, and join the group of its port",
+                    f"{self._owner}: {self._channel} does not exist, or this user may not read and write it",
+                    "plug the adapter in, and add this user to the group of the port",
                 )
             if tty.startswith("/dev/pts/"):
                 options["sleep_after_open"] = 0.0
@@ -91,9 +91,9 @@ class CanBus:
                 ignore_config=True,
                 **options,
             )
-        except Exception as exc:  # an adapter whose library is missing may raise anything
+        except Exception as exc:  # python-can raises any exception if the library of an adapter is missing
             self.close()
-            fix = "plug the adapter in, and install what python-can needs for it"
+            fix = "plug the adapter in, and install the library that python-can needs for it"
             if "/" in self._channel and self._interface == "socketcan":
                 fix = "add interface=slcan to the address of an adapter on a serial port"
             elif self._interface == "socketcan":
@@ -107,7 +107,7 @@ class CanBus:
         if bus is not None:
             with contextlib.suppress(*BUS_ERRORS):
                 bus.shutdown()
-            # the slcan bus does not close its port when its last command to the adapter fails
+            # the slcan bus of python-can leaves its port open if the last command to the adapter fails
             if port := getattr(bus, "serialPortOrig", None):
                 with contextlib.suppress(*LINK_ERRORS):
                     port.close()
@@ -117,20 +117,20 @@ class CanBus:
                 os.close(lock)
 
     def send(self, identifier: int, data: bytes) -> None:
-        """Send one data frame; it is lost when a busy adapter does not accept it in time. Raises `StreamBroken`."""
+        """Send one data frame, which is lost if a busy adapter does not accept it in time. Raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         timeout_s = self._clock.patience_s(_SEND_S)
         try:
             self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False), timeout=timeout_s)
         except BUS_ERRORS as exc:
-            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a stalled computer causes it too
+            if not isinstance(exc.__cause__, serial.SerialTimeoutException):  # a busy computer causes time-outs too
                 raise self._broken(exc) from exc
 
     def receive(self, timeout_s: float) -> tuple[int, bytes] | None:
-        """Wait for the next data frame of the device as (identifier, data). Raises `StreamBroken`.
+        """Wait for the next data frame of the device and return (identifier, data); None after the time-out.
 
-        It also blocks in an emulated cell, where shorter waits would delay the polls.
+        Raises `StreamBroken`. In an emulated cell it blocks too, because many short waits would delay the polls.
         """
         for left_s in self._clock.looks(timeout_s):
             if frame := self.look(left_s):
@@ -138,7 +138,7 @@ class CanBus:
         return None
 
     def look(self, wait_s: float) -> tuple[int, bytes] | None:
-        """Return the next data frame; wait for it in real time, at most 0.05 s. Raises `StreamBroken`."""
+        """Return the next data frame within `wait_s` of real time, at most 0.05 s, else None. Raises `StreamBroken`."""
         if self._bus is None:
             raise StreamBroken(f"{self._owner}: the bus is closed", "open it first")
         while True:
@@ -156,17 +156,17 @@ class CanBus:
                 return message.arbitration_id, bytes(message.data)
 
     def discard(self) -> None:
-        """Drop the frames that have arrived. Raises `StreamBroken`."""
+        """Drop all received frames. Raises `StreamBroken`."""
         if isinstance(self._bus, slcanBus):
-            with contextlib.suppress(*BUS_ERRORS):  # `send` will raise
-                self._bus.flush()  # its `recv` would wait 1 ms before it returns nothing
+            with contextlib.suppress(*BUS_ERRORS):  # the next `send` raises the error
+                self._bus.flush()  # faster than `recv`, which waits 1 ms for each missing frame
             return
         for _ in self._clock.looks(_DISCARD_S):
             if self.look(0.0) is None:
                 return
 
     def _broken(self, exc: Exception) -> StreamBroken:
-        return StreamBroken(f"{self._owner}: the CAN interface is gone ({exc})", "plug it in and open it again")
+        return StreamBroken(f"{self._owner}: the CAN interface was lost ({exc})", "plug it in and open it again")
 
 
 CanFrame = tuple[int, bytes]

@@ -1,4 +1,4 @@
-"""Frames in a stream of bytes: their limits, checksums and status words."""
+"""Frames in a stream of bytes: their boundaries, checksums and status words."""
 
 from collections.abc import Callable, Mapping
 
@@ -16,12 +16,12 @@ _MODBUS, _X25 = _table(0xA001), _table(0x8408)
 
 
 def crc16_modbus(data: bytes) -> int:
-    """CRC-16/MODBUS; of ``b"123456789"`` it is 0x4B37."""
+    """Return the checksum CRC-16/MODBUS; the check value, that of ``b"123456789"``, is 0x4B37."""
     return _crc(data, _MODBUS)
 
 
 def crc16_x25(data: bytes) -> int:
-    """CRC-16/X-25; of ``b"123456789"`` it is 0x906E."""
+    """Return the checksum CRC-16/X-25; the check value, that of ``b"123456789"``, is 0x906E."""
     return _crc(data, _X25) ^ 0xFFFF
 
 
@@ -33,11 +33,11 @@ def _crc(data: bytes, table: tuple[int, ...]) -> int:
 
 
 class Deframer:
-    """Cuts a byte stream into intact frames and numbers them.
+    """Divides a byte stream into intact frames and numbers them.
 
-    Behind a false header the search continues one byte later, so the next true frame is still found. Dropped bytes are
-    counted as whole frames, at least one for each interruption. Bytes before the first frame are not counted, because a
-    stream is often joined in its middle.
+    After a false header the search continues at the next byte, so that the next true frame is found. Dropped bytes are
+    counted as damaged frames, at least one per interruption. Bytes before the first frame are not counted, because
+    reading often starts in the middle of a stream.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Deframer:
     size : int
         Length of a whole frame.
     is_intact : callable
-        Returns whether `size` bytes that begin with the header are a frame: checksum, end mark.
+        Returns whether `size` bytes that begin with the header are an intact frame, by checksum and end mark.
     """
 
     def __init__(self, header: bytes, size: int, is_intact: Callable[[bytes], bool]) -> None:
@@ -56,12 +56,12 @@ class Deframer:
         self._buffer = bytearray()
         self._skipped = 0
         self.number = 0
-        """Number of the newest frame; damaged frames are counted too."""
+        """Number of the newest frame. Damaged frames are counted as well."""
         self.damaged = 0
 
     def feed(self, data: bytes) -> list[tuple[int, bytes]]:
-        """Take received bytes and return the frames that they complete as (number, frame)."""
-        # A header occurs in data and nothing is escaped: after a failed checksum the search continues one byte later.
+        """Add received bytes; return the completed frames as a list of (number, frame)."""
+        # The header may occur within a frame, because it is not escaped: after a wrong checksum, try the next byte.
         buffer, at = self._buffer, 0
         buffer += data
         frames = []
@@ -86,14 +86,14 @@ class Deframer:
 
     @property
     def arrived(self) -> str:
-        """What has arrived so far, in words."""
+        """A phrase for error messages: which data have arrived so far."""
         if self.number:
-            return f"{self.number - self.damaged} frames arrive"
-        return f"bytes arrive, but no frames of {self._size} bytes" if self.has_noise else "no bytes arrive"
+            return f"{self.number - self.damaged} frames arrived"
+        return f"bytes arrived, but no frames of {self._size} bytes" if self.has_noise else "no bytes arrived"
 
     @property
     def has_noise(self) -> bool:
-        """Whether bytes have arrived, but no frame, as with another baud rate or another device."""
+        """Whether bytes have arrived but no frame, which happens with a wrong baud rate or another device."""
         return not self.number and bool(self._skipped or self._buffer)
 
     def _next_number(self) -> int:
@@ -107,11 +107,11 @@ class Deframer:
 
 
 def is_stream(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
-    """Build the test whether received bytes hold five intact frames or more, which identify a stream."""
+    """Return a function that tells whether bytes contain at least five intact frames, enough to identify a stream."""
     return lambda data: len(deframer().feed(data)) >= 5
 
 
 def describe_status(status: int, bits: Mapping[int, str], width: int = 16) -> str:
-    """Describe a status word of `width` bits, such as ``0x0040 (bit 6: no valid calibration in the active slot)``."""
+    """Return a status word of `width` bits with the meaning of each set bit: ``0x0040 (bit 6: EEPROM error)``."""
     words = [f"bit {n}: {bits.get(n, 'reserved')}" for n in range(width) if status >> n & 1]
     return f"0x{status:0{width // 4}X} ({', '.join(words) or 'ok'})"

@@ -1,4 +1,4 @@
-"""A master of Modbus RTU, for sensors that use it until they stream: frames, requests and replies.
+"""A Modbus RTU master for sensors that use Modbus until they stream: frames, requests and replies.
 
 Ref: Modbus over Serial Line 1.02, section 2.5; Modbus Application Protocol 1.1b3, sections 6.3, 6.12 and 7.
 """
@@ -21,30 +21,30 @@ _EXCEPTIONS = {1: "illegal function", 2: "illegal register", 3: "illegal value",
 
 
 class Refused(ProtocolError):
-    """The device refuses a request; a repetition does not help."""
+    """The device refuses a request with a Modbus exception; repeating the request does not help."""
 
 
 def frame(address: int, function: int, payload: bytes) -> bytes:
-    """Build a frame to or from the device at `address`."""
+    """Return the bytes of a frame to or from the device at `address`."""
     body = bytes([address, function]) + payload
     return body + crc16_modbus(body).to_bytes(2, "little")
 
 
 def read_registers(address: int, register: int, count: int) -> bytes:
-    """Request `count` holding registers."""
+    """Return the request to read `count` holding registers."""
     return frame(address, READ_HOLDING, struct.pack(">HH", register, count))
 
 
 def write_registers(address: int, register: int, values: Sequence[int]) -> bytes:
-    """Request to write holding registers."""
+    """Return the request to write holding registers."""
     n = len(values)
     return frame(address, WRITE_MULTIPLE, struct.pack(f">HHB{n}H", register, n, 2 * n, *values))
 
 
 def reply_size(request: bytes) -> int:
-    """Return the length in bytes of the success reply to `request`. A vendor's function replies one byte of data.
+    """Return the length of the normal reply to `request`, in bytes. A Modbus exception always has 5 bytes.
 
-    A refusal (Modbus exception) has 5 bytes.
+    Replies to vendor-specific functions are expected to have one byte of data.
     """
     match request[1]:
         case 0x03:
@@ -56,12 +56,12 @@ def reply_size(request: bytes) -> int:
 
 
 def check_reply(request: bytes, reply: bytes) -> bytes:
-    """Check a whole reply against its request and return its data: the registers read, nothing for a write.
+    """Check a complete reply to a request and return its data: the registers of a read request, nothing for a write.
 
     Raises
     ------
     ProtocolError
-        The reply is damaged, belongs to another request, or is a refusal (`Refused`).
+        The reply is damaged, belongs to another request, or is a Modbus exception (`Refused`).
     """
     text = reply.hex(" ")
     if len(reply) < 5 or crc16_modbus(reply[:-2]) != int.from_bytes(reply[-2:], "little"):
@@ -94,16 +94,16 @@ def ask(
     timeout_s: float,
     before_again: Callable[[], object],
 ) -> T:
-    """Send a request and return what `check` decodes from its reply. Try three times, with `before_again` between them.
+    """Send a request up to three times and return the result of `check` for its reply; call `before_again` in between.
 
     Raises
     ------
     DeviceTimeout
-        The last reply is not complete within `timeout_s`.
+        The last reply is not complete after `timeout_s`.
     ProtocolError
-        The error of `check`, with the name of the device and a fix. A refusal is raised at once.
+        The error that `check` raised, with the name of the device and a fix. A `Refused` is raised at once.
     """
-    # No library: the port changes from Modbus to a bare stream.
+    # Libraries for Modbus cannot be used, because the same port later carries a stream without frames of Modbus.
     for _ in range(_ATTEMPTS - 1):
         try:
             return _exchange(port, name, request, check, clock, timeout_s)
@@ -118,7 +118,7 @@ def _exchange(
     port: SerialPort, name: str, request: bytes, check: Callable[[bytes, bytes], T], clock: Clock, timeout_s: float
 ) -> T:
     port.write(request, discard=True)
-    reply, wanted = b"", 5  # of a refusal
+    reply, wanted = b"", 5  # bytes of a Modbus exception
     for _ in clock.looks(timeout_s):
         while len(reply) < wanted and (more := port.read(wanted - len(reply))):
             reply += more

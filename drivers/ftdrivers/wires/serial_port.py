@@ -1,8 +1,8 @@
-"""A serial port, and the parity marks of the kernel.
+"""A serial port, and the marks with which the kernel reports parity errors.
 
 Ref: POSIX.1-2024, Base Definitions, 11.2.2 Input Modes. With INPCK and PARMRK set and IGNPAR clear, a byte X received
-with wrong parity or framing arrives as FF 00 X, and a valid FF as FF FF. pyserial clears both flags whenever it
-configures a port, so the system then delivers damaged bytes unmarked.
+with wrong parity or framing is delivered as FF 00 X, and a valid FF as FF FF. pyserial clears both flags whenever it
+configures a port, so that damaged bytes are then delivered unmarked.
 """
 
 import contextlib
@@ -23,12 +23,12 @@ from ftdrivers.errors import ConnectError, PortInUse, StreamBroken
 
 
 def ask_for_marks(port: serial.Serial | int) -> bool:
-    """Let the system mark damaged bytes; return whether it can. Drops earlier bytes, which have no marks."""
-    # Some adapters (FTDI) report parity for a whole USB packet, and all its records are dropped.
-    if sys.platform != "linux":  # setting flags may undo pyserial's unusual bit rates there
+    """Let the kernel mark damaged bytes; return whether it can. Bytes received before have no marks and are dropped."""
+    # Some adapters (FTDI) report parity errors per USB packet; then all records of the packet are dropped.
+    if sys.platform != "linux":  # on other systems, setting flags may reset the non-standard bit rates of pyserial
         return False
     settings = termios.tcgetattr(port)
-    # with BRKINT a break, which is a framing error, would empty the input silently
+    # with BRKINT, a break, which is a framing error, would clear the input silently
     settings[0] = settings[0] & ~(termios.IGNPAR | termios.BRKINT) | termios.INPCK | termios.PARMRK
     termios.tcsetattr(port, termios.TCSANOW, settings)
     termios.tcflush(port, termios.TCIFLUSH)
@@ -36,14 +36,13 @@ def ask_for_marks(port: serial.Serial | int) -> bool:
 
 
 def marks_asked_for(port: serial.Serial | int) -> bool:
-    """Return whether the reader of this terminal undoes marks; works on both sides of a pseudo-terminal."""
-    # INPCK alone: a far side that makes the marks itself has cleared PARMRK
+    """Return whether the reader of this terminal expects marks. It works at both ends of a pseudo-terminal."""
+    # PARMRK is not checked, because an emulator that writes the marks itself has cleared it
     return sys.platform == "linux" and bool(termios.tcgetattr(port)[0] & termios.INPCK)
 
 
 def leave_marks_to_far_side(port: serial.Serial | int) -> None:
-    """Let the system pass bytes unchanged, because the far side makes the marks itself."""
-    # A pseudo-terminal rejects parity, but an emulator or a transcript can make the marks itself.
+    """Let the kernel pass bytes unchanged, because the emulator at the other end writes the marks itself."""
     if sys.platform == "linux":
         settings = termios.tcgetattr(port)
         settings[0] &= ~termios.PARMRK
@@ -51,21 +50,19 @@ def leave_marks_to_far_side(port: serial.Serial | int) -> None:
 
 
 _PLAIN: Final = re.compile(rb"(?:[^\xff]+|\xff\xff)+")
-# FF 00 X, or an FF whose second FF is lost, which counts as damaged.
+# FF 00 X, or an FF whose second FF was lost, which is treated as a damaged byte.
 _MARKED: Final = re.compile(rb"\xff(?:\0.|(?=[^\0]))", re.DOTALL)
 
 
 class Unmarker:
-    """Restores the bytes on the line from marked bytes, however reads divide them."""
+    """Restores the bytes on the line from marked bytes; a mark may be split between two reads."""
 
     def __init__(self) -> None:
-        # The beginning of a mark or of a doubled FF whose rest has not arrived.
+        # Beginning of a mark, or of a doubled FF, whose remaining bytes have not arrived.
         self._cut = b""
 
     def undo(self, data: bytes) -> tuple[bytes, list[int]]:
-        """Return the true bytes, and the places of those received with wrong parity or framing."""
-        # pyserial delivers bytes of wrong parity unmarked, so Linux marks them as POSIX defines, and the marks are
-        # removed here.
+        """Return the bytes on the line, and the indices of those received with wrong parity or framing."""
         data = self._cut + data
         true, damaged, at = bytearray(), list[int](), 0
         while at < len(data):
@@ -82,20 +79,20 @@ class Unmarker:
         return bytes(true), damaged
 
     def forget(self) -> None:
-        """Restart, because the rest of a cut mark was dropped."""
+        """Forget the beginning of a mark, because the following bytes were dropped."""
         self._cut = b""
 
 
 LINK_ERRORS = (OSError, termios.error)
-"""Raised by a vanished serial port; `termios.error` is not an `OSError`."""
+"""Exceptions that a vanished serial port raises; `termios.error` is not an `OSError`."""
 
 _WRITE_S = 0.2
-# 5 ms of the fastest sensor.
+# The fastest sensor sends as many bytes in 5 ms.
 _DRAIN_BYTES = 416
 
 
 def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> ConnectError:
-    """Convert the error of opening a port: `PortInUse` where another program has it, else `found` and `fix`."""
+    """Return `PortInUse` if the port did not open because another program uses it, else a `ConnectError`."""
     if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
         holder = f"`fuser -v {shlex.quote(path)}` names it"
         return PortInUse(f"{owner}: the port is in use by another program", f"end it, {holder}")
@@ -103,7 +100,7 @@ def refusal(owner: str, path: str, error: Exception, found: str, fix: str) -> Co
 
 
 def other_baud(default: int) -> str:
-    """Return the fix for bytes without frames; `default` is the baud rate of a new sensor."""
+    """Return what to do if bytes arrive but no frames; `default` is the factory setting of the baud rate."""
     return (
         f"set baud=… in its address to the baud rate of the sensor ({default} by default), and check that no other "
         "device is on this port"
@@ -116,17 +113,17 @@ class SerialPort:
     Parameters
     ----------
     owner : str
-        Name of the device; begins every error message.
+        Name of the device, with which every error message begins.
     path : str
-        Such as ``/dev/serial/by-id/…``.
+        Path of the port, such as ``/dev/serial/by-id/…``.
     baud : int
-        Bit/s; always 8 data bits and 1 stop bit.
+        Baud rate. There are always 8 data bits and 1 stop bit.
     even_parity : bool
-        Else no parity. The system marks bytes of wrong parity, where it can; this class undoes the marks.
+        True for even parity, false for none. Marks of the kernel for bytes of wrong parity are removed here.
     read_s : float
-        The longest that one read waits, in real time.
+        Time-out of one read, s of real time.
     clock : Clock
-        Measures silences.
+        Clock with which silences are measured.
     """
 
     def __init__(
@@ -146,13 +143,13 @@ class SerialPort:
         self._read_s = min(read_s, clock.poll_s)
         self._clock = clock
         self._port: serial.Serial | None = None
-        # While the system marks damaged bytes.
+        # None while the kernel does not mark damaged bytes.
         self._marks: Unmarker | None = None
 
     def open(self) -> None:
         """Open the port and lock it. Raises `ConnectError`."""
-        # A pseudo-terminal rejects even parity on the second configuration, but can mark bytes. Everything is set here,
-        # because pyserial clears the marks whenever it configures the port.
+        # A pseudo-terminal rejects even parity when it is configured again, but can mark bytes. All settings are made
+        # here, because pyserial switches the marks off whenever it configures the port.
         emulated = os.path.realpath(self._path).startswith("/dev/pts/")
         try:
             self._port = serial.Serial(
@@ -166,10 +163,10 @@ class SerialPort:
             self._marks = Unmarker() if self._even_parity and ask_for_marks(self._port) else None
         except (ValueError, *LINK_ERRORS) as exc:
             self.close()
-            fix = "plug it in, end other programs that use it, and join its group"
+            fix = "plug it in, end other programs that use it, and add this user to the group of the port"
             raise refusal(self._owner, self._path, exc, f"the port does not open ({exc})", fix) from exc
         with contextlib.suppress(ValueError, NotImplementedError, *LINK_ERRORS):
-            self._port.set_low_latency_mode(True)  # some adapters can: 1 ms instead of 16 ms
+            self._port.set_low_latency_mode(True)  # reduces the delay of some USB adapters from 16 ms to 1 ms
 
     def close(self) -> None:
         """Close the port. Idempotent."""
@@ -184,24 +181,24 @@ class SerialPort:
         return self._port is not None
 
     def read(self, size: int) -> bytes:
-        """Read `size` bytes, fewer after `read_s` or with marks among them. Raises `StreamBroken`."""
+        """Read `size` bytes; fewer after the time-out `read_s`, or if marks were among them. Raises `StreamBroken`."""
         with self._in_use() as port:
             data = port.read(size)
         return self._undo(data)[0]
 
     def read_all(self, at_least: int) -> bytes:
-        """Read `at_least` bytes, or fewer as in `read`, and all others that have arrived. Raises `StreamBroken`."""
+        """Read `at_least` bytes, fewer as in `read`, and all further bytes that have arrived. Raises `StreamBroken`."""
         return self.read_marked(at_least)[0]
 
     def read_marked(self, at_least: int) -> tuple[bytes, list[int]]:
-        """Read like `read_all`; also return the places of bytes received with wrong parity or framing."""
+        """Read like `read_all`; also return the indices of bytes received with wrong parity or framing."""
         with self._in_use() as port:
             data = port.read(at_least)
             data += port.read(port.in_waiting)
         return self._undo(data)
 
     def drain(self, silence_s: float, at_most_s: float) -> None:
-        """Drop what arrives until a silence of `silence_s`, for `at_most_s`. Raises `StreamBroken`."""
+        """Drop received bytes until none arrives for `silence_s`, at most for `at_most_s`. Raises `StreamBroken`."""
         heard_ns = self._clock.now_ns()
         for _ in self._clock.looks(at_most_s):
             if self.read(_DRAIN_BYTES):
@@ -210,7 +207,7 @@ class SerialPort:
                 return
 
     def write(self, data: bytes, *, discard: bool = False) -> None:
-        """Send bytes; `discard` drops what has arrived before. Raises `StreamBroken`."""
+        """Send bytes; with `discard`, first drop all received bytes. Raises `StreamBroken`."""
         with self._in_use() as port:
             if discard:
                 port.reset_input_buffer()
@@ -223,13 +220,13 @@ class SerialPort:
 
     @contextlib.contextmanager
     def _in_use(self) -> Iterator[serial.Serial]:
-        """Give the open port, and raise `StreamBroken` when it is gone."""
+        """Yield the open port; raise `StreamBroken` if it is closed or has vanished."""
         if self._port is None:
             raise StreamBroken(f"{self._owner}: the port is closed", "open it first")
         try:
             yield self._port
-        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: closed under a blocked read
-            raise StreamBroken(f"{self._owner}: the port is gone ({exc})", "plug it in and open it again") from exc
+        except (TypeError, *LINK_ERRORS) as exc:  # TypeError: the port was closed during a read
+            raise StreamBroken(f"{self._owner}: the port was lost ({exc})", "plug it in and open it again") from exc
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,11 +237,11 @@ class SerialProbe:
     """Address of the sensor, with ``{port}`` for the port."""
     baud: int
     streams: Callable[[bytes], bool]
-    """Returns whether received bytes are the stream of this sensor."""
+    """Returns whether received bytes are a stream of this sensor."""
     request: bytes = b""
     """A read request; empty if the sensor is recognized by listening only."""
     identify: Callable[[bytes], str] | None = None
-    """Returns what the reply reports about the sensor. Raises `ProtocolError`."""
+    """Returns model and serial number from the reply to the request. Raises `ProtocolError`."""
     even_parity: bool = False
     boot_url: Callable[[bytes], str | None] | None = None
-    """Returns the address, with ``{port}``, if received bytes are printed by this sensor while it boots."""
+    """Returns the address, with ``{port}``, if this sensor printed the received bytes while it booted, else None."""

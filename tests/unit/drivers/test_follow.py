@@ -15,5 +15,5 @@ def test_as_many_samples_as_may_wait_are_read_and_one_more_is_an_error() -> None
     assert unread.take() == []
     unread.put("two", 2)
     unread.put("two more", 2)
-    with pytest.raises(StreamBroken, match="sensor: 4 samples have not been read, 3 may wait"):
+    with pytest.raises(StreamBroken, match="sensor: 4 samples are waiting to be read, and the limit is 3"):
         unread.take()

@@ -121,7 +121,9 @@ def test_both_usual_baud_rates_are_tried_unless_one_is_given(
 
 
 def test_a_sensor_at_neither_usual_baud_rate_is_refused(table: Table) -> None:
-    silent = r"no bytes arrive within 5.0 s at 460800 baud, no bytes.* at 230400 baud; check supply and wiring; .*sinc="
+    silent = (
+        r"no bytes arrived within 5.0 s at 460800 baud, no bytes.* at 230400 baud; check supply and wiring; .*sinc="
+    )
     with table.serial([]) as wire, pytest.raises(ConnectError, match=silent):
         Sensor(wire.clock).open()
 
@@ -155,7 +157,7 @@ def test_first_frames_are_waited_for_five_seconds(table: Table, boot_s: float, o
         assert len(sensor.collect(0.1))
         sensor.close()
     else:
-        with pytest.raises(ConnectError, match=r"no bytes arrive within 5\.\d s at 460800 baud; check supply"):
+        with pytest.raises(ConnectError, match=r"no bytes arrived within 5\.\d s at 460800 baud; check supply"):
             sensor.open()
 
 
@@ -202,7 +204,7 @@ OTHER_BAUD = r"; set baud=… in its address .*\(230400 by default\), and check 
 
 
 def test_bytes_without_frames_are_of_another_baud_rate_or_device(table: Table) -> None:
-    noise = r": bytes arrive, but no frames of 37 bytes within (?P<s>\d\.\d) s at 115200 baud" + OTHER_BAUD
+    noise = r": bytes arrived, but no frames of 37 bytes within (?P<s>\d\.\d) s at 115200 baud" + OTHER_BAUD
     with table.serial([], NOISE) as wire, pytest.raises(ConnectError, match=noise) as caught:
         Sensor(wire.clock, baud=115_200).open()
     found = re.search(noise, str(caught.value))
@@ -221,5 +223,5 @@ def test_bytes_without_frames_are_named_beside_a_command(table: Table) -> None:
 def test_frames_that_end_name_the_line(table: Table) -> None:
     few = Stream(frames(range(0, 30_000, 10_000)), 0.01)
     wire = table.serial([], few)
-    with wire, pytest.raises(ConnectError, match=r"3 frames arrive within 5\.\d s at 460800 baud; check supply"):
+    with wire, pytest.raises(ConnectError, match=r"3 frames arrived within 5\.\d s at 460800 baud; check supply"):
         Sensor(wire.clock, baud=460_800).open()

@@ -191,7 +191,7 @@ def test_noise_is_no_sensor(table: Table) -> None:
     mute = [(sent, b"") for sent, _ in turns]
     noise = Stream.of(b"\xaa" * 40, 0.005)
     wire = table.serial([*[mute[0], (mute[1][0], noise)] * 3, mute[0]], noise)
-    found = r"to MODEL .*: bytes arrive, but no frames of 19 bytes at 921600 baud; set baud=… .* \(115200 by default"
+    found = r"to MODEL .*: bytes arrived, but no frames of 19 bytes at 921600 baud; set baud=… .* \(115200 by default"
     with wire, pytest.raises(ConnectError, match=found):
         uart(wire).open()
 

@@ -217,7 +217,7 @@ def test_a_gap_that_no_wait_noticed_is_found_in_the_stamps(sensor: FakeSensor) -
 def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
     with FakeSensor(most=10) as fake:
         fake.stream(3)
-        with pytest.raises(StreamBroken, match=r"12 samples .* 10 may wait; .* in shorter pieces"):
+        with pytest.raises(StreamBroken, match=r"12 samples .* limit is 10; .* in shorter pieces"):
             fake.collect(1.0)
 
 
@@ -875,7 +875,7 @@ class TestFollow:
                 fake.settle()
                 assert len(follow.read(0.0)) == 5  # reads in time
             for _ in range(2):
-                with pytest.raises(StreamBroken, match=r"20 samples .* 10 may wait; read more often"):
+                with pytest.raises(StreamBroken, match=r"20 samples .* limit is 10; read more often"):
                     idle.read(0.0)
             assert not idle.read.__self__._read.args[0]._items  # type: ignore[attr-defined]
 

@@ -48,10 +48,10 @@ def test_a_false_header_costs_no_frame() -> None:
 @pytest.mark.parametrize(
     ("data", "arrived", "has_noise"),
     [
-        (b"", "no bytes arrive", False),
-        (b"A", "bytes arrive, but no frames of 6 bytes", True),
-        (b"?" * 30, "bytes arrive, but no frames of 6 bytes", True),
-        (b"?" + frame(b"abc") + b"?" * 6 + frame(b"abc"), "2 frames arrive", False),
+        (b"", "no bytes arrived", False),
+        (b"A", "bytes arrived, but no frames of 6 bytes", True),
+        (b"?" * 30, "bytes arrived, but no frames of 6 bytes", True),
+        (b"?" + frame(b"abc") + b"?" * 6 + frame(b"abc"), "2 frames arrived", False),
     ],
 )
 def test_what_has_arrived_is_described(data: bytes, arrived: str, has_noise: bool) -> None:

@@ -50,7 +50,7 @@ def test_a_long_recording_is_collected_in_pieces() -> None:
 
 
 def test_a_silent_sensor_is_an_error() -> None:
-    with pytest.raises(DeviceTimeout, match="no sample came in 2 s"):
+    with pytest.raises(DeviceTimeout, match="no sample arrived in 2 s"):
         _watch(cast("Any", Sensor(silent=True)), 2.0)
 
 
