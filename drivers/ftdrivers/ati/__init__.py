@@ -1,1 +1,1 @@
-"""ATI force/torque sensors: one codec and one calibration model, two wires."""
+"""ATI force/torque sensors on CAN, RS-485 and Ethernet."""

@@ -3,8 +3,8 @@
 Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04.
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_codec.py and the emulator (tests/wire).
 
-The sensor is polled; it has no stream, no clock and no bias command. In a critical error it keeps sending data. It does
-not report saturation. A reset selects calibration slot 0. The driver checks all three.
+The sensor is polled; it has no stream, no clock and no bias command. It keeps sending data after a critical error, does
+not report saturation, and selects calibration slot 0 after a reset. The driver checks for all three.
 """
 
 import contextlib
@@ -28,43 +28,44 @@ log = logging.getLogger(__name__)
 
 _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
-# A poll takes 1 to 3 ms, more on a busy computer. A lost frame must not make the stream stale.
+# Time-out of a poll, which takes 1 to 3 ms. It is short, so that one lost frame does not make the stream stale.
 _POLL_S = 0.05
-# Read after the deadline, because on a busy host often this process is late, not the reply.
+# Number of frames that are still read after the time-out: on a busy computer the process is late, not the reply.
 _LATE_FRAMES = 32
-# After a missed poll the bus must be silent, so that a late half is not paired with the next reading.
+# Required silence on the bus after a missed poll, so that a late half is not paired with the next reading.
 _QUIET_S = 0.01
-# How long a reading whose halves came in the wrong order waits for a contradicting frame.
+# If the halves of a reading arrive in the wrong order, further frames are awaited for this time.
 _STRAGGLER_S = 0.004
 _ANOTHER_SLOT = "choose another slot, slot=0 to 15 in its address"
-# The manual fixes 1 000 000 counts per unit for firmware that does not report them.
+# Counts per unit of firmware that does not report them, according to the manual.
 _MILLION = (1_000_000, 1_000_000)
-# About what a 250 kbit/s bus carries; faster polls of a faster bus or an emulator would load a CPU core.
+# Shortest poll period: about the capacity of a bus at 250 kbit/s. Faster polls would only load the CPU.
 _PERIOD_S = 1e-3
 
 
 class AtiCanSensor(StreamingSensor):
     """An ATI NETCANOEM sensor on any CAN interface of python-can.
 
-    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauges. A poll without a reply counts as lost.
+    `seq` counts polls, `t_device_s` is NaN, `counts` are the six gauges. A poll without a reply is a lost sample.
 
     Parameters
     ----------
     channel : str
-        As python-can names it: ``can0``, or the serial port of an slcan adapter.
+        Channel of python-can: ``can0``, or the serial port of an slcan adapter.
     interface : str
-        python-can's interface name.
+        Interface of python-can, such as ``socketcan`` or ``slcan``.
     bitrate : int
-        Bit/s; not used on socketcan, where ``ip link`` sets it.
+        Bit rate, bit/s. It is ignored on socketcan, where ``ip link`` sets it.
     base : int
         Base identifier, 0x00 to 0x7F; factory setting 0x20 (identifiers 0x200 to 0x20F).
     slot : int
         Calibration slot, 0 to 15.
     unit_codes, counts_per_unit : (int, int), optional
-        For force, for torque, as on the calibration certificate: for firmware before 3.7, which does not report them.
-        A sensor that reports others is rejected. The default is N, N·m and 1 000 000 counts, logged as assumed.
+        Values for force and torque from the calibration certificate, for firmware before 3.7, which does not report
+        them. A sensor that reports other values is rejected. By default N, N·m and 1 000 000 counts are assumed, and a
+        warning is logged.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(
@@ -93,9 +94,10 @@ class AtiCanSensor(StreamingSensor):
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``ati-can://can0?bitrate=250000&base=0x20&slot=0&interface=socketcan``.
+        """Build the driver from an address such as ``ati-can://can0?bitrate=250000&base=0x20&slot=0``.
 
-        Firmware before 3.7 needs ``units=lbf,lbf-in``, and ``counts=1000000,1000000`` if the certificate differs.
+        Firmware before 3.7 needs the options ``units=lbf,lbf-in`` and ``counts=1000000,1000000`` if the certificate
+        differs from the defaults.
         """
         units = options.optional("units")
         return cls(
@@ -132,7 +134,7 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _read_block(self) -> FtSamples:
-        # The next poll leaves before this reply is decoded: a slow NETCANOEM is then polled as fast as it can reply.
+        # The next poll is sent before this reply is decoded, so that the NETCANOEM prepares its reply meanwhile.
         if not self._asked:
             self._clock.sleep(self._next_poll_s - self._clock.now_s())
             self._poll()
@@ -151,7 +153,7 @@ class AtiCanSensor(StreamingSensor):
         t_host_ns, seq = self._clock.now_ns(), self._polls
         self._missed = 0
         if t_host_ns >= self._next_poll_s * 1e9:
-            self._poll()  # the sensor prepares the next reading while this one is decoded
+            self._poll()
         reading = codec.decode_gauges(first, second)
         self._judge(reading)
         counts = reading.gauges[np.newaxis]
@@ -167,7 +169,7 @@ class AtiCanSensor(StreamingSensor):
         self._bus.close()
 
     def _select_slot(self) -> None:
-        # After a watchdog reset the sensor is back at slot 0, and two missed polls in a row may be such a reset.
+        # A watchdog reset selects slot 0. Two missed polls in a row may be such a reset.
         echo = codec.decode_slot(*self._ask(Op.SELECT_SLOT, self._slot))
         if echo != self._slot:
             raise ConnectError(
@@ -184,9 +186,9 @@ class AtiCanSensor(StreamingSensor):
     def _read_scale(
         self, firmware: codec.Firmware
     ) -> tuple[tuple[int, int], tuple[int, int], Literal["device", "configured", "assumed"]]:
-        """Return counts per unit, unit codes and their source. Raises `ConnectError` where two sources differ."""
+        """Return counts per unit, unit codes and their source. Raises `ConnectError` if two sources differ."""
         if firmware < codec.COUNTS_PER_UNIT_SINCE:
-            counts = self._counts_per_unit or _MILLION  # fixed by the manual for this firmware
+            counts = self._counts_per_unit or _MILLION
             if self._unit_codes is not None:
                 return counts, self._unit_codes, "configured"
             log.warning(
@@ -210,8 +212,8 @@ class AtiCanSensor(StreamingSensor):
         return counts, unit_codes, "device"
 
     def _judge(self, reading: codec.GaugeReading) -> None:
-        """Raise when a reading is unusable; log other status bits once."""
-        # A healthy unit on a shared bus had bit 14 set, so bits 0, 8, 14 and 15 are logged once and no fault.
+        """Raise `DeviceFault` if a reading is unusable; log other status bits once."""
+        # Bits 0, 8, 14 and 15 are no faults: a healthy unit on a shared bus had bit 14 set.
         status = reading.status
         if status & codec.CRITICAL:
             raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}", UNUSABLE)
@@ -225,7 +227,7 @@ class AtiCanSensor(StreamingSensor):
         refuse_saturated(self.name, reading.gauges[np.newaxis])
 
     def _ask(self, op: Op, *args: int) -> list[bytes]:
-        """Exchange with retries, for the start-up sequence."""
+        """Send a request of the start-up sequence, repeatedly if necessary, and return the reply."""
         for _ in range(_ATTEMPTS):
             with contextlib.suppress(DeviceTimeout, ProtocolError):
                 self._request(op, bytes(args))
@@ -236,20 +238,20 @@ class AtiCanSensor(StreamingSensor):
         )
 
     def _request(self, op: Op, data: bytes) -> None:
-        """Drop what belongs to earlier requests, and send one; `_answer` must follow."""
+        """Drop replies to earlier requests, and send a new request; `_answer` must follow."""
         self._bus.discard()
         self._bus.send(self._base << 4 | op, data)
 
     def _answer(self, op: Op, data: bytes, timeout_s: float) -> list[bytes]:
-        """Return the payloads of the reply to the request just sent, or raise `DeviceTimeout`: never half a reply.
+        """Return the payloads of the complete reply to the last request, or raise `DeviceTimeout`.
 
-        Frames are matched by identifier and length, not by order of arrival, as they carry no number. Two differing
-        frames for one part are a `ProtocolError`: one of them belongs to an earlier request.
+        Frames carry no number, and are matched by identifier and length. Two different frames with one identifier raise
+        `ProtocolError`, because one of them belongs to an earlier request.
         """
         expected = codec.REPLIES[op]
         request_id = self._base << 4 | op
         parts: dict[int, bytes] = {}
-        # only the reply to SELECT_SLOT equals its request: on a bus that echoes, the first one is ours
+        # the reply to SELECT_SLOT equals its request: on a bus with echo, the first of the two frames is the request
         skip_echo = self._echoes and op is Op.SELECT_SLOT
         deadline_s = self._clock.now_s() + timeout_s
         late = 0
@@ -279,7 +281,7 @@ class AtiCanSensor(StreamingSensor):
         return [parts[opcode] for opcode in expected]
 
     def _await_quiet(self) -> None:
-        """Drop what arrives until nothing does, at most for a transaction."""
+        """Drop received frames until the bus is silent, at most for the duration of one transaction."""
         for _ in self._clock.looks(_TRANSACTION_S):
             if self._bus.receive(_QUIET_S) is None:
                 return
@@ -290,7 +292,7 @@ def _scale_text(counts: tuple[int, int], unit_codes: tuple[int, int]) -> str:
     return f"{counts[0]} counts per {force} and {counts[1]} per {torque}"
 
 
-# Nodes of CANopen. On their bus every lower identifier may be a command, also one that nobody sends at the moment.
+# Heartbeats of CANopen nodes. On such a bus any lower identifier may be a command, even if none is sent at the moment.
 _HEARTBEATS = frozenset(range(0x701, 0x780))
 
 

@@ -1,11 +1,11 @@
-"""ATI NETCANOEM over CAN: commands, replies and status, as pure functions on bytes; the units of every wire.
+"""ATI NETCANOEM over CAN: commands, replies and status, as pure functions on bytes. Units of all ATI sensors.
 
-Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04: wrench
-counts are matrix (rows Fx..Tz, columns G0..G5) times gauges; force and torque are counts divided by counts per unit.
-Unit codes are shared by NETCANOEM, Digital F/T, Axia and Net F/T.
+Ref: ATI Industrial Automation, "F/T CAN Bus and Serial Bus Network Interface for OEM", 9610-05-1030 revision 04. The
+wrench in counts is the matrix (rows Fx..Tz, columns G0..G5) times the gauges; force and torque are these counts divided
+by the counts per unit. NETCANOEM, Digital F/T, Axia and Net F/T have the same unit codes.
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_codec.py and test_calibration.py.
 
-A decoder returns a value or raises `ProtocolError`, never anything else. All multi-byte numbers are big-endian.
+A decoder returns a value or raises `ProtocolError` and no other exception. All multi-byte numbers are big-endian.
 """
 
 import struct
@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from ftdrivers.errors import DeviceFault, ProtocolError
 from ftdrivers.interfaces import Array
 
-# Firmware before 3.7 reports neither units nor counts per unit.
 COUNTS_PER_UNIT_SINCE = (3, 7)
-"""First firmware that answers `COUNTS_PER_UNIT` and `UNIT_CODES`; older ones use 1 000 000 for both."""
+"""First firmware that replies to `COUNTS_PER_UNIT` and `UNIT_CODES`. Older firmware has 1 000 000 counts per unit."""
 
 
 class Op(IntEnum):
-    """Opcodes that this driver sends; an identifier is `base << 4 | opcode`, for request and reply alike."""
+    """Opcodes that this driver sends. The identifier of a request or reply is `base << 4 | opcode`."""
 
     GAUGES = 0x0
     MATRIX_ROW = 0x2
@@ -64,9 +63,9 @@ STATUS_BITS: Mapping[int, str] = {
     15: "any error",
 }
 WATCHDOG_RESET = 0x0001
-# All bits but watchdog reset, configuration, CAN and the summary: a healthy unit on a shared bus had the CAN bit set.
+# All bits except watchdog reset, configuration, CAN and the summary bit: a healthy unit had the CAN bit set.
 CRITICAL = 0x18FE
-"""Status bits with which the data is unusable. The device keeps sending, so the host has to check them."""
+"""Status bits that make the data unusable. The device keeps sending data, so that the host has to check them."""
 
 
 class GaugeReading(NamedTuple):
@@ -77,7 +76,7 @@ class GaugeReading(NamedTuple):
 
 
 class Firmware(NamedTuple):
-    """Firmware version; compares with tuples."""
+    """Firmware version, which can be compared with a tuple."""
 
     major: int
     minor: int
@@ -85,7 +84,7 @@ class Firmware(NamedTuple):
 
 
 def decode_gauges(first: bytes, second: bytes) -> GaugeReading:
-    """Decode the two halves of a reading: status, G0, G2, G4 and G1, G3, G5."""
+    """Decode the two halves of a reading: status, G0, G2, G4, and G1, G3, G5."""
     status, g0, g2, g4 = _unpack(">Hhhh", first, "first half of a gauge reading")
     g1, g3, g5 = _unpack(">hhh", second, "second half of a gauge reading")
     return GaugeReading(status, np.array([g0, g1, g2, g3, g4, g5], dtype=np.int32))
@@ -112,7 +111,7 @@ def decode_serial(data: bytes) -> str:
 
 
 def decode_slot(data: bytes) -> int:
-    """Decode the echo of the selected calibration slot."""
+    """Decode the reply to `SELECT_SLOT`: the selected calibration slot."""
     return int(_unpack(">B", data, "calibration slot echo")[0])
 
 
@@ -120,7 +119,7 @@ def decode_counts_per_unit(data: bytes) -> tuple[int, int]:
     """Decode counts per unit of force and of torque."""
     force, torque = _unpack(">II", data, "counts per unit")
     if not force or not torque:
-        raise ProtocolError(f"counts per unit are {force} and {torque}, which no calibration has")
+        raise ProtocolError(f"counts per unit are {force} and {torque}, and must be positive")
     return force, torque
 
 
@@ -155,7 +154,7 @@ FORCE_UNITS_N = {
     "kgf": 9.80665,
     "gf": 0.00980665,
 }
-"""In the order of ATI's unit codes 1 to 6, as are the torque units."""
+"""One unit of force in N, in the order of ATI's unit codes 1 to 6. Units of torque have the same order."""
 TORQUE_UNITS_NM = {
     "lbf-in": 0.1129848290276167,
     "lbf-ft": 1.3558179483314004,
@@ -171,7 +170,7 @@ _LOWEST, _HIGHEST = -32768, 32767
 
 
 def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
-    """Name the units of force and torque. Raises `ProtocolError` for unknown codes."""
+    """Return the names of the units of force and torque. Raises `ProtocolError` for unknown codes."""
     force, torque = unit_codes
     if not (1 <= force <= len(_FORCES) and 1 <= torque <= len(_TORQUES)):
         raise ProtocolError(f"unit codes are {force} (force) and {torque} (torque), known are 1 to 6")
@@ -179,13 +178,13 @@ def unit_names(unit_codes: tuple[int, int]) -> tuple[str, str]:
 
 
 def units(unit_codes: tuple[int, int]) -> tuple[float, float]:
-    """Return one unit of force in N and one of torque in N·m. Raises `ProtocolError` for unknown codes."""
+    """Return one unit of force in N and one unit of torque in N·m. Raises `ProtocolError` for unknown codes."""
     force, torque = unit_names(unit_codes)
     return FORCE_UNITS_N[force], TORQUE_UNITS_NM[torque]
 
 
 def parse_units(text: str) -> tuple[int, int]:
-    """Find the unit codes of an option such as ``lbf,lbf-in``. Raises `ValueError`."""
+    """Return the unit codes of an option such as ``lbf,lbf-in``. Raises `ValueError`."""
     force, _, torque = text.partition(",")
     if force not in _FORCES or torque not in _TORQUES:
         raise ValueError(
@@ -205,19 +204,19 @@ class Calibration:
 
     @classmethod
     def from_vendor(cls, matrix: Array, counts_per_unit: tuple[int, int], unit_codes: tuple[int, int]) -> "Calibration":
-        """Build from the values that the device reports.
+        """Build a calibration from the values that the device reports.
 
         Parameters
         ----------
         matrix : array, shape (6, 6)
-            The run-time matrix, which includes the gauge gains.
+            The run-time matrix, which includes the gauge gains, in counts per gauge count.
         counts_per_unit, unit_codes : (int, int)
-            For force, for torque.
+            Values for force and for torque.
 
         Raises
         ------
         ProtocolError
-            An unknown unit code, or a matrix that is not finite or singular.
+            A unit code is unknown, or the matrix is singular or not finite.
         """
         unit_N, unit_Nm = units(unit_codes)
         if not np.isfinite(matrix).all() or np.linalg.matrix_rank(matrix) < 6:
@@ -231,9 +230,9 @@ class Calibration:
 
 
 def refuse_saturated(name: str, gauges: NDArray[np.int32]) -> None:
-    """Raise `DeviceFault` when a gauge of the sensor is at the end of its range in any of n rows (n, 6).
+    """Raise `DeviceFault` if a gauge is at the end of its range in any row of `gauges` (n, 6).
 
-    The wrench is then meaningless. No status bit reports an overload or a broken cable.
+    Such a wrench is meaningless. No status bit reports an overload or a broken cable.
     """
     saturated = np.flatnonzero(((gauges == _LOWEST) | (gauges == _HIGHEST)).any(axis=0))
     if len(saturated):

@@ -3,7 +3,7 @@
 Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py.
 
-A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, high word first.
+A decoder returns a value or raises `ProtocolError` and no other exception. Registers are big-endian, high word first.
 """
 
 import struct
@@ -20,15 +20,15 @@ from ftdrivers.interfaces import Array
 from ftdrivers.wires import modbus as _modbus
 
 ADDRESS = 10
-"""The slave address, fixed by ATI."""
+"""Slave address of every sensor, fixed by ATI."""
 
 START_STREAM, STORAGE = 0x46, 0x6A
 
 GAINS, OFFSETS, STATUS = 0x0000, 0x0006, 0x001D
 
-# Only a jamming sequence stops the stream, which outlives the program that started it.
+# The stream continues after the program that started it has ended. Only a jamming sequence stops it.
 JAM = b"\xaa" * 14
-"""Any 14 bytes stop a running stream; these are not a Modbus frame."""
+"""Jamming sequence that stops a running stream. Any 14 bytes do; these are not a Modbus frame."""
 
 RECORD_SIZE = 13
 NOMINAL_RATE_Hz = 7000.0
@@ -54,11 +54,11 @@ STATUS_BITS = {
 WATCHDOG_RESET = 0x0001
 ANY_ERROR = 0x8000
 CRITICAL = 0x3EFE
-"""All bits but watchdog reset, configuration, CAN and the summary bit."""
+"""Status bits that make the data unusable: all except watchdog reset, configuration, CAN and the summary bit."""
 
 frame = partial(_modbus.frame, ADDRESS)
 read_registers = partial(_modbus.read_registers, ADDRESS)
-"""At most 64 registers in one request are known to work."""
+"""Returns the request to read registers. Up to 64 registers per request are known to work."""
 write_registers = partial(_modbus.write_registers, ADDRESS)
 reply_size = _modbus.reply_size
 
@@ -68,7 +68,7 @@ START = frame(START_STREAM, b"\x55")
 
 
 def check_reply(request: bytes, reply: bytes) -> bytes:
-    """Check a whole reply against its request and return the registers in it; see `ftdrivers.wires.modbus`."""
+    """Check a complete reply to a request and return the bytes of its registers, see `ftdrivers.wires.modbus`."""
     payload = _modbus.check_reply(request, reply)
     function = request[1]
     if function not in {START_STREAM, STORAGE}:
@@ -81,29 +81,29 @@ def check_reply(request: bytes, reply: bytes) -> bytes:
 
 
 def calibration_reads(index: int) -> list[tuple[int, int]]:
-    """Return the registers (start, count) of calibration `index`, 1 to 16, in reads of at most 64."""
+    """Return pairs (start, count) of registers that hold calibration `index`, 1 to 16, with a count of at most 64."""
     base = 0x00E3 + 192 * (index - 1)
     return [(base, 64), (base + 64, 64), (base + 128, 41)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _CalibrationBlock:
-    """One calibration as the sensor stores it."""
+    """A calibration that is stored in the sensor."""
 
     serial: str
     part_number: str
     matrix: Array
-    """(6, 6) counts per gauge count, rows Fx..Tz, columns G0..G5."""
+    """(6, 6) calibration matrix, counts per gauge count, rows Fx..Tz, columns G0..G5."""
     unit_codes: tuple[int, int]
     max_rating: tuple[float, ...]
-    """(6,) Fx..Tz, in these units."""
+    """(6,) largest Fx..Tz, in the units of the unit codes."""
     counts_per_unit: tuple[int, int]
     gains: tuple[int, ...]
     offsets: tuple[int, ...]
 
 
 def decode_calibration_block(data: bytes) -> _CalibrationBlock:
-    """Decode the 338 bytes of a calibration; an empty slot is a `ProtocolError`."""
+    """Decode the 338 bytes of a calibration. Raises `ProtocolError` for an empty slot."""
     if len(data) != 338:
         raise ProtocolError(f"a calibration has 338 bytes, got {len(data)}")
     matrix = np.frombuffer(data, ">f4", 36, offset=2 * 32).reshape(6, 6)
@@ -127,32 +127,33 @@ class Records:
     """n decoded stream records."""
 
     gauges: NDArray[np.int32]
-    """(n, 6) in natural order G0..G5."""
+    """(n, 6) gauge counts in natural order G0..G5."""
     intact: NDArray[np.bool_]
-    """(n,) the checksum holds."""
+    """(n,) whether the checksum is correct."""
     parity: NDArray[np.bool_]
-    """(n,) the parity of every byte holds. Not for slips, because some adapters mark a whole packet for one byte."""
+    """(n,) whether the parity of all bytes is correct. It does not show a slip: some adapters mark whole packets."""
     error: NDArray[np.bool_]
-    """(n,) the error bit: stop the stream and read the status word."""
+    """(n,) error bit, which asks the host to stop the stream and read the status word."""
 
 
 _RECORD = np.dtype([("gauges", ">i2", 6), ("last", "u1")])
-# The record has the gauges as G0 G2 G4 G1 G3 G5.
+# A record has the gauges in the order G0 G2 G4 G1 G3 G5.
 _NATURAL_ORDER = np.array([0, 3, 1, 4, 2, 5])
 
 
 def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
-    """Decode n whole stream records, 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum.
+    """Decode n complete records of 13 bytes each: G0 G2 G4 G1 G3 G5, then error bit and 7-bit sum.
 
-    The sum misses a flipped bit 7 of any byte, parity an even number of flipped bits in one byte. Together they find
-    every single damaged byte. `damaged` are the places of bytes with wrong parity; places behind `data` are ignored.
+    The sum does not detect a flipped bit 7, and parity does not detect an even number of flipped bits in one byte.
+    Together they detect any single damaged byte. `damaged` are the indices of bytes with wrong parity; indices beyond
+    `data` are ignored.
     """
     if len(data) % RECORD_SIZE:
         raise ProtocolError(f"{len(data)} bytes are not a whole number of {RECORD_SIZE}-byte records")
     columns = np.frombuffer(data, np.uint8).reshape(-1, RECORD_SIZE).T.copy()
-    total = columns[:12].sum(axis=0, dtype=np.uint8)  # wraps at 256, and only seven bits count
+    total = columns[:12].sum(axis=0, dtype=np.uint8)  # overflow is harmless, because only seven bits are compared
     last = columns[12]
-    # sums along columns and `take` are many times faster than sums along short rows and strided assignments
+    # sums along columns and `take` are much faster than sums along short rows and strided assignments
     gauges = np.frombuffer(data, _RECORD)["gauges"].take(_NATURAL_ORDER, axis=1).astype(np.int32)
     intact = (total ^ last) & 0x7F == 0
     parity = np.ones(len(last), bool)
@@ -161,12 +162,12 @@ def decode_records(data: bytes, damaged: Sequence[int] = ()) -> Records:
 
 
 def keep_records(intact: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], int, bool]:
-    """Judge n records by their checksums: which to keep, how many are settled, and whether the stream has slipped.
+    """Decide by checksums which of n records to keep, how many are decided, and whether the stream has slipped.
 
-    The stream has no sync byte, and after a slip one record in 128 still passes. So three damaged records in a row
-    mean a slip. An intact record between two damaged ones, or directly before a slip, is dropped. Therefore the last
-    record waits for its successor, and so does the damage next to it: judge the records that are not settled again,
-    together with their successors. After a slip all bytes behind the settled ones are misaligned.
+    The stream has no sync byte, and after a slip one record in 128 still passes the checksum. Three damaged records in
+    a row are therefore treated as a slip, and an intact record between two damaged ones, or directly before a slip, is
+    dropped. The last records can only be decided with their successors: pass the undecided ones again with the next
+    records. After a slip, all bytes after the decided records are misaligned.
     """
     bad = ~intact
     n = len(bad)

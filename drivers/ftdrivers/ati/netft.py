@@ -5,7 +5,7 @@ public drivers and a public page of a live box; tool transformation as in ATI's 
 OptoForce, "Ethernet Converter" manual, version 2.0.
 Checked on hardware: no. Verified against: tests/unit/drivers/test_netft.py and the emulator (tests/wire).
 
-pynetft reads the scale, drains the socket and reports why a stream has ended. Its bias command is never used here.
+pynetft reads the scale and the samples, and reports why a stream has ended. The driver never uses its bias command.
 """
 
 import http.client
@@ -30,25 +30,25 @@ from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
 
-# A longer silence ends the stream: a sensor set to less than 10 Hz is too slow for this driver.
+# A longer silence ends the stream. Sensors that are set to less than 10 Hz are too slow for this driver.
 _SILENCE_S = 0.3
-# The request to start is a datagram, which can be lost.
+# Number of start requests: a request is a datagram, which can be lost.
 _STARTS = 5
 _HTTP_S = 1.0
-# pynetft's fail-stop mode ends at one duplicate or late datagram; its reconnecting mode with so long a delay never
-# acts before this driver.
+# Without its reconnecting mode, pynetft ends the stream after one duplicate or late datagram. With so long a delay this
+# driver always detects a lost connection first.
 _NEVER_S = 3600.0
-# In real time, for the first sample and then for those after it.
+# Time-outs, s of real time: for the first sample of a block, and for each further one.
 _WAIT_S, _BATCH_S = 0.05, 0.002
-# More than 2 s at 7 kHz. A full queue drops the oldest sample, whose number is then missing.
+# Samples in the queue of pynetft, more than 2 s at 7 kHz. A full queue drops the oldest sample, which leaves a gap.
 _QUEUE = 16_384
-# Per N and per N·m, fixed by the manual: an OnRobot converter does not report them.
+# Counts per N and per N·m, fixed by the manual, because an OnRobot converter does not report them.
 _ONROBOT_COUNTS = (10_000, 100_000)
 _DISTANCES_M = {"in": 0.0254, "ft": 0.3048, "mm": 0.001, "cm": 0.01, "m": 1.0}
 
-# pynetft ends the stream at every other status, so the Axia's warning of a gauge near its limit is a fault.
+# pynetft ends the stream for any other status, so that the Axia's warning of a gauge near its limit is a fault too.
 MONITOR_LATCHED = 0x80010000
-"""A monitored threshold was crossed earlier; the data is valid."""
+"""Status after a monitored threshold was crossed. The data are valid."""
 
 NET_FT_BITS = {
     1: "HTTP",
@@ -114,13 +114,13 @@ ONROBOT_BITS = {
 
 
 def text_in(page: bytes, element: str) -> str:
-    """Find the text of an element in a page of a sensor; empty where it is missing."""
+    """Return the text of an element in a page of the sensor; empty if the element is missing."""
     match = re.search(rf"<{element}>\s*([\x20-\x3b\x3d-\x7e]{{1,200}}?)\s*</{element}>".encode(), page)
     return match[1].decode("ascii") if match else ""
 
 
 def numbers_in(page: bytes, element: str) -> list[float]:
-    """Find the numbers of an element, such as ``130;130;400;10;10;10``; empty where it holds other text."""
+    """Return the numbers of an element, such as ``130;130;400;10;10;10``; empty if it holds other text."""
     try:
         numbers = [float(number) for number in text_in(page, element).split(";")]
     except ValueError:
@@ -129,12 +129,12 @@ def numbers_in(page: bytes, element: str) -> list[float]:
 
 
 def transformation_in(page: bytes) -> Array:
-    """Find the tool transformation of the box in ``netftapi2.xml``, and return the matrix (6, 6) that undoes it.
+    """Return the inverse (6, 6) of the tool transformation in ``netftapi2.xml``; the identity if there is none.
 
-    The box sends the wrench in the axes of its tool frame, about the origin of that frame. The frame is displaced from
-    that of the transducer, then turned about x, y and z. The identity stands for a page without a frame.
+    The device sends the wrench in the axes and about the origin of its tool frame. This frame is displaced from the
+    transducer frame, then rotated about x, y and z.
 
-    Raises `ProtocolError` for a page with another number of values, or an unknown unit.
+    Raises `ProtocolError` if the number of values is wrong, or a unit is unknown.
     """
     undo = np.eye(6)
     values, distance, angle = numbers_in(page, "cfgtfx"), text_in(page, "scfgtdu"), text_in(page, "scfgtau")
@@ -156,17 +156,17 @@ class NetFtSensor(StreamingSensor):
     """A sensor with ATI's RDT protocol.
 
     `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
-    `wrench` is in the axes and about the origin of the transducer, without the tool transformation of the box. The box
-    subtracts its software bias before it sends. Both are facts, so a driver that reconnects rejects a changed one.
-    Nominal rate and range are known where the page of the sensor contains them. Every status but a latched monitor
-    condition is a `DeviceFault`.
+    `wrench` is in the axes and about the origin of the transducer: the driver undoes the tool transformation. The
+    device subtracts its software bias. Both are facts, so that a change is rejected after a reconnection. Nominal rate
+    and range are known if the configuration page contains them. Any status except a latched monitor condition raises
+    `DeviceFault`.
 
     Parameters
     ----------
     host : str
         Address of the sensor; ATI's factory setting is 192.168.1.1.
     onrobot : bool
-        An OnRobot HEX or OptoForce converter, with the scale and status bits of its manual.
+        True for an OnRobot HEX or OptoForce converter, which has its own scale and status bits.
     rdt_port, http_port : int
         Ports of RDT (UDP) and of the configuration pages.
     sign : int
@@ -184,7 +184,7 @@ class NetFtSensor(StreamingSensor):
         clock: Clock = REAL,
     ) -> None:
         name = f"{'OnRobot' if onrobot else 'ATI'} Ethernet sensor at {host}"
-        # UDP reports no broken cable: a silence ends the stream, before the stream is stale
+        # UDP does not report a broken cable: a silence ends the stream before the stream would be stale
         super().__init__(name, sign=sign, clock=clock, limits=StreamLimits(stale_s=_SILENCE_S + 0.15))
         self._http_s = clock.patience_s(_HTTP_S)
         self._host = host
@@ -195,7 +195,7 @@ class NetFtSensor(StreamingSensor):
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152&http_port=80``."""
+        """Build the driver from an address such as ``ati-netft://192.168.1.1?onrobot=0&rdt_port=49152``."""
         return cls(
             address,
             onrobot=bool(options.integer("onrobot", 0, 0, 1)),
@@ -206,7 +206,7 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _connect(self) -> DeviceInfo:
-        # an OnRobot converter serves no pages
+        # an OnRobot converter has no configuration pages
         page = b"" if self._onrobot else self._read_page("/netftapi2.xml")
         rate_Hz, *_ = numbers_in(page, "comm?rdtrate") or [math.nan]  # both spellings exist
         self._nominal_Hz = rate_Hz if rate_Hz > 0 else math.nan
@@ -239,7 +239,7 @@ class NetFtSensor(StreamingSensor):
         if scale.force_unit.value not in FORCE_UNITS_N or scale.torque_unit.value not in TORQUE_UNITS_NM:
             raise ConnectError(
                 f"{self.name}: the sensor measures in {scale.force_unit.value} and {scale.torque_unit.value}",
-                "choose N and Nm on its configuration page",
+                "select N and Nm on its configuration page",
             )
         counts_per_N = scale.counts_per_force_unit / FORCE_UNITS_N[scale.force_unit.value]
         counts_per_Nm = scale.counts_per_torque_unit / TORQUE_UNITS_NM[scale.torque_unit.value]
@@ -288,7 +288,7 @@ class NetFtSensor(StreamingSensor):
         client.stop()
 
     def health(self) -> Health:
-        """Return the counters since `open`, including datagrams that pynetft has dropped."""
+        """Return the statistics since `open`, including datagrams that pynetft has dropped."""
         with self._news:
             health, client = super().health(), self._client
             if client is None:
@@ -302,7 +302,7 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _start(self, client: pynetft.Client) -> pynetft.SensorConfiguration:
-        """Request the stream until it starts; return the configuration that the sensor reports."""
+        """Request the stream repeatedly until it starts; return the configuration that the sensor reports."""
         for _ in range(_STARTS):
             try:
                 client.start()
@@ -326,7 +326,7 @@ class NetFtSensor(StreamingSensor):
         )
 
     def _fetch(self) -> list[pynetft.Sample]:
-        """Return all samples that have arrived; wait 50 ms for the first and 2 ms for more."""
+        """Return all samples that have arrived; wait 50 ms for the first one and 2 ms for each further one."""
         client = self._client
         if client is None:
             raise StreamBroken(f"{self.name}: closed")
@@ -353,7 +353,7 @@ class NetFtSensor(StreamingSensor):
         return samples
 
     def _judge(self, status: int) -> None:
-        """Raise on a fault, log a latched monitor condition once."""
+        """Raise `DeviceFault` if the status is a fault; log a latched monitor condition once."""
         if status not in {0, MONITOR_LATCHED}:
             raise DeviceFault(f"{self.name}: status {describe_status(status, self._bits, 32)}", UNUSABLE)
         if status and not self._warned:
@@ -361,7 +361,7 @@ class NetFtSensor(StreamingSensor):
             self._warned = True
 
     def _read_page(self, path: str) -> bytes:
-        """Read what pynetft does not, such as firmware, rate and range."""
+        """Return a page of the sensor, which holds values that pynetft does not read, such as rate and range."""
         try:
             page = http.client.HTTPConnection(self._host, self._http_port, timeout=self._http_s)
             with self._clock.away(), closing(page) as connection:

@@ -3,9 +3,9 @@
 Ref: ATI "Digital F/T" Modbus interface (sections 8.1, 8.3, 8.4 of 9620-05-Digital FT, as cited by public drivers).
 Checked on hardware: no. Verified against: tests/unit/drivers/ati/test_modbus.py and the emulator (tests/wire).
 
-Modbus RTU for set-up, then a bare stream of 13-byte records at 7 kHz. Only a jamming sequence stops the stream, which
-outlives the program that started it. Gauge gains and offsets are volatile: at power-up the sensor has those of its
-lowest calibration in force. The driver reads them, and writes them only where they are not those of its calibration.
+The sensor is set up by Modbus RTU and then sends a stream of 13-byte records at 7 kHz. The stream continues after the
+program that started it has ended; only a jamming sequence stops it. Gains and offsets of the gauges are volatile: after
+power-up they are those of the lowest stored calibration. The driver writes them if they differ from its calibration.
 """
 
 import logging
@@ -29,34 +29,34 @@ from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 log = logging.getLogger(__name__)
 
 _BAUD = 1_250_000
-# The longest wait of one read, and the silence that proves that a stream has stopped.
+# Time-out of one read, s, and the silence after which a stream has stopped.
 _READ_S = 0.02
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
-# Larger batches cost less of a core and delay the guards; evenly spread stamps would be invented precision.
-# The least that one read waits for, 4 ms of stream: few wake-ups, and far less than a port buffers.
+# Bytes for which one read waits, 4 ms of stream. Larger batches need less CPU but delay the guards. The records of a
+# batch share one time stamp, because evenly spread stamps would pretend a precision that they do not have.
 _BATCH_BYTES = 28 * modbus.RECORD_SIZE
-# An error bit without a bit in the word is a damaged byte; three in a row are not.
+# If the error bit is set but the status word is clear, a byte was damaged. Three times in a row it is a fault.
 _MAX_RESTARTS = 3
 
 
 class AtiSerialSensor(StreamingSensor):
     """An ATI Digital F/T (or the RS-485 port of a NETCANOEM) on a serial port, 7 kHz.
 
-    Records carry no time and no number. `t_host_ns` is the receipt of their batch of at least 28, `t_device_s` is NaN.
-    `seq` counts records, including damaged ones (wrong sum, or a byte with wrong parity) and an estimate from the clock
-    for those lost in a restart. `counts` are the six gauges. `status` is the status word as last read. A record has
-    only an error bit; when it is set, the driver stops the stream and reads the word again. If the word explains the
-    bit and is not critical, measuring continues.
+    Records carry neither time nor number. `t_host_ns` is the time at which a batch of at least 28 records was received,
+    `t_device_s` is NaN. `seq` counts records, including damaged ones (wrong sum or parity) and, estimated from the
+    clock, those lost during a restart of the stream. `counts` are the six gauges. `status` is the last status word: a
+    record only has an error bit, and if it is set, the driver stops the stream and reads the word. If the word explains
+    the bit and is not critical, the stream continues.
 
     Parameters
     ----------
     port : str
-        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+        Serial port. A path such as ``/dev/serial/by-id/…`` remains valid after replugging.
     calibration : int
-        Stored calibration to use, 1 to 16.
+        Number of the stored calibration, 1 to 16.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(self, port: str, *, calibration: int = 1, sign: int = 1, clock: Clock = REAL) -> None:
@@ -64,16 +64,16 @@ class AtiSerialSensor(StreamingSensor):
         self._calibration_index = calibration
         self._port = SerialPort(self.name, port, _BAUD, even_parity=True, read_s=_READ_S, clock=clock)
         self._buffer = bytearray()
-        # Places in the buffer of bytes with wrong parity.
+        # Indices of bytes with wrong parity in the buffer.
         self._damaged: list[int] = []
         self._seq = self._status = self._restarts = 0
         self._slipped = False
-        # Until a restarted stream delivers: when the old one last delivered.
+        # Time of the last record before a restart, ns; None after the first record of the restarted stream.
         self._last_good_ns: int | None = None
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
+        """Build the driver from an address such as ``ati-serial:///dev/serial/by-id/…?calibration=1``."""
         return cls(address, calibration=options.integer("calibration", 1, 1, 16), sign=sign, clock=clock)
 
     def _connect(self) -> DeviceInfo:
@@ -108,8 +108,7 @@ class AtiSerialSensor(StreamingSensor):
         )
 
     def _set_gauges(self, gains: Sequence[int], offsets: Sequence[int]) -> None:
-        """Write the active gains and offsets where they are not those of the calibration in use."""
-        # Gains and offsets are volatile: at power-up they are those of the lowest calibration in force.
+        """Write gains and offsets of the calibration in use, unless they are active already."""
         active = self._ask(modbus.read_registers(modbus.GAINS, len(gains) + len(offsets)))
         if active == struct.pack(f">{len(gains) + len(offsets)}H", *gains, *offsets):
             return
@@ -139,7 +138,7 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             keep &= ~flagged
         elif keep.any() and not flagged.any():
-            self._status &= ~modbus.ANY_ERROR  # an error is over: the next one is new
+            self._status &= ~modbus.ANY_ERROR  # the error has ended, so that another one is logged again
         gauges = records.gauges[:settled][keep]
         seq = self._seq + 1 + np.flatnonzero(keep)
         if self._last_good_ns is not None and len(gauges):
@@ -150,7 +149,7 @@ class AtiSerialSensor(StreamingSensor):
             self._last_good_ns = None
         if len(gauges) and not suspect:
             self._restarts = 0
-        # the records behind a slip were sent and are lost
+        # the records after a slip are lost
         done = len(records.intact) if slipped else settled
         self._seq += done
         self._malformed += done - len(gauges)
@@ -164,13 +163,13 @@ class AtiSerialSensor(StreamingSensor):
         return FtSamples.of(t_host_ns, seq, self._calibration.wrench(gauges), counts=gauges, status=self._status)
 
     def _discard_backlog(self) -> None:
-        """Treat an overflow of the port as a slip, because the start of a record is unknown."""
+        """Drop buffered bytes and restart the stream, because the start of the next record is unknown."""
         self._buffer.clear()
         self._slipped = True
         self._last_good_ns = self._last_good_ns or self._newest_ns
 
     def _look_at_status(self, t_host_ns: int) -> None:
-        """Stop and read the status, because the sum does not cover the error bit of a record."""
+        """Stop the stream and read the status word, because the checksum does not cover the error bit."""
         self._judge_status(self._stop_stream())
         if not self._status & modbus.ANY_ERROR:
             text = describe_status(self._status, modbus.STATUS_BITS)
@@ -197,7 +196,7 @@ class AtiSerialSensor(StreamingSensor):
             self._port.close()
 
     def _stop_stream(self) -> int:
-        """Stop the stream, prove it by reading the status word, and return the word."""
+        """Stop the stream and return the status word, whose reply shows that the stream has stopped."""
         self._jam()
         try:
             return int.from_bytes(self._ask(modbus.read_registers(modbus.STATUS, 1), self._jam), "big")
@@ -205,12 +204,12 @@ class AtiSerialSensor(StreamingSensor):
             raise DeviceTimeout(exc.found, f"{exc.fix}, check termination and address") from exc
 
     def _start_stream(self) -> None:
-        self._ask(modbus.START, self._jam)  # it may stream already, with only the reply lost
+        self._ask(modbus.START, self._jam)  # if only the reply was lost, the stream runs already
         self._buffer.clear()
         self._damaged.clear()
 
     def _restart(self) -> None:
-        # A restart takes 40 ms; `seq` and `lost` are then estimates from the clock at 7 kHz.
+        # A restart takes 40 ms. The number of records lost meanwhile is estimated from the clock.
         self._restarts += 1
         if self._restarts > _MAX_RESTARTS:
             raise ProtocolError(
@@ -227,13 +226,13 @@ class AtiSerialSensor(StreamingSensor):
         self._port.drain(_READ_S, _SILENCE_S)
 
     def _ask(self, request: bytes, before_again: Callable[[], object] | None = None) -> bytes:
-        """Exchange with retries; by default a late reply is read between them."""
+        """Send a request up to three times and return the reply. By default a late reply is dropped in between."""
         again = before_again or (lambda: self._port.read(_BATCH_BYTES))
         return ask(self._port, self.name, request, modbus.check_reply, self._clock, _REPLY_S, again)
 
     def _judge_status(self, status: int) -> None:
-        """Raise when the data is unusable; log other status bits once."""
-        # The RS-485 port of a NETCANOEM without CAN has bit 15 ("any error") set all the time.
+        """Raise `DeviceFault` if the data are unusable; log other status bits once."""
+        # On the RS-485 port of a NETCANOEM without CAN, bit 15 ("any error") is always set.
         new, self._status = status & ~self._status, status
         text = describe_status(status, modbus.STATUS_BITS)
         if status & modbus.CRITICAL:
@@ -245,7 +244,7 @@ class AtiSerialSensor(StreamingSensor):
 
 
 def _streams(data: bytes) -> bool:
-    """Require a right checksum in 20 records or more, because they have neither header nor number."""
+    """Return whether 20 records in a row have a correct checksum; records have neither header nor number."""
     data = data[-100 * modbus.RECORD_SIZE :]
     if not data.strip(b"\0"):
         return False
@@ -256,7 +255,7 @@ def _streams(data: bytes) -> bool:
     return False
 
 
-# Serial and part number of the first stored calibration.
+# Reads serial number and part number of the first stored calibration.
 _IDENTITY_REQUEST = modbus.read_registers(modbus.calibration_reads(1)[0][0], 20)
 
 

@@ -3,7 +3,7 @@
 Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs and ROS drivers.
 Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py.
 
-A decoder returns a value or raises `ProtocolError`, never anything else. All numbers are little-endian.
+A decoder returns a value or raises `ProtocolError` and no other exception. All numbers are little-endian.
 """
 
 import math
@@ -22,7 +22,7 @@ STATUS_BITS = {0: "application too slow", 1: "overrange", 2: "invalid measuremen
 OVERRANGE, INVALID, RAW = 2, 4, 8
 
 BAUDS = (9600, 57_600, 115_200, 230_400, 460_800)
-"""In the order of their codes 0 to 4."""
+"""Baud rates in the order of their codes 0 to 4."""
 DEFAULT_BAUD = 230_400
 
 ENTER_SETUP, ENTER_RUN, ASK_SERIAL = b"C", b"R", b"p?"
@@ -33,7 +33,7 @@ _SERIAL_REPLY = re.compile(rb"p,\d,(\d+),[^,\r\n]*,[^,\r\n]*,([ -~]*)")
 
 
 class Identity(NamedTuple):
-    """What a sensor reports about itself; empty where it does not."""
+    """Name, serial number and firmware that a sensor reports; empty texts for what it does not report."""
 
     name: str
     serial: str
@@ -45,26 +45,26 @@ class Frame(NamedTuple):
 
     status: int
     wrench: tuple[float, ...]
-    """(6,) N and N·m."""
+    """(6,) force in N, then torque in N·m."""
     t_us: int
-    """The sensor's clock, which wraps at 2**32 µs, that is every 71.6 minutes."""
+    """Time on the sensor's clock, µs, which wraps at 2**32 µs, that is every 71.6 minutes."""
     temperature_C: float
 
 
 def is_frame(data: bytes) -> bool:
-    """Return whether bytes are a whole frame: length, header and checksum."""
+    """Return whether bytes are a complete frame with correct header and checksum."""
     return (
         len(data) == FRAME_SIZE and data.startswith(HEADER) and crc16_x25(data[1:-2]).to_bytes(2, "little") == data[-2:]
     )
 
 
 def deframer() -> Deframer:
-    """Build a finder of frames in a stream of bytes."""
+    """Return a `Deframer` for these frames."""
     return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
 def decode_frame(data: bytes) -> Frame:
-    """Decode a whole frame."""
+    """Decode a complete frame."""
     if not is_frame(data):
         raise ProtocolError(f"the bytes {data.hex(' ')} are not a frame")
     status, *wrench, t_us, temperature_C = _PAYLOAD.unpack_from(data, 1)
@@ -74,7 +74,7 @@ def decode_frame(data: bytes) -> Frame:
 
 
 def find_identity(text: bytes) -> Identity:
-    """Find what a sensor has printed while it booted, or replied to `ASK_SERIAL`; other bytes may surround it."""
+    """Find the identity in the boot text of a sensor or in its reply to `ASK_SERIAL`, possibly among other bytes."""
     if reply := _SERIAL_REPLY.search(text):
         return Identity(reply[2].decode("ascii").strip(), reply[1].decode("ascii"), "")
     found = (pattern.search(text) for pattern in (_NAME, _SERIAL, _FIRMWARE))
@@ -82,19 +82,20 @@ def find_identity(text: bytes) -> Identity:
 
 
 def find_baud(text: bytes) -> int | None:
-    """Find the baud rate of a sensor in its configuration, which it prints at 230400 baud while it boots."""
+    """Return the baud rate in the configuration that a sensor prints at 230400 baud while it boots, or None."""
     match = _CONFIGURATION.search(text)
     return None if match is None else BAUDS[int(match[1])]
 
 
 def setup_commands(baud: int, sinc: int) -> tuple[bytes, bytes]:
-    """Build the commands that select calibrated binary frames, and set the length of the sinc filter.
+    """Return the commands that select calibrated binary frames and set the length of the sinc filter.
 
-    Without temperature compensation (vendor's advice); no chopping, no fast mode, FIR off (the vendor's example).
+    They switch temperature compensation off, as the vendor advises, and chopping, fast mode and FIR filter, as in the
+    vendor's example.
     """
     return f"c,0,1,0,{BAUDS.index(baud)}".encode("ascii"), f"f,{sinc},0,0,1".encode("ascii")
 
 
 def success(command: bytes) -> bytes:
-    """Return the confirmation of a command."""
+    """Return the bytes with which the sensor confirms a command."""
     return b"r,0," + command[:1] + b",0"

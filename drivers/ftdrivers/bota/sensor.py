@@ -3,9 +3,9 @@
 Ref: Bota Systems, serial interface of SensONE and Rokubi, as in the vendor's example programs and ROS drivers.
 Checked on hardware: no. Verified against: tests/unit/drivers/bota/test_codec.py and the emulator (tests/wire).
 
-The sensor streams from power-up on. Opening its port restarts it, unless it has its own supply; the maker's driver
-waits 3 s for it. This driver only reads, unless the address configures the filter; `close` leaves the stream running.
-It does not require the boot text, which may have been sent hours ago.
+The sensor streams after power-up. Opening its port restarts it, unless it has its own supply; the vendor's driver waits
+3 s. This driver only reads, unless the address configures the filter. `close` leaves the stream running. The boot text
+is optional, because a sensor with its own supply may have sent it long ago.
 """
 
 import contextlib
@@ -28,18 +28,18 @@ from ftdrivers.wires.serial_port import SerialPort, SerialProbe, other_baud
 
 log = logging.getLogger(__name__)
 
-# The rates of the maker's examples, and the default of its ROS 2 driver.
+# Baud rates of the vendor's examples, and of its ROS 2 driver.
 _USUAL_BAUDS = (460_800, codec.DEFAULT_BAUD)
-# The median of their spacing is the sample period.
+# Number of frames whose median spacing gives the sample period.
 _FIRST_FRAMES = 8
-# The longest wait for a sensor that boots.
+# Time-out for a sensor that boots, s.
 _BOOT_S = 5.0
-# More than the boot text: so many without an intact frame are of another baud rate or format.
+# If so many bytes, more than the boot text, contain no frame, the baud rate or the format is wrong.
 _NOISE_BYTES = 40 * codec.FRAME_SIZE
-# A port that is closed for less may not restart the sensor, which then prints no boot text.
+# Time for which the port is closed, s. After a shorter time the sensor may not restart and prints no boot text.
 _CLOSED_S = 0.1
 _REPLY_S = 1.0
-# The first ones are not heard while the sensor boots.
+# The first commands are ignored while the sensor boots.
 _ATTEMPTS = 5
 _CLOCK = 1 << 32
 
@@ -47,20 +47,20 @@ _CLOCK = 1 << 32
 class BotaSensor(StreamingSensor):
     """A Bota SensONE or Rokubi with the serial interface of 37-byte frames.
 
-    `t_device_s` is the sensor's clock, `seq` counts its sample periods, so that gaps are visible. `counts` are empty,
-    because the sensor sends N and N·m. Overrange, invalid and uncalibrated samples are a `DeviceFault`.
+    `t_device_s` is the time on the sensor's clock. `seq` counts its sample periods, so that gaps are visible. `counts`
+    are empty, because the sensor sends N and N·m. Overrange, invalid and uncalibrated samples raise `DeviceFault`.
 
     Parameters
     ----------
     port : str
-        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+        Serial port. A path such as ``/dev/serial/by-id/…`` remains valid after replugging.
     baud : int, optional
-        One of `codec.BAUDS`; without it, the driver tries 460800, then 230400.
+        Baud rate, one of `codec.BAUDS`. By default the driver tries 460800, then 230400.
     sinc : int, optional
-        Filter length, 64 to 2048, such as 512; the sample period is 19.53125 µs times this. With it, the driver
-        configures the sensor to stream calibrated binary frames; without it, the driver never sends anything.
+        Filter length, 64 to 2048, such as 512; the sample period is 19.53125 µs times the length. If it is given, the
+        driver configures the sensor to stream calibrated binary frames; otherwise the driver sends nothing.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(
@@ -72,17 +72,17 @@ class BotaSensor(StreamingSensor):
         if sinc is not None and not 64 <= sinc <= 2048:
             raise ValueError(f"sinc is {sinc}; choose 64 to 2048")
         bauds = _USUAL_BAUDS if baud is None else (baud,)
-        # The one that was opened last comes first.
+        # The port settings, with the last used baud rate first.
         self._ports = [(baud, SerialPort(self.name, port, baud, clock=clock)) for baud in bauds]
         self._port = self._ports[0][1]
         self._sinc = sinc
-        # What has arrived since the port was opened, before the first frames.
+        # Bytes received between opening the port and the first frames.
         self._text = b""
         self._temperature_C = math.nan
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``bota:///dev/serial/by-id/…?baud=460800&sinc=512``."""
+        """Build the driver from an address such as ``bota:///dev/serial/by-id/…?baud=460800&sinc=512``."""
         return cls(
             address,
             baud=options.integer("baud", 0, 0, 460_800) or None,
@@ -92,7 +92,7 @@ class BotaSensor(StreamingSensor):
         )
 
     def temperature_C(self) -> float | None:
-        """Return the temperature of the newest frame."""
+        """Return the temperature of the newest frame, °C."""
         return self._temperature_C if math.isfinite(self._temperature_C) else None
 
     def _connect(self) -> DeviceInfo:
@@ -132,16 +132,16 @@ class BotaSensor(StreamingSensor):
         )
 
     def _disconnect(self) -> None:
-        # The sensor is left streaming, as it was found.
+        # The sensor continues to stream, as before it was opened.
         self._port.close()
 
     def _find(self) -> list[codec.Frame]:
         """Open the port at the baud rate of the sensor, configure it if requested, and return its first frames."""
-        # The boot text is not waited for, because a sensor that runs already sends none.
+        # The boot text is not awaited, because a running sensor sends none.
         found, has_noise = list[str](), False
         for baud, port in tuple(self._ports):
             self._port, self._text, self._frames = port, b"", codec.deframer()
-            self._ports.sort(key=lambda one: one[0] != baud)  # a driver that reconnects tries the last one first
+            self._ports.sort(key=lambda port: port[0] != baud)  # this rate is tried first when the driver reconnects
             if found:
                 self._clock.sleep(_CLOSED_S)
             port.open()
@@ -159,16 +159,16 @@ class BotaSensor(StreamingSensor):
         raise ConnectError(f"{self.name}: {', '.join(found)}", fix)
 
     def _configure(self, baud: int, sinc: int) -> None:
-        # Only what the address requests is changed; an unusual mode needs ?sinc=512 once.
+        # Only what the address requests is changed; a sensor in another mode needs ?sinc=512 once.
         self._command(codec.ENTER_SETUP)
-        if not codec.find_identity(self._text).serial:  # it has not just booted
+        if not codec.find_identity(self._text).serial:  # the sensor did not boot now, and must be asked
             with contextlib.suppress(DeviceTimeout):
                 self._command(codec.ASK_SERIAL, attempts=1)
         for command in (*codec.setup_commands(baud, sinc), codec.ENTER_RUN):
             self._command(command)
 
     def _command(self, command: bytes, attempts: int = _ATTEMPTS) -> None:
-        """Send a command until it is confirmed; its reply comes after frames that were already sent."""
+        """Send a command until the sensor confirms it. Frames may arrive before the reply."""
         for _ in range(attempts):
             begin = len(self._text)
             self._port.write(command)
@@ -178,7 +178,7 @@ class BotaSensor(StreamingSensor):
                 self._frames.feed(data)
                 if codec.success(command) in self._text[begin:]:
                     return
-        raise DeviceTimeout(f"'{command.decode()}' was not confirmed within {attempts} times {_REPLY_S:g} s")
+        raise DeviceTimeout(f"'{command.decode()}' was not confirmed in {attempts} attempts of {_REPLY_S:g} s")
 
     def _first_frames(self) -> list[codec.Frame]:
         frames: list[codec.Frame] = []
@@ -195,7 +195,7 @@ class BotaSensor(StreamingSensor):
         raise DeviceTimeout(f"{self._frames.arrived} within {self._clock.now_s() - begin_s:.1f} s")
 
     def _elapse(self, t_us: int) -> tuple[int, int]:
-        """Unwrap the sensor's clock; return (time in µs, sequence number)."""
+        """Unwrap a time of the sensor's clock; return (time in µs, sequence number)."""
         step_us = (t_us - self._t_us) % _CLOCK
         if step_us > _CLOCK // 2:
             raise StreamBroken(
@@ -203,14 +203,14 @@ class BotaSensor(StreamingSensor):
             )
         self._t_us += step_us
         if not step_us:
-            return self._t_us, self._seq  # the same sample again
+            return self._t_us, self._seq  # a duplicate
         periods = max(1, round(step_us / self._period_us))
         self._seq += periods
         self._lost += periods - 1
         return self._t_us, self._seq
 
     def _judge(self, status: int) -> None:
-        """Raise when a sample is unusable; log other status bits once."""
+        """Raise `DeviceFault` if a sample is unusable; log other status bits once."""
         if status & (codec.RAW | codec.OVERRANGE | codec.INVALID):
             found = f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}"
             if status & codec.RAW:

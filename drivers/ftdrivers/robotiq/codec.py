@@ -4,7 +4,7 @@ Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modb
 firmware as in Robotiq's own C driver.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotiq/test_codec.py.
 
-A decoder returns a value or raises `ProtocolError`, never anything else. Registers are big-endian, the stream is
+A decoder returns a value or raises `ProtocolError` and no other exception. Registers are big-endian, the stream is
 little-endian.
 """
 
@@ -23,15 +23,15 @@ FIRMWARE, SERIAL = 500, 510
 START_STREAM = _modbus.write_registers(ADDRESS, 410, [0x0200])
 
 STOP = b"\xff" * 50
-"""Stops a running stream, which may take 0.5 s."""
+"""Bytes that stop a running stream, which may take 0.5 s."""
 
 HEADER = b"\x20\x4e"
 FRAME_SIZE = 16
 NOMINAL_RATE_Hz = 100.0
 COUNTS_PER_UNIT = (100, 100, 100, 1000, 1000, 1000)
-"""Per N and per N·m."""
+"""(6,) counts per N and per N·m."""
 RANGE = (300.0, 300.0, 300.0, 30.0, 30.0, 30.0)
-"""N and N·m, in both directions."""
+"""(6,) largest force in N and torque in N·m, in both directions."""
 
 
 Refused = _modbus.Refused
@@ -40,13 +40,13 @@ reply_size = _modbus.reply_size
 
 
 def check_reply(request: bytes, reply: bytes) -> tuple[int, ...]:
-    """Check a whole reply against its request and return the registers in it; none for a write."""
+    """Check a complete reply to a request and return its registers; an empty tuple for a write request."""
     payload = _modbus.check_reply(request, reply)
     return struct.unpack(f">{len(payload) // 2}H", payload)
 
 
 def is_frame(data: bytes) -> bool:
-    """Return whether bytes are a whole stream frame: length, header and checksum."""
+    """Return whether bytes are a complete stream frame with correct header and checksum."""
     return (
         len(data) == FRAME_SIZE
         and data.startswith(HEADER)
@@ -55,7 +55,7 @@ def is_frame(data: bytes) -> bool:
 
 
 def deframer() -> Deframer:
-    """Build a finder of frames in a stream of bytes."""
+    """Return a `Deframer` for these frames."""
     return Deframer(HEADER, FRAME_SIZE, is_frame)
 
 
@@ -89,5 +89,5 @@ def _words(registers: Sequence[int], count: int) -> Sequence[int]:
 
 
 def _letters(*codes: int) -> str:
-    """Decode character codes; empty where one of them is not printable."""
+    """Decode character codes; return an empty text if one of them is not printable."""
     return bytes(codes).decode("ascii") if all(0x20 < code < 0x7F for code in codes) else ""

@@ -1,11 +1,11 @@
-"""Robotiq FT 300 and FT 300-S force/torque sensor on a serial port, or through the URCap that owns the port.
+"""Robotiq FT 300 and FT 300-S force/torque sensor on a serial port, or through Robotiq's URCap on the controller.
 
-On the port: Modbus RTU for set-up, then a bare stream at 100 Hz, which may run directly after boot. Only 50 bytes of
-0xFF stop it. The sensor has no zero command: other programs zero on the host.
+On a serial port the sensor is set up by Modbus RTU and then sends a stream at 100 Hz, which may run directly after
+boot. Only 50 bytes of 0xFF stop the stream. The sensor has no command for zeroing; other programs zero on the host.
 
 The URCap sends readings such as ``( 1.5 , -2.0 , 30.0 , 0.1 , 0.2 , 0.3 )`` in N and N·m to every client of port 63351,
-about 100 a second, without a separator between them. They are after the zero that the URCap has set, which it does not
-report. This driver sends nothing.
+about 100 per second, without separators. The URCap subtracts its zero, which it does not report. The driver sends
+nothing.
 
 Ref: Robotiq, "FT 300 Force Torque Sensor" instruction manual, control over Modbus RTU and data stream; Robotiq's Linux
 driver (the format), and public clients of the URCap (port, rate).
@@ -30,23 +30,23 @@ from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 PORT = 63351
 _CONNECT_S = 2.0
 _RECEIVE_BYTES = 65536
-# (6,) N and N·m: the end of the sensor's 16 bits. The URCap's zero may hide it.
+# (6,) largest value of 16 bits, N and N·m. The zero of the URCap may hide that a value has reached it.
 _END = 32_767 / np.array(codec.COUNTS_PER_UNIT)
-# No reading is longer.
+# Longest reading, bytes.
 _MOST_BYTES = 512
 
 
 class Readings:
-    """Readings in a stream of text, whose parts arrive in any pieces."""
+    """Finds readings in a stream of text that arrives in pieces of any length."""
 
     def __init__(self) -> None:
         self.number = 0
-        """Number of the last reading, damaged ones included."""
+        """Number of the last reading. Damaged readings are counted as well."""
         self.damaged = 0
         self._rest = b""
 
     def feed(self, data: bytes) -> list[tuple[int, list[float]]]:
-        """Return the readings that are complete now: their number, and six values in N and N·m."""
+        """Add received text; return the completed readings as (number, six values in N and N·m)."""
         *pieces, rest = (self._rest + data).split(b")")
         self._rest = rest[-_MOST_BYTES:]
         found = []
@@ -64,19 +64,19 @@ class Readings:
 
 
 class RobotiqUrcap(StreamingSensor):
-    """A Robotiq FT 300 or FT 300-S behind the URCap of the controller, about 100 Hz, read-only.
+    """A Robotiq FT 300 or FT 300-S that is read through the URCap of the controller, about 100 Hz.
 
-    `counts` are empty, because the URCap sends N and N·m. `t_device_s` is NaN and `status` is 0, as it reports neither.
-    Readings carry no number: `seq` counts arrived ones, including damaged ones.
+    `counts` are empty, because the URCap sends N and N·m. `t_device_s` is NaN and `status` is 0, because it reports
+    neither. Readings carry no number: `seq` counts received readings, including damaged ones.
 
     Parameters
     ----------
     host : str
         Address of the controller.
     port : int
-        Port of the URCap.
+        TCP port of the URCap.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(self, host: str, *, port: int = PORT, sign: int = 1, clock: Clock = REAL) -> None:
@@ -136,7 +136,7 @@ class RobotiqUrcap(StreamingSensor):
 
 
 def _host_and_port(address: str) -> tuple[str, int | None]:
-    """Split the address of a controller; raises `ValueError` with what to write."""
+    """Split the address of a controller into host and port. Raises `ValueError` with an example of a valid address."""
     try:
         parts = urlsplit(f"//{address}")
         if parts.hostname and parts.netloc == address:
@@ -151,25 +151,25 @@ def _host_and_port(address: str) -> tuple[str, int | None]:
 
 _BAUD = 19_200
 _REPLY_S = 0.2
-# The silence that proves that a stream has stopped, and the longest wait for it.
+# Silence after which a stream has stopped, and the time-out for it, s.
 _SILENCE_S, _STOP_S = 0.05, 1.0
-# Around 62.5 Hz, one delivery in each 16 ms of an FTDI adapter's latency timer.
+# Rates around 62.5 Hz: an FTDI adapter whose latency timer is 16 ms delivers so often.
 _LATENT_RATE_Hz = (55.0, 70.0)
 
 
 class RobotiqFt300(StreamingSensor):
     """A Robotiq FT 300 or FT 300-S, 100 Hz.
 
-    `counts` are the six raw values (0.01 N and 0.001 N·m), `t_device_s` is NaN, `status` is 0, as the sensor reports
-    neither. A value at the end of its 16 bits is a `DeviceFault`. Frames carry no number: `seq` counts arrived frames,
-    including damaged ones, so a wholly lost frame shows only in the rate.
+    `counts` are the six raw values (0.01 N and 0.001 N·m). `t_device_s` is NaN and `status` is 0, because the sensor
+    reports neither. A value at the end of its 16 bits raises `DeviceFault`. Frames carry no number: `seq` counts
+    received frames, including damaged ones, so that a lost frame is only visible in the rate.
 
     Parameters
     ----------
     port : str
-        The serial port; ``/dev/serial/by-id/…`` survives replugging.
+        Serial port. A path such as ``/dev/serial/by-id/…`` remains valid after replugging.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(self, port: str, *, sign: int = 1, clock: Clock = REAL) -> None:

@@ -142,7 +142,7 @@ def test_a_command_has_a_second_and_is_sent_five_times(table: Table) -> None:
         pass
     wire = table.serial([(b"C", b"")] * 5)
     start_s = wire.clock.now_s()
-    with wire, pytest.raises(ConnectError, match="'C' was not confirmed within 5 times 1 s at 460800 baud;"):
+    with wire, pytest.raises(ConnectError, match="'C' was not confirmed in 5 attempts of 1 s at 460800 baud;"):
         Sensor(wire.clock, baud=460_800, sinc=512).open()
     assert wire.clock.now_s() - start_s == pytest.approx(5.0, abs=0.3)
 
