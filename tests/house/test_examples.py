@@ -21,7 +21,7 @@ NAMES = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 NOTEBOOKS = sorted(
     path.stem for path in PAGES.glob("*.md") if "file_format: mystnb" in path.read_text(encoding="utf-8")
 )
-"""The pages are built with what they show, and `test_wheel.py` runs them."""
+"""Sphinx runs them when it builds the pages."""
 
 
 def cells_of(notebook: str) -> list[str]:

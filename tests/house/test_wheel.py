@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.house.example_data import EXAMPLES, PUSH_N
-from tests.house.test_examples import NOTEBOOKS, SLOW, cells_of
+from tests.house.example_data import EXAMPLES
+from tests.house.test_examples import SLOW
 from tests.house.uv import run_uv
 
 ROOT = EXAMPLES.parent
@@ -26,25 +26,13 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
-def environment(wheel: Path, name: str, *packages: str) -> Path:
-    """Return the interpreter of an environment that has only the wheel, what it requires, and these packages."""
-    folder = wheel.parent
-    run_uv("venv", "--python", sys.executable, folder / name, cwd=folder)
-    interpreter = folder / name / "bin/python"
-    run_uv("pip", "install", "--python", interpreter, wheel, *packages, cwd=folder)
-    return interpreter
-
-
 @pytest.fixture(scope="module")
 def python(wheel: Path) -> Path:
     """The interpreter of an environment that has only the wheel and what it requires."""
-    return environment(wheel, "venv")
-
-
-@pytest.fixture(scope="module")
-def python_of_notebooks(wheel: Path) -> Path:
-    """The interpreter of an environment that also has what a notebook shows figures and DataFrames with."""
-    return environment(wheel, "notebooks", "matplotlib", "pandas")
+    folder = wheel.parent
+    run_uv("venv", "--python", sys.executable, folder / "venv", cwd=folder)
+    run_uv("pip", "install", "--python", folder / "venv/bin/python", wheel, cwd=folder)
+    return folder / "venv/bin/python"
 
 
 @pytest.fixture(scope="module")
@@ -89,17 +77,3 @@ def test_the_wheel_installs_four_packages_and_nothing_else(python: Path, user_fo
 def test_an_example_runs_from_the_wheel(name: str, python: Path, user_folder: Path) -> None:
     printed = run(python, f"{name}.py", cwd=user_folder)
     assert printed == (EXAMPLES / f"output/{name}.txt").read_text(encoding="utf-8")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NOTEBOOKS)
-def test_a_notebook_runs_from_the_wheel(name: str, python_of_notebooks: Path, user_folder: Path) -> None:
-    folder = user_folder.parent / "docs/examples"  # as its page, beside the examples
-    if not folder.exists():
-        folder.mkdir(parents=True)
-        (user_folder.parent / "examples").symlink_to(user_folder)
-    printed = run(python_of_notebooks, "-W", "error", "-c", "\n".join(cells_of(name)), cwd=folder)
-    # A contact is over up to 0.1 s after a push of 0.5 s.
-    of_live = "0.5 s, peak 12 N", "0.6 s, peak 12 N"
-    pushed = {"csv_to_contact_forces": (f"Fz {PUSH_N[2]:+.2f} N",), "live_contact_and_a_push": of_live}
-    assert printed.splitlines()[-1].startswith(pushed[name])

@@ -1,14 +1,11 @@
 """The demo recovers the truth within its own sigmas, and its run can be replayed, solved again and shown live."""
 
-import json
-import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine, assert_demo_found_the_truth
 
 pytestmark = pytest.mark.slow
@@ -60,28 +57,3 @@ def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str,
         assert np.abs(look["compensated"][key]).max() < limit
         assert np.abs(np.divide(look["compensated"][key], look["sigma"][key])).max() < 6
     assert np.linalg.norm(look["raw"]["force_N"]) > 1
-
-
-def test_the_python_of_the_readme_runs(
-    demo: dict[str, Any], ftdrive: CommandLine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    made_by = json.loads((Path(demo["run"]) / "run.json").read_text())["station"]
-    printed: list[tuple[Any, ...]] = []
-
-    def show(*values: Any) -> None:
-        printed.append(values)
-        if len(printed) == 100:
-            raise KeyboardInterrupt
-
-    with Station(made_by["sensor"], (*made_by["options"], "--time-scale", "1")) as station:
-        ftdrive.connect(station).rename(ftdrive.folder / "ftdrive.toml")
-        monkeypatch.chdir(ftdrive.folder)
-        monkeypatch.setenv("FTDRIVE_CLOCK", station.endpoints["clock"])
-        with pytest.raises(KeyboardInterrupt):
-            exec(program.replace("runs/…", demo["run"]), {"print": show})
-    _, force_N, torque_Nm, _, frame = printed[-1]
-    assert np.linalg.norm(force_N) < 0.5
-    assert np.linalg.norm(torque_Nm) < 0.05
-    assert str(frame) == "sensor axes, about the sensor origin"

@@ -16,7 +16,7 @@ ANSWERS = "yes\nyes\nyes\nMOVE\nyes\n"
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("serial", ["--seed", "3"]) as station:
+    with Station("robotous-serial", ["--seed", "3"]) as station:
         yield station
 
 

@@ -24,7 +24,7 @@ FIRST_MOTION = "MOVE\nyes\n"
 @pytest.fixture
 def station() -> Iterator[Station]:
     options = ["--seed", "5", "--payload", "1.5"]
-    with Station("serial", options) as station:
+    with Station("robotous-serial", options) as station:
         yield station
 
 

@@ -24,7 +24,7 @@ LIMITS = ("--max-force", "0.2", "--max-torque", "0.02")
 
 @pytest.fixture
 def station() -> Iterator[Station]:
-    with Station("serial", ["--seed", "5"]) as station:
+    with Station("robotous-serial", ["--seed", "5"]) as station:
         yield station
 
 

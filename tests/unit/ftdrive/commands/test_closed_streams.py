@@ -67,10 +67,8 @@ def test_the_end_of_a_command_collects_no_garbage() -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("setsid") is None, reason="setsid of util-linux gives a process its terminal")
-@pytest.mark.parametrize(
-    "command", ["record -o a.mcap", "stream --port 0", "serve-load", "live", "live --plain", "weigh"]
-)
-def test_a_closed_terminal_ends_each_command_of_the_stream_well(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("command", ["record -o a.mcap", "live"])  # a file that must be kept, and a screen
+def test_a_closed_terminal_ends_a_command_of_the_stream_well(command: str, tmp_path: Path) -> None:
     calibration().save(tmp_path / "calibration.json")
     options = ["--simulate", "--force", "--calibration", "calibration.json"]
     terminal, slave = pty.openpty()
@@ -82,15 +80,15 @@ def test_a_closed_terminal_ends_each_command_of_the_stream_well(command: str, tm
         cwd=tmp_path,
     )
     os.close(slave)
-    shown, ready = "", {"record": " s, ", "serve-load": "registers", "stream": "Ctrl-C"}
-    deadline_s = time.monotonic() + 60
+    shown, ready = "", " s, " if command.startswith("record") else "\x1b["
+    deadline_s = time.monotonic() + 300
     try:
-        while ready.get(command.split(maxsplit=1)[0], "\x1b[") not in shown:
+        while ready not in shown:
             assert time.monotonic() < deadline_s, shown
             if select.select([terminal], [], [], 0.1)[0]:
                 shown += os.read(terminal, 4096).decode(errors="replace")
         os.close(terminal)
-        assert process.wait(timeout=60) == 9
+        assert process.wait(timeout=300) == 9
     finally:
         process.kill()
         process.wait()
