@@ -13,7 +13,11 @@ WORLDS = {
         "usable",  # turned so far, the sensor has the tool behind it, as it would be with reversed torques
         ["--mount", "wall", "--tcp", "0.03,-0.02,0.15,0.4,-0.3,0.9", "--sensor-rotvec-deg", "79.1,-98.9,52.7"],
     ),
-    "arm under a ceiling, base tilted by 8 degrees": ("robotous-serial", "good", ["--mount", "ceiling", "--tilt-deg", "8,0"]),
+    "arm under a ceiling, base tilted by 8 degrees": (
+        "robotous-serial",
+        "good",
+        ["--mount", "ceiling", "--tilt-deg", "8,0"],
+    ),
 }
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import dataclass, field
 from math import radians
 from typing import Any
 
@@ -20,6 +19,7 @@ from ftdrivers.ur.timing import UrTiming
 from tests.cell_time import CellTime
 from tests.ur_rtde import require_ur_rtde
 from tests.wire.laboratory import Laboratory
+from tests.wire.sensor_kinds import KINDS
 from tests.wire.station_process import StationProcess
 
 TIME_SCALE = 10
@@ -132,36 +132,6 @@ WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
 
-@dataclass(frozen=True)
-class Kind:
-    """What a test must know about one sort of sensor."""
-
-    scheme: str
-    query: str
-    quantisation: tuple[float, float]
-    rate_Hz: float
-    counts: int
-    serial: str
-    options: dict[str, Any] = field(default_factory=dict)
-    name: str = ""
-    """Of the emulator, where it is not the scheme."""
-
-
-KINDS = {
-    kind.name or kind.scheme: kind
-    for kind in (
-        Kind("ati-can", "interface=slcan", (0.02, 0.001), 1000, 6, "FT"),
-        Kind("ati-serial", "", (0.02, 0.001), 7000, 6, "FT"),
-        Kind("robotous-can", "interface=slcan", (0.02, 0.0005), 200, 6, "A60HA00123"),
-        Kind("robotous-serial", "", (0.02, 0.0005), 200, 6, "A60HA00123"),
-        Kind("robotiq-ft300", "", (0.01, 0.001), 100, 6, "FTS-1234"),
-        Kind("robotiq-ft300", "", (0.01, 0.001), 100, 0, "not reported", {"port": 0}, name="robotiq-urcap"),
-        Kind("bota", "", (1e-5, 1e-6), 100, 0, "1", {"boot_s": 0.05}),
-        Kind("ati-netft", "", (1e-6, 1e-6), 1000, 6, "FT12345", {"rdt_port": 0, "rate_hz": 1000}),
-    )
-}
-
-
 @pytest.fixture
 def cell_time() -> Iterator[CellTime]:
     """The clocks of emulated sensors and of their drivers, where both are in the test's process."""
@@ -228,7 +198,7 @@ def start(laboratory: Laboratory) -> Iterator[Callable[..., Emulator]]:
         emulator.stop()
 
 
-@pytest.fixture(scope="module", params=KINDS)
+@pytest.fixture(scope="module", params=[name for name in KINDS if name != "ur-ft"])
 def shared(request: pytest.FixtureRequest, laboratory: Laboratory) -> Iterator[Emulator]:
     """A healthy emulator of every kind, for tests that leave it as they found it."""
     emulator = Emulator(laboratory, request.param, {})

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,10 @@ from numpy.typing import NDArray
 
 from ftdrive.cell.emulated_clock import EmulatedClock
 from ftmocks.clock import CellClock
-from ftmocks.sensors.ati_can import AtiCanNode
-from ftmocks.sensors.ati_serial import AtiSerialBox
-from ftmocks.sensors.bota import BotaBox
-from ftmocks.sensors.netft import Calibration, NetFtBox
-from ftmocks.sensors.robotiq import RobotiqBox
-from ftmocks.sensors.robotiq_urcap import RobotiqUrcap
-from ftmocks.sensors.robotous import Model, RobotousCanNode, RobotousSerialBox
+from ftmocks.sensors.netft import Calibration
+from ftmocks.sensors.robotous import Model
 from ftmocks.wires.faults import Faults
+from tests.wire.sensor_kinds import KINDS
 
 Array = NDArray[np.float64]
 ROOT = Path(__file__).parents[2]
@@ -87,14 +84,7 @@ class Counter:
 
 def serve(*measured: Array) -> None:
     """Start, disturb and stop sensors as the lines on standard input say."""
-    from tests.wire.emulated_wrist import EmulatedWrist
-
     rng = np.random.default_rng(1)
-    kinds: dict[str, Any] = {
-        "ati-can": AtiCanNode, "ati-serial": AtiSerialBox, "robotous-can": RobotousCanNode, "bota": BotaBox,
-        "robotous-serial": RobotousSerialBox, "robotiq-ft300": RobotiqBox, "ati-netft": NetFtBox,
-        "robotiq-urcap": RobotiqUrcap, "ur-ft": EmulatedWrist,
-    }  # fmt: skip
     parts = {"faults": Faults, "model": Model, "calibration": Calibration}
     devices, counters, clock = list[Any](), list[Any](), CellClock()
 
@@ -118,7 +108,9 @@ def serve(*measured: Array) -> None:
                 for key, value in options.items()
             }
             counters.append(constant if measured else Counter())
-            devices.append(kinds[argument](counters[-1], seed=2 + len(devices), clock=clock, **given))
+            module, _, name = KINDS[argument].emulator.partition(":")
+            make = getattr(import_module(module), name)
+            devices.append(make(counters[-1], seed=2 + len(devices), clock=clock, **given))
             answer = [len(devices) - 1, devices[-1].start()]
         elif word == "faults":
             for key, value in options.items():

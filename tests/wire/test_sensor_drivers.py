@@ -13,20 +13,12 @@ import pytest
 from ftdrivers.clock import Clock
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.streaming.sensor import StreamingSensor
+from tests.wire.sensor_kinds import KINDS
 
 WRENCH = np.array([10.0, -5.0, 20.0, 0.5, -0.25, 0.1])  # what the emulators of conftest.py measure, with
 NOISE = np.array([0.03] * 3 + [0.001] * 3)
 
-SCHEMES = (
-    "ati-can",
-    "ati-serial",
-    "robotous-can",
-    "robotous-serial",
-    "robotiq-ft300",
-    "robotiq-urcap",
-    "bota",
-    "ati-netft",
-)
+SCHEMES = tuple(name for name in KINDS if name != "ur-ft")
 
 
 class Emulator(Protocol):
@@ -58,7 +50,7 @@ def test_wrench_counts_and_samples(shared: Emulator) -> None:
         samples = sensor.collect(0.3)
         info, health = sensor.identify(), sensor.health()
     n = len(samples)
-    bound = np.repeat(kind.quantisation, 3) / 2 + 5 * np.hypot(NOISE, np.repeat(kind.quantisation, 3)) / math.sqrt(n)
+    bound = np.repeat(kind.resolution, 3) / 2 + 5 * np.hypot(NOISE, np.repeat(kind.resolution, 3)) / math.sqrt(n)
     assert (np.abs(samples.wrench.mean(axis=0) - WRENCH) < bound).all()
     assert (np.diff(samples.seq) >= 1).all()
     assert samples.seq[-1] - samples.seq[0] + 1 - n <= health.lost <= max(3, 0.01 * n)

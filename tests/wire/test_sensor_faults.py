@@ -20,37 +20,9 @@ from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
 from tests.wire.laboratory import STEPS, Laboratory, numbers_in
+from tests.wire.sensor_kinds import KINDS
 
 pytestmark = pytest.mark.slow  # `test_sensor_drivers.py` has a share of it
-
-
-@dataclass(frozen=True)
-class Kind:
-    """What a test must know about one sort of sensor."""
-
-    scheme: str
-    query: str
-    options: dict[str, Any] = field(default_factory=dict)
-    name: str = ""
-    """Of the emulator, where it is not the scheme."""
-    numbered: bool = False
-    """Samples carry a number or time, or are asked for one by one: what came twice is noticed."""
-
-
-KINDS = {
-    kind.name or kind.scheme: kind
-    for kind in (
-        Kind("ati-can", "interface=slcan", numbered=True),
-        Kind("ati-serial", ""),
-        Kind("robotous-can", "interface=slcan"),
-        Kind("robotous-serial", "baud=921600&rate=1000", {"baud_code": 1}),
-        Kind("robotiq-ft300", ""),
-        Kind("robotiq-ft300", "", {"port": 0}, name="robotiq-urcap"),
-        Kind("bota", "baud=460800&sinc=64", {"boot_s": 0.05}, numbered=True),
-        Kind("ati-netft", "", {"rdt_port": 0, "rate_hz": 1000}, numbered=True),
-        Kind("ur-ft", "counts_per_N=1&counts_per_Nm=1", numbered=True),
-    )
-}
 
 
 class Emulator:
@@ -64,15 +36,16 @@ class Emulator:
         options: dict[str, Any] | None = None,
         clock: Clock | None = None,
     ) -> None:
-        self.kind = KINDS[scheme]
+        self.name, self.kind = scheme, KINDS[scheme]
+        self._query, fast_options = self.kind.fast or (self.kind.query, self.kind.options)
         self.clock: Clock = clock or laboratory.clock
         self._laboratory = laboratory
         self._link = link
-        self._options = self.kind.options | (options or {})
+        self._options = fast_options | (options or {})
         self.plug_in()
 
     def plug_in(self) -> None:
-        self._number, where = self._laboratory.request("start", self.kind.name or self.kind.scheme, self._options)
+        self._number, where = self._laboratory.request("start", self.name, self._options)
         ports: list[str] = []
         if isinstance(where, dict):
             self._options |= where
@@ -82,10 +55,10 @@ class Emulator:
             self._link.unlink(missing_ok=True)
             self._link.symlink_to(where)
             self._address = str(self._link)
-        self._query = "&".join(filter(None, [self.kind.query, *ports]))
+        self._ports = ports
 
     def sensor(self, options: str = "") -> StreamingSensor:
-        query = "&".join(filter(None, [self._query, options]))
+        query = "&".join(filter(None, [self._query, *self._ports, options]))
         sensor = sensor_from_url(f"{self.kind.scheme}://{self._address}?{query}".rstrip("?"), clock=self.clock)
         assert isinstance(sensor, StreamingSensor)
         return sensor
@@ -272,7 +245,7 @@ def reset(emulator: Emulator, before_s: float) -> list[Watched]:
         emulator.reset()
         errors = suffer(sensor, emulator.clock, 0.8)
         assert all(isinstance(exc, DeviceTimeout | StreamBroken) for exc in errors)
-        quiet = emulator.kind.scheme == "ati-netft" or emulator.kind.name == "robotiq-urcap"  # the box, the controller
+        quiet = emulator.kind.scheme == "ati-netft" or emulator.name == "robotiq-urcap"  # the box, the controller
         assert errors or sensor.health().lost or quiet
     return [watched]
 

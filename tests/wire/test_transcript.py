@@ -7,6 +7,7 @@ import tty
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,9 @@ from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript import Player, Transcript, Writer, recording
 from ftmocks.sensors.ati_can import AtiCanNode
 from ftmocks.sensors.ati_serial import AtiSerialBox
-from ftmocks.sensors.bota import BotaBox
 from ftmocks.sensors.robotiq import RobotiqBox
-from ftmocks.sensors.robotous import RobotousSerialBox
 from ftmocks.wires.faults import Faults
+from tests.wire.sensor_kinds import KINDS
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
 
@@ -42,20 +42,15 @@ def measured() -> Any:
     return lambda n: WRENCH + rng.normal(size=(n, 6)) * NOISE
 
 
-EMULATORS: dict[str, tuple[Any, str]] = {
-    "ati-serial": (AtiSerialBox, ""),
-    "robotous-serial": (RobotousSerialBox, ""),
-    "robotiq-ft300": (RobotiqBox, ""),
-    "bota": (BotaBox, ""),
-    "ati-can": (AtiCanNode, "?interface=slcan"),
-}
+RECORDED = ("ati-serial", "robotous-serial", "robotiq-ft300", "bota", "ati-can")
 
 
-@pytest.fixture(params=EMULATORS)
+@pytest.fixture(params=RECORDED)
 def url(request: pytest.FixtureRequest, cell_time: Any) -> Iterator[str]:
-    kind, query = EMULATORS[request.param]
-    device = kind(measured(), seed=1, clock=cell_time.of_devices)
-    yield f"{request.param}://{device.start()}{query}"
+    kind = KINDS[request.param]
+    module, _, name = kind.emulator.partition(":")
+    device = getattr(import_module(module), name)(measured(), seed=1, clock=cell_time.of_devices)
+    yield f"{request.param}://{device.start()}?{kind.query}".rstrip("?")
     device.stop()
 
 

@@ -425,7 +425,7 @@ class StreamingSensor(ForceTorqueSensor):
             self._interruption = error, self._clock.now_s() + self._limits.recover_s
             self._note(str(error))
         first, deadline_s = self._interruption
-        self._fail(StreamBroken(f"{self.name}: the stream was interrupted and the driver reconnects ({error})"))
+        self._fail(StreamBroken(f"{self.name}: the stream was interrupted, reconnecting ({error})"))
         self._earlier_lost += self._lost
         self._earlier_malformed += self._malformed
         self._lost = self._malformed = 0

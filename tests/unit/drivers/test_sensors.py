@@ -9,6 +9,7 @@ import pytest
 
 from ftdrivers.sensors import SENSORS, SensorKind
 from ftmocks.sensors.catalogue import KINDS, WRIST
+from tests.wire.sensor_kinds import KINDS as ROWS
 
 ROOT = Path(__file__).parents[3]
 SCHEMES = {WRIST: WRIST} | {name: kind.scheme for name, kind in KINDS.items()}
@@ -26,14 +27,16 @@ def missing(scheme: str, kind: SensorKind) -> Iterator[str]:
         probe = {"serial": "SERIAL_PROBES", "can": "can_probe"}.get(kind.wire)
         if probe and not hasattr(driver, probe):
             yield f"{module}: {probe}, by which `devices --probe` finds the sensor"
-    package = module.split(".")[1]
-    if not list((ROOT / "tests/unit/drivers" / package).glob("test_*.py")):
-        yield f"tests/unit/drivers/{package}: a test of the codec with the bytes that the vendor's document prints"
+    tests = f"tests/unit/drivers/{module.split('.')[1]}"
+    if not list((ROOT / tests).glob("test_*.py")):
+        yield f"{tests}: a test of the codec with the bytes that the vendor's document prints"
     if not kind.emulated and kind.wire != "topic":
         yield "drivers/ftdrivers/sensors.py: the names of its emulators"
     for emulator in kind.emulated:
         if SCHEMES.get(emulator) != scheme:
             yield f"mocks/ftmocks/sensors/catalogue.py: the emulator {emulator}"
+    if scheme not in {row.scheme for row in ROWS.values()} and kind.wire != "topic":
+        yield "tests/wire/sensor_kinds.py: a row, which runs the tests of every driver"
     if f"| `{scheme}:" not in (ROOT / "docs/reference/sensors.md").read_text(encoding="utf-8"):
         yield "docs/reference/sensors.md: a row with its address"
 
@@ -56,12 +59,18 @@ def test_every_emulated_sensor_has_a_driver() -> None:
                 "ftdrivers.acme.sensor",
                 "tests/unit/drivers/acme",
                 "drivers/ftdrivers/sensors.py",
+                "tests/wire/sensor_kinds.py",
                 "docs/reference/sensors.md",
             ],
         ),
         (
             SensorKind("ftdrivers.ati.netft:NetFtSensor", "serial", {"acme": "Acme sensor"}),
-            ["ftdrivers.ati.netft", "mocks/ftmocks/sensors/catalogue.py", "docs/reference/sensors.md"],
+            [
+                "ftdrivers.ati.netft",
+                "mocks/ftmocks/sensors/catalogue.py",
+                "tests/wire/sensor_kinds.py",
+                "docs/reference/sensors.md",
+            ],
         ),
     ],
 )
