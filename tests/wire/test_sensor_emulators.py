@@ -7,14 +7,11 @@ from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
-import serial
 from numpy.typing import NDArray
 
-from ftmocks.sensors.bota import BotaBox, banner, stream_frame
 from ftmocks.sensors.netft import RECORD, NetFtBox
-from tests.wire.waiting import LIMIT_S, read_to, wait_until
+from tests.wire.waiting import LIMIT_S
 
-BOTA_WRENCH = np.array([1, -2, 9.81, 0.1, -0.2, 0.3])
 RDT_ONE = bytes.fromhex("12 34 00 02 00 00 00 01")
 RDT_BIAS = bytes.fromhex("12 34 00 42 00 00 00 00")
 RDT_WRENCH = np.array([1.5, -2.25, 10, 0.1, -0.05, 0.025])
@@ -25,30 +22,6 @@ def constant(wrench: NDArray[np.float64]) -> Callable[[int], NDArray[np.float64]
 
 
 # ---------------------------------------------------------------- Bota
-
-
-def test_bota_restarts_when_its_port_is_opened_and_is_heard_at_its_own_speed_only() -> None:
-    box = BotaBox(constant(BOTA_WRENCH), boot_s=0.1)
-    frame = stream_frame(0, BOTA_WRENCH.tolist(), 0, 25.5)[3:27]
-    path = box.start()
-    try:
-        for _ in range(2):
-            with serial.Serial(path, 460_800, timeout=LIMIT_S) as port:
-                before = read_to(port, banner(12345))
-                assert b"c,0,1,0,4" not in before, "printed at 230400 baud"
-                assert frame in port.read(37)
-                port.write(b"C")
-                read_to(port, b"r,0,C,0\r\n")
-            wait_until(lambda: not box._was_open)
-        with serial.Serial(path, 230_400, timeout=LIMIT_S) as port:
-            assert read_to(port, b"c,0,1,0,4\r\n") == b""
-            received = port.read(1000)
-            assert b"App Init" not in received
-            assert frame not in received
-            port.write(b"C")
-            assert b"r,0,C,0" not in port.read(200), "it does not hear this"
-    finally:
-        box.stop()
 
 
 # ---------------------------------------------------------------- Net F/T
@@ -130,26 +103,3 @@ def test_rdt_bias_status_latch_and_reset(net_box: NetFtBox) -> None:
         assert record["status"] == 0x80020000
         assert record["counts"].tolist() == [1_500_000, -2_250_000, 400_000_000, 100_000, -50_000, 25_000]
         assert record["ft"] < 7000, "counts since the reset"
-
-
-def test_pynetft_reads_the_box(net_box: NetFtBox) -> None:
-    """What the published client asks for: the configuration page, a real-time stream, bias, and the stream again."""
-    pynetft = pytest.importorskip("pynetft")
-    net_box.rate_hz = 200
-    endpoint = net_box.start()
-    config = pynetft.Config(
-        sensor_host=endpoint["host"], rdt_port=endpoint["rdt_port"], http_port=endpoint["http_port"]
-    )
-    with pynetft.Client(config, queue_size=1000) as client:
-        samples = client.samples(timeout=LIMIT_S)
-        first = next(samples)
-        np.testing.assert_allclose(first.wrench, RDT_WRENCH)
-        assert first.force_unit is pynetft.ForceUnit.NEWTON
-        assert first.torque_unit is pynetft.TorqueUnit.NEWTON_METER
-        following = [next(samples).rdt_sequence for _ in range(50)]
-        assert following == list(range(first.rdt_sequence + 1, first.rdt_sequence + 51))
-        health = client.health()
-        assert (health.lost_count, health.malformed_count, health.device_error_count) == (0, 0, 0)
-        client.bias()
-        wait_until(lambda: not any(next(samples).wrench))
-    wait_until(lambda: not net_box.streaming)

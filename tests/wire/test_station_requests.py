@@ -2,8 +2,6 @@
 
 import json
 import math
-import socket
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,8 +10,6 @@ import numpy as np
 import pytest
 
 from ftmocks.__main__ import main
-from ftmocks.sensors.netft import RECORD, NetFtBox
-from tests.wire.rtde_socket import RtdeSocket
 from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S
 
@@ -128,34 +124,6 @@ def test_a_wrong_request_is_an_error_and_changes_nothing(
     np.testing.assert_allclose(wrench(station), before)
 
 
-def test_a_hand_moves_the_arm(station: StationProcess) -> None:
-    before = station.ask("state")
-    goal = [*before["q_rad"][:5], before["q_rad"][5] - 0.1]
-    assert station.ask("hand_move", q_rad=goal, speed_rad_s=0.5) == {"done": "hand-move"}
-    station.wait_for(lambda s: not s["moving"] and s["q_rad"] == pytest.approx(goal, abs=1e-6))
-    what = [event["what"] for event in station.ask("state", since=len(before["events"]))["events"]]
-    assert what == ["hand-move", "moves", "stands"], "and no program"
-
-
-def test_the_operator_guides_the_arm_and_lets_go(station: StationProcess) -> None:
-    before = station.ask("state")
-    try:
-        assert station.ask("hand-guide", rest_s=0.05) == {"done": "hand-guide"}
-        state = station.wait_for(lambda s: s["moving"] and abs(s["q_rad"][4] - before["q_rad"][4]) > 0.3)
-    finally:
-        station.ask("hand-guide", on=False)
-    assert state["runtime_state"] == "STOPPED"
-    assert state["q_rad"][:3] == before["q_rad"][:3]
-    station.wait_for(lambda s: s["steady"])
-
-
-def test_the_operator_starts_a_program_on_the_pendant(station: StationProcess) -> None:
-    assert station.ask("pendant-program", rest_s=0.05)["accepted"]
-    station.wait_for(lambda s: s["program"] == "turns" and s["moving"])
-    station.ask("dashboard-stop")
-    station.wait_for(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
-
-
 def test_a_pushed_joint_and_a_changed_payload(station: StationProcess) -> None:
     before = station.ask("state")
     station.ask("push-joint", joint=2, off_deg=3)
@@ -169,15 +137,6 @@ def test_a_pushed_joint_and_a_changed_payload(station: StationProcess) -> None:
     assert (state["payload_kg"], state["payload_cog_m"]) == (2.6, [0.01, 0, 0.05])
 
 
-def test_another_client_moves_the_arm(station: StationProcess) -> None:
-    before = station.ask("state")
-    goal = [*before["q_rad"][:5], before["q_rad"][5] + 0.1]
-    assert station.ask("foreign_program", q_rad=goal, speed_rad_s=0.5)["accepted"]
-    station.wait_for(lambda s: s["runtime_state"] == "STOPPED" and s["q_rad"] == pytest.approx(goal, abs=1e-6))
-    what = [event["what"] for event in station.ask("state", since=len(before["events"]))["events"]]
-    assert what == ["program other", "started other", "moves", "stands", "stopped other"]
-
-
 def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationProcess) -> None:
     with station.connect(29999) as dashboard:
         assert dashboard.recv(100).startswith(b"Connected")
@@ -189,44 +148,6 @@ def test_a_silent_arm_keeps_its_connections_and_answers_later(station: StationPr
         station.ask("silence_arm", on=False)
         dashboard.settimeout(LIMIT_S)
         assert dashboard.recv(100) == b"Robotmode: RUNNING\n"
-
-
-def test_a_program_swings_the_arm_and_inertia_comes_and_goes() -> None:
-    with StationProcess("--seed", "3", "--force-bias", "0,0,0") as station:
-        mass_kg, weight_N = station.hello["truth"]["mass_kg"], station.hello["truth"]["weight_N"]
-
-        def inertia_N(state: dict[str, Any]) -> float:
-            """Change of the load's magnitude, which weight alone does not make."""
-            return abs(math.hypot(*state["true_wrench"][:3]) - float(weight_N))
-
-        assert inertia_N(station.ask("state")) < 1e-6
-        swing = station.ask("swing", seconds=3, acceleration_m_s2=3)
-        assert swing["accepted"]
-        assert swing["seconds"] >= 3
-        state = station.wait_for(lambda s: inertia_N(s) > 0.5 * mass_kg)
-        assert (state["program"], state["runtime_state"]) == ("swing", "PLAYING")
-        assert "the arm moves" in station.refusal("swing", seconds=3)
-        station.ask("dashboard-stop")
-        state = station.wait_for(lambda s: s["steady"] and s["runtime_state"] == "STOPPED")
-        assert inertia_N(state) < 1e-6
-
-
-def test_a_production_runs_beside_a_reader_and_writes_its_truth(tmp_path: Path) -> None:
-    file, noise_rad = tmp_path / "truth.jsonl", 1e-2
-    scene = json.dumps({"do": "production", "file": str(file), "parts_kg": [1, 1]})
-    settings = ("--time-scale", "20", "--do", scene, "--imperfections", f"none,joint_noise_rad={noise_rad}")
-    with StationProcess(*settings) as station, RtdeSocket(station.host) as reader:
-        reader.ask("O", struct.pack(">d", 500.0) + b"actual_q,target_q,runtime_state")
-        reader.ask("S")
-        seen = [struct.unpack(">12dI", reader.answer()[4:]) for _ in range(500)]
-        assert "the arm moves" in station.refusal("production")
-        assert station.hello["imperfections"]["joint_noise_rad"] == noise_rad
-    lines = [json.loads(line) for line in file.read_text().splitlines()]
-    assert {line["part_kg"] for line in lines} == {0, 1}
-    assert lines[0]["event"] == "start"
-    q, target_q, runtime = np.split(np.array(seen), [6, 12], axis=1)
-    assert (runtime == 2).mean() > 0.9
-    assert np.std((q - target_q)[:, 1]) == pytest.approx(noise_rad, rel=0.2), "joint 2 is hardly late"
 
 
 def test_the_truth_names_the_inertia_and_the_sensor_origin(station: StationProcess) -> None:
@@ -251,32 +172,6 @@ def write_recording(path: Path) -> None:
     for k in range(4001):
         lines.append(f"{0.001 * k:.3f},{0.001 * k:.3f},0,0,0,0,0,0.5,-1.5,1,-0.5,1.5,{0.00025 * k},x")
     path.write_text("\n".join(lines) + "\n")
-
-
-def test_a_recording_comes_over_the_wires(tmp_path: Path) -> None:
-    write_recording(tmp_path / "peg.csv")
-    options = ("--sensor", "netft", "--recording", str(tmp_path / "peg.csv"), "--pace", "0")
-    with StationProcess(*options) as station, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
-        assert station.hello["truth"] is None
-        assert station.hello["recording"] == {"file": str(tmp_path / "peg.csv"), "samples": 4001, "duration_s": 4.0}
-        where = station.hello["sensors"]["netft"]
-        client.settimeout(LIMIT_S)
-        client.connect((where["host"], where["rdt_port"]))
-        client.send(struct.pack(">HHI", 0x1234, 2, 1500))  # so many samples in real time
-        first = np.frombuffer(client.recv(36), RECORD)
-        assert station.ask("recording", at_s=1.0, pace=1.0) == {"done": "recording", "at_s": 1.0, "pace": 1.0}
-        records = np.concatenate([first, *(np.frombuffer(client.recv(36), RECORD) for _ in range(1499))])
-        counts_per_N = NetFtBox(lambda n: np.zeros((n, 6))).calibration.counts_per_SI[0]
-        rows = np.round(1e3 * records["counts"][:, 0] / counts_per_N).astype(int)
-        assert rows[0] == 0, "held at the first row"
-        played = rows[rows >= 1000]
-        np.testing.assert_array_equal(played, np.arange(1000, 1000 + len(played)))
-        assert len(played) > 500
-        station.wait_for(lambda s: s["recording_s"] == 4.0)
-        end = pytest.approx([0.5, -1.5, 1, -0.5, 1.5, 1.0])
-        station.wait_for(lambda s: s["q_rad"] == end)  # the joints lag by some cycles
-        assert "follows a recording" in station.refusal("hand-move", q_rad=[0] * 6)
-        assert "not understood" in station.refusal("payload-shift", mass_kg=1)
 
 
 def test_requests_to_begin_with() -> None:

@@ -5,8 +5,6 @@ import os
 import signal
 import socket
 import struct
-import subprocess
-import sys
 from collections.abc import Iterator
 from random import Random
 from typing import Any
@@ -21,7 +19,7 @@ from ftmocks.ur import rtde
 from ftmocks.ur.uploads import take_uploads
 from ftmocks.ur.variables import INPUTS, OUTPUTS
 from tests.wire.rtde_socket import RtdeSocket
-from tests.wire.station_process import ROOT, StationProcess
+from tests.wire.station_process import StationProcess
 from tests.wire.waiting import LIMIT_S, wait_until
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
@@ -232,19 +230,6 @@ def test_the_first_line_reports_addresses_and_truth(station: StationProcess) -> 
     assert math.hypot(*truth["gravity_force_base_N"]) == pytest.approx(truth["weight_N"])
 
 
-def test_a_host_has_one_station(station: StationProcess) -> None:
-    taken = subprocess.run(
-        [sys.executable, "-m", "ftmocks", "station", "--sensor", "none", "--host", station.host],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        cwd=ROOT,
-        check=False,
-    )
-    assert taken.returncode == 3
-    assert "cannot listen" in taken.stderr
-
-
 @pytest.mark.parametrize("how", ["SIGTERM", "frozen"])
 def test_a_station_ends(how: str) -> None:
     with StationProcess() as cell, RtdeSocket(cell.host) as client:
@@ -256,28 +241,6 @@ def test_a_station_ends(how: str) -> None:
             cell.process.send_signal(signal.SIGTERM)
             assert cell.process.wait(LIMIT_S) == 0
         assert cell.quit() == 0
-
-
-def test_the_program_reads_the_clock_of_the_station(station: StationProcess) -> None:
-    clock = EmulatedClock(station.hello["clock"])
-    before_ns = clock.now_ns()
-    between_ns = station.ask("state")["t_host_ns"]
-    assert before_ns <= between_ns <= clock.now_ns()
-    station.ask("slider", fraction=1.0)
-    assert between_ns <= station.ask("state")["events"][-1]["t_host_ns"] <= clock.now_ns()
-
-
-def test_a_reader_that_keeps_up_holds_the_cell_until_it_goes_on(station: StationProcess) -> None:
-    clock = EmulatedClock(station.hello["clock"])
-    with clock.keeping_up(), RtdeSocket(station.host) as client:
-        client.ask("O", struct.pack(">d", 500.0) + b"timestamp")
-        client.ask("S")
-        held_ns = clock.now_ns() + LEAD_NS
-        wait_until(lambda: station.ask("state")["t_host_ns"] >= held_ns)
-        for _ in range(10):
-            assert station.ask("state")["t_host_ns"] == held_ns
-        clock.sleep(0.1)
-        assert clock.now_ns() >= held_ns + 0.05e9
 
 
 def test_the_clock_goes_on_when_the_station_was_killed() -> None:

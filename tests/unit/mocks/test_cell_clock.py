@@ -1,6 +1,5 @@
 """The clock of a cell: it follows real time, waits for its followers, and survives those that end or stop."""
 
-import fcntl
 import mmap
 import os
 import signal
@@ -12,18 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from ftdrive.cell.emulated_clock import EmulatedClock
 from ftmocks.clock import (
     DEBT_NS,
     LEAD_NS,
-    LOOK_S,
     PAGE_VERSION,
     PATIENCE_S,
-    REST_S,
     SLOTS,
     SUSPECT_S,
     CellClock,
-    time_out_s,
 )
 from tests.unit.mocks.real_time import RealTime
 
@@ -100,23 +95,6 @@ def test_the_page_is_laid_out_as_documented(clock: CellClock) -> None:
     assert content[4:] == [0] * 2 * SLOTS
 
 
-def test_without_followers_it_is_real_time(real: RealTime, clock: CellClock) -> None:
-    begun_ns = clock.now_ns()
-    assert begun_ns == real.ns
-    real.pass_s(7.5)
-    assert clock.now_ns() - begun_ns == 7.5 * S
-    assert clock.now_s() == pytest.approx(real.ns * 1e-9)
-
-
-def test_every_reading_is_published(real: RealTime, clock: CellClock) -> None:
-    client = Client(clock, 0)
-    client.leave()
-    for read in (clock.now_ns, clock.follow, lambda: round(clock.now_s() * 1e9)):
-        real.pass_s(0.25)
-        read()
-        assert client.published_ns == real.ns
-
-
 def test_it_does_not_pass_the_slowest_follower_by_more_than_its_lead(real: RealTime, clock: CellClock) -> None:
     clients = [Client(clock, slot) for slot in (0, 3, SLOTS - 1)]
     begun_ns = real.ns
@@ -145,16 +123,6 @@ def test_a_thread_of_the_station_is_waited_for_until_it_follows(real: RealTime, 
         assert clock.now_ns() == begun_ns + 3 * LEAD_NS
     real.pass_s(1.0)
     assert clock.now_ns() > begun_ns + S, "no follower is left"
-
-
-def test_who_sleeps_until_a_time_is_waited_for_from_then_on(real: RealTime, clock: CellClock) -> None:
-    client = Client(clock, 0)
-    begun_ns = real.ns
-    client._page[client._at + 1] = begun_ns + 5 * S
-    real.pass_s(3.0)
-    assert clock.now_ns() == begun_ns + 3 * S
-    real.pass_s(3.0)
-    assert clock.now_ns() == begun_ns + 5 * S + LEAD_NS
 
 
 def test_a_short_hold_is_made_up_for_and_a_long_one_is_lost(real: RealTime, clock: CellClock) -> None:
@@ -214,55 +182,6 @@ def test_a_living_process_that_stops_is_waited_for_with_patience(
     assert clock.now_ns() <= held_ns, "it follows again, so it is waited for again"
 
 
-def test_one_that_is_given_up_and_dies_is_released(
-    real: RealTime, clock: CellClock, start_process: Callable[[], subprocess.Popen[bytes]]
-) -> None:
-    process = start_process()
-    client = Client(clock, 0, process.pid)
-    pass_in_steps(real, clock, PATIENCE_S + 1.0)
-    assert client.pid == process.pid
-    kill(process)
-    pass_in_steps(real, clock, 2 * SUSPECT_S)
-    assert client.pid == 0
-
-
-def test_a_stall_of_the_station_does_not_try_its_patience(real: RealTime, clock: CellClock) -> None:
-    Client(clock, 0)
-    pass_in_steps(real, clock, 0.05)
-    held_ns = clock.now_ns()
-    real.pass_s(10 * PATIENCE_S)
-    assert clock.now_ns() == held_ns
-    pass_in_steps(real, clock, PATIENCE_S / 2)
-    assert clock.now_ns() == held_ns
-
-
-def test_the_clock_of_the_program_follows_it(real: RealTime, clock: CellClock) -> None:
-    """The other side of the page, written for the program."""
-    client = EmulatedClock(clock.path)
-    assert client.now_ns() == clock.now_ns()
-    with client.keeping_up():
-        begun_ns = client.now_ns()
-        real.pass_s(2.0)
-        clock.now_ns()
-        assert clock.now_ns() == begun_ns + LEAD_NS
-        assert client.now_ns() == begun_ns + LEAD_NS
-        assert clock.now_ns() == begun_ns + 2 * LEAD_NS
-    real.pass_s(1.0)
-    assert clock.now_ns() > begun_ns + S
-
-
-def test_closing_releases_the_lock_and_leaves_the_time_readable(real: RealTime) -> None:
-    clock = CellClock(real)
-    with Path(clock.path).open("r+b") as page:
-        with pytest.raises(BlockingIOError):
-            fcntl.flock(page, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        clock.close()
-        clock.close()
-        fcntl.flock(page, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    real.pass_s(1.0)
-    assert clock.now_ns() == real.ns
-
-
 def test_threads_read_one_rising_time_and_publish_it() -> None:
     clock = CellClock()
     try:
@@ -293,10 +212,3 @@ def test_threads_read_one_rising_time_and_publish_it() -> None:
         assert wrong == []
     finally:
         clock.close()
-
-
-@pytest.mark.parametrize(
-    ("wait_s", "time_out"), [(None, LOOK_S), (1.0, LOOK_S), (0.002, 0.002), (1e-6, REST_S), (-1.0, REST_S)]
-)
-def test_a_thread_that_keeps_up_looks_often_but_does_not_spin(wait_s: float | None, time_out: float) -> None:
-    assert time_out_s(wait_s) == time_out

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ftmocks.clock import CellClock
 from ftmocks.hung_load import HungLoad
-from ftmocks.kinematics import forward, rotation, vector6
+from ftmocks.kinematics import forward, vector6
 from ftmocks.ur.motion import JointMove, LineMove
 from ftmocks.ur.robot import Robot, RobotSettings
 from ftmocks.workcell import Workcell
@@ -101,19 +101,6 @@ def test_the_period_is_that_of_a_pendulum_and_its_swing_decays(string_m: float, 
     )
 
 
-def test_without_damping_energy_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """After 20 periods it turns where it began, and its pull at the lowest point is that of its speed from there."""
-    monkeypatch.setattr("ftmocks.hung_load.DAMPING_RATIO", 0.0)
-    one, swings_deg, pulls_N = load(swing_deg=30.0), [], []
-    for _ in range(10_200):
-        one.follow(CYCLE_S, np.zeros(3), np.zeros(3))
-        swings_deg.append(one.swing_deg)
-        pulls_N.append(float(np.linalg.norm(one.force_base_N)))
-    assert max(swings_deg[-510:]) == pytest.approx(30.0, rel=1e-3)
-    turn, lowest = math.cos(math.radians(30.0)), 3 - 2 * math.cos(math.radians(30.0))
-    np.testing.assert_allclose([min(pulls_N[-510:]), max(pulls_N[-510:])], [19.62 * turn, 19.62 * lowest], rtol=1e-3)
-
-
 def follow(one: HungLoad, at: Callable[[float], Array], seconds: float, cycle_s: float) -> list[Array]:
     """Let the hook follow a path; the pull at each cycle."""
     pulls = []
@@ -149,22 +136,6 @@ def ran(robot: Robot, path: JointMove | LineMove) -> tuple[float, float]:
 def hook(robot: Robot) -> Array:
     X = forward(DH, robot.world.q)
     return np.asarray(X[:3, :3] @ TIP_M + X[:3, 3])
-
-
-@pytest.mark.parametrize("time_scale", [1.0, 20.0])
-def test_a_hook_that_stays_while_the_flange_turns_does_not_swing(time_scale: float) -> None:
-    robot = cell(time_scale)
-    X_flange_tip = np.eye(4)
-    X_flange_tip[:3, 3] = TIP_M
-    goal = forward(DH, POSTURE) @ X_flange_tip
-    goal[:3, :3] = rotation([0.5, 0.0, 0.0]) @ goal[:3, :3]
-    swing_deg, moved_m = ran(robot, LineMove(DH, X_flange_tip, goal, 0.5, 1.0))
-    assert moved_m < 1e-4
-    assert swing_deg < 0.05
-    R_base_flange = forward(DH, robot.world.q)[:3, :3]
-    assert math.acos((np.trace(R_base_flange @ forward(DH, POSTURE)[:3, :3].T) - 1) / 2) == pytest.approx(0.5, abs=1e-6)
-    pull_N = R_base_flange @ robot.world.contact_wrench(robot.cycle_s)[:3]
-    np.testing.assert_allclose(pull_N, 19.62 * DOWN, atol=0.02)
 
 
 @pytest.mark.parametrize("time_scale", [1.0, 20.0])

@@ -65,31 +65,6 @@ def test_turning_joints_make_a_ripple_as_large_as_that_of_a_real_arm(joint: int)
     assert not ripple[ENDED].any()
 
 
-@pytest.mark.slow
-def test_the_ripple_has_the_lines_of_the_motor_and_little_below_3_Hz() -> None:
-    ripple = vibration(4, ripple=1.0)[EVEN, 0]
-    power = np.abs(np.fft.rfft(ripple * np.hanning(len(ripple)))) ** 2
-    hertz = np.fft.rfftfreq(len(ripple), 1 / RATE_HZ)
-    motor_hz = 101 * SPEED_RAD_S / (2 * np.pi)
-    lines = np.any([np.abs(hertz - k * motor_hz) < 1.5 for k in (2, 4, 6)], axis=0)
-    assert power[lines].sum() > 0.98 * power.sum()
-    whole = vibration(4, ripple=1.0)[:3200, 0]
-    power, hertz = np.abs(np.fft.rfft(whole)) ** 2, np.fft.rfftfreq(len(whole), 1 / RATE_HZ)
-    assert power[hertz < 3].sum() < 0.03 * power.sum(), "speeding up and slowing down included"
-
-
-def test_links_ring_after_a_stop_for_0_3_s() -> None:
-    ring = vibration(4, ring=1.0)
-    stop = ring[3160:, :3] @ np.linalg.svd(ring[3160:, :3], full_matrices=False)[2][0]
-    peaks = [np.abs(stop[a : a + 100]).max() for a in (0, 300, 600)]
-    assert 0.05 < peaks[0] < 1.0
-    assert peaks[1] < 0.1 * peaks[0]
-    assert peaks[2] < 0.005 * peaks[0]
-    assert not ring[-1].any()
-    crossings_s = np.flatnonzero(np.diff(np.sign(stop[:300]))) / RATE_HZ
-    assert 8 < 0.5 / np.diff(crossings_s).mean() < 20
-
-
 def test_a_ringing_link_is_a_damped_mass_on_a_spring() -> None:
     """Against steps of 20 µs; half a cycle later it is where the next would have it."""
     rng = np.random.default_rng(0)
@@ -107,20 +82,6 @@ def test_a_ringing_link_is_a_damped_mass_on_a_spring() -> None:
     for _ in range(1000):
         ringing = ringing.after(CYCLE_S, ZERO6)
     assert ringing.amplitudes is None
-
-
-def test_a_still_cell_is_as_an_ideal_one() -> None:
-    real, ideal = (cell(one, Truth.drawn(1)) for one in (Imperfections(), IDEAL))
-    np.testing.assert_array_equal(real.world.measure(50), ideal.world.measure(50))
-    np.testing.assert_array_equal(real.raw_wrench(), ideal.raw_wrench())
-
-
-def test_the_controller_reports_noisy_angles_of_a_still_arm() -> None:
-    robot = cell(Imperfections())
-    q = np.array([robot.measured_q for _ in cycles(robot, 2.0)])
-    np.testing.assert_allclose(q.mean(axis=0), HOME, atol=3e-6)
-    np.testing.assert_allclose(q.std(axis=0), 2e-5, rtol=0.1)
-    assert robot.arm.actual_q is HOME
 
 
 def test_a_sensor_measures_before_it_sends() -> None:

@@ -8,9 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from ftmocks.factory_kinematics import drawn
-from ftmocks.inertia import inertia_tensor
-from ftmocks.kinematics import JointState, Vector6, flange_motion, forward, jacobian, vector6
-from ftmocks.world import AHEAD_S, Truth, World
+from ftmocks.kinematics import JointState, flange_motion, forward, jacobian, vector6
+from ftmocks.world import Truth, World
 
 Array = NDArray[np.float64]
 
@@ -120,60 +119,3 @@ def test_a_resting_arm_reads_bit_for_bit_what_it_read_without_inertia() -> None:
     q = vector6(HOME)
     alone = World(replace(truth, gyration_m2=None), DH, q).load_wrench()
     np.testing.assert_array_equal(World(truth, DH, q).load_wrench(), alone)
-
-
-def test_a_payload_without_inertia_has_only_weight_while_it_moves() -> None:
-    truth, at = replace(Truth.drawn(4), gyration_m2=None), smooth(4)
-    world = World(truth, DH, at(0.0).q)
-    world.move(0.3, at(0.3).q, at)
-    still = World(truth, DH, at(0.3).q)
-    np.testing.assert_allclose(world.load_wrench(0.3), still.load_wrench(), atol=1e-12)
-
-
-def test_readings_of_a_burst_are_the_truth_at_their_times() -> None:
-    truth, at = replace(Truth.drawn(5), noise_force_N=0.0, noise_torque_Nm=0.0), smooth(5)
-    world = World(truth, DH, at(0.0).q)
-    start_s = world.now_s
-    world.move(start_s, at(0.0).q, lambda t_s: at(t_s - start_s))
-    times_s = start_s + np.arange(14) / 7000
-    expected = [world.true_wrench(t_s) for t_s in times_s]
-    np.testing.assert_allclose(world.measure_at(times_s), expected, atol=2e-4)
-    assert np.ptp(expected, axis=0).max() > 0.005, "it changes within a burst"
-
-
-def standing(q: Vector6) -> Callable[[float], JointState]:
-    return lambda _t_s: JointState(q)
-
-
-def test_a_late_sensor_reads_the_cycle_of_its_time_and_a_dead_controller_leaves_the_arm_at_rest() -> None:
-    at = smooth(6)
-    world = World(replace(Truth.drawn(6), gyration_m2=None), DH, at(0.0).q)
-    for k in range(20):
-        world.move(0.002 * k, at(0.002 * k).q, standing(at(0.002 * k).q))
-    for k in (13, 15, 19):
-        R = forward(DH, at(0.002 * k).q)[:3, :3] @ world.truth.R_flange_sensor
-        np.testing.assert_allclose(world.load_wrench(0.002 * k + 0.001)[:3], R.T @ world.truth.gravity_force_base_N)
-    world.move(0.04, at(0.04).q, at)
-    late_s = 0.04 + AHEAD_S + 1e-6
-    still = World(world.truth, DH, at(0.04).q).load_wrench()
-    np.testing.assert_allclose(world.load_wrench(late_s), still)
-
-
-def test_the_inertia_scales_with_a_mass_that_changes() -> None:
-    world = World(Truth.drawn(7), DH, vector6(HOME))
-    before = world.truth.inertia_kg_m2
-    world.shift_payload(2 * world.truth.mass_kg, None)
-    after = world.truth.inertia_kg_m2
-    assert before is not None
-    assert after is not None
-    np.testing.assert_allclose(after, 2 * before)
-
-
-def test_elements_of_a_tensor_stand_where_the_readme_says() -> None:
-    np.testing.assert_array_equal(
-        inertia_tensor(np.array([1.0, 2, 2.5, 0.1, 0.2, 0.3])), [[1, 0.1, 0.2], [0.1, 2, 0.3], [0.2, 0.3, 2.5]]
-    )
-    assert not inertia_tensor(np.zeros(6)).any()
-    for wrong in ([1.0, 1, 3, 0, 0, 0], [-0.1, 1, 1, 0, 0, 0], [1, 1, 1, 2, 0, 0]):
-        with pytest.raises(ValueError, match="no body"):
-            inertia_tensor(np.array(wrong))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ftmocks.clock import CellClock
-from ftmocks.disturbances import Push
 from ftmocks.kinematics import MODELS, forward
 from ftmocks.recording import COLUMNS, RecordedArm, RecordedWorld, Recording
 from ftmocks.ur.robot import Robot, RobotSettings
@@ -44,32 +43,6 @@ def test_a_sensor_of_the_same_rate_sends_every_row_once_at_any_phase() -> None:
         np.testing.assert_array_equal(row(recording.wrench(times_s)), np.arange(1500))
 
 
-@pytest.mark.parametrize(("pace", "step"), [(2.0, 2.0), (0.25, 0.25), (10.0, 10.0)])
-def test_the_pace_scales_rows_and_speeds(pace: float, step: float) -> None:
-    recording = made()
-    recording.play(100.0, 0.0, pace)
-    times_s = 100.0 + np.arange(150) / RATE_HZ
-    np.testing.assert_array_equal(row(recording.wrench(times_s)), np.floor(step * np.arange(150) + 1e-6))
-    state = recording.joints(100.1)
-    assert state.q[5] - HOME[5] == pytest.approx(0.1 * pace * 0.5)
-    assert state.qd == pytest.approx([0, 0, 0, 0, 0, 0.5 * pace])
-
-
-def test_a_recording_holds_its_ends_and_continues_where_a_request_says() -> None:
-    recording = made()
-    assert row(recording.wrench(np.array([5.0, 500.0]))).tolist() == [0, 0], "not played yet"
-    recording.play(100.0, 0.5, 1.0)
-    assert recording.at_s(100.25) == pytest.approx(0.75)
-    assert row(recording.wrench(np.array([100.25, 1000.0]))).tolist() == [750, 2000]
-    assert recording.at_s(1000.0) == recording.duration_s == pytest.approx(2.0)
-    assert not any(recording.joints(1000.0).qd)
-    recording.play(1000.0, 0.25, 0.0)
-    assert recording.at_s(2000.0) == pytest.approx(0.25)
-    for at_s, pace in ((2.1, 1.0), (-0.1, 1.0), (0.0, -1.0), (0.0, np.inf)):
-        with pytest.raises(ValueError, match="at_s is 0 to 2"):
-            recording.play(0.0, at_s, pace)
-
-
 def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
     recording, real = made(), RealTime()
     clock = CellClock(real)
@@ -86,32 +59,6 @@ def test_the_arm_has_the_recorded_joints_and_takes_no_command() -> None:
     assert "follows a recording" in robot.events[-1].why
     with pytest.raises(ValueError, match="follows a recording"):
         robot.hand_move(robot.arm.q, 0.3)
-
-
-def test_the_controller_feels_the_recorded_wrench_while_the_arm_stands() -> None:
-    k = np.arange(3.0)
-    recording = Recording(k, np.outer(k, np.ones(6)), np.tile(HOME, (3, 1)))
-    world = RecordedWorld(recording, Truth.drawn(1), DH, 0, CellClock(RealTime()))
-    robot = Robot(world, RobotSettings(), RecordedArm(DH, recording))
-    recording.play(world.now_s, 0.0, 1.0)
-    felt = []
-    for at_s in (0.0, 1.0, 2.0):
-        robot.tick(robot.clock.now_s() + at_s)
-        felt.append(robot.tcp_wrench())
-    np.testing.assert_allclose(np.linalg.norm(np.diff(felt, axis=0)[:, :3], axis=1), np.sqrt(3))
-
-
-def test_a_push_comes_on_top_of_the_recorded_wrench() -> None:
-    recording = made()
-    truth = Truth.drawn(1)
-    nothing = np.zeros(3)
-    truth = Truth(truth.mass_kg, truth.p_sensor_com_m, np.eye(3), 0.0, 0.0, nothing, nothing, 0.0, 0.0)
-    world = RecordedWorld(recording, truth, DH, 0, CellClock(RealTime()))
-    recording.play(world.now_s, 1.0, 0.0)
-    np.testing.assert_allclose(world.measure(3), np.tile(np.arange(1.0, 7.0), (3, 1)), atol=1e-12)
-    np.testing.assert_allclose(world.true_wrench(), np.arange(1.0, 7.0), atol=1e-12)
-    world.touch("push", Push(np.array([0, 0, 5.0, 0, 0, 0]), in_sensor=True))
-    np.testing.assert_allclose(world.measure(1)[0], [1, 2, 8, 4, 5, 6], atol=1e-12)
 
 
 @pytest.mark.parametrize("units", [False, True])

@@ -1,7 +1,6 @@
 """The shared truth: sign of a wrench, frames, bias, noise, and what a seed draws."""
 
 import math
-import threading
 from dataclasses import replace
 
 import numpy as np
@@ -102,29 +101,6 @@ def test_bias_drifts_with_time() -> None:
 TURNED = vector6([*POSTURE[:5], POSTURE[5] + 0.7])
 
 
-def test_a_push_in_base_axes_stays_there_while_the_arm_turns_and_ends_in_time() -> None:
-    real = RealTime()
-    world = World(plain(), DH, POSTURE, clock=CellClock(real))
-    world.touch("push", Push(np.array([0, 0, -9.81, 0, 0, 0.5]), until_s=world.now_s + 2.0))
-    for q in (POSTURE, TURNED):
-        world.q = q
-        R_base_sensor = forward(DH, q)[:3, :3] @ world.truth.R_flange_sensor
-        felt = world.contact_wrench()
-        np.testing.assert_allclose(R_base_sensor @ felt[:3], [0, 0, -9.81], atol=1e-12)
-        np.testing.assert_allclose(R_base_sensor @ felt[3:], [0, 0, 0.5], atol=1e-12)
-    real.pass_s(2.0)
-    assert not world.contact_wrench().any()
-
-
-def test_several_things_touch_the_tool_at_a_time() -> None:
-    world = World(plain(), DH, POSTURE)
-    world.touch("push", Push(np.array([1.0, 0, 0, 0, 0, 0]), in_sensor=True))
-    world.touch("bump", Push(np.array([0, 2.0, 0, 0, 0, 0]), in_sensor=True))
-    np.testing.assert_allclose(world.contact_wrench(), [1, 2, 0, 0, 0, 0])
-    world.touch("push", None)
-    np.testing.assert_allclose(world.contact_wrench(), [0, 2, 0, 0, 0, 0])
-
-
 @pytest.mark.parametrize(
     ("beyond_deg", "angle_deg", "degrees"), [(30, 40, 10), (30, 20, 0), (-30, -50, 20), (-30, 0, 0)]
 )
@@ -135,17 +111,6 @@ def test_a_cable_pulls_in_proportion_beyond_an_angle(beyond_deg: float, angle_de
     felt = world.contact_wrench()
     assert np.linalg.norm(felt[:3]) == pytest.approx(0.2 * degrees)
     np.testing.assert_allclose(felt[3:], np.cross(lever, felt[:3]), atol=1e-12)
-
-
-def test_a_cable_pulls_in_some_orientations() -> None:
-    world = World(plain(), DH, POSTURE)
-    z_base = (forward(DH, POSTURE)[:3, :3] @ world.truth.R_flange_sensor)[:, 2]
-    for towards, pull_N in ((z_base, 5.0), (-z_base, 0.0)):
-        cable = Cable(np.array([3.0, 0, 4.0]), np.zeros(3), towards=towards, within_rad=0.5)
-        world.touch("cable", cable)
-        assert np.linalg.norm(world.contact_wrench()) == pytest.approx(pull_N)
-    world.touch("cable", Cable(np.array([3.0, 0, 4.0]), np.zeros(3)))
-    assert np.linalg.norm(world.contact_wrench()) == pytest.approx(5.0), "always taut"
 
 
 def test_a_drift_is_linear_and_ends_at_its_total() -> None:
@@ -166,38 +131,3 @@ def test_a_shifted_payload_is_the_new_truth() -> None:
     np.testing.assert_allclose(world.load_wrench(), 2 * before)
     world.shift_payload(None, np.zeros(3))
     np.testing.assert_allclose(world.load_wrench(), [*(2 * before[:3]), 0, 0, 0], atol=1e-12)
-
-
-def test_a_frozen_sensor_repeats_itself_until_it_measures_again() -> None:
-    world = World(Truth.drawn(1), DH, POSTURE)
-    world.read_always(world.measure(1)[0])
-    frozen = world.measure(50)
-    world.q = TURNED
-    assert (world.measure(50) == frozen[0]).all()
-    world.read_always(None)
-    assert len(np.unique(world.measure(50), axis=0)) == 50
-
-
-def test_readers_in_other_threads_never_see_half_a_posture() -> None:
-    """Wrench magnitude is the same in all postures; a mixed one would differ."""
-    world = World(plain(), DH, POSTURE)
-    postures = [vector6(q) for q in np.random.default_rng(0).uniform(-2, 2, (50, 6))]
-    wrong: list[float] = []
-    ended = threading.Event()
-
-    def read() -> None:
-        while not ended.is_set():
-            wrench = world.measure(1)[0]
-            if not np.allclose(np.cross([0, 0, 0.05], wrench[:3]), wrench[3:], atol=1e-9):
-                wrong.append(float(wrench[0]))
-
-    readers = [threading.Thread(target=read) for _ in range(2)]
-    for reader in readers:
-        reader.start()
-    for _ in range(40):
-        for q in postures:
-            world.q = q
-    ended.set()
-    for reader in readers:
-        reader.join()
-    assert wrong == []

@@ -109,22 +109,6 @@ def test_adapter_refuses_malformed_lines(line: bytes) -> None:
     assert opened_adapter().feed(line + b"\r") == (b"\a", [])
 
 
-def test_listen_only_transmits_nothing_but_reports_the_bus() -> None:
-    adapter = SlcanAdapter()
-    assert adapter.feed(b"S5\rL\rt2000\r") == (b"\r\r\a", [])
-    assert adapter.line(CanFrame(0x206, b"\0")) == b"t206100\r"
-    assert adapter.feed(b"C\r") == (b"\r", [])
-    assert adapter.line(CanFrame(0x206, b"\0")) == b""
-
-
-def test_garbage_without_end_keeps_little_memory_and_the_next_line_works() -> None:
-    adapter = opened_adapter()
-    for _ in range(100):
-        adapter.feed(b"t2000" * 100)
-    assert len(adapter._line) < 64
-    assert adapter.feed(b"\rt2000\r") == (b"\az\r", [CanFrame(0x200)])
-
-
 @given(
     st.booleans().flatmap(
         lambda extended: st.builds(

@@ -107,31 +107,6 @@ def test_other_addresses_are_met_with_silence(box: AtiSerialBox) -> None:
         assert box._reply(with_crc(bytes([address]) + bytes.fromhex("03 00 1D 00 01"))) == b""
 
 
-def test_calibration_slots_follow_each_other_and_empty_ones_read_zero(box: AtiSerialBox) -> None:
-    def words(first: int, count: int) -> bytes:
-        return box._reply(with_crc(struct.pack(">BBHH", 0x0A, 3, first, count)))[3:-2]
-
-    block = calibration_block(REFERENCE)
-    assert words(0x00E3, 64) + words(0x0123, 64) + words(0x0163, 41) == block
-    assert words(0x00E3 + 192, 64) == bytes(128)
-    assert words(0x0C23 + 128, 41) == bytes(82)
-
-
-def test_baud_survives_a_power_cycle_only_when_stored(box: AtiSerialBox) -> None:
-    def write(register: int, value: int) -> None:
-        reply = box._reply(with_crc(struct.pack(">BBHHBH", 0x0A, 0x10, register, 1, 2, value)))
-        assert reply[1] == 0x10
-
-    read_baud = with_crc(bytes.fromhex("0A 03 00 1F 00 01"))
-    write(0x1F, 2)
-    box._power_up()
-    assert box._reply(read_baud)[3:5] == b"\x00\x00"
-    write(0x1E, 1)
-    write(0x1F, 2)
-    box._power_up()
-    assert box._reply(read_baud)[3:5] == b"\x00\x02"
-
-
 V1_WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
 WRITE_GAINS = "0A 10 00 00 00 06 0C 02 1F 02 2B 02 39 02 43 02 35 02 37 47 2D"
 WRITE_OFFSETS = "0A 10 00 06 00 06 0C 80 00 80 00 80 00 80 00 80 00 80 00 75 66"
@@ -150,21 +125,4 @@ def test_gauges_are_right_from_power_up_on_and_after_writing_the_same_gains() ->
     assert box._reply(with_crc(bytes.fromhex("0A 03 00 00 00 06"))) == gains
     for request in ("0A 6A AA FF 1D", WRITE_GAINS, WRITE_OFFSETS, "0A 6A 18 7F 68"):
         assert not box._reply(bytes.fromhex(request))[1] & 0x80
-    assert box._gauges(1)[0].tolist() == V1
-
-
-def test_gains_of_another_calibration_scale_the_gauges_until_the_next_power_up() -> None:
-    box = made()
-    box._reply(bytes.fromhex("0A 6A AA FF 1D"))
-    box._reply(with_crc(struct.pack(">BBHHB6H", 0x0A, 0x10, 0, 6, 12, *(2 * g for g in REFERENCE.gauge_gains))))
-    assert box._gauges(1)[0].tolist() == [2 * gauge for gauge in V1]
-    box._power_up()
-    assert box._gauges(1)[0].tolist() == V1
-
-
-def test_a_device_without_gains_reads_wrong_until_they_are_written() -> None:
-    box = made(loads_gains=False)
-    assert box._gauges(1)[0].tolist() == [-8192] * 6
-    for request in ("0A 6A AA FF 1D", WRITE_GAINS, WRITE_OFFSETS):
-        box._reply(bytes.fromhex(request))
     assert box._gauges(1)[0].tolist() == V1

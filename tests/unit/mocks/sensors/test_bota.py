@@ -46,17 +46,6 @@ def test_it_boots_for_three_seconds_then_says_who_it_is_and_streams() -> None:
     assert banner(471) == b"App Init\r\nname: SensONE\r\nS/N: 471\r\nFW version: 1.2.0\r\n"
 
 
-def test_samples_carry_time_status_and_temperature(box: BotaBox) -> None:
-    box.temperature_C = 31.25
-    box.status = 0x8001
-    box._stream_start_us = 2**32 - 10_000
-    box._pacer.made = 3
-    fields = [struct.unpack("<H6fIf", frame[1:-2]) for frame in box._samples(3)]
-    assert [f[7] for f in fields] == [2**32 - 10_000, 0, 10_000], "the counter wraps"
-    assert {f[0] for f in fields} == {0x8001}
-    assert {f[8] for f in fields} == {31.25}
-
-
 def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
     box.measure = lambda n: np.tile([0, 0, -1300.0, 0, 0, 0], (n, 1))
     status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
@@ -67,11 +56,6 @@ def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
     status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
     assert status == 0x000A
     assert values[4] == 15
-
-
-def test_text_and_uncalibrated_output(box: BotaBox) -> None:
-    assert answers(box, b"C c,0,0,1,4\r\nR") == b"r,0,C,0\r\nr,0,c,0\r\nr,0,R,0\r\n"
-    assert box._samples(1)[0].decode().split(",")[:7] == ["8", "1", "-2", "9.81", "0.1", "-0.2", "0.3"]
 
 
 @pytest.mark.parametrize(
@@ -96,35 +80,8 @@ def test_sampling_time_follows_the_filter(sinc: int, rate_hz: float) -> None:
     assert 1 / BotaBox(lambda n: np.zeros((n, 6)), sinc_length=sinc).sample_s == pytest.approx(rate_hz, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("sinc", "error"), [(1, 1), (51, 1), (63, 1), (64, 0), (512, 0), (2048, 0), (2049, 1), (4096, 1)]
-)
-def test_sinc_lengths(box: BotaBox, sinc: int, error: int) -> None:
-    assert answers(box, b"C") == b"r,0,C,0\r\n"
-    assert answers(box, b"f,%d,0,0,0" % sinc) == b"r,%d,f,0\r\n" % error
-    assert box.sinc_length == (512 if error else sinc)
-
-
 def test_serial_number_in_configuration_mode(box: BotaBox) -> None:
     assert answers(box, b"p?") == b"", "it streams"
     assert answers(box, b"C") == b"r,0,C,0\r\n"
     assert answers(box, b"p") == b""
     assert answers(box, b"?") == b"p,0,12345,1,0,SensONE\r\nr,0,p,0\r\n"
-
-
-def test_a_restart_forgets_what_was_not_stored(box: BotaBox) -> None:
-    answers(box, b"C c,0,1,0,3 f,64,0,0,0")
-    assert (box.baud_code, box.sinc_length) == (4, 64), "a new speed needs a restart"
-    assert answers(box, b"#") == b""
-    assert (box.baud_code, box.sinc_length) == (4, 512)
-    box._boot_texts.clear()
-    assert answers(box, b"C c,0,1,0,3 f,64,0,0,0 s").endswith(b"r,0,s,0\r\n")
-    answers(box, b"#")
-    assert (box.baud_code, box.sinc_length) == (3, 64)
-
-
-@pytest.mark.parametrize("letter", [b"C", b"I"])
-def test_letters_that_end_the_stream(box: BotaBox, letter: bytes) -> None:
-    assert box.streaming
-    assert answers(box, b"x" + letter) == b"r,0,%b,0\r\n" % letter
-    assert not box.streaming

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ftmocks.sensors.ati_gauges import REFERENCE
-from ftmocks.sensors.netft import Calibration, Command, NetFtBox, rdt_records, transform_matrix
+from ftmocks.sensors.netft import Command, NetFtBox, rdt_records, transform_matrix
 
 WRENCH = [1.5, -2.25, 10, 0.1, -0.05, 0.025]
 VECTOR = "00000001 000003E8 00000000 0016E360 FFDDAAF0 00989680 000186A0 FFFF3CB0 000061A8"
@@ -63,26 +63,6 @@ def test_configuration_page(box: NetFtBox) -> None:
     assert expected.items() <= configuration.items()
 
 
-def test_page_of_a_real_box(box: NetFtBox) -> None:
-    """Elements of a page of a Gamma SI-330-30, firmware 2.2.59."""
-    real = {
-        "runrate": "7000",
-        "scfgfu": "N",
-        "scfgtu": "Nm",
-        "cfgtfx": "0;0;132.710;0;0;0",
-        "scfgtdu": "mm",
-        "scfgtau": "degrees",
-        "cfgcpf": "1000000",
-        "cfgcpt": "1000000",
-        "cfgmr": "330;330;990;30;30;30",
-        "setcfgsel": "0",
-        "setbias": "745;17;447;184;-596;-253",
-        "mfgdigver": "2.2.59",
-    }
-    box.calibration = Calibration(rating=(330.0, 330.0, 990.0, 30.0, 30.0, 30.0))
-    assert real.items() <= page(box, "/netftapi2.xml").items()
-
-
 @pytest.mark.parametrize(
     ("transform", "wrench"),
     [
@@ -137,32 +117,6 @@ def test_bias_command_and_settings_page(box: NetFtBox) -> None:
     assert sent(box) == cleared
 
 
-def test_tool_transformation_is_set_over_http(box: NetFtBox) -> None:
-    assert box.page("/config.cgi?cfgid=0&" + "&".join(f"cfgtfx{i}=0" for i in range(6))) is not None
-    assert page(box, "/netftapi2.xml")["cfgtfx"] == "0;0;0;0;0;0"
-    assert sent(box) == pytest.approx(WRENCH)
-    assert box.page("/config.cgi?cfgid=0&cfgtfx0=2.5&cfgtdu=4&cfgtau=2") is not None
-    assert page(box, "/netftapi2.xml").items() >= {"cfgtfx": "2.500;0;0;0;0;0", "scfgtdu": "cm", "cfgtau": "2"}.items()
-
-
-def test_calibration_page(box: NetFtBox) -> None:
-    calibration = page(box, "/netftcalapi.xml?index=0")
-    assert calibration["calsn"] == "FT12345"
-    assert "calmr" not in calibration, "no public page has it"
-    assert (calibration["calcpf"], calibration["calfu"], calibration["caltu"]) == ("1000000", "2", "3")
-
-
-def test_rate_is_set_over_http(box: NetFtBox) -> None:
-    assert box.page("/comm.cgi?comrdtrate=500&comrdtbsiz=50") is not None
-    assert (box.rate_hz, box.buffer_size) == (500, 40)
-    assert page(box, "/netftapi2.xml")["comrdtrate"] == "500"
-    for asked, rate_hz in ((99, 100), (150, 152), (700, 700), (1, 1)):
-        box.page(f"/comm.cgi?comrdtrate={asked}")
-        assert box.rate_hz == rate_hz, "the next higher fraction of 7000 Hz"
-    assert box.page("/comm.cgi?comrdtrate=9000") is not None
-    assert box.rate_hz == 7000
-
-
 @pytest.mark.parametrize(
     "path",
     [
@@ -179,16 +133,6 @@ def test_rate_is_set_over_http(box: NetFtBox) -> None:
 )
 def test_pages_that_are_not_there(box: NetFtBox, path: str) -> None:
     assert box.page(path) is None
-
-
-def test_counts_in_the_units_of_the_configuration(box: NetFtBox) -> None:
-    box.calibration = Calibration(counts_per_force=1000, counts_per_torque=100, force_unit=1, torque_unit=1)
-    assert page(box, "/netftapi2.xml")["scfgfu"] == "lbf"
-    box.tool_transform = [0.0] * 6
-    box.measure = lambda n: np.tile([4.4482216152605, 0, 0, 0.1129848290276167, 0, 0], (n, 1))
-    measured, saturated = box._measured(2)
-    np.testing.assert_allclose(box._counts(measured), [[1000, 0, 0, 100, 0, 0]] * 2, atol=1e-9)
-    assert not saturated.any()
 
 
 def test_saturation_clips_at_the_rating_of_the_transducer(box: NetFtBox) -> None:

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from ftmocks.sensors.robotous import (
@@ -11,7 +9,6 @@ from ftmocks.sensors.robotous import (
     RobotousCanNode,
     RobotousSensor,
     RobotousSerialBox,
-    fields,
     packet,
     sample_field,
 )
@@ -90,33 +87,6 @@ def test_every_model_reports_its_name_and_has_its_divisors(
     assert sensor.samples(1)[0].hex().upper() == (small if torque_divisor == 1000 else SAMPLE.replace(" ", ""))
 
 
-@given(st.lists(st.tuples(st.binary(max_size=30), st.binary(min_size=8, max_size=8)), max_size=5), st.data())
-def test_packets_are_found_between_garbage_in_any_pieces(
-    pieces: list[tuple[bytes, bytes]], data: st.DataObject
-) -> None:
-    garbage_without_start = [(bytes(b for b in garbage if b != 0x55), field) for garbage, field in pieces]
-    stream = b"".join(garbage + packet(field) for garbage, field in garbage_without_start)
-    received = bytearray()
-    found = []
-    while stream:
-        size = data.draw(st.integers(1, 40))
-        received += stream[:size]
-        stream = stream[size:]
-        found += fields(received)
-    assert found == [field for _, field in pieces]
-    assert not received
-
-
-def test_damaged_packets_are_skipped_and_the_next_one_found() -> None:
-    good = packet(command("0A"))
-    wrong_sum, wrong_end = bytearray(good), bytearray(good)
-    wrong_sum[-2] ^= 1
-    wrong_end[-1] ^= 1
-    stray_start = b"\x55" + good
-    received = bytearray(wrong_sum + wrong_end + stray_start)
-    assert fields(received) == [command("0A")]
-
-
 @pytest.mark.parametrize(
     ("request_", "response"),
     [
@@ -159,45 +129,6 @@ def test_the_baud_rate_limits_the_rate(baud_code: int, fastest_hz: int, readings
         assert sensor.execute(command(f"0F {code:02X}"))[0][1:3] == (b"\1\0" if allowed else b"\0\2")
         assert sensor.rate_hz == (rate_hz if allowed else before)
     assert RobotousCanNode(readings).execute(command("0F 08"))[0][1] == 1, "CAN carries every rate"
-
-
-def test_a_line_that_became_slower_sends_what_it_carries(readings: Readings) -> None:
-    sensor = RobotousSerialBox(readings, baud_code=1)
-    sensor.boot()
-    sensor.execute(command("0F 08"))
-    sensor.execute(command("06 00"))
-    assert sensor.rate_hz == 1000
-    sensor.boot()
-    assert sensor.rate_hz == pytest.approx(115_200 / 190)
-
-
-def test_settings_read_back_and_those_of_the_line_wait_for_a_reboot(sensor: RobotousSensor[bytes]) -> None:
-    sensor.execute(command("06 01"))
-    sensor.execute(command("08 01 05"))
-    assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 00 01")
-    assert sensor.execute(command("09"))[0][:3] == bytes.fromhex("09 01 05")
-    sensor.boot()
-    assert sensor.execute(command("07"))[0][:3] == bytes.fromhex("07 01 01")
-
-
-def test_can_node_sets_identifiers_but_no_baud_rate(readings: Readings) -> None:
-    node = RobotousCanNode(readings)
-    node.boot()
-    assert node.execute(command("06 01"))[0][:3] == bytes.fromhex("06 00 01")
-    assert node.execute(command("04 10 10 12"))[0][:3] == bytes.fromhex("04 00 02")
-    assert node.execute(command("04 10 11 12"))[0][:3] == bytes.fromhex("04 01 00")
-    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 64 01 02 10 11 12")
-    node.boot()
-    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 10 11 12 10 11 12")
-
-
-def test_can_node_with_identifiers_of_its_own(readings: Readings) -> None:
-    node = RobotousCanNode(readings, ids=(0xF0, 0xF1, 0xF2))
-    node.boot()
-    sample = b"\x0a" + bytes.fromhex(SAMPLE)[1:]
-    assert node._answer(CanFrame(0x64, command("0A"))) == []
-    assert node._answer(CanFrame(0xF0, command("0A"))) == [CanFrame(0xF1, sample[:8]), CanFrame(0xF2, sample[8:])]
-    assert node.execute(command("05"))[0][:7] == bytes.fromhex("05 F0 F1 F2 F0 F1 F2")
 
 
 def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
@@ -253,20 +184,6 @@ def test_overload_bits_and_counts(sensor: RobotousSensor[bytes], readings: Readi
     assert list(sensor.execute(command("12"))[0][1:7]) == [int(i == axis) for i in range(6)]
 
 
-def test_saturated_axis_and_overload_knob(sensor: RobotousSensor[bytes]) -> None:
-    sensor.saturated_axis = 2
-    sensor.overload = 0x01
-    field = sensor.samples(1)[0]
-    assert field[5:7] == b"\x7f\xff"
-    assert field[13] == 0x09
-
-
 def test_readings_are_clipped_not_wrapped(sensor: RobotousSensor[bytes], readings: Readings) -> None:
     readings.wrench = np.array([1000, -1000, 0, 0, 0, 0.0])
     assert sensor.samples(1)[0][1:5] == b"\x7f\xff\x80\x00"
-
-
-def test_one_reading_per_sample(sensor: RobotousSensor[bytes], readings: Readings) -> None:
-    sensor.samples(7)
-    sensor.execute(command("0A"))
-    assert readings.made == 8

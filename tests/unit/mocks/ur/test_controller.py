@@ -1,13 +1,12 @@
 """The emulated controller without sockets: what stops a program, what holds it, what lets it go on, and who did it."""
 
-import math
 from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 
 from ftmocks.kinematics import vector6
-from ftmocks.ur.dashboard import LOCAL_CONTROL, TOO_EARLY, answer
+from ftmocks.ur.dashboard import answer
 from ftmocks.ur.events import Event
 from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
@@ -70,24 +69,6 @@ def test_what_ends_the_program_brings_the_arm_to_rest_for_good(how: str) -> None
     assert abs(q[5] - GOAL[5]) > 0.5
 
 
-def test_only_unlock_and_play_continue_after_a_protective_stop() -> None:
-    robot = moving_robot()
-    robot.protective_stop("asked for")
-    run(robot, 4.9)
-    assert robot.arm.at_rest
-    assert answer(robot, "unlock protective stop") == TOO_EARLY
-    assert not robot.events[-1].accepted
-    assert answer(robot, "play") == "Failed to execute: play"
-    run(robot, 0.2)
-    assert answer(robot, "unlock protective stop", by="operator") == "Protective stop releasing"
-    assert (robot.events[-1].by, robot.events[-1].accepted) == ("operator", True)
-    run(robot, 1.0)
-    assert (robot.runtime, robot.arm.at_rest) == (Runtime.PAUSED, True)
-    assert answer(robot, "play") == "Starting program"
-    run(robot, 6.0)
-    assert robot.arm.q == GOAL
-
-
 def test_a_closed_safeguard_lets_a_held_program_go_on_but_not_a_stopped_one() -> None:
     robot = moving_robot()
     robot.safeguard_stop(True)
@@ -101,18 +82,6 @@ def test_a_closed_safeguard_lets_a_held_program_go_on_but_not_a_stopped_one() ->
     robot.safeguard_stop(False)
     run(robot, 1.0)
     assert (robot.runtime, robot.arm.at_rest) == (Runtime.STOPPED, True)
-
-
-def test_a_loaded_program_has_its_base_name_and_loops_until_it_is_stopped() -> None:
-    robot = new_robot()
-    assert answer(robot, "load lines/a.urp") == "Loading program: /programs/lines/a.urp, /programs/default.installation"
-    assert answer(robot, "programState") == "STOPPED a.urp"
-    assert answer(robot, "get loaded program") == "Loaded program: /programs/lines/a.urp"
-    assert answer(robot, "play") == "Starting program"
-    run(robot, 5.0)
-    assert answer(robot, "programState") == "PLAYING a.urp"
-    assert answer(robot, "stop") == "Stopped"
-    assert answer(robot, "programState") == "STOPPED a.urp"
 
 
 @pytest.mark.parametrize(
@@ -138,19 +107,6 @@ def test_newer_safety_modes_hold_the_arm_or_cut_its_power(
     assert (robot.robot_mode == RobotMode.RUNNING) == ("EMERGENCY" not in name)
 
 
-def test_reduced_mode_stops_nothing_and_outlives_a_protective_stop() -> None:
-    robot = moving_robot()
-    robot.reduced_mode(True)
-    run(robot, 0.1)
-    assert (robot.safety_mode, robot.runtime, robot.arm.at_rest) == (SafetyMode.REDUCED, Runtime.PLAYING, False)
-    robot.protective_stop("asked for")
-    run(robot, 5.1)
-    assert robot.unlock()
-    assert robot.safety_mode == SafetyMode.REDUCED
-    robot.reduced_mode(False)
-    assert answer(robot, "safetymode") == "Safetymode: NORMAL"
-
-
 @pytest.mark.parametrize("mode", [m for m in SafetyMode if m not in (SafetyMode.NORMAL, SafetyMode.REDUCED)])
 def test_no_program_starts_in_any_other_safety_mode(mode: SafetyMode) -> None:
     robot = new_robot()
@@ -159,30 +115,6 @@ def test_no_program_starts_in_any_other_safety_mode(mode: SafetyMode) -> None:
     assert not found(robot, "program rtde_control").accepted
     run(robot, 0.3)
     assert robot.runtime == Runtime.STOPPED
-
-
-def test_a_program_whose_start_was_under_way_does_not_start_in_a_stopped_robot() -> None:
-    robot = new_robot()
-    assert start_upload(robot, CONTROL)
-    robot.protective_stop("asked for")
-    run(robot, 0.3)
-    assert robot.runtime == Runtime.STOPPED
-    assert not found(robot, "started rtde_control").accepted
-
-
-@pytest.mark.parametrize("late", [0.0, 0.25])
-def test_power_comes_back_step_by_step(late: float) -> None:
-    robot = new_robot()
-    robot.emergency_stop(True)
-    assert answer(robot, "power on") == "Failed to execute: power on"
-    robot.emergency_stop(False)
-    if late:
-        assert answer(robot, "power on") == "Powering on"
-        run(robot, late)
-    assert answer(robot, "brake release") == "Brake releasing"
-    run(robot, 2.0)
-    assert robot.robot_mode == RobotMode.RUNNING
-    assert [e.what for e in robot.events if e.by == "power"] == ["POWER_OFF", "POWER_ON", "IDLE", "RUNNING"]
 
 
 def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
@@ -199,15 +131,6 @@ def test_a_command_to_a_foreign_program_is_noted_as_lost() -> None:
     assert robot.events[-1] is lost
     run(robot, 2.0)
     assert robot.runtime == Runtime.STOPPED
-
-
-def test_an_untrusted_connection_can_only_ask() -> None:
-    robot = moving_robot()
-    for command in ("stop", "play", "pause", "load x", "unlock protective stop", "power off", "brake release"):
-        assert answer(robot, command, trusted=False) == LOCAL_CONTROL
-        assert not robot.events[-1].accepted
-    assert answer(robot, "robotmode", trusted=False) == "Robotmode: RUNNING"
-    assert robot.runtime == Runtime.PLAYING
 
 
 def test_limiter_and_slider_multiply_and_only_the_slider_is_the_fraction() -> None:
@@ -252,13 +175,6 @@ def test_dashboard_of_a_version(polyscope: tuple[int, int, int], understood: str
     assert known == [mark == "1" for mark in understood]
 
 
-def test_event_times_are_those_of_the_host_and_of_the_controller() -> None:
-    robot = moving_robot()
-    times = [(event.t_host_ns, event.t_robot_s) for event in robot.events]
-    assert times == sorted(times)
-    assert math.isclose(found(robot, "started rtde_control").t_robot_s, 100.1, abs_tol=0.01)
-
-
 def test_a_hand_moves_the_arm_without_a_program_at_its_own_speed() -> None:
     robot = new_robot()
     robot.arm.speed_fraction = 0.1  # the slider has no say
@@ -275,12 +191,3 @@ def test_a_hand_moves_the_arm_without_a_program_at_its_own_speed() -> None:
     assert max(abs(b - a) for a, b in pairwise(q_rad)) < 0.41 * robot.period_s
     assert robot.arm.q == HOME
     assert robot.arm.at_rest
-
-
-def test_an_arm_held_by_a_program_or_its_brakes_cannot_be_moved_by_hand() -> None:
-    with pytest.raises(ValueError, match="a program plays"):
-        moving_robot().hand_move(GOAL, 0.4)
-    robot = new_robot()
-    robot.emergency_stop(True)
-    with pytest.raises(ValueError, match="POWER_OFF"):
-        robot.hand_move(GOAL, 0.4)

@@ -13,10 +13,8 @@ import pytest
 from ftmocks.clock import DEBT_NS, LEAD_NS, CellClock
 from ftmocks.kinematics import MODELS, vector6
 from ftmocks.station import free_hosts
-from ftmocks.ur.clients import BACKLOG_LIMIT_S
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.rtde_client import RtdeClient
 from ftmocks.ur.server import UrServer
 from ftmocks.ur.uploads import Upload, start_upload
 from ftmocks.world import Truth, World
@@ -99,14 +97,6 @@ def test_the_wires_keep_the_time_of_the_cell_and_the_arm_a_multiple(
         assert controller.selector.longest_s <= 0.005
 
 
-def test_the_clock_of_a_fast_arm_with_a_sensor_of_its_own_is_that_of_the_cell() -> None:
-    with running(time_scale=20.0) as controller:
-        controller.robot.wrist_sensor = controller.robot.world.measure
-        begun_s = controller.robot.timestamp_s
-        controller.run(2.0)
-        assert controller.robot.timestamp_s - begun_s == pytest.approx(2.0, abs=0.012)
-
-
 def test_a_stall_of_the_computer_costs_no_cycle_and_makes_none_up() -> None:
     with running() as controller:
         controller.run(0.5)
@@ -138,66 +128,6 @@ def test_the_watchdog_bites_in_the_time_of_the_cell() -> None:
         controller.run(1.0, then=lambda: controller.robot.runtime == Runtime.STOPPED)
         assert controller.clock.now_s() - begun_s == pytest.approx(0.1, abs=0.015)
         assert "watchdog" in controller.robot.events[-1].why
-
-
-def test_the_watchdog_is_content_as_long_as_its_input_is_written_and_the_computer_stalls() -> None:
-    with running() as controller:
-        start_guarded_program(controller)
-        for _ in range(10):
-            controller.real.pass_s(2.0)
-            controller.run(0.08)
-            controller.robot.write_inputs({"input_int_register_0": 0})
-        assert controller.robot.runtime == Runtime.PLAYING
-        controller.run(0.12)
-        assert "watchdog" in controller.robot.events[-1].why
-
-
-def test_a_frozen_controller_lives_through_no_cycle_and_reads_nothing(controller: Controller) -> None:
-    with socket.create_connection((controller.server.host, 29999), 10.0) as client:
-        controller.run(0.1)
-        assert client.recv(100).startswith(b"Connected")
-        controller.server.frozen = True
-        cycle = controller.robot.cycle
-        client.sendall(b"robotmode\n")
-        turns = iter(range(20))
-
-        def turn() -> bool:
-            controller.real.pass_s(0.005)
-            return next(turns, None) is None
-
-        controller.run(10.0, then=turn)
-        assert controller.robot.cycle == cycle
-        controller.server.frozen = False
-        controller.run(0.1)
-        assert client.recv(100) == b"Robotmode: RUNNING\n"
-        assert controller.robot.cycle == pytest.approx(cycle + 50, abs=6), "the time it was frozen is not made up for"
-
-
-def test_a_client_that_never_reads_is_disconnected_in_the_end(controller: Controller) -> None:
-    """Whole samples are left out as long as it lags; only one that reads nothing for long is given up."""
-    with socket.create_connection((controller.server.host, 30004), 10.0) as client:
-        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        controller.run(0.1)
-        (server_side,) = controller.server._clients
-        assert isinstance(server_side, RtdeClient)
-        server_side._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 4096)
-        payload = struct.pack(">d", 500.0) + b",".join([b"actual_q"] * 40)
-        client.sendall(struct.pack(">HB", 3 + len(payload), ord("O")) + payload + b"\x00\x03S")
-        controller.run(60.0, then=lambda: server_side.lagging)
-        assert server_side.lagging
-        waiting, begun_s = len(server_side._out), controller.clock.now_s()
-        controller.run(0.9 * BACKLOG_LIMIT_S)
-        assert server_side.open
-        assert len(server_side._out) <= waiting, "nothing is queued behind a sample that was not taken"
-        controller.run(10 * BACKLOG_LIMIT_S, then=lambda: not server_side.open)
-        assert not server_side.open
-        assert controller.clock.now_s() - begun_s >= BACKLOG_LIMIT_S
-
-
-def test_the_event_log_is_in_the_time_of_the_cell(controller: Controller) -> None:
-    controller.real.pass_s(5.0)
-    controller.robot.note("operator", "slider")
-    assert controller.robot.events[-1].t_host_ns == controller.clock.now_ns()
 
 
 def test_while_the_clock_is_held_a_client_that_commands_gets_the_last_sample_again(controller: Controller) -> None:
@@ -267,32 +197,3 @@ def test_samples_step_exactly_in_the_time_of_the_controller_even_when_the_comput
     stamps_s = np.array([stamp_s for stamp_s, _ in reader.arrivals])
     assert len(stamps_s) == pytest.approx(2.0 / step_s, abs=0.05 / step_s)
     np.testing.assert_allclose(np.diff(stamps_s), step_s, atol=1e-12)
-
-
-@pytest.mark.parametrize("delay_s", [0.0, 0.007, 0.02])
-def test_samples_of_the_arm_are_sent_after_the_delay_of_their_link(delay_s: float) -> None:
-    with running() as controller:
-        reader = Reader(controller, 500.0)
-        controller.server.rtde.delay_s = delay_s
-        controller.run(1.0)
-        reader.close()
-        offset_s = controller.robot.cycle_s - controller.robot.timestamp_s
-    stamps_s, came_s = np.array(reader.arrivals).T
-    late_s = came_s - (stamps_s + offset_s) - delay_s
-    assert len(late_s) > 450
-    assert late_s.min() > -1e-6
-    assert late_s.max() < 0.0006, "the emulator waits half a millisecond at least"
-    np.testing.assert_allclose(np.diff(stamps_s), 0.002, atol=1e-12)
-
-
-def test_a_paused_client_gets_no_sample_that_was_on_its_way(controller: Controller) -> None:
-    reader = Reader(controller, 500.0)
-    controller.server.rtde.delay_s = 0.02
-    controller.run(0.1)
-    reader.pause()
-    controller.run(0.01)
-    count = len(reader.arrivals)
-    controller.run(0.1)
-    reader.close()
-    assert count > 20
-    assert len(reader.arrivals) == count

@@ -1,17 +1,14 @@
 """The emulated operator who guides the arm, and the program on the pendant: poses, speed, rests and interruptions."""
 
-import math
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
 from ftmocks.arrays import Array
 from ftmocks.kinematics import MODELS, Vector6, forward, vector6
-from ftmocks.ur.hand import IN_A_PROGRAM, SPEED_RAD_S, guided_by_hand, orientations, pendant_program
+from ftmocks.ur.hand import IN_A_PROGRAM, guided_by_hand, orientations, pendant_program
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.uploads import Upload, start_upload
+from ftmocks.ur.uploads import start_upload
 from ftmocks.world import Truth, World
 from tests.unit.mocks.ur.urscript_robot import run
 
@@ -64,52 +61,12 @@ def test_a_hand_turns_the_wrist_to_all_turns_of_a_cube_and_begins_again() -> Non
     assert len({tuple(row) for row in down.round().astype(int).tolist()}) == 6  # soon it has pulled along every axis
 
 
-def test_a_hand_moves_smoothly_whatever_the_slider_says() -> None:
-    robot = new_robot()
-    robot.arm.speed_fraction = 0.1
-    robot.hand = guided_by_hand(robot, REST_S)
-    speeds: list[float] = []
-    for _ in range(1500):
-        robot.tick()
-        speeds.append(max(map(abs, robot.arm.qd)))
-    assert max(speeds) == pytest.approx(SPEED_RAD_S)
-    assert max(abs(b - a) for a, b in pairwise(speeds)) < 2.0 * SCALE * robot.period_s
-
-
-def test_the_joints_stay_within_a_turn() -> None:
-    q = vector6([*HOME[:5], math.radians(350)])
-    found = orientations(new_robot(q))
-    assert all(abs(angle) <= 2 * math.pi for posture in found for angle in posture)
-    assert found[0] == pytest.approx([*q[:4], math.pi / 2, q[5]])
-
-
 def test_a_tool_with_a_hanging_load_points_down_or_is_tilted() -> None:
     robot = new_robot()
     robot.world.hang(2.0, np.array([0.0, 0.0, 0.2]), 0.25, 0.0)
     axes = np.array([flange(q)[:, 2] for q in orientations(robot)])
     assert set(np.degrees(np.arccos(-axes[:, 2])).round()) == {0, 60}
     assert np.abs(axes[:, :2].sum(axis=0)).max() < 1e-6, "to all sides"
-
-
-def test_a_hand_waits_for_a_program_and_for_power() -> None:
-    robot = new_robot()
-    start_upload(robot, Upload("other", "def other():\n  sleep(20)\nend\n", secondary=False))
-    run(robot, 0.1)
-    assert robot.runtime == Runtime.PLAYING
-    robot.hand = guided_by_hand(robot, REST_S)
-    run(robot, 0.8)
-    assert robot.arm.q == HOME
-    run(robot, 1.0)
-    assert robot.arm.q != HOME
-    robot.emergency_stop(True)
-    run(robot, 0.3)
-    stopped_at = robot.arm.q
-    run(robot, 1.0)
-    assert robot.arm.q == stopped_at
-    robot.emergency_stop(False)
-    robot.brake_release()
-    run(robot, 1.0)
-    assert robot.arm.q != stopped_at
 
 
 def test_a_program_on_the_pendant_goes_there_once_and_back() -> None:

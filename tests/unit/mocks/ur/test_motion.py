@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftmocks.kinematics import MODELS, ZERO6, Vector6, forward, matrix_of, pose_of, rotvec, vector6
-from ftmocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, MotionError, Trapezoid
+from ftmocks.kinematics import MODELS, Vector6, forward, matrix_of, pose_of, rotvec, vector6
+from ftmocks.ur.motion import Arm, CannotFollow, JointMove, LineMove, Trapezoid
 
 DH = MODELS["UR5e"]
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
@@ -53,12 +53,6 @@ def test_trapezoid_takes_length_over_speed_plus_one_ramp(
         assert np.abs(np.diff(rate)).max() / np.diff(times)[0] <= acceleration * 1.01
 
 
-@pytest.mark.parametrize(("speed", "acceleration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0)])
-def test_impossible_speeds_are_refused(speed: float, acceleration: float) -> None:
-    with pytest.raises(MotionError, match="must be positive"):
-        JointMove(DH, HOME, speed, acceleration)
-
-
 def test_movej_is_led_by_the_longest_way_and_all_joints_arrive_together() -> None:
     arm = Arm(DH, HOME)
     goal = shifted(shifted(HOME, 5, 1.5), 3, -0.5)
@@ -77,15 +71,6 @@ def test_movej_keeps_every_joint_below_its_own_limit() -> None:
         arm.step(DT)
         fastest = max(fastest, abs(arm.qd[0]))
     assert fastest == pytest.approx(math.radians(120), rel=1e-3)
-
-
-def test_a_slow_slider_stretches_the_motion() -> None:
-    arm = Arm(DH, HOME)
-    arm.speed_fraction = 0.5
-    for _ in range(100):
-        arm.step(DT)
-    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "main")
-    assert run(arm) == pytest.approx(2 * 1.5, abs=3 * DT)
 
 
 def test_movel_moves_the_tcp_on_a_straight_line() -> None:
@@ -126,35 +111,6 @@ def test_stopj_takes_speed_over_deceleration() -> None:
     assert run(arm) == pytest.approx(0.5, abs=2 * DT)
 
 
-def test_pausing_stops_on_the_path_and_resuming_finishes_it() -> None:
-    arm = Arm(DH, HOME)
-    goal = shifted(HOME, 5, 1.0)
-    arm.start(JointMove(DH, goal, 1.0, 2.0), "main")
-    for _ in range(250):
-        arm.step(DT)
-    arm.paused = True
-    for _ in range(100):
-        arm.step(DT)
-    assert arm.at_rest
-    assert arm.busy
-    arm.paused = False
-    run(arm)
-    assert arm.q == goal
-
-
-def test_two_threads_of_a_program_cannot_both_move_the_arm() -> None:
-    arm = Arm(DH, HOME)
-    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "move")
-    arm.step(DT)
-    with pytest.raises(MotionError, match="already controlling"):
-        arm.start(JointMove(DH, HOME, 1.0, 2.0), "main")
-    arm.release("main")
-    arm.step(DT)
-    assert arm.busy  # only the owner can let go
-    arm.release("move")
-    arm.start(JointMove(DH, HOME, 1.0, 2.0), "main")
-
-
 def test_actual_joints_follow_and_settle_exactly() -> None:
     arm = Arm(DH, HOME)
     goal = shifted(HOME, 5, 1.0)
@@ -167,21 +123,6 @@ def test_actual_joints_follow_and_settle_exactly() -> None:
         arm.step(DT)
     assert arm.actual_q == goal
     assert arm.actual_qd == (0.0,) * 6
-
-
-def test_a_pushed_joint_is_off_its_set_point_until_it_is_let_go() -> None:
-    arm = Arm(DH, HOME)
-    arm.pushed_rad = shifted(ZERO6, 1, 0.05)
-    arm.start(JointMove(DH, shifted(HOME, 5, 1.0), 1.0, 2.0), "main")
-    for _ in range(500):
-        arm.step(DT)
-    assert arm.actual_q[1] - arm.q[1] == pytest.approx(0.05, abs=1e-6)
-    assert arm.q[1] == HOME[1]
-    arm.pushed_rad = ZERO6
-    run(arm)
-    for _ in range(100):
-        arm.step(DT)
-    assert arm.actual_q == arm.q == shifted(HOME, 5, 1.0)
 
 
 commands = st.lists(
@@ -254,36 +195,3 @@ def test_speeds_and_accelerations_of_the_set_point_are_derivatives_of_its_angles
     np.testing.assert_allclose(qd[1:-1][even], rate[even], atol=2e-4)
     np.testing.assert_allclose(qdd[1:-1][even], change[even], atol=0.05)
     assert np.abs(qdd).max() > 0.5
-
-
-def test_the_actual_joints_follow_as_a_first_order_lag_does() -> None:
-    """Against the lag of the set-point, integrated in steps of a hundredth of a cycle."""
-    targets, actual = [HOME], [HOME]
-    for arm in scripted("joints"):
-        targets.append(arm.q)
-        actual.append(arm.actual_q)
-    cycles = np.arange(len(targets))
-    fine = np.arange(0, len(targets) - 1, 0.01)
-    dense = np.array([np.interp(fine, cycles, column) for column in np.transpose(targets)]).T
-    lagged, share = np.array(HOME), 1 - math.exp(-0.01 * DT / 0.005)
-    for k, target in enumerate(dense):
-        if k % 100 == 0:
-            np.testing.assert_allclose(actual[k // 100], lagged, atol=1.5e-5)
-        lagged = lagged + share * (target - lagged)
-
-
-@pytest.mark.parametrize("order", ["joints", "line"])
-def test_motion_between_cycles_has_its_own_derivatives_and_meets_the_next_cycle(order: str) -> None:
-    h = 1e-5
-    cycles = [(arm.motion, arm.actual_q) for arm in scripted(order) if arm.motion is not None]
-    begun, now, before, after, end = (
-        [np.array(column) for column in zip(*(motion.at(t) for motion, _ in cycles), strict=True)]
-        for t in (0.0, 0.001, 0.001 - h, 0.001 + h, DT)
-    )
-    np.testing.assert_allclose(now[1], (after[0] - before[0]) / (2 * h), atol=1e-5)
-    np.testing.assert_allclose(now[2], (after[1] - before[1]) / (2 * h), atol=1e-3)
-    actual = np.array([q for _, q in cycles])
-    np.testing.assert_allclose(begun[0], actual, atol=1e-15)
-    met = np.abs(end[0][:-1] - actual[1:]).max(axis=1)
-    assert np.median(met) < 1e-8
-    assert met.max() < 2e-5, "where the acceleration jumps"

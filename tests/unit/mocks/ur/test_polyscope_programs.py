@@ -15,7 +15,6 @@ from ftmocks.kinematics import MODELS, Vector6, forward, pose_of, vector6
 from ftmocks.ur.dashboard import answer
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot
-from ftmocks.ur.variables import OUTPUTS
 from tests.unit.mocks.ur.urscript_robot import HOME, end_of, logged, new_robot, results, run, start
 
 POLYSCOPE = {"3": (3, 15, 0), "5": (5, 15, 0), "10": (10, 11, 0)}
@@ -117,30 +116,9 @@ TIMER = """global timer_1=0
   run Timer_Thread_1()"""
 
 
-def pallet(first: Sequence[float], across: Sequence[float]) -> str:
-    return f"""cnt_1_x = cnt_1 % 2
-      cnt_1_y = floor(cnt_1 / 2)
-      pose_1 = interpolate_pose(interpolate_pose({pose(first)}, {pose(across)}, cnt_1_x/1), {pose(LOW)}, cnt_1_y/1)
-      if (cnt_1 >= 3):
-        cnt_1 = 0
-      else:
-        cnt_1 = cnt_1 + 1
-      end"""
-
-
 def contact(robot: Robot) -> None:
     """Something opposes the tool, which moves down."""
     robot.world.touch("push", Push(np.array([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])))
-
-
-def answered(value: object) -> Callable[[Robot], None]:
-    """The operator enters a value in each popup."""
-
-    def enter(robot: Robot) -> None:
-        robot.popup_answer = value  # type: ignore[assignment]
-        answer(robot, "close popup")
-
-    return enter
 
 
 def input_on(place: int) -> Callable[[Robot], None]:
@@ -230,28 +208,6 @@ PROGRAMS = [
         ["0.75", "[3, 4]"],
     ),
     Saved(
-        "output, and wait for an input",
-        "3",
-        """while (True):
-    $ 1 "Robot Program"
-    $ 2 "Set DO[0]=On"
-    set_standard_digital_out(0, True)
-    $ 3 "Wait DI[2]=HI"
-    while (get_standard_digital_in(2) == False):
-      sync()
-    end
-    $ 4 "Set DO[0]=Off"
-    set_standard_digital_out(0, False)
-    set_configurable_digital_out(7, True)
-    $ 5 "Wait: 0.01"
-    sleep(0.01)
-    halt
-  end""",
-        [],
-        meanwhile=input_on(2),
-        shows=lambda r: OUTPUTS["actual_digital_output_bits"][1](r) == 1 << 15,
-    ),
-    Saved(
         "thread that assigns global variables in blocks",
         "3",
         """global chosen=0
@@ -278,145 +234,6 @@ PROGRAMS = [
   kill threadId_Thread_1
   textmsg(speed)""",
         ["0.5", "1.0"],
-    ),
-    Saved(
-        "loop, choice and a popup that waits",
-        "3",
-        """$ 1 "Robot Program"
-  $ 2 "Loop 3 times"
-  Loop_1 = 0
-  while (Loop_1 < 3):
-    $ 3 "If Loop_1 = 1"
-    if (Loop_1 == 1):
-      # the second round
-      $ 4 "Popup"
-      popup("the second round", title="Message", warning=True, error=False, blocking=True)
-    # between
-    elif (Loop_1 == 2):
-      $ 5 "ElseIf"
-      textmsg("third")
-    else:
-      # first
-      $ 6 "Else"
-    end
-    Loop_1 = Loop_1 + 1
-  end
-  textmsg(Loop_1)""",
-        ["third", "3"],
-        meanwhile=answered(None),
-    ),
-    Saved(
-        "pallet of a pattern",
-        "3",
-        f"""global cnt_1=0
-  global count=0
-  while (True):
-      $ 1 "Robot Program"
-      $ 2 "Pallet"
-      {pallet(NEAR, HOME)}
-      $ 3 "Approach_1" "noBreak"
-      movel(pose_trans(pose_1, pose_trans(pose_inv({pose(NEAR)}),{pose(at(0.11))})), a=2.5, v=0.25)
-      $ 4 "PatternPoint_1" "noBreak"
-      movel(pose_1, a=2.5, v=0.25)
-      global count=count+1
-      if (cnt_1 == 0):
-        $ 5 "AfterEnd" "noBreak"
-        textmsg(count)
-        halt
-      end
-  end""",
-        ["4"],
-        seconds=9.0,
-        stands=LOW,
-    ),
-    Saved(
-        "timer that is set back",
-        "3",
-        f"""{TIMER}
-  $ 1 "Robot Program"
-  $ 2 "timer_1: Start"
-  timer_1_is_counting = True
-  sleep(0.4)
-  $ 3 "timer_1: Stop"
-  timer_1_is_counting = False
-  global CycleTime=timer_1
-  $ 4 "timer_1: Reset"
-  timer_1 = 0
-  textmsg(norm(CycleTime - 0.4) < 0.02)
-  textmsg(timer_1)""",
-        ["True", "0"],
-    ),
-    Saved(
-        "variable that the operator enters",
-        "3",
-        """global var_1=1
-  $ 2 "var_1:=operator"
-  global var_1=request_integer_from_primary_client("How many rows?")
-  global var_1=var_1+1
-  textmsg(var_1)""",
-        ["8"],
-        meanwhile=answered(7),
-    ),
-    Saved(
-        "gripper at the tool flange",
-        "3",
-        """global measure_width=0
-  global lost_grip=False
-  global zsysm=0.7415
-  global zsysz=0.06935
-  thread lost_grip_thread():
-    while True:
-      set_tool_voltage(24)
-      if True ==get_digital_in(8):
-        lost_grip=True
-      end
-      sync()
-    end
-  end
-  run lost_grip_thread()
-  def RG(width, force=40, payload=0.0):
-    set_tool_digital_out(0, True)
-    zscale = (get_analog_in(2)-0.026)/2.9760034
-    zangle = zscale*1.57079633+-0.08726646
-    global measure_width = (floor((5.0+110*sin(zangle))*10))/10-9.2
-    zload=payload+zsysm
-    set_payload(zload,[0, 0,(zsysz*zsysm)/zload])
-    return measure_width < width
-  end
-  set_tcp(p[0,0,0.18659,0,-0,-3.14159])
-  $ 2 "RG(100)"
-  textmsg(RG(100, 40, payload=0.25))
-  while (not lost_grip):
-    sync()
-  end
-  textmsg(lost_grip)""",
-        ["True", "True"],
-        meanwhile=input_on(16),
-        shows=lambda r: (r.payload_kg, r.signals.outputs, r.tcp_offset[2]) == (0.9915, 1 << 16, 0.18659),
-    ),
-    Saved(
-        "two waypoints for ever",
-        "5",
-        f"""{NEAR_}
-  {FAR_}
-  global rounds=0
-  while (True):
-    $ 2 "Robot Program"
-    $ 3 "MoveJ"
-    $ 4 "Waypoint_1" "breakAfter"
-    {MOVEJ("Waypoint_1")}
-    $ 6 "Waypoint_2" "breakAfter"
-    {MOVEJ("Waypoint_2")}
-    $ 7 "rounds≔rounds+1" "breakAfter"
-    global rounds=rounds+1
-    if (rounds == 2):
-      $ 8 "Script: textmsg"
-      textmsg("two rounds")
-    end
-  end""",
-        ["two rounds"],
-        seconds=2.5,
-        ends=False,
     ),
     Saved(
         "move down until contact",
@@ -458,44 +275,6 @@ PROGRAMS = [
   textmsg(moved < 0.03)""",
         ["True", "True"],
         meanwhile=contact,
-    ),
-    Saved(
-        "force mode",
-        "5",
-        f"""{NEAR_}
-  $ 2 "Force"
-  zero_ftsensor()
-  force_mode_set_damping(0.005)
-  force_mode_set_gain_scaling(1.0)
-  force_mode(tool_pose(), [0, 0, 1, 0, 0, 0], [0.0, 0.0, -2.0, 0.0, 0.0, 0.0], 2, [0.1, 0.1, 0.15, 0.3, 0.3, 0.3])
-  $ 3 "MoveL"
-  $ 4 "Waypoint_1"
-  movel(Waypoint_1_p, a=1.2, v=0.25)
-  $ 5 "Wait: 0.1"
-  sleep(0.1)
-  end_force_mode()
-  stopl(5.0)
-  textmsg(force() < 1.0)""",
-        ["True"],
-        seconds=2.0,
-        stands=NEAR,
-    ),
-    Saved(
-        "signals of Modbus",
-        "5",
-        """modbus_add_signal("192.168.1.3", 255, 1, 0, "MODBUS_1", False)
-  modbus_set_signal_update_frequency("MODBUS_1", 10)
-  modbus_add_signal("192.168.1.3", 255, 1, 1, "MODBUS_2", False)
-  modbus_set_signal_update_frequency("MODBUS_2", 10)
-  modbus_set_runstate_dependent_choice("MODBUS_2",0)
-  set_standard_digital_input_action(0, "default")
-  set_runstate_standard_digital_output_to_value(1, 2)
-  $ 2 "Set MODBUS_2=On"
-  modbus_set_output_signal("MODBUS_2", True, False)
-  set_tool_digital_out(1, True)
-  textmsg(get_tool_digital_out(1))""",
-        ["True"],
-        shows=lambda r: r.signals.outputs == 1 << 17,
     ),
     Saved(
         "subprogram with assignments",
@@ -553,54 +332,6 @@ PROGRAMS = [
         meanwhile=input_on(9),
     ),
     Saved(
-        "tool and payload",
-        "5",
-        """$ 2 "Set"
-  set_tcp(p[-0.018457705833652818,-0.06671608895162245,0.19891377627880122,0.0,0.0,0.0])
-  set_target_payload(1.500000, [-0.003000, -0.016000, 0.015000], [0.003026, 0.003026, 0.003026, 0.0, 0.0, 0.0])
-  set_payload_mass(1.25)
-  set_payload_cog([0.0, 0.0, 9.03E-5])
-  global offset=get_tcp_offset()
-  textmsg(offset[2])
-  textmsg(point_dist(get_actual_tcp_pose(), get_target_tcp_pose()) < 1E-3)""",
-        ["0.19891377627880122", "True"],
-        shows=lambda r: (r.payload_kg, r.payload_cog_m) == (1.25, (0.0, 0.0, 9.03e-5)),
-    ),
-    Saved(
-        "popups, and halt inside a folder",
-        "5",
-        """$ 2 "Folder"
-  $ 3 "Popup"
-  popup("Not activated.", "Sensor", False, True, True)
-  textmsg("closed")
-  if (True):
-    $ 4 "Halt"
-    halt
-  end
-  textmsg("never")""",
-        ["closed"],
-        meanwhile=lambda r: answer(r, "close popup"),
-    ),
-    Saved(
-        "waypoints in a plane",
-        "5",
-        f"""global Plane_1=p[0.0,0.0,0.0,5.470302593228572E-14,0.0,-3.5212753610990396E-14]
-  {NEAR_}
-  {LOW_}
-  $ 2 "MoveJ"
-  movej(pose_trans(Plane_1, Waypoint_1_p), a=1.3962634015954636, v=1.0471975511965976)
-  $ 3 "MoveP"
-  movep(pose_trans(Plane_1, Waypoint_3_p), a=1.2, v=0.25, r=0.025)
-  $ 4 "CircleMove"
-  movec(Waypoint_1_p, Waypoint_3_p, a=1.2, v=0.25, r=0.025, mode=0)
-  $ 5 "MoveL"
-  movel(Waypoint_1_q, a=1.2, v=0.25, t=1.0)
-  textmsg(norm(get_actual_joint_positions()[0] - Waypoint_1_q[0]) < 1e-3)""",
-        ["True"],
-        seconds=5.0,
-        stands=NEAR,
-    ),
-    Saved(
         "move of PolyScope X",
         "10",
         f"""{FAR_}
@@ -640,88 +371,6 @@ PROGRAMS = [
         shows=lambda r: r.signals.outputs == 1 << 7,
     ),
     Saved(
-        "loop with a condition",
-        "10",
-        """global i_var_1 = 0
-  while (i_var_1 < 2 and not get_standard_digital_in(0)):
-    global i_var_1 = i_var_1 + 0.5
-    sync()
-  end
-  textmsg(i_var_1)""",
-        ["2.0"],
-    ),
-    Saved(
-        "values that the operator enters",
-        "10",
-        """global mass_1 = request_float_from_primary_client("Mass of the part?")
-  global wanted = mass_1 * 2
-  textmsg(wanted)
-  set_payload(mass_1, [0.0, 0.0, 0.1])""",
-        ["3.0"],
-        meanwhile=answered(1.5),
-        shows=lambda r: r.payload_kg == 1.5,
-    ),
-    Saved(
-        "registers",
-        "10",
-        """write_output_boolean_register(0, True)
-  write_output_boolean_register(33, True)
-  write_output_integer_register(24, 7)
-  write_output_float_register(24, 9.03E-5)
-  textmsg(read_output_boolean_register(33) == True  and  read_output_integer_register(24) == 7)""",
-        ["True"],
-        shows=lambda r: (
-            [OUTPUTS[f"output_bit_registers{bits}"][1](r) for bits in ("0_to_31", "32_to_63")] == [1, 2]
-            and r.output_doubles[24] == 9.03e-5
-        ),
-    ),
-    Saved(
-        "pallet in a function",
-        "10",
-        f"""global cnt_1 = 0
-  def palletizing():
-      {pallet(NEAR, HOME)}
-      movel(pose_1, a=2.5, v=0.25)
-      return cnt_1
-  end
-  textmsg(palletizing())
-  textmsg(palletizing())""",
-        ["1", "2"],
-        seconds=4.0,
-        stands=HOME,
-    ),
-    Saved(
-        "analog output by a choice",
-        "10",
-        """global level = 2
-  if (level == 1):
-    set_standard_analog_out(0, 0.25)
-  elif (level == 2):
-    # half of the range
-    set_standard_analog_out(0, 0.5)
-  else:
-    # nothing
-  end
-  textmsg(get_standard_analog_in(1))
-  textmsg(get_standard_analog_out(0))""",
-        ["0.0", "0.5"],
-        shows=lambda r: OUTPUTS["standard_analog_output0"][1](r) == 0.5,
-    ),
-    Saved(
-        "signals of the box",
-        "10",
-        """set_configurable_digital_out(0, True)
-  while (get_configurable_digital_in(3) == False):
-    sync()
-  end
-  set_configurable_digital_out(0, get_standard_digital_out(0))
-  set_digital_out(1, True)
-  textmsg(get_configurable_digital_out(0))""",
-        ["False"],
-        meanwhile=input_on(11),
-        shows=lambda r: r.signals.outputs == 1 << 1,
-    ),
-    Saved(
         "timer and steps beside a move",
         "10",
         f"""{TIMER}
@@ -755,10 +404,6 @@ def test_what_polyscope_saves_runs_to_its_end(saved: Saved) -> None:
     if saved.stands is not None:
         assert robot.arm.q == pytest.approx(saved.stands, abs=1e-6)
     assert saved.shows(robot)
-
-
-def test_each_generation_has_nine_programs() -> None:
-    assert [sum(saved.generation == one for saved in PROGRAMS) for one in POLYSCOPE] == [9, 9, 9]
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,6 @@ from tests.unit.mocks.real_time import RealTime
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 CYCLE_S = 0.002
-START = 12
-"""Cycle in which the program has begun."""
 
 
 class Watched:
@@ -69,25 +67,6 @@ def test_a_cycle_picks_places_and_touches(watched: Watched) -> None:
     assert np.ptp(watched.q, axis=0)[0] > 1.0
 
 
-def test_the_file_names_contacts_and_loads_when_they_are_there(watched: Watched) -> None:
-    touches = np.abs(watched.contact).max(axis=1) > 1e-9
-    said = np.array(watched.at_cycles("contact")[START:])
-    assert (said != touches[START:]).sum() <= 2 * len(watched.lines), "a cycle at each end"
-    assert 0.2 < touches.mean() < 0.45
-    assert np.linalg.norm(watched.contact[:, :3], axis=1).max() > 5
-    masses_kg = [truth["mass_kg"] for truth in watched.at_cycles("truth")[START:]]
-    np.testing.assert_allclose(masses_kg, watched.mass_kg[START:, 0])
-
-
-def test_a_part_is_taken_and_left_without_a_jolt(watched: Watched) -> None:
-    """Its support carries it in that moment; only what slips jumps."""
-    changed = np.flatnonzero(np.diff(watched.mass_kg[:, 0]))
-    assert len(changed) >= 4
-    jolts = np.abs(np.diff(watched.wrench, axis=0))[changed]
-    assert jolts[:, :3].max() < 0.01
-    assert jolts[:, 3:].max() < 0.001
-
-
 def test_a_held_part_weighs_on_the_sensor(watched: Watched) -> None:
     robot = watched.robot
     truth = Truth.drawn(2)
@@ -96,25 +75,6 @@ def test_a_held_part_weighs_on_the_sensor(watched: Watched) -> None:
         weight_N = R_base_sensor.T @ truth.gravity_m_s2 * watched.mass_kg[k]
         felt_N = watched.wrench[k, :3] - truth.force_bias_N - watched.contact[k, :3]
         assert np.linalg.norm(felt_N - weight_N) < 4.0 * watched.mass_kg[k], "the rest is inertia"
-
-
-@pytest.mark.slow
-def test_a_seed_repeats_itself_and_contacts_can_be_left_out(tmp_path: Path, watched: Watched) -> None:
-    def repeated(name: str, **how: Any) -> Watched:
-        return Watched(tmp_path / name, 1.6, slip_m=0.005, **how)
-
-    same, free, other = repeated("same"), repeated("free", contacts=False), repeated("other", seed=5)
-    count = len(same.q)
-    np.testing.assert_array_equal(same.q, watched.q[:count])
-    np.testing.assert_array_equal(same.wrench, watched.wrench[:count])
-    np.testing.assert_array_equal(free.q, same.q)
-    assert not free.contact.any()
-    assert not any(line["contact"] for line in free.lines)
-    assert np.abs(other.q - same.q).max() > 0.1
-
-
-def test_a_faster_arm_works_faster(tmp_path: Path) -> None:
-    assert Watched(tmp_path / "truth.jsonl", 1.5, scale=20.0).events().count("grasp") >= 2
 
 
 @pytest.mark.parametrize("how", [{"parts_kg": (2.0, 1.0)}, {"parts_kg": (-1.0, 1.0)}, {"slip_m": float("nan")}])

@@ -7,8 +7,7 @@ import pytest
 from ftmocks.ur import api, http_wire
 from ftmocks.ur.modes import RobotMode, Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
-from ftmocks.ur.variables import output_type
-from tests.unit.mocks.ur.urscript_robot import new_robot, run, start
+from tests.unit.mocks.ur.urscript_robot import new_robot, start
 
 SLEEPING = "def f():\n  sleep(9)\nend\n"
 X = (10, 12, 0)
@@ -62,18 +61,6 @@ def test_modes_by_their_names() -> None:
     assert values()[0] == "UPDATING"
 
 
-def test_a_program_is_paused_resumed_and_stopped() -> None:
-    robot = new_robot(X)
-    assert put(robot, "/program/v1/state", "resume") == 500
-    assert put(robot, "/program/v1/state", "play") == 500
-    start(SLEEPING, robot)
-    states = {"pause": Runtime.PAUSED, "resume": Runtime.PLAYING, "stop": Runtime.STOPPED}
-    for action, state in states.items():
-        assert (put(robot, "/program/v1/state", action), robot.runtime) == (200, state)
-    assert put(robot, "/program/v1/state", "stop") == 200
-    assert [(e.what, e.accepted) for e in robot.events if e.by == "api"][-2:] == [("stop", True), ("stop", True)]
-
-
 def test_local_control_forbids_every_action_and_no_question() -> None:
     robot = start(SLEEPING, new_robot(X))
     robot.remote_control = False
@@ -82,19 +69,6 @@ def test_local_control_forbids_every_action_and_no_question() -> None:
     assert robot.runtime == Runtime.PLAYING
     assert get(robot, "/program/v1/state") == {"state": "PLAYING", "message": "OK"}
     assert (robot.events[-1].by, robot.events[-1].accepted) == ("api", False)
-
-
-def test_power_and_protective_stop() -> None:
-    robot = new_robot(X)
-    assert put(robot, "/robotstate/v1/state", "UNLOCK_PROTECTIVE_STOP") == 409
-    robot.protective_stop("test")
-    assert put(robot, "/robotstate/v1/state", "UNLOCK_PROTECTIVE_STOP") == 409  # too early
-    run(robot, 5.1)
-    assert put(robot, "/robotstate/v1/state", "UNLOCK_PROTECTIVE_STOP") == 200
-    assert put(robot, "/robotstate/v1/state", "POWER_OFF") == 200
-    assert put(robot, "/robotstate/v1/state", "BRAKE_RELEASE") == 200
-    run(robot, 1.5)
-    assert (robot.robot_mode, robot.safety_mode) == (RobotMode.RUNNING, SafetyMode.NORMAL)
 
 
 @pytest.mark.parametrize("body", [b"", b"[]", b'"stop"', b'{"action": 1}', b'{"action": "STOP"}', b"\xff"])
@@ -128,10 +102,3 @@ def test_requests_are_taken_whole_and_in_order() -> None:
 def test_what_is_no_request_is_rejected(head: bytes) -> None:
     with pytest.raises(http_wire.HttpError):
         http_wire.take_request(bytearray(head))
-
-
-def test_polyscope_x_reports_what_polyscope_5_does() -> None:
-    robot = new_robot((10, 11, 0))
-    for name in ("ft_raw_wrench", "payload", "payload_inertia", "tcp_offset", "actual_current_as_torque"):
-        assert output_type(robot, name) != "NOT_FOUND"
-    assert output_type(robot, "target_gravity") == "NOT_FOUND"

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ftmocks.ur.modes import Runtime, SafetyMode
 from ftmocks.ur.robot import Robot
-from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, run, start
+from tests.unit.mocks.ur.urscript_robot import HOME, failure, logged, new_robot, run, start
 
 TURN_RAD_S, LOOKAHEAD_S, SERVO_LAG_S = 1.5, 0.1, 0.005
 SWEEP = """def sweep():
@@ -99,23 +99,6 @@ def test_another_thread_stops_the_sweep() -> None:
     assert logged(robot) == ["stopped"]
     assert robot.arm.at_rest
     assert robot.runtime == Runtime.STOPPED
-
-
-def test_a_thread_that_ends_leaves_the_arm_to_others() -> None:
-    robot = start("""def f():
-  thread t():
-    q = get_target_joint_positions()
-    q[5] = q[5] + 0.005
-    servoj(q, t=0.002)
-  end
-  local mover = run t()
-  join mover
-  movej([0, -1.5, 1, 0, 1, 0], v=1)
-end
-""")
-    run(robot, 5.0)
-    assert end_of(robot).why == "ended"
-    assert robot.arm.q == (0, -1.5, 1, 0, 1, 0)
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,7 @@ import pytest
 
 from ftmocks.factory_kinematics import drawn
 from ftmocks.kinematics import MODELS, forward, rotvec, vector6
-from ftmocks.ur.modes import Runtime
-from ftmocks.ur.robot import Robot, RobotSettings
-from ftmocks.ur.swing import Swing, SwingProgram
-from ftmocks.world import Truth, World
+from ftmocks.ur.swing import Swing
 
 HOME = vector6(np.radians([45, -100, 60, -50, 90, 45]))
 STEP_S = 0.004
@@ -48,40 +45,6 @@ def test_a_swing_starts_and_ends_at_rest_where_it_began_after_whole_periods() ->
         np.testing.assert_allclose(swing.at(t).qd, 0.0, atol=1e-9)
 
 
-def test_the_program_swings_the_arm_and_ends() -> None:
-    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings(time_scale=20.0))
-    swing = Swing(robot.arm.dh, HOME, 8.0)
-    assert robot.start_soon(SwingProgram(robot, swing), by="operator", obstacle=robot.obstacle)
-    played_s = 0.0
-    for _ in range(1000):
-        robot.tick()
-        played_s += 20 * robot.period_s * (robot.runtime == Runtime.PLAYING)
-        if robot.runtime == Runtime.PLAYING:
-            assert robot.program_name == "swing"
-    assert played_s == pytest.approx(swing.duration_s, abs=4 * 20 * robot.period_s)
-    np.testing.assert_allclose(robot.arm.q, HOME, atol=1e-9)
-    assert [event.what for event in robot.events] == [
-        "program swing",
-        "started swing",
-        "moves",
-        "stands",
-        "stopped swing",
-    ]
-
-
-def test_a_stop_ends_the_swing_and_the_arm_comes_to_rest() -> None:
-    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
-    robot.start_soon(SwingProgram(robot, Swing(robot.arm.dh, HOME, 30.0)), by="operator", obstacle=robot.obstacle)
-    for _ in range(500):
-        robot.tick()
-    assert not robot.arm.at_rest
-    robot.stop_program("another client")
-    for _ in range(200):
-        robot.tick()
-    assert robot.arm.at_rest
-    assert not robot.arm.busy
-
-
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
@@ -94,11 +57,3 @@ def test_a_stop_ends_the_swing_and_the_arm_comes_to_rest() -> None:
 def test_an_impossible_swing_is_refused(changes: dict[str, float], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         Swing(MODELS["UR5e"], HOME, **{"seconds": 5.0, **changes})
-
-
-def test_no_swing_starts_without_power() -> None:
-    robot = Robot(World(Truth.drawn(0), MODELS["UR5e"], HOME), RobotSettings())
-    robot.power_off()
-    program = SwingProgram(robot, Swing(robot.arm.dh, HOME, 5.0))
-    assert not robot.start_soon(program, by="operator", obstacle=robot.obstacle)
-    assert "POWER_OFF" in robot.events[-1].why

@@ -55,49 +55,6 @@ def test_expressions(expression: str, value: str) -> None:
     assert results(expression, before=before) == [value]
 
 
-def test_scopes_as_in_the_manual() -> None:
-    before = """
-a = 0
-def free():
-  a = 1
-end
-def hidden():
-  local a = 2
-  inner = 5
-  return a
-end
-def deeper():
-  local a = 3
-  def below():
-    a = 4
-  end
-  below()
-  return a
-end
-def spreading():
-  global b = 6
-end
-free()
-spreading()
-"""
-    assert results("a", "hidden()", "a", "deeper()", "a", "b", before=before) == ["1", "2", "1", "3", "4", "6"]
-
-
-def test_functions_have_defaults_names_and_recursion() -> None:
-    before = """
-def power(x, n=2):
-  if n == 0:
-    return 1
-  elif n == 1:
-    return x
-  else:
-    return x * power(x, n=n - 1)
-  end
-end
-"""
-    assert results("power(3)", "power(n=3, x=2)", "power(5, 0)", before=before) == ["9", "8", "1"]
-
-
 def test_loops_break_and_continue() -> None:
     before = """
 i = 0
@@ -218,13 +175,6 @@ def test_what_is_urscript_is_not_called_an_error(text: str, place: tuple[int, in
     assert rejected.value.place == place
 
 
-def test_labels_of_the_program_tree_are_accepted() -> None:
-    robot = start(
-        'def f():\n  $ 1 "Robot Program"\n  textmsg("a")\n  $ 2 "x≔1" "noBreak"\n  x = 1\n  textmsg(x)\nend\n'
-    )
-    assert logged(robot) == ["a", "1"]
-
-
 @pytest.mark.parametrize(
     ("body", "why"),
     [
@@ -253,11 +203,6 @@ def test_a_type_that_changes_while_the_program_runs_ends_it(body: str, why: str)
     assert why in failure(body).why
 
 
-def test_a_local_variable_may_have_another_type_than_one_of_its_name() -> None:
-    before = "x = 1\ndef g():\n  local x = 2.5\n  return x\nend\ndef h():\n  local y = True\n  return y\nend\ny = 3"
-    assert results("g()", "x", before=before) == ["2.5", "1"]
-
-
 @pytest.mark.parametrize(
     ("text", "doubt"),
     [
@@ -279,20 +224,6 @@ def test_what_reports_contradict_about_runs_and_is_recorded(text: str, doubt: st
     robot = start(text)
     (found,) = robot.events[0].detail["doubts"]
     assert doubt in found
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        "  global x = 1\n  def g():\n    return x\n  end",
-        "  def g(x):\n    y = x\n    return y\n  end\n  x = 1",
-        "  x = 0\n  while x < 3:\n    x = x + 1  # counts\n  end",
-        "  thread t():\n    n = 0\n    while n < 2:\n      n = n + 1\n    end\n  end\n  h = run t()\n  join h",
-    ],
-)
-def test_a_careful_program_raises_no_doubt(body: str) -> None:
-    robot = start(f"def f():\n{body}\nend\n")
-    assert robot.events[0].detail == {}
 
 
 def test_a_program_that_is_rejected_leaves_the_running_one() -> None:
@@ -324,8 +255,3 @@ def test_any_text_is_a_program_or_a_syntax_error_and_moves_nothing(text: str) ->
     else:
         assert "syntax error" in robot.events[-1].why
     assert robot.arm.at_rest
-
-
-def test_one_line_alone_is_a_program_too() -> None:
-    robot = start('textmsg("hello")\n')
-    assert logged(robot) == ["hello"]

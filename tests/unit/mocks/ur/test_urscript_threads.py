@@ -5,10 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ftmocks.ur.dashboard import answer
 from ftmocks.ur.modes import Runtime
 from ftmocks.ur.robot import Robot
-from tests.unit.mocks.ur.urscript_robot import HOME, end_of, failure, logged, new_robot, results, run, start
+from tests.unit.mocks.ur.urscript_robot import HOME, end_of, logged, new_robot, results, run, start
 
 GUARDED = """
 def segment():
@@ -40,34 +39,6 @@ def segment():
   write_output_integer_register(24, 1)
 end
 """
-
-
-def test_a_program_waits_for_the_answer_to_its_popup() -> None:
-    robot = start('def f():\n  popup("Is the tool free?", title="Tour", blocking=True)\n  textmsg("yes")\nend\n')
-    run(robot, 1.0)
-    assert (robot.popup, logged(robot)) == ("Is the tool free?", [])
-    asked = next(event for event in robot.events if event.what == "popup")
-    assert (asked.why, asked.detail["title"], asked.detail["blocking"]) == ("Is the tool free?", "Tour", True)
-    assert answer(robot, "close popup") == "closing popup"
-    run(robot, 0.1)
-    assert logged(robot) == ["yes"]
-
-
-def test_a_move_takes_its_speed_from_its_arguments() -> None:
-    robot = start("def f():\n  movej([0.785, -1.745, 1.047, -0.873, 1.571, 1.785], a=100, v=0.5)\nend\n")
-    run(robot, 1.0)
-    assert robot.arm.actual_qd[5] == pytest.approx(0.5, rel=1e-6)
-    assert answer(robot, "running") == "Program running: true"
-    run(robot, 1.1)
-    assert answer(robot, "running") == "Program running: false"
-
-
-def test_a_move_with_a_time_takes_that_time() -> None:
-    robot = start("def f():\n  movej([0.785, -1.745, 1.047, -0.873, 1.571, 1.785], t=1.5)\n  textmsg(1)\nend\n")
-    run(robot, 1.46)
-    assert logged(robot) == []
-    run(robot, 0.1)
-    assert logged(robot) == ["1"]
 
 
 @pytest.mark.parametrize("scale", [1.0, 20.0])
@@ -124,11 +95,6 @@ def test_the_stop_behind_a_kill_decelerates_as_it_says_from_the_first_cycle(guar
     drops = [before - after for before, after in pairwise(speeds)]
     assert np.max(drops) <= 2.0 * guarded.period_s + 1e-12
     assert len(speeds) == pytest.approx(1 + 0.5 / 2.0 / guarded.period_s, abs=2)
-
-
-def test_two_threads_cannot_both_move_the_arm() -> None:
-    end = failure("  thread mover():\n    movej([0, -1.5, 1, -1, 1.5, 0])\n  end\n  run mover()\n  sync()\n  stopj(2)")
-    assert end.detail == {"error": "Another thread is already controlling the robot", "line": 7, "column": 3}
 
 
 def test_a_killed_thread_gives_the_arm_away_to_another_move() -> None:
@@ -202,25 +168,3 @@ exit_critical
 )
 def test_threads(before: str, values: dict[str, str]) -> None:
     assert results(*values, before=before) == list(values.values())
-
-
-def test_the_end_of_the_program_ends_its_threads() -> None:
-    robot = start("def f():\n  thread t():\n    sleep(0.05)\n    textmsg(1)\n  end\n  run t()\nend\n")
-    run(robot, 0.2)
-    assert logged(robot) == []
-
-
-def test_settings_and_registers_of_a_program() -> None:
-    robot = start(
-        "def f():\n  set_payload(1.5, [0, 0, 0.1])\n  write_output_float_register(24, 2)\n"
-        "  write_output_integer_register(25, read_output_integer_register(24) - 3)\n"
-        "  write_output_float_register(25, read_input_float_register(24))\nend\n"
-    )
-    assert (robot.payload_kg, robot.payload_cog_m) == (1.5, (0.0, 0.0, 0.1))
-    assert (robot.output_doubles[24], robot.output_ints[25]) == (2.0, -3)
-    start("def g():\n  set_payload(1.6)\n  set_gravity([0, 9.82, 0])\n  zero_ftsensor()\nend\n", robot)
-    assert (robot.payload_kg, robot.payload_cog_m) == (1.6, (0.0, 0.0, 0.1))
-    assert robot.target_gravity_m_s2 == (0.0, 9.82, 0.0)
-    assert robot.tcp_wrench() == pytest.approx([0.0] * 6, abs=1e-9)
-    start("def h():\n  set_target_payload(1.7, [0, 0, 0.2], [1, 2, 3, 0, 0, 0])\nend\n", robot)
-    assert (robot.payload_kg, robot.payload_inertia) == (1.7, (1.0, 2.0, 3.0, 0.0, 0.0, 0.0))
