@@ -207,7 +207,7 @@ def test_a_spoilt_sensor_is_one_sentence(stack: ExitStack, spoil: str, words: st
     ("spoil", "host", "words"),
     [
         ("stamp", "ros2:/arm/pose", "have the stamp 0"),
-        ("quaternion", "ros2:/arm/pose", "quaternion of length 0.7"),
+        ("quaternion", "ros2:/arm/pose", "quaternion of norm 0.7"),
         ("pose-nan", "ros2:/arm/pose", "is not finite"),
         ("mixed", "ros2:/arm/pose", r"went back by 3\.\d s"),
         ("joint", "ros2:/joint_states?urdf={urdf}&flange=flange", "missing joint1, found joint2"),

@@ -1,6 +1,4 @@
-"""Robotous over CAN: a sample comes in two halves, which are paired by order and clock.
-
-Pure: halves go in with their time of receipt, fields come out whose halves belong to one sample.
+"""Robotous over CAN: a sample consists of two frames, here called halves, which are paired by order and time.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8: 1 Mbit/s, 11-bit identifiers, configurable.
 """
@@ -17,54 +15,55 @@ from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.robotous.sensor import RobotousSensor
 from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames, request_message
 
-# The halves of a field follow each other directly. Between two fields lies this silence, or half a period.
+# Silence between two fields, s, at most half a period. The halves of one field follow each other directly.
 _SILENCE_S = 0.002
-# The sensor may be slower than its rate by this fraction: manual and vendor's header differ by 0.1 on one rate.
+# Largest relative deviation of the rate: manual and the vendor's header file differ by 0.1 for one rate.
 _DRIFT = 0.12
-# Fraction of a period by which the host may be late when it has all fields.
+# Fraction of a period by which the host may be late if all fields have arrived.
 _LATE = 0.5
-# Fraction of a period by which the clock may be late when it counts missing fields.
+# Fraction of a period by which the clock may be late when missing fields are counted.
 _EARLY = 0.25
 _MOST_WAITING = 1000
 
 
 class Halves:
-    """Pairs halves, and drops every pair that may be of two samples.
+    """Pairs first and second halves to fields, and drops every pair that may belong to two samples.
 
-    Halves must take turns. That is not enough: when a second half and the next first one are lost, the others still
-    take turns, but one field is missing by the clock. So a run of fields is accepted in the first silence after it, and
-    only if all fields due since the last run have arrived. A late host reads all of them together. So after a deficit
-    the fields wait, and the next run shows whether the host was late or a field was lost. After a half out of turn, all
-    fields up to the next silence are dropped. The run that follows only sets the clock, as do the first two.
+    First and second halves must alternate. This condition is not sufficient: if a second half and the next first half
+    are lost, the others still alternate, but one field is missing. Therefore fields are accepted in the first silence
+    after them, and only if as many fields have arrived as are due by the clock. If some are missing, the fields wait,
+    because the host may be late; the next fields show whether it was late or a field was lost. After two first or two
+    second halves in a row, all fields up to the next silence are dropped, and the following ones only set the clock,
+    as do the first two fields of a stream.
 
     Parameters
     ----------
     period_s : float
-        Between two samples; NaN for replies to requests.
+        Time between two samples, s; NaN for replies to requests.
     late_s : float
-        How late the sensor itself may be: `Clock.lead_s`. A shorter deficit then counts as late, so two neighbouring
-        losses are not detected.
+        Largest lag of the sensor itself, s: `Clock.lead_s`. If it is not zero, the loss of two neighbouring halves may
+        remain undetected.
     """
 
     def __init__(self, period_s: float = math.nan, late_s: float = 0.0) -> None:
         self.silence_s = _SILENCE_S if math.isnan(period_s) else min(_SILENCE_S, period_s / 2)
-        """Call `silence` after this time without a half."""
+        """Time without a half, s, after which `silence` must be called."""
         self.lost = 0
-        """Fields that were due and were not accepted."""
+        """Number of fields that were due and were not accepted."""
         self.quiet = True
-        """Whether nothing arrived since a silence."""
+        """Whether no half has arrived since the last silence."""
         self._period_ns = period_s * 1e9
         self._late_ns = late_s * 1e9
         self._number = 0
-        # Arrival of the field `_number`.
+        # Estimated arrival of the field `_number`.
         self._clock_ns: float | None = None
         self._first = b""
-        # Fields since then, which the clock has not confirmed yet.
+        # Later fields, which are not confirmed by the clock yet.
         self._waiting: list[Field] = []
-        # How many of them arrived late or after a loss.
+        # How many of the waiting fields arrived late or after a loss.
         self._doubtful = 0
         self._in_turn = True
-        # Whether the clock is valid for these fields: none was out of turn since it was set.
+        # Whether the clock is valid for the waiting fields, because all halves have alternated since it was set.
         self._in_step = False
 
     def take(self, t_host_ns: int, data: bytes, *, second: bool) -> None:
@@ -79,13 +78,12 @@ class Halves:
             self._first = data
 
     def silence(self) -> list[Field]:
-        """Return the accepted fields, after `silence_s` without a half."""
-        # In every silence the count is compared with the clock, so two neighbouring losses are found.
+        """Return the accepted fields. It is called after `silence_s` without a half."""
         if self.quiet:
             return []
         self.quiet = True
         if not self._in_turn:
-            # a first half at the end may belong to the next field, or have lost its second half
+            # a first half at the end belongs to the next field, or its second half was lost
             self._first, self._waiting, self._doubtful = b"", [], 0
             self._in_turn, self._in_step = True, False
         if self._first or not self._waiting:
@@ -100,19 +98,21 @@ class Halves:
             self._set_clock(self._doubtful)
             if self._complete():
                 return self._accept()
-            self._set_clock(len(self._waiting), by_period=False)  # twice: the sensor's clock has shifted
+            self._set_clock(
+                len(self._waiting), by_period=False
+            )  # two deficits in a row: the sensor's clock shifted
         return []
 
     def _complete(self) -> bool:
-        """Return whether all fields that were due since the clock was set have arrived."""
+        """Return whether all fields have arrived that are due since the clock was set."""
         if self._clock_ns is None:
             return True
-        # more fields than due mean that the clock was set late
+        # more fields than due show that the clock was set too late
         due_ns = (len(self._waiting) + _LATE) * self._period_ns + self._late_ns
         return self._waiting[-1].t_host_ns - self._clock_ns < due_ns
 
     def _accept(self) -> list[Field]:
-        # After any irregularity the next sample is dropped, because neighbouring values prove nothing.
+        # After an irregularity the next sample is dropped, because its values do not show whether its halves match.
         fields, self._waiting, self._doubtful = self._waiting, [], 0
         self._number = fields[-1].number
         if self._clock_ns is not None:
@@ -121,17 +121,17 @@ class Halves:
         return fields
 
     def _set_clock(self, fields: int, *, by_period: bool = True) -> None:
-        """Set the clock by the last of the oldest `fields`, and drop them.
+        """Set the clock by the last one of the oldest `fields`, and drop them.
 
-        The host may be late, so a clock that was set before moves by whole periods.
+        A clock that was set before is moved by whole periods, because the host may be late.
         """
         clock_ns: float = self._waiting[fields - 1].t_host_ns
-        self._in_step = by_period and self._clock_ns is not None  # else it may be late, so the next run sets it again
+        self._in_step = by_period and self._clock_ns is not None  # otherwise it may be late, and the next fields set it
         if self._clock_ns is not None:
             missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
             if by_period:
                 clock_ns = min(clock_ns, self._clock_ns + missed * self._period_ns)
-            if self._number:  # the stream begins with the first accepted field
+            if self._number:  # fields before the first accepted one are not counted
                 self._number += missed
                 self.lost += missed
         self._clock_ns = clock_ns
@@ -142,20 +142,20 @@ class Halves:
 
 
 IDS = (0x64, 0x01, 0x02)
-"""The factory's identifiers of commands, and of the first and second half of a field."""
+"""Factory settings of the identifiers: of commands, and of the first and second half of a field."""
 BITRATE = 1_000_000
 _WAIT_S = 0.05
-# The silence after the last half: shorter than `StreamLimits.stale_s`, longer than the slowest sensor's period.
+# Silence without any half, s: shorter than `StreamLimits.stale_s`, longer than the period of the slowest sensor.
 _HEARD_S = 0.15
-# After so many without a silence the reader looks at its other tasks.
+# Number of frames after which the reader returns to its other tasks if there is no silence.
 _MOST_FRAMES = 50
 
 
 class RobotousCan(RobotousSensor):
-    """A Robotous RFT on a CAN bus; the other parameters are those of `RobotousSensor`.
+    """A Robotous RFT on a CAN bus. Parameters that are not described here are those of `RobotousSensor`.
 
-    `ids` are the identifiers to the sensor and the two from it. `Halves` pairs the frames, because the second half of a
-    field does not identify the first.
+    `ids` are the identifiers of commands and of the two halves of a field. `Halves` pairs the frames, because a second
+    half does not show to which first half it belongs.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class RobotousCan(RobotousSensor):
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``robotous-can://can0?interface=socketcan&ids=0xF0,0xF1,0xF2&rate=500``."""
+        """Build the driver from an address such as ``robotous-can://can0?ids=0xF0,0xF1,0xF2&rate=500``."""
         return cls(
             address,
             interface=options.text("interface", "socketcan"),
@@ -211,20 +211,20 @@ class RobotousCan(RobotousSensor):
         super()._start_stream(rate_Hz)
 
     def _damaged(self) -> int:
-        """Return the fields that are missing by the clock, or were dropped because their pairing was uncertain."""
+        """Return the number of fields that were missing, or were dropped because their pairing was uncertain."""
         return self._halves.lost
 
     def _silence_fix(self) -> str:
         if self._heard_ns is not None and self._clock.now_ns() - self._heard_ns < _HEARD_S * 1e9:
-            return "give this computer less to do, because frames arrive too late to be paired"
+            return "reduce the load of this computer, because frames are read too late to be paired"
         return super()._silence_fix()
 
     def _receive(self) -> list[Field]:
-        """Return the fields of a run of frames, which ends with a silence."""
-        # The adapter's time stamps differ between adapters or are missing, so they are not used.
+        """Return the fields of the frames up to the next silence."""
+        # Time stamps of adapters are not used, because they differ between adapters or are missing.
         wait_s = min(_WAIT_S, self._clock.poll_s) if self._halves.quiet else self._halves.silence_s
         frame = self._bus.look(wait_s)
-        with self._clock.held():  # else an emulated sensor might send as fast as a starved program reads
+        with self._clock.held():  # otherwise an emulated sensor could send as fast as a slow program reads
             for _ in range(_MOST_FRAMES):
                 if frame is None:
                     return self._halves.silence()
@@ -236,7 +236,7 @@ class RobotousCan(RobotousSensor):
 
 
 def _parse_ids(text: str) -> tuple[int, int, int]:
-    """Find the identifiers of commands and of both halves in an option such as ``0xF0,0xF1,0xF2``."""
+    """Return the identifiers of commands and of both halves from an option such as ``0xF0,0xF1,0xF2``."""
     try:
         command, first, second = (int(number, 0) for number in text.split(","))
     except ValueError:

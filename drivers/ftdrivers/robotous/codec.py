@@ -1,14 +1,14 @@
-"""Robotous RFT: commands, replies and samples, the same on both wires, as pure functions on bytes.
+"""Robotous RFT: commands, replies and samples, which are equal on both wires, as pure functions on bytes.
 
-A command is a field of 8 bytes, a reply or sample one of 16; byte 0 is the command. CAN carries bare fields, the UART
-puts each into a frame. All multi-byte numbers are big-endian.
+A command is a field of 8 bytes, a reply or sample is a field of 16 bytes. Byte 0 is the command. On CAN, fields are
+sent without a frame; on a UART each field is in a frame. All multi-byte numbers are big-endian.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8, communication protocol, dividers and rates,
 as in the public protocol page of ItsLP18/robotous-ft-pipeline. RFT76-HA01 is missing there; public drivers give it the
 scale of RFT40-SA01.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py.
 
-A decoder returns a value or raises `ProtocolError`, never anything else.
+A decoder returns a value or raises `ProtocolError` and no other exception.
 """
 
 import struct
@@ -26,14 +26,14 @@ FRAME_SIZE = REPLY_SIZE + 3
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 RATE_CODES = {10: 1, 20: 2, 50: 3, 100: 4, 200: 5, 333: 6, 500: 7, 1000: 8}
-"""Code of each output rate in Hz. A new sensor reports code 0, which is 200 Hz."""
+"""Code of each output rate in Hz. A new sensor reports code 0, which means 200 Hz."""
 
 DEFAULT_BAUD = 115_200
 
 FASTEST_Hz = {57_600: 200, 115_200: 333, 230_400: 500, 460_800: 500, 921_600: 1000}
-"""The highest output rate at each baud rate of a UART."""
+"""Highest output rate, Hz, at each baud rate of a UART."""
 
-# By the whole model, because its first number does not determine the scale of torque.
+# Keys are complete model names, because the first number does not determine the scale of the torque.
 _COUNTS_PER_N_NM = {
     "RFT40-SA01": (50, 2000),
     "RFT44-SB01": (50, 2000),
@@ -48,10 +48,9 @@ _COUNTS_PER_N_NM = {
 _FAILURES = {1: "not supported", 2: "value out of range", 3: "failed to set"}
 
 
-# The filter command is left out: manual and vendor's header number its settings in opposite order. So is the bias
-# command.
+# The filter command is not used, because manual and header file number its settings in opposite order.
 class Command(IntEnum):
-    """The commands of this driver, which never sends the bias command, 0x11."""
+    """The commands that this driver sends. It never sends the bias command, 0x11."""
 
     MODEL = 0x01
     SERIAL = 0x02
@@ -64,7 +63,7 @@ class Command(IntEnum):
 
 
 class Field(NamedTuple):
-    """A received field of 16 bytes; `number` counts damaged ones too."""
+    """A received field of 16 bytes. `number` also counts damaged fields."""
 
     number: int
     t_host_ns: int
@@ -79,22 +78,22 @@ class Sample(NamedTuple):
 
 
 def encode(command: Command, *parameters: int) -> bytes:
-    """Build a command field (8 bytes)."""
+    """Return a command field (8 bytes)."""
     return bytes([command, *parameters]).ljust(COMMAND_SIZE, b"\0")
 
 
 def encode_frame(field: bytes) -> bytes:
-    """Put a field into a UART frame: start, field, sum of the field, end. Nothing is escaped."""
+    """Return the UART frame of a field: start byte, field, sum of the field, end byte. Nothing is escaped."""
     return bytes([START_OF_FRAME, *field, sum(field) & 0xFF, END_OF_FRAME])
 
 
 def is_frame(data: bytes) -> bool:
-    """Return whether bytes are a whole frame of the sensor: length, both marks and the sum."""
+    """Return whether bytes are a complete frame of the sensor with correct start, end and sum."""
     return len(data) == FRAME_SIZE and data == encode_frame(data[1:-2])
 
 
 def deframer() -> Deframer:
-    """Build a finder of frames in a stream of bytes."""
+    """Return a `Deframer` for these frames."""
     return Deframer(bytes([START_OF_FRAME]), FRAME_SIZE, is_frame)
 
 
@@ -110,7 +109,7 @@ def decode_text(field: bytes) -> str:
 
 
 def decode_rate(field: bytes) -> int:
-    """Decode the reply to `GET_RATE`: output rate in Hz."""
+    """Decode the reply to `GET_RATE` and return the output rate in Hz."""
     _expect_size(field)
     for rate_Hz, code in RATE_CODES.items():
         if field[1] in {code, 0} and (field[1] or rate_Hz == 200):
@@ -119,7 +118,7 @@ def decode_rate(field: bytes) -> int:
 
 
 def check_set(field: bytes) -> None:
-    """Check the reply to a setting; a refusal is a `ProtocolError` with its reason."""
+    """Check the reply to a setting. A refusal raises `ProtocolError` with its reason."""
     _expect_size(field)
     if field[1] != 1:
         reason = _FAILURES.get(field[2], "unknown reason")
@@ -142,7 +141,7 @@ def overloaded_axes(overload: int) -> list[str]:
 
 
 def counts_per_unit(model: str) -> tuple[int, int]:
-    """Return counts per N and per N·m of a model such as ``RFT60-HA01``; a code of its wire may follow."""
+    """Return counts per N and per N·m of a model such as ``RFT60-HA01``; a code of the wire may follow the name."""
     counts = _COUNTS_PER_N_NM.get(model[:10])
     if counts is None:
         found = f"the scale of model '{model}' is unknown, known are those of {', '.join(_COUNTS_PER_N_NM)}"

@@ -1,10 +1,10 @@
-"""Robotous RFT force/torque sensor, on either wire; and on a serial port, where each field has a frame with a sum.
+"""Robotous RFT force/torque sensor: the common part of both wires, and the driver for a serial port.
 
 Ref: Robotous, "RFT Series Installation and Operation Manual", revision 1.8: 8N1, 115200 baud from the factory.
 Checked on hardware: no. Verified against: tests/unit/drivers/robotous/test_codec.py and the emulator (tests/wire).
 
-A streaming sensor accepts only stop and bias, so a reply to any other command proves that it has stopped. This driver
-never sends the bias command.
+A streaming sensor only accepts the commands stop and bias. A reply to any other command shows that it has stopped. This
+driver never sends the bias command.
 """
 
 from abc import abstractmethod
@@ -27,24 +27,24 @@ _ATTEMPTS = 3
 
 
 class RobotousSensor(StreamingSensor):
-    """A Robotous RFT; a subclass sends and receives its fields on one wire.
+    """A Robotous RFT. A subclass sends and receives fields on one wire.
 
-    `counts` are the six raw values, `t_device_s` is NaN, `status` holds the overload bits (5 for Fx down to 0 for Tz);
-    any of them set is a `DeviceFault`. Samples carry no number. On a UART `seq` counts arrived frames, including
-    damaged ones, so a wholly lost sample shows only in the rate. On CAN the clock shows what is missing.
+    `counts` are the six raw values, `t_device_s` is NaN, and `status` holds the overload bits (5 for Fx to 0 for Tz).
+    Any overload raises `DeviceFault`. Samples carry no number. On a UART, `seq` counts received frames including
+    damaged ones, so that a lost sample is only visible in the rate. On CAN, lost samples are detected by the clock.
 
     Parameters
     ----------
     name : str
-        The device as the user knows it.
+        Name of the device, with which every error message begins.
     fastest_Hz : int
-        The highest output rate of the wire.
+        Highest output rate of the wire.
     rate_Hz : int, optional
-        10, 20, 50, 100, 200, 333, 500 or 1000. Without it, the rate that is set in the sensor.
+        Output rate: 10, 20, 50, 100, 200, 333, 500 or 1000. By default the rate that is set in the sensor.
     counts_per_unit : (int, int), optional
-        Per N and per N·m, for a model whose scale this driver does not know.
+        Counts per N and per N·m, for a model whose scale this driver does not know.
     sign : int
-        -1 for a sensor mounted or wired to report the reaction.
+        -1 for a sensor that reports the reaction.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class RobotousSensor(StreamingSensor):
 
     @abstractmethod
     def _damaged(self) -> int:
-        """Return how many fields were damaged or incomplete."""
+        """Return the number of damaged or incomplete fields."""
 
     def _start_stream(self, _rate_Hz: int) -> None:
         self._send(codec.encode(Command.START))
@@ -110,7 +110,7 @@ class RobotousSensor(StreamingSensor):
     def _read_block(self) -> FtSamples:
         received = self._receive()
         self._lost = self._malformed = self._damaged() - self._damaged_before
-        fields = [field for field in received if field.data[0] == Command.START]  # a late reply is no sample
+        fields = [field for field in received if field.data[0] == Command.START]  # other fields are late replies
         if not fields:
             return NOTHING
         samples = [codec.decode_sample(field.data) for field in fields]
@@ -135,7 +135,7 @@ class RobotousSensor(StreamingSensor):
             self._close()
 
     def _ask(self, command: Command, *parameters: int) -> bytes:
-        """Stop any stream, send a command and return the field that replies to it."""
+        """Stop any stream, send a command and return the reply."""
         for _ in range(_ATTEMPTS):
             self._send(codec.encode(Command.STOP))
             self._send(codec.encode(command, *parameters))
@@ -152,7 +152,7 @@ class RobotousSensor(StreamingSensor):
 class RobotousSerial(RobotousSensor):
     """A Robotous RFT on a serial port.
 
-    `baud` is one of `codec.FASTEST_Hz`; the other parameters are those of `RobotousSensor`.
+    `baud` is a key of `codec.FASTEST_Hz`; the other parameters are those of `RobotousSensor`.
     """
 
     def __init__(
@@ -180,7 +180,7 @@ class RobotousSerial(RobotousSensor):
 
     @classmethod
     def from_url(cls, address: str, options: Options, *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
+        """Build the driver from an address such as ``robotous-serial:///dev/serial/by-id/…?baud=921600&rate=1000``."""
         return cls(
             address,
             baud=options.integer("baud", codec.DEFAULT_BAUD, 57_600, 921_600),
@@ -215,7 +215,7 @@ class RobotousSerial(RobotousSensor):
         return [Field(number, t_host_ns, frame[1:-2]) for number, frame in frames]
 
     def _damaged(self) -> int:
-        # Frames carry no number: only damaged ones are counted, and one lost as a whole shows in the rate.
+        # Frames carry no number: damaged frames are counted, but lost ones are only visible in the rate.
         return self._frames.damaged
 
 
@@ -223,7 +223,7 @@ def _identify(data: bytes) -> str:
     for _, frame in codec.deframer().feed(data):
         if frame[1] == Command.MODEL:
             return f"Robotous {codec.decode_text(frame[1:-2])}"
-    raise ProtocolError("no reply of a Robotous sensor")
+    raise ProtocolError("the bytes contain no reply of a Robotous sensor")
 
 
 SERIAL_PROBES = tuple(

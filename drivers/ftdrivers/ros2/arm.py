@@ -1,4 +1,4 @@
-"""An arm of any make that is read by topics of ROS 2 and never moved.
+"""An arm of any make that is read through topics of ROS 2 and never moved.
 
 Ref: REP 105 (frames), geometry_msgs/msg/PoseStamped, sensor_msgs/msg/JointState, tf2_msgs/msg/TFMessage.
 Checked on hardware: no. Verified against: tests/ros2.
@@ -23,23 +23,23 @@ from ftdrivers.ros2.middleware import Node, OnePublisher, Received, clock_diagno
 from ftdrivers.ros2.poses import Chain, Joints, PoseReader, Poses, StampedPose, Transforms
 
 SCHEME: Final = "ros2:"
-# From the publisher to the first pose.
+# Time-out from the discovery of the publisher to the first pose, s.
 _FIRST_S: Final = 2.0
 _STALE_S: Final = 0.3
-# The speed is that of so long, because encoders have steps and stamps scatter.
+# Interval over which the speed is averaged, because encoders have steps and stamps have jitter.
 _SPEED_NS: Final = 100_000_000
-# A translation counts as a turn with this lever.
+# Lever with which a translation is converted to an angle.
 _LEVER_M: Final = 1.0
 _MOST_UNREAD: Final = 1_000_000
-# A clock that goes back by more belongs to another publisher.
+# If stamps go back by more, s, they were given by another clock.
 _BACK_S: Final = 0.5
 
 
 class Ros2Arm(ReadOnlyArm):
-    """The pose of a flange by topics; `t_device_s` is the stamp of the header.
+    """An arm whose flange pose is published on topics; `t_device_s` is the stamp of the header.
 
-    Joint angles are not known to ftdrive (NaN), whatever their number. All joint speeds are the speed of the flange,
-    a turn in rad/s or a translation over 1 m, whichever is faster, over 0.1 s.
+    Joint angles are NaN. All joint speeds are the speed of the flange, averaged over 0.1 s: the larger one of its
+    angular velocity in rad/s and its velocity divided by 1 m.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Ros2Arm(ReadOnlyArm):
         ``ros2:/pose_topic``, ``ros2:tf?base=base&flange=tool0`` or
         ``ros2:/joint_states?urdf=arm.urdf&flange=tool0&base=base``.
     model : str, optional
-        Name of the arm, for the calibration.
+        Name of the arm, which is stored in calibrations.
     """
 
     def __init__(
@@ -55,12 +55,12 @@ class Ros2Arm(ReadOnlyArm):
         host: str,
         *,
         model: str | None = None,
-        speed_rad_s: float = 0.0,  # noqa: ARG002 - it is never moved
+        speed_rad_s: float = 0.0,  # noqa: ARG002 - the arm is never moved
         acceleration_rad_s2: float = 0.0,  # noqa: ARG002
         clock: Clock = REAL,
     ) -> None:
         self._host, self._model, self._clock = host, model, clock
-        self._reader = pose_reader_of(host)  # also finds wrong options
+        self._reader = pose_reader_of(host)  # also rejects wrong options
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
         self._single: list[OnePublisher] = []
@@ -71,7 +71,7 @@ class Ros2Arm(ReadOnlyArm):
         self._failure: ProtocolError | None = None
 
     def open(self, *, control: bool = False) -> None:
-        """Subscribe and wait for the first pose. Raises `ConnectError`; always if control is requested."""
+        """Subscribe and wait for the first pose. Raises `ConnectError`, always if control is requested."""
         super().open(control=control)
         if self._ros is not None:
             if self._failure is None and self._age_s() < _STALE_S:
@@ -111,7 +111,7 @@ class Ros2Arm(ReadOnlyArm):
                 raise ConnectError(self._reader.missing(), "check topic, frames and that the driver of the arm runs")
 
     def close(self) -> None:
-        """Leave the graph of ROS. Followers end."""
+        """Leave the ROS graph. Followers raise `StreamBroken`."""
         ros, self._ros = self._ros, None
         if ros is not None:
             ros.close()
@@ -120,7 +120,7 @@ class Ros2Arm(ReadOnlyArm):
             self._changed.notify_all()
 
     def identify(self) -> DeviceInfo:
-        """Return the configured name of the arm, and who publishes."""
+        """Return the configured name of the arm and the publishing nodes."""
         if self._ros is None:
             raise ConnectError(f"{self._host}: not open", "open it first")
         facts = {"publisher": Fact(", ".join(sorted(set(self._publishers.values()))), "device")}
@@ -217,7 +217,7 @@ class Ros2Arm(ReadOnlyArm):
         )
 
     def diagnose(self) -> list[Diagnosis]:
-        """Report who publishes, and by how much the stamps differ from the clock of this computer."""
+        """Report the publishing nodes, and the difference between the stamps and the clock of this computer."""
         self._check()
         state, ros = self.state(), self._ros
         found = f"{self._host} is published by {', '.join(sorted(set(self._publishers.values())))}"
@@ -225,7 +225,7 @@ class Ros2Arm(ReadOnlyArm):
 
 
 def _speed(before: StampedPose, after: StampedPose) -> float:
-    """Return the speed of the flange between two poses, rad/s; 0 for one pose alone."""
+    """Return the speed of the flange between two poses, rad/s; 0 if both are the same pose."""
     dt_s = 1e-9 * (after.t_ns - before.t_ns)
     if dt_s <= 0:
         return 0.0
@@ -242,7 +242,7 @@ def _no_states() -> ArmStates:
 
 
 def pose_reader_of(host: str) -> PoseReader:
-    """Return what turns the messages of an address into poses. Raises `BadUrl`."""
+    """Return the reader that converts messages to poses for an address. Raises `BadUrl`."""
     parts = split_url(host)
     options = Options(host, parts.query)
     address = parts.address.strip("/")

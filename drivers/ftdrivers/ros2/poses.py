@@ -13,7 +13,7 @@ from ftdrivers.errors import BadUrl, ProtocolError
 from ftdrivers.interfaces import Array
 from ftdrivers.ros2.middleware import stamp_ns
 
-# Bytes of a URDF; its meshes are files of their own.
+# Largest size of a URDF, bytes. Meshes are separate files.
 _LARGEST: Final = 16_000_000
 _MOVES: Final = ("revolute", "continuous", "prismatic")
 
@@ -28,19 +28,19 @@ class _Joint(NamedTuple):
 
 
 class Chain:
-    """The joints from a base to a flange.
+    """The kinematic chain from a base to a flange.
 
     Parameters
     ----------
     path : Path
-        A URDF, with xacro already evaluated.
+        A URDF file without xacro.
     base, flange : str
-        Links; an empty base is the root.
+        Names of links. An empty base selects the root.
 
     Raises
     ------
     BadUrl
-        The file is no URDF, a link does not exist, or the flange is not below the base.
+        The file is not a URDF, a link does not exist, or the flange is not a descendant of the base.
     """
 
     def __init__(self, path: Path, base: str, flange: str) -> None:
@@ -68,7 +68,7 @@ class Chain:
             self._joints.insert(0, joints[link])
             link = joints[link].parent
         if base and link != base:
-            raise BadUrl(f"{path}: {flange} is not below {base}: exchange base and flange, or give another base")
+            raise BadUrl(f"{path}: {flange} is not a descendant of {base}: exchange both, or give another base")
         self.names = [joint.name for joint in self._joints if joint.kind in _MOVES]
         if not self.names:
             raise BadUrl(f"{path}: no joint moves between {base or link} and {flange}: give other links")
@@ -117,13 +117,13 @@ def _numbers(text: str) -> Array:
 
 
 UNIT_TOLERANCE: Final = 1e-3
-"""Largest difference between the length of a quaternion and 1."""
-# The parts of a chain of tf may differ by so much in time.
+"""Largest difference between the norm of a quaternion and 1."""
+# Largest difference between the stamps of the transforms in a chain.
 _SPREAD_NS: Final = 100_000_000
 
 
 class StampedPose(NamedTuple):
-    """The flange in the base at one time."""
+    """Pose of the flange in the base at one time."""
 
     t_ns: int
     R_base_flange: Array
@@ -131,26 +131,26 @@ class StampedPose(NamedTuple):
 
 
 class PoseReader(Protocol):
-    """Takes messages of its topics and gives poses."""
+    """Converts messages of its topics to poses."""
 
     topics: dict[str, str]
-    """Types by topic."""
+    """Message type of each topic."""
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the poses that a message completes. Raises `ProtocolError`."""
+        """Yield the poses that a message completes. Raises `ProtocolError`."""
 
     def missing(self) -> str:
-        """Return why there is no pose yet."""
+        """Return the reason why there is no pose yet."""
 
 
 def _pose_of(position: Any, quaternion: Any, what: str) -> tuple[Array, Array]:
-    """Return orientation and origin of a message's parts. Raises `ProtocolError`."""
+    """Return rotation matrix and position of a pose in a message. Raises `ProtocolError`."""
     p = position.x, position.y, position.z
     q = quaternion.x, quaternion.y, quaternion.z, quaternion.w
     if not np.isfinite((*p, *q)).all():
-        raise ProtocolError(f"{what} is not finite", "check its driver")
+        raise ProtocolError(f"{what} is not finite", "check the driver that publishes it")
     if abs(float(np.linalg.norm(q)) - 1) > UNIT_TOLERANCE:
-        raise ProtocolError(f"{what} has a quaternion of length {np.linalg.norm(q):.3g}", "normalize it in its driver")
+        raise ProtocolError(f"{what} has a quaternion of norm {np.linalg.norm(q):.3g}", "normalize it in its driver")
     return Rotation.from_quat(q).as_matrix(), np.array(p)
 
 
@@ -161,17 +161,17 @@ class Poses:
         self.topics = {topic: "geometry_msgs/msg/PoseStamped"}
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the pose of a message."""
+        """Yield the pose of a message."""
         pose = _pose_of(message.pose.position, message.pose.orientation, f"a pose of {topic}")
         yield StampedPose(stamp_ns(message.header, topic), *pose)
 
     def missing(self) -> str:
-        """Return that no message came."""
+        """Return that no message arrived."""
         return f"no message of {next(iter(self.topics))} arrived"
 
 
 class Joints:
-    """Poses from joint angles. Messages of other joints, such as those of a gripper, are left out."""
+    """Poses from joint angles. Messages of other joints, such as those of a gripper, are ignored."""
 
     def __init__(self, topic: str, chain: Chain) -> None:
         self.topics = {topic: "sensor_msgs/msg/JointState"}
@@ -179,7 +179,7 @@ class Joints:
         self._seen: set[str] = set()
 
     def positions(self, topic: str, message: Any) -> dict[str, float] | None:
-        """Return the joints of the chain; None for a message of others. Raises `ProtocolError`."""
+        """Return the joint positions of the chain; None for a message of other joints. Raises `ProtocolError`."""
         if len(message.position) != len(message.name):
             raise ProtocolError(
                 f"a message of {topic} has {len(message.name)} names and {len(message.position)} positions",
@@ -194,30 +194,30 @@ class Joints:
         return {name: found[name] for name in self.chain.names}
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the pose of a message that has all joints."""
+        """Yield the pose of a message that has all joints."""
         if (found := self.positions(topic, message)) is not None:
             R, p = self.chain.poses({name: np.array([value]) for name, value in found.items()})
             yield StampedPose(stamp_ns(message.header, topic), R[0], p[0])
 
     def missing(self) -> str:
-        """Return which joints no message had."""
+        """Return the joints that were missing in all messages."""
         lacking = [name for name in self.chain.names if name not in self._seen]
         has = ", ".join(sorted(self._seen)) or "none"
         return f"no message of {next(iter(self.topics))} has all joints; missing {', '.join(lacking)}, found {has}"
 
 
 class Transforms:
-    """Poses from tf: all transforms between two frames, at the time of the oldest of them that moves."""
+    """Poses from tf: the product of the transforms between two frames, at the time of the oldest one that moves."""
 
     def __init__(self, base: str, flange: str) -> None:
         self._base, self._flange = base, flange
         self.topics = {"/tf": "tf2_msgs/msg/TFMessage", "/tf_static": "tf2_msgs/msg/TFMessage"}
-        # By child: parent, time or None if it is static, orientation, origin.
+        # Keys are child frames; values are parent, time (None if static), orientation and origin.
         self._parts: dict[str, tuple[str, int | None, Array, Array]] = {}
         self._last_ns = 0
 
     def read(self, topic: str, message: Any) -> Iterator[StampedPose]:
-        """Give the pose if the oldest part of the chain is newer than before."""
+        """Yield a pose if the oldest transform of the chain is newer than before."""
         for part in message.transforms:
             child = part.child_frame_id.lstrip("/")
             parent = part.header.frame_id.lstrip("/")
@@ -247,7 +247,7 @@ class Transforms:
         yield StampedPose(oldest_ns, R, p)
 
     def _chain(self) -> list[tuple[str, int | None, Array, Array]] | None:
-        """Return the parts from base to flange; None while one is missing."""
+        """Return the transforms from base to flange; None while one is missing."""
         chain: list[tuple[str, int | None, Array, Array]] = []
         frame = self._flange
         while frame != self._base:
@@ -258,13 +258,13 @@ class Transforms:
         return chain
 
     def missing(self) -> str:
-        """Return where the tree is cut."""
+        """Return which frame or transform is missing."""
         frames = {*self._parts, *(parent for parent, *_ in self._parts.values())}
         for frame in (self._base, self._flange):
             if frame not in frames:
                 return f"tf has no frame {frame!r}; it has {', '.join(sorted(frames)) or 'none'}"
         frame = self._flange
-        for _ in self._parts:  # a wrong tree may be a circle
+        for _ in self._parts:  # a wrong tree may contain a cycle
             if frame in self._parts and frame != self._base:
                 frame = self._parts[frame][0]
         if frame != self._base:

@@ -1,10 +1,10 @@
-"""A force/torque sensor of any make, as a topic of ROS 2.
+"""A force/torque sensor of any make that is published on a topic of ROS 2.
 
 Ref: geometry_msgs/msg/WrenchStamped; REP 103 (SI units), REP 105 (frames), REP 107 (stamps).
 Checked on hardware: no. Verified against: tests/ros2.
 
-The wrench must be as measured: not compensated for a payload and not filtered for contact. A zeroing that does not
-change while ftdrive runs is a part of the bias. Whether it is compensated, `doctor` and the calibration show.
+The wrench must be as measured, neither compensated for a payload nor filtered for contact; `doctor` and a calibration
+detect a compensated wrench. A zero that does not change while ftdrive runs is part of the bias.
 """
 
 from queue import Empty, SimpleQueue
@@ -26,17 +26,17 @@ _WAIT_S = 0.05
 
 
 class Ros2Sensor(StreamingSensor):
-    """The WrenchStamped of a topic.
+    """A sensor whose wrench is published as WrenchStamped.
 
-    `t_device_s` is the stamp of the header, `seq` the number that the publisher's middleware gave, so that lost
-    messages are gaps. `counts` are empty and `status` is 0. The rate is that of the topic; none is nominal.
+    `t_device_s` is the stamp of the header. `seq` is the sequence number of the publisher's middleware, so that lost
+    messages are gaps. `counts` are empty and `status` is 0. There is no nominal rate.
 
     Parameters
     ----------
     topic : str
-        Such as ``/ft_sensor/wrench``.
+        Name of the topic, such as ``/ft_sensor/wrench``.
     reliable : bool
-        Request reliable delivery; the publisher must offer it.
+        Request reliable delivery, which the publisher must offer.
     sign : int
         -1 for a sensor that reports the reaction.
     """
@@ -51,7 +51,7 @@ class Ros2Sensor(StreamingSensor):
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``ros2:/topic?reliable=0``."""
+        """Build the driver from an address such as ``ros2:/topic?reliable=0``."""
         topic = "/" + address.lstrip("/")
         return cls(topic, reliable=bool(options.integer("reliable", 0, 0, 1)), sign=sign, clock=clock)
 
@@ -66,7 +66,7 @@ class Ros2Sensor(StreamingSensor):
         return DeviceInfo(f"{self.name}, frame {frame_id}", NOT_REPORTED, NOT_REPORTED, facts)
 
     def _first_frame(self) -> str:
-        """Return the frame of the first message and drop it."""
+        """Wait for the first message, drop it and return its frame."""
         try:
             first = self._queue.get(timeout=self._limits.first_sample_s)
         except Empty:
@@ -103,7 +103,7 @@ class Ros2Sensor(StreamingSensor):
         )
 
     def _check_frame(self, frames: set[str]) -> None:
-        """Raise `ProtocolError` for another frame: the wrench would be in other axes."""
+        """Raise `ProtocolError` for a message in another frame, whose wrench is in other axes."""
         self._frame_id = self._frame_id or min(frames)
         if frames != {self._frame_id}:
             other = ", ".join(sorted(frames - {self._frame_id}))
@@ -117,7 +117,7 @@ class Ros2Sensor(StreamingSensor):
             ros.close()
 
     def diagnose(self) -> list[Diagnosis]:
-        """Report who publishes in which frame, and by how much the stamps differ from the clock of this computer."""
+        """Report publishing node and frame, and the difference between the stamps and the clock of this computer."""
         facts = self.identify().facts
         found = f"published by {facts['publisher'].value}, frame {facts['frame_id'].value!r}"
         topic = Diagnosis("topic", bool(facts["frame_id"].value), found, "set header.frame_id in its driver")

@@ -1,1 +1,1 @@
-"""Universal Robots arms, through ur_rtde."""
+"""Universal Robots arms."""

@@ -1,9 +1,9 @@
 """A Universal Robots arm.
 
-`reading.py` reads it, a control path (`control.py`) moves it. The dashboard server or the Robot API can stop the arm
-without either.
+`reading.py` reads the arm, and a control path (`control.py`) moves it. The dashboard server or the Robot API can stop
+the arm even if both fail.
 
-Ref: `is_steady` in the URScript manual.
+Ref: Universal Robots, URScript manual, `is_steady`.
 Checked on hardware: no.
 """
 
@@ -43,10 +43,10 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 log = logging.getLogger(__name__)
 
 _ARRIVED_RAD: Final = 1e-3
-# Speed of the set-point, which is exactly zero at rest.
+# Largest set-point speed of an arm at rest, which reports exactly zero.
 _STANDING_RAD_S: Final = 1e-6
 _STILL_RAD_S: Final = 0.002
-# Within this time after the end of a sweep the arm stands.
+# Time-out from the end of a sweep to standstill, s.
 _SETTLES_S: Final = 5.0
 
 
@@ -58,20 +58,20 @@ class UrArm(RobotArm):
     host
         Address of the controller.
     model
-        Such as "UR5e", to compare poses with; None takes the model that the controller reports.
+        Model with which poses are compared, such as "UR5e". None selects the model that the controller reports.
     speed_rad_s, acceleration_rad_s2
-        Defaults of the leading joint in `move_to`. The speed slider of the pendant scales them down further.
+        Default speed and acceleration of the leading joint in `move_to`. The speed slider of the pendant reduces them.
     stop_rad_s2
         Deceleration of the fastest joint in a stop, on every control path.
     control
-        The control path: "ur-rtde", "script", or "auto", which takes ur_rtde where it is installed and the controller
-        has a dashboard server.
+        Control path: "ur-rtde", "script", or "auto", which selects ur_rtde if it is installed and the controller has a
+        dashboard server.
     api_port
-        Of the Robot API of PolyScope X.
+        TCP port of the Robot API of PolyScope X.
     clock
-        Measures and waits; an emulated cell has its own.
+        Clock of the time stamps and time-outs; an emulated cell has a clock of its own.
     timing
-        Every time limit; by default those of the cell that `clock` times.
+        Time-outs. By default they are those of a real or an emulated cell, according to `clock`.
     """
 
     def __init__(  # noqa: PLR0913 - one for each setting of the arm
@@ -115,12 +115,12 @@ class UrArm(RobotArm):
     # ------------------------------------------------------------------ opening and closing
 
     def open(self, *, control: bool = False) -> None:
-        """Connect, read-only unless `control` is requested; reopen lost connections.
+        """Connect, read-only unless `control` is requested, and reopen lost connections. It takes at most 5 s.
 
-        Reading disturbs nothing and needs no remote control. Taking control starts a program on the controller, which
-        zeroes the sensor in an e-Series wrist. It never stops another program that plays or is paused, except one that
-        this object has started before. After a safety stop the operator has to clear it first; the interrupted move is
-        gone. Takes 5 s at most. Raises `ConnectError`, and then the arm is closed.
+        Reading has no side effects and needs no remote control. Taking control starts a program on the controller,
+        which zeroes the sensor in an e-Series wrist. A program that plays or is paused is never stopped, unless this
+        object has started it before. The operator has to clear a safety stop first; an interrupted move is not
+        continued. If `ConnectError` is raised, the arm is closed.
         """
         try:
             self._drop_what_is_lost(control)
@@ -166,7 +166,7 @@ class UrArm(RobotArm):
         return Opening(self._host, self._setting, reader, self._program, self._stop_rad_s2, self._clock, self._timing)
 
     def close(self) -> None:
-        """Stop the arm and its control script, then disconnect. Idempotent; takes 1.5 s at most."""
+        """Stop the arm and the control program, then disconnect. Idempotent. It takes at most 1.5 s."""
         control, self._control = self._control, None
         reader, self._reader = self._reader, None
         self._goal = None
@@ -178,7 +178,7 @@ class UrArm(RobotArm):
             reader.close()
 
     def _end_program(self, control: Control, reader: Reader | None) -> None:
-        """End our program through its control path, if that can be confirmed to work."""
+        """End the control program through its control path, if that can be confirmed to work."""
         try:
             look = None if reader is None else reader.look(limit_s=self._timing.glance_s)
             if control.has_ended:
@@ -202,11 +202,11 @@ class UrArm(RobotArm):
         return replace(reader.info, facts={**reader.info.facts, "control": Fact(f"{path}: {why}", source)})
 
     def state(self) -> ArmState:
-        """Read a new, consistent state; the pose is that of the mechanical flange, whatever TCP is active.
+        """Read a new, consistent state. The flange is the mechanical flange and does not depend on the active TCP.
 
-        Raises `DeviceTimeout` when the controller's clock stands still for 0.2 s, `StreamBroken` when the connection is
-        lost, `DeviceFault` when the joints are not measured (no power) or the pose does not fit the model, and
-        `ConnectError` when the controller is too old to report its TCP and the arm was opened without control.
+        Raises `DeviceTimeout` if the controller's clock stands still for 0.2 s, `StreamBroken` if the connection was
+        lost, `DeviceFault` if the joints are not measured (no power) or the pose does not fit the model, and
+        `ConnectError` if the controller is too old to report its TCP and the arm was opened without control.
         """
         reader = self._reading()
         if not reader.reports_tcp and self._control is None:
@@ -217,12 +217,12 @@ class UrArm(RobotArm):
         return reader.state(lambda: self._in_control().call("tcp_offset"))
 
     def follow(self) -> AbstractContextManager[Follow[ArmStates]]:
-        """Read every sample from now on, 500 a second (CB3: 125), as flange poses; see `RobotArm`.
+        """Read every sample from now on as flange poses, 500 Hz (CB3: 125 Hz); see `RobotArm`.
 
-        Before the first call, the arm is read 125 times a second, which is enough for a session and costs a quarter.
-        That call replaces the reader; a `state` or `status` that waits in another thread then raises `StreamBroken`.
-        Samples that are late are included: compare `t_device_s`. Samples without power over the joints are left out;
-        a read that finds no others raises `DeviceFault`. A controller that is too old to report its TCP is polled.
+        Before the first call the arm is read at 125 Hz, which is enough for a session and needs a quarter of the CPU
+        time. The first call replaces the reader; a `state` or `status` that waits in another thread then raises
+        `StreamBroken`. Late samples are included, see `t_device_s`. Samples of an arm without power are left out, and a
+        read without other samples raises `DeviceFault`. A controller that is too old to report its TCP is polled.
         """
         reader = self._reading()
         if not reader.reports_tcp:
@@ -235,22 +235,23 @@ class UrArm(RobotArm):
         return reader.follow()
 
     def status(self) -> ArmStatus:
-        """Return the controller's modes and settings, updated with every sample; see `RobotArm`."""
+        """Return modes and settings of the controller, which are updated with every sample; see `RobotArm`."""
         return self._reading().status()
 
     def controller_settings(self) -> ControllerSettings:
-        """Read payload, inertia and gravity over a connection of their own, which takes some milliseconds.
+        """Read payload, inertia and gravity over a separate connection, which takes a few milliseconds.
 
-        Payload from PolyScope 5.6 and 3.11 on, inertia from 5.11 and 3.15 on, gravity only on recent versions.
+        The payload is reported since PolyScope 5.6 and 3.11, the inertia since 5.11 and 3.15, and gravity by recent
+        versions only.
         """
         self._reading()
         return read_controller_settings(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
 
     def in_remote_control(self) -> bool | None:
-        """Ask the dashboard server or the Robot API, which takes some milliseconds. Raises `NoDashboard`.
+        """Return whether the robot is in remote control, from the dashboard server or the Robot API.
 
-        None before PolyScope 5.6 and on PolyScope X before 10.12, which do not report it, and at the addresses of
-        URSim, which does not need it.
+        The result is None before PolyScope 5.6 and on PolyScope X before 10.12, which do not report it, and at the
+        addresses of URSim, which does not need remote control. Raises `NoDashboard`.
         """
         reader = self._reading()
         if reader.version[:2] < (5, 6) or self._host in SIMULATORS:
@@ -258,9 +259,9 @@ class UrArm(RobotArm):
         return reader.services.ask(lambda services: services.in_remote_control(), timeout_s=self._timing.connect_s)
 
     def reported_program(self) -> str | None:
-        """Ask the controller for the program's state and name; None where it does not answer.
+        """Return state and name of the program on the controller; None if the controller does not answer.
 
-        A program that a client has sent may be reported with the name of the loaded one: not checked on hardware.
+        Not checked on hardware: a program that a client has sent may be reported with the name of the loaded program.
         """
         return self._reading().reported_program()
 
@@ -271,10 +272,10 @@ class UrArm(RobotArm):
     # ------------------------------------------------------------------ moving
 
     def within_safety_limits(self, q_rad: Sequence[float]) -> bool:
-        """Ask the controller whether it would accept these joint angles (6,). Needs control.
+        """Return whether the controller accepts these joint angles (6,). Needs control.
 
-        The controller knows its own limits and planes, not the obstacles around it. Raises `DeviceFault` or
-        `StreamBroken` when it cannot be asked.
+        The controller checks its own limits and planes, but does not know the obstacles in the cell. Raises
+        `DeviceFault` or `StreamBroken` if it cannot be asked.
         """
         q = _joints(q_rad)
         return bool(self._ask(self._in_control(), "within_safety_limits", q))
@@ -282,27 +283,27 @@ class UrArm(RobotArm):
     def set_payload(
         self, mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float] = (0.0,) * 6
     ) -> None:
-        """Set the payload; see `RobotArm`. The controller also zeroes the sensor in an e-Series wrist.
+        """Set the payload, see `RobotArm`. The controller also zeroes the sensor in an e-Series wrist.
 
-        The change is instantaneous, so the arm may make a small jump. Raises `DeviceFault` or `StreamBroken` when it
-        cannot be confirmed, and `ValueError` for values that no payload has. PolyScope before 5.10 takes no inertia.
+        The arm may move slightly, because the change is instantaneous. Raises `DeviceFault` or `StreamBroken` if the
+        change is not confirmed, and `ValueError` for impossible values. PolyScope before 5.10 accepts no inertia.
         """
         mass, com, inertia = checked_payload(mass_kg, p_flange_com_m, inertia_kg_m2)
         version = self._reading().version[:2]
         takes_inertia = version >= (5, 10)
         if any(inertia) and not takes_inertia:
             raise DeviceFault(
-                "PolyScope {}.{} takes no inertia of the payload from a program".format(*version),
+                "PolyScope {}.{} accepts no inertia of the payload from a program".format(*version),
                 "set the payload at the pendant",
             )
         self._set("payload", mass, com, inertia if takes_inertia else None)
 
     def set_gravity(self, up_base_m_s2: Sequence[float]) -> None:
-        """Set the direction of gravity; see `RobotArm`. Errors as `set_payload`."""
+        """Set gravity, see `RobotArm`. Raises the exceptions of `set_payload`."""
         self._set("gravity", checked_gravity(up_base_m_s2))
 
     def _set(self, what: str, *values: object) -> None:
-        """Have our program set what a controller assumes; another program is left as it is."""
+        """Let the control program set a value in the controller. Another program is not affected."""
         control = self._in_control()
         self._look_out()
         self._check_ours(control)
@@ -312,7 +313,7 @@ class UrArm(RobotArm):
             )
 
     def _ask(self, control: Control, name: str, *values: object) -> object:
-        """Call our program; a fault that the controller reports goes before the error of the call."""
+        """Call the control program. A fault that the controller reports is raised instead of the error of the call."""
         try:
             return control.call(name, *values, look_out=self._look_out)
         except DeviceError as error:
@@ -331,10 +332,10 @@ class UrArm(RobotArm):
     ) -> None:
         """Move all joints to `q_rad` (6,) and return when they have arrived; see `RobotArm` for the speed.
 
-        `guard` is called about 100 times a second. Whatever ends the wait early stops the arm first and is raised then:
-        `DeviceFault` (protective, emergency or safeguard stop, program ended, not arrived), `StreamBroken`,
-        `DeviceTimeout` (silent controller, or `timeout_s` is over), an exception of the guard, KeyboardInterrupt.
-        A safety stop is never reset. The program is ended, so that the rest of the move cannot be resumed.
+        `guard` is called about 100 times per second. Each of these exceptions stops the arm before it is raised:
+        `DeviceFault` (protective, emergency or safeguard stop, program ended, arm not at the goal), `StreamBroken`,
+        `DeviceTimeout` (silent controller, or `timeout_s` has passed), an exception of the guard, KeyboardInterrupt.
+        A safety stop is never reset. After a failure the control program is ended, so that nobody can resume the move.
         """
         q = _joints(q_rad)
         speed = self._speed_rad_s if speed_rad_s is None else float(speed_rad_s)
@@ -347,20 +348,18 @@ class UrArm(RobotArm):
         self._travel(begin, q, speed, f"the move to {_degrees(q)}", timeout_s=timeout_s, guard=guard)
 
     def sweep(self, sweep: Sweep, *, guard: Guard) -> None:
-        """Follow a sweep from the posture where it begins; see `RobotArm`. Guard and errors as in `move_to`.
+        """Follow a sweep from its first posture, see `RobotArm`. Guard and exceptions are those of `move_to`.
 
-        Our program evaluates it in every cycle of the controller. The path "ur-rtde" cannot: the arm would follow this
-        computer, and not stop with it.
+        The control program evaluates the sweep in every cycle of the controller. This is not possible on the path
+        "ur-rtde": its set-points would come from this computer, and the arm would not stop if the computer fails.
         """
-        # ur_rtde's servoJ would follow Python's timing, and a suspended computer would leave the last set-point
-        # without any stop.
         centre = _joints(sweep.centre_rad)
         speed = float(sweep.largest(1).max())
         _check_speed(speed, float(sweep.largest(2).max()))
         if not self._in_control().stops_itself:
             raise DeviceFault(
-                "the control path ur-rtde follows no sweep, because its program on the controller cannot evaluate one",
-                "take the other path: --control script, or [robot] control",
+                "the control path ur-rtde cannot follow a sweep, because its program cannot evaluate one",
+                "select the other path: --control script, or [robot] control",
             )
 
         def begin(control: Control) -> bool:
@@ -381,14 +380,13 @@ class UrArm(RobotArm):
         timeout_s: float,
         guard: Guard,
     ) -> None:
-        """Begin a motion that ends at `q`, and return when it has."""
-        # A program of another client found before a move is not stopped.
+        """Start a motion that ends at `q`, and return when the arm has arrived."""
         control = self._in_control()
         self._stop_requested.clear()
         self._goal = None
         with self._stopping_on_error():
             self._look_out()
-        self._check_ours(control)  # another program is not stopped
+        self._check_ours(control)  # if another program runs, it is not stopped
         guard()
         self._moves_at_rad_s = speed_rad_s
         with self._stopping_on_error():
@@ -419,7 +417,7 @@ class UrArm(RobotArm):
         return bool(ended)
 
     def _check_arrival(self, look: Sample, q: list[float]) -> None:
-        # The control process may report the end before the last set-points arrive over RTDE.
+        # The control process may report the end of the move before the last set-points arrive over RTDE.
         deadline_s = self._clock.now_s() + self._timing.reason_s
         while not _near(look.target_q_rad, q):
             if self._clock.now_s() > deadline_s:
@@ -430,12 +428,12 @@ class UrArm(RobotArm):
             look = self._reading().look()
 
     def wait_until_still(self, *, timeout_s: float, guard: Guard) -> None:
-        """Return when the joints have been at rest long enough for the structure to stop ringing.
+        """Return when the joints have been at rest for so long that vibrations of the structure have decayed.
 
-        For 0.3 s without a break, the arm is at the target of `move_to`, its target velocity is zero and every measured
-        joint speed is below 0.002 rad/s. (The controller's own `is_steady` waits for 0.5 s of zero target velocity; the
-        mean force over 1 s does not show the difference.) Errors as in `move_to`; without control, safety stops are not
-        errors.
+        For 0.3 s without interruption, the arm must be at the target of `move_to`, its target velocity must be zero and
+        each measured joint speed below 0.002 rad/s. (The controller's own `is_steady` requires 0.5 s of zero target
+        velocity; the mean force over 1 s is the same.) Exceptions are those of `move_to`; without control, safety stops
+        raise none.
         """
         still_since_s: float | None = None
         with self._stopping_on_error():
@@ -453,13 +451,13 @@ class UrArm(RobotArm):
                     return
 
     def stop(self) -> None:
-        """Stop the arm and end `move_to` with `DeviceFault`. From any thread, at any time; needs control."""
+        """Stop the arm; `move_to` then raises `DeviceFault`. May be called from any thread. Needs control."""
         if self._control is not None:
             self._stop_requested.set()
             self._halt()
 
     def _watch(self, timeout_s: float, guard: Guard, what: str, look_out: Callable[[], Sample]) -> Iterator[Sample]:
-        """Yield each new sample until the time is over; raise any fault of the arm."""
+        """Yield each new sample until the time-out; raise any fault of the arm."""
         deadline_s = self._clock.now_s() + timeout_s
         while True:
             look = look_out()
@@ -473,7 +471,7 @@ class UrArm(RobotArm):
 
     @contextmanager
     def _reporting_stop(self) -> Iterator[None]:
-        """Report any failure after `stop` in another thread as that stop."""
+        """Raise the requested stop instead of the failure that it caused, if another thread has called `stop`."""
         try:
             yield
         except DeviceError as error:
@@ -482,7 +480,7 @@ class UrArm(RobotArm):
             raise
 
     def _look_out(self) -> Sample:
-        """Return a new sample; raise any fault of the arm, its program or the connections."""
+        """Return a new sample; raise any fault of the arm, the control program or the connections."""
         try:
             look = self._reading().look()
         except (DeviceTimeout, StreamBroken) as error:
@@ -500,7 +498,7 @@ class UrArm(RobotArm):
             return self._look_out()
 
     def _fault(self, look: Sample | None = None) -> DeviceError | None:
-        """Return why the arm does not move, if the controller reports a reason."""
+        """Return the reason why the arm does not move, or None if the controller reports none."""
         reader = self._reading()
         look = look or reader.look()
         deadline_s = self._clock.now_s() + self._timing.reason_s
@@ -522,9 +520,9 @@ class UrArm(RobotArm):
             raise
 
     def _halt(self) -> None:
-        """Stop the arm with `stopJ`, or else by ending its program; never raises."""
-        # Time-outs of TCP are far longer than the 0.2 s after which a controller is lost, so the child is killed and
-        # the services are asked to stop the program.
+        """Stop the arm with `stopJ`; if that fails, end the control program. Never raises."""
+        # TCP detects a lost controller much later than the time-out of 0.2 s. Therefore the control process is killed,
+        # and dashboard server or Robot API are asked to stop the program.
         control = self._control
         if control is None:
             return
@@ -557,9 +555,9 @@ class UrArm(RobotArm):
         return False
 
     def _check_ours(self, control: Control) -> None:
-        """Raise `DeviceFault` when another program runs, whose registers mean nothing to us."""
-        # Another program looks like ours: playing, with our last values in its registers. So ours is asked for its
-        # TCP offset.
+        """Raise `DeviceFault` if another program runs instead of the control program."""
+        # Another program may look the same: it plays, and the registers hold the last values of ours. Only the control
+        # program answers the question for its TCP offset.
         if not self._is_ours(control, timeout_s=self._timing.ours_s, look_out=self._look_out):
             raise (
                 control.end_reason()
@@ -577,7 +575,7 @@ class UrArm(RobotArm):
             control.call("tcp_offset", timeout_s=timeout_s, look_out=look_out)
         except DeviceTimeout as error:
             if control.alive:
-                raise  # of `look_out`: the controller sends nothing, whatever program it runs
+                raise  # raised by `look_out`: the controller sends nothing
             log.info("%s: the control program does not answer: %s", self._host, error)
             self._program.is_gone()  # another program has probably replaced it
             return False
@@ -596,7 +594,7 @@ class UrArm(RobotArm):
         return self._control
 
     def _reading(self) -> Reader:
-        reader = self._reader  # once: another thread may close the arm meanwhile
+        reader = self._reader  # read once, because another thread may close the arm meanwhile
         if reader is None:
             raise ConnectError(f"the arm at {self._host} is not open", "open it first")
         return reader
@@ -622,7 +620,7 @@ def _joints(q_rad: Sequence[float]) -> list[float]:
     if len(q) != 6 or not all(math.isfinite(angle) for angle in q):
         raise ValueError(f"q_rad is {q}; give six finite angles in radians.")
     if max(map(abs, q)) > 2 * math.pi + 1e-9:
-        raise ValueError(f"q_rad is {_degrees(q)}, every joint ends at 360 degrees; give radians.")
+        raise ValueError(f"q_rad is {_degrees(q)}, and the limit of every joint is 360 degrees; give radians.")
     return q
 
 

@@ -1,4 +1,4 @@
-"""A control path: what moves the arm. `UrArm` does not know which one is in use."""
+"""The interface of a control path, which moves the arm. `UrArm` uses both paths in the same way."""
 
 import logging
 from abc import ABC, abstractmethod
@@ -14,51 +14,51 @@ ControlPath = Literal["ur-rtde", "script"]
 ControlSetting = Literal["auto", "ur-rtde", "script"]
 CONTROL_SETTINGS: Final[tuple[ControlSetting, ...]] = ("auto", "ur-rtde", "script")
 
-# 300 °/s² is the most that UR's staff recommend for a joint; from 60 °/s the arm turns 1.8° less than at 4 rad/s².
+# The largest deceleration that UR's staff recommend. From 60 °/s the stopping angle is 1.8° smaller than at 4 rad/s².
 STOP_RAD_S2: Final = radians(300)
-"""Default deceleration of a stop. UR's own programs stop with 2 to 4."""
+"""Default deceleration of a stop, rad/s². UR's own programs use 2 to 4 rad/s²."""
 
 LookOut = Callable[[], object]
-"""Called about 20 times a second during a wait; may raise."""
+"""Called about 20 times per second during a wait. It raises to end the wait."""
 
 
 class ProgramRefused(ConnectError):
-    """The controller did not take our program, so none of ours runs there."""
+    """The controller did not accept the control program, which therefore does not run."""
 
 
 class Control(ABC):
-    """A program of ours on the controller, and the link to it. Any thread may call.
+    """The control program on the controller, and the connection to it. Methods may be called from any thread.
 
-    A constructor connects or starts what is needed on this computer. It returns before a program can run.
+    A constructor opens connections or starts processes on this computer. The program is started afterwards.
     """
 
     stops_itself = False
-    """Whether the program stops the arm and ends when the link is lost. Only such a program follows a sweep."""
+    """Whether the program stops the arm and ends if the connection is lost, which a sweep requires."""
 
     @property
     @abstractmethod
     def alive(self) -> bool:
-        """Whether it accepts calls."""
+        """Whether the program accepts calls."""
 
     @property
     def has_ended(self) -> bool:
-        """Whether our program has reported its end, so that a program on the controller is not ours."""
+        """Whether the control program has reported its end. A program that runs afterwards is another one."""
         return False
 
     @abstractmethod
     def wait_until_ready(self, look_out: LookOut) -> None:
-        """Return when our program runs on the controller. Raises what `call` and `look_out` raise."""
+        """Return when the control program runs on the controller. Raises the exceptions of `call` and `look_out`."""
 
     @abstractmethod
     def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
-        """Call one of the methods of `control_child.Calls`, within `call_s` of the timing if no time-out is given.
+        """Call one of the methods of `control_child.Calls`. The default time-out is `UrTiming.call_s`.
 
-        Raises `StreamBroken` when the link is gone or the call failed, `DeviceTimeout` after `kill` of a link that
-        hangs, and the errors of `look_out`.
+        Raises `StreamBroken` if the connection was lost or the call failed, and the exceptions of `look_out`. After the
+        time-out, the connection is killed and `DeviceTimeout` is raised.
         """
 
     def quit(self, *, timeout_s: float) -> bool:
-        """Stop the arm, end our program and the link; return whether that was confirmed in time."""
+        """Stop the arm, end the control program and the connection; return whether that was confirmed in time."""
         try:
             self.call("quit", timeout_s=timeout_s)
         except DeviceError as error:
@@ -70,12 +70,12 @@ class Control(ABC):
 
     @abstractmethod
     def kill(self) -> None:
-        """End the link at once, whatever the program does. Idempotent."""
+        """End the connection immediately, without waiting for the program. Idempotent."""
 
     def end_reason(self) -> DeviceError | None:
-        """Return why our program has ended, if that is known."""
+        """Return the reason why the control program has ended, or None if it is unknown."""
         return None
 
     def explained(self, error: DeviceError) -> DeviceError:
-        """Return the error of a lost controller, with what the arm does about it."""
+        """Return the error of a lost controller, completed by what the arm does in this case."""
         return error

@@ -1,10 +1,10 @@
-"""The process that holds ur_rtde's `RTDEControlInterface`. Run by its path; imports nothing of ours.
+"""The process that runs ur_rtde's `RTDEControlInterface`. It is started by its path and imports no module of ftdrive.
 
 Requests and replies are lines of JSON on stdin and stdout. When stdin ends, this process stops the arm, ends the
-control script and exits. SIGALRM ends it when ur_rtde hangs. It also stops the arm when the parent, suspended or
-hanging, sends no request for too long during a move.
+control script and exits. SIGALRM ends the process if ur_rtde hangs. The process also stops the arm if the parent, which
+may be suspended, sends no request for too long during a move.
 
-Arguments: host, frequency in Hz, deceleration of a stop in rad/s², and three limits in seconds of `UrTiming`:
+Arguments: host, frequency in Hz, deceleration of a stop in rad/s², and three time-outs of `UrTiming` in seconds:
 `child_starting_s`, `child_leaving_s` and `unwatched_s`.
 
 Ref: ur_rtde 1.6.5, API reference of `RTDEControlInterface`.
@@ -30,7 +30,7 @@ class _Progress(Protocol):
     def isAsyncOperationRunning(self) -> bool: ...
 
 
-# setWatchdog is not used: it cannot be disarmed while an operator reads a prompt, and was seen to cause a protective
+# setWatchdog is not used, because it cannot be disabled while an operator reads a question, and has caused a protective
 # stop (C207A0).
 class _Control(Protocol):
     def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool, /) -> bool: ...
@@ -57,7 +57,7 @@ class _Control(Protocol):
 
 
 class Calls:
-    """The calls of the parent."""
+    """The methods that the parent process calls."""
 
     def __init__(self, control: _Control, stop_rad_s2: float) -> None:
         self._control = control
@@ -65,10 +65,10 @@ class Calls:
         self._before = 0
         self._unwatched = False
         self.moving = False
-        """Whether the parent has to keep calling `progress`."""
+        """Whether the arm moves, so that the parent has to call `progress` regularly."""
 
     def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
-        """Begin a move; return whether it was accepted."""
+        """Start a move; return whether the controller accepted it."""
         self._before = self._control.getAsyncOperationProgressEx().operationId()
         self._unwatched = False
         self.moving = self._control.moveJ(q_rad, speed_rad_s, acceleration_rad_s2, True)
@@ -76,17 +76,16 @@ class Calls:
 
     def progress(self) -> tuple[bool, bool]:
         """Return whether the move has ended, and whether it was stopped because the parent did not watch it."""
-        # If no caller asks for 0.5 s, the arm is stopped and the program stays: a guard may hang.
         progress = self._control.getAsyncOperationProgressEx()
-        if not self._control.isConnected():  # a lost link looks like arrival
+        if not self._control.isConnected():  # otherwise a lost connection would look like an arrival
             raise RuntimeError("the control connection was lost")
         ended = progress.operationId() != self._before and not progress.isAsyncOperationRunning()
         self.moving = self.moving and not ended
         return ended, self._unwatched
 
     def stop_unwatched(self) -> None:
-        """Stop a move that the parent has not watched for too long."""
-        time.sleep(0.02)  # after a suspension of this process ur_rtde has to catch up
+        """Stop a move that the parent has not watched for too long, because a guard may hang."""
+        time.sleep(0.02)  # if this process was suspended, ur_rtde first has to receive the newest state
         ended, _ = self.progress()
         if not ended:
             self._unwatched = True
@@ -95,7 +94,7 @@ class Calls:
     def stop(self) -> None:
         """Decelerate all joints and wait for standstill.
 
-        The asynchronous stop would decelerate the tool instead of the joints, which fails at a singularity.
+        The asynchronous stop of ur_rtde decelerates the tool instead of the joints, which fails at a singularity.
         """
         self.moving = False
         self._control.stopJ(self._stop_rad_s2)
@@ -109,21 +108,21 @@ class Calls:
         raise RuntimeError("the control program is not running")  # ur_rtde would return False
 
     def tcp_offset(self) -> list[float]:
-        """Return the active TCP in the flange."""
+        """Return the pose (6,) of the active TCP in the flange."""
         return self._control.getTCPOffset()
 
     def set_payload(self, mass_kg: float, com_m: list[float], inertia_kg_m2: list[float] | None) -> bool:
-        """Set the payload; return whether the program did. Without an inertia by the older command, which resets it."""
+        """Set the payload; return whether that succeeded. Without inertia, the older command resets the inertia."""
         if inertia_kg_m2 is None:
             return self._control.setPayload(mass_kg, com_m)
         return self._control.setTargetPayload(mass_kg, com_m, inertia_kg_m2)
 
     def set_gravity(self, up_base_m_s2: list[float]) -> bool:
-        """Set the direction of gravity; return whether the program did."""
+        """Set gravity; return whether that succeeded."""
         return self._control.setGravity(up_base_m_s2)
 
     def quit(self) -> None:
-        """Stop the arm and end the script, which would otherwise stay on the controller."""
+        """Stop the arm and end the control script, which would otherwise continue on the controller."""
         if self._control.getAsyncOperationProgressEx().isAsyncOperationRunning():
             self.stop()
         self._control.stopScript()
@@ -136,15 +135,15 @@ def _main() -> None:
     os.dup2(2, 1)  # the output of the C++ library must not mix with the replies
 
     def reply(**content: object) -> None:
-        with suppress(OSError):  # the parent is gone, so stdin will end
+        with suppress(OSError):  # the parent has ended, and stdin will end too
             replies.write(json.dumps(content) + "\n")
             replies.flush()
 
     signal.setitimer(signal.ITIMER_REAL, starting_s)
     try:
         interface = import_module("rtde_control").RTDEControlInterface
-        # rt_priority: by default the library would put this thread under real-time scheduling, where it spins.
-        # FLAG_NO_EXT_FT: another client may use that input to send wrist-sensor readings to the controller.
+        # rt_priority: by default the library gives this thread real-time priority, although it waits in a busy loop.
+        # FLAG_NO_EXT_FT: another client may use this input to send readings of a sensor to the controller.
         flags = int(interface.FLAG_UPLOAD_SCRIPT) | int(interface.FLAG_NO_EXT_FT)
         control = cast(_Control, interface(hostname=host, frequency=frequency_Hz, flags=flags, rt_priority=-1))
     except Exception as error:
@@ -159,16 +158,16 @@ def _main() -> None:
     serve(calls, requests, reply, unwatched_s)
     with suppress(Exception):
         calls.quit()
-    os._exit(0)  # the exit of the library takes 0.5 s and may crash
+    os._exit(0)  # the regular exit of the library takes 0.5 s and may crash
 
 
 def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[..., None], unwatched_s: float) -> None:
-    """Answer requests until None comes."""
+    """Answer requests until None is received."""
     while True:
         try:
             line = requests.get(timeout=unwatched_s if calls.moving else None)
         except Empty:
-            with suppress(Exception):  # then the parent will stop the arm when it resumes
+            with suppress(Exception):  # if this fails, the parent stops the arm when it resumes
                 calls.stop_unwatched()
             continue
         if line is None:
@@ -177,12 +176,12 @@ def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[...
         call = cast(Callable[..., object], getattr(calls, request["call"]))
         try:
             reply(id=request["id"], value=call(*request["args"]))
-        except Exception as error:  # the library may raise anything; the parent decides
+        except Exception as error:  # the library raises any exception; the parent handles it
             reply(id=request["id"], error=str(error))
 
 
 def _listen(requests: "SimpleQueue[str | None]", leaving_s: float) -> None:
-    # A child whose parent was killed ends its program within 0.5 s.
+    # After the parent was killed, stdin ends, and the control script is ended within 0.5 s.
     for line in sys.stdin:
         requests.put(line)
     signal.setitimer(signal.ITIMER_REAL, leaving_s)

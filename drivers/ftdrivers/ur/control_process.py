@@ -1,7 +1,7 @@
-"""The parent's side of the process that moves the arm: requests with a time-out, and SIGKILL if it hangs.
+"""The control path `ur-rtde`, as seen from the parent process: requests with a time-out, and SIGKILL after it.
 
-Ref: ur_rtde 1.6.5. Its control interface hangs for 301 s on a lost link, or ends its process with SIGSEGV, so it must
-not live in ours.
+Ref: ur_rtde 1.6.5. Its control interface hangs for 301 s after a lost connection, or ends its process with SIGSEGV.
+Therefore it runs in a separate process.
 """
 
 import json
@@ -24,15 +24,15 @@ INPUTS: Final = (
     *(f"input_int_register_{k}" for k in range(8)),
     *(f"input_double_register_{k}" for k in range(18)),
 )
-"""The RTDE inputs that ur_rtde's control interface writes, exclusively."""
+"""RTDE inputs that ur_rtde's control interface reserves."""
 PROGRAM_PORT: Final = 30003
-"""To which ur_rtde sends its program."""
-# Rate of ur_rtde's own connection: the full rate of the CB3 generation.
+"""TCP port to which ur_rtde sends its program."""
+# Rate of ur_rtde's own connection, Hz: the full rate of the CB3 generation.
 _FREQUENCY_HZ: Final = 125.0
 
 
 class ControlProcess(Control):
-    """A disposable process with ur_rtde's control interface."""
+    """A process with ur_rtde's control interface, which can be killed at any time."""
 
     def __init__(self, host: str, stop_rad_s2: float, *, clock: Clock, timing: UrTiming) -> None:
         """Start the process; call `wait_until_ready` before `call`."""
@@ -40,8 +40,8 @@ class ControlProcess(Control):
         self._clock = clock
         self._timing = timing
         arguments = (_FREQUENCY_HZ, stop_rad_s2, timing.child_starting_s, timing.child_leaving_s, timing.unwatched_s)
-        # Started by path, so that no code of the application runs in it. In its own session, so that Ctrl-C or a closed
-        # terminal cannot end it before it has stopped the arm.
+        # The process is started by path, so that it runs no code of the application, and in a session of its own, so
+        # that Ctrl-C or a closed terminal cannot end it before it has stopped the arm.
         self._process = subprocess.Popen(
             [sys.executable, "-P", control_child.__file__, host, *map(str, arguments)],
             stdin=subprocess.PIPE,
@@ -54,9 +54,9 @@ class ControlProcess(Control):
         self._requests = cast(IO[str], self._process.stdin)
         self._changed = threading.Condition()
         self._replies: dict[int, dict[str, Any]] = {}
-        self._lock = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
+        self._lock = threading.RLock()  # re-entrant, because a signal handler may stop the arm during a call
         self._last_id = 0
-        self._ended = False  # its last reply has been read
+        self._ended = False  # true after the last reply was read
         self._killed = False
         self._readers = [
             threading.Thread(target=read, args=(pipe,), name=f"ur-control-{read.__name__}", daemon=True)
@@ -67,15 +67,15 @@ class ControlProcess(Control):
 
     @property
     def alive(self) -> bool:
-        """Whether it accepts calls."""
+        """Whether the process accepts calls."""
         return not (self._ended or self._killed)
 
     def wait_until_ready(self, look_out: LookOut) -> None:
-        """Return when the control script runs on the controller. Raises what `call` and `look_out` raise."""
+        """Return when the control script runs on the controller. Raises the exceptions of `call` and `look_out`."""
         self._answer(0, self._timing.starting_s, look_out)
 
     def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
-        """Send a request to the process and wait for its reply; see `Control`."""
+        """Send a request to the process and wait for its reply, see `Control`."""
         with held(self._lock, self._clock):
             self._last_id += 1
             request = self._last_id
@@ -87,7 +87,7 @@ class ControlProcess(Control):
             return self._answer(request, self._timing.call_s if timeout_s is None else timeout_s, look_out)
 
     def kill(self) -> None:
-        """Kill the process. The arm finishes its last command, so stop it through the dashboard server."""
+        """Kill the process. The arm finishes its last command unless it is stopped through the dashboard server."""
         self._killed = True
         self._process.kill()
         self._process.wait()

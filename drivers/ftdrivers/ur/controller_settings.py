@@ -1,7 +1,7 @@
-"""What a controller assumes about its load and about gravity: reading it, and checking what it is to assume.
+"""Load and gravity that a controller assumes: reading them, and checking new values.
 
-Read over a connection of its own. The stream of samples does not carry these, because they seldom change, and the type
-of `target_gravity` is not documented where we could read it: a wrong guess must not stop the stream.
+They are read over a separate connection, because they seldom change. In addition, no public document states the type of
+`target_gravity`, and a wrong type would end the stream of samples.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", outputs; URScript manual, `set_target_payload`,
 `set_payload`, `set_gravity`.
@@ -27,15 +27,15 @@ OUTPUTS: Final = MappingProxyType(
         "target_gravity": "VECTOR3D",
     }
 )
-"""Names and types; a controller may lack any but the first."""
-# Limit of `set_target_payload` for each element.
+"""Names and types of the outputs. A controller may lack any except the first."""
+# Largest element of the inertia in `set_target_payload`.
 _LARGEST_INERTIA_KG_M2: Final = 133.0
 _RATE_HZ: Final = 125.0
 _G_M_S2: Final = (8.0, 12.0)
 
 
 def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> ControllerSettings:
-    """Read them once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
+    """Read the settings once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
     # Over a connection of its own: the type of target_gravity stands in no source, and one wrong type ends a
     # connection.
     stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=clock)
@@ -62,7 +62,7 @@ def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> Co
 def checked_payload(
     mass_kg: float, p_flange_com_m: Sequence[float], inertia_kg_m2: Sequence[float]
 ) -> tuple[float, list[float], list[float]]:
-    """Return a payload as ur_rtde takes it, or raise `ValueError`; ur_rtde checks neither lengths nor values."""
+    """Return mass, centre of mass and inertia as ur_rtde expects them. Raises `ValueError` if they are invalid."""
     mass, com, inertia = float(mass_kg), [*map(float, p_flange_com_m)], [*map(float, inertia_kg_m2)]
     if not 0 <= mass < math.inf:
         raise ValueError(f"mass_kg is {mass_kg}; give a number from 0 on.")
@@ -78,7 +78,7 @@ def checked_payload(
 
 
 def checked_gravity(up_base_m_s2: Sequence[float]) -> list[float]:
-    """Return a direction of gravity as ur_rtde takes it, or raise `ValueError`."""
+    """Return gravity in the form that ur_rtde expects. Raises `ValueError` if it is invalid."""
     up = [*map(float, up_base_m_s2)]
     if len(up) != 3 or not _G_M_S2[0] <= math.hypot(*up) <= _G_M_S2[1]:
         raise ValueError(f"up_base_m_s2 is {up}; give three numbers, about 9.82 m/s² away from the earth.")

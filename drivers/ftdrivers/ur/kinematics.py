@@ -3,8 +3,8 @@
 Ref: Universal Robots, "DH parameters for calculations of kinematics and dynamics"; ROS 2 description of the arms,
 `default_kinematics.yaml` of each model, version 2.4.5.
 
-A real arm is up to 7.5 mm and 1.3 degrees from the nominal one, so its controller uses measured parameters. The flange
-that it reports is the source of flange poses; kinematics check it, and plan.
+A real arm differs from the nominal one by up to 7.5 mm and 1.3 degrees, and its controller uses measured parameters.
+Flange poses are those that the controller reports. Kinematics are used to check these poses, and for planning.
 """
 
 from collections.abc import Sequence
@@ -26,10 +26,10 @@ _ALPHA_RAD = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
 
 @dataclass(frozen=True)
 class Kinematics:
-    """Standard Denavit-Hartenberg parameters of one arm, six each; those of `MODELS` are nominal.
+    """Standard Denavit-Hartenberg parameters of one arm, (6,) each. Those of `MODELS` are nominal.
 
-    The axes of joints 2, 3 and 4 are nearly parallel. So measured `d_m` of these joints are up to hundreds of metres,
-    which cancel: `links_m` has lengths that can be seen on the arm.
+    The axes of joints 2, 3 and 4 are nearly parallel. The measured `d_m` of these joints may therefore be hundreds of
+    metres long, and cancel each other. The lengths in `links_m` are those of the real links.
     """
 
     theta_rad: tuple[float, ...]
@@ -39,9 +39,9 @@ class Kinematics:
 
     @classmethod
     def of(cls, numbers: Sequence[float]) -> "Kinematics":
-        """Build from theta, a, d and alpha of all joints, (24,), in the order of `numbers`.
+        """Build kinematics from theta, a, d and alpha of all joints, (24,), in the order of `numbers`.
 
-        Raises `ValueError` unless all are finite and the last axis is that of the flange.
+        Raises `ValueError` if a number is not finite, or if the last axis is not that of the flange.
         """
         theta, a, d, alpha = np.array(numbers, np.float64).reshape(4, 6)
         if not np.isfinite([theta, a, d, alpha]).all() or max(abs(a[5]), abs(alpha[5])) > _ROUNDED:
@@ -55,24 +55,24 @@ class Kinematics:
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """(24,) theta, a, d and alpha of all joints."""
+        """(24,) theta, a, d and alpha of all joints, rad and m."""
         return (*self.theta_rad, *self.a_m, *self.d_m, *self.alpha_rad)
 
     @cached_property
     def links_m(self) -> Array:
-        """(6, 3) from a point on the axis of each joint to one on the next axis, in axes that turn with the joint.
+        """(6, 3) vectors from a point on each joint axis to a point on the next one, in axes that turn with the joint.
 
-        Points on axes 3 and 4 are level with the shoulder along the lift axis, as those of the nominal arm. The next
-        axis is turned by alpha about x.
+        The points on axes 3 and 4 are chosen level with the shoulder along the lift axis, as in the nominal arm. The
+        next axis is rotated by alpha about x.
         """
         a, d, alpha = np.array([self.a_m, self.d_m, self.alpha_rad])
-        # From the origin of each frame of Denavit and Hartenberg to the chosen point, along the axis of its joint.
+        # Distance from the origin of each Denavit-Hartenberg frame to the chosen point, along the joint axis.
         along = np.zeros(7)
         for joint in (1, 2):
             along[joint + 1] = (along[joint] - d[joint]) / np.cos(alpha[joint])
         sideways = -along[1:] * np.sin(alpha)
         level = d - along[:-1] + along[1:] * np.cos(alpha)
-        level[1:3] = 0.0  # by choice of the points; the sum of large numbers leaves a rest
+        level[1:3] = 0.0  # by the choice of the points; the sum of large numbers has rounding errors
         return np.stack([a, sideways, level], axis=1)
 
 
@@ -104,23 +104,23 @@ class Pose:
     """Pose of a frame b in a frame a: `p_a = R @ p_b + p_m`."""
 
     R: Array
-    """(3, 3)"""
+    """(3, 3) rotation matrix."""
     p_m: Array
-    """(3,)"""
+    """(3,) origin of b in a, m."""
 
     def __matmul__(self, other: "Pose") -> "Pose":
         return Pose(self.R @ other.R, self.R @ other.p_m + self.p_m)
 
     def angle_to_rad(self, other: "Pose") -> float:
-        """Return the angle between the two orientations."""
+        """Return the angle between the two orientations, rad."""
         chord = float(np.linalg.norm(self.R - other.R)) / sqrt(8.0)
         return 2.0 * asin(min(1.0, chord))
 
 
 def flange_poses(tcp_poses: Array, tcp_offsets: Array) -> tuple[Array, Array]:
-    """Return n flanges in base, R (n, 3, 3) and p in metres (n, 3), from UR poses (n, 6).
+    """Return orientations (n, 3, 3) and positions (n, 3), m, of the flange in the base.
 
-    `tcp_poses` are those of the active TCP in base, `tcp_offsets` those of the TCP in the flange.
+    `tcp_poses` (n, 6) are UR poses of the active TCP in the base, `tcp_offsets` (n, 6) those of the TCP in the flange.
     """
     rotvec_rad = np.concatenate([tcp_poses[:, 3:], tcp_offsets[:, 3:]])
     R_base_tcp, R_flange_tcp = Rotation.from_rotvec(rotvec_rad).as_matrix().reshape(2, -1, 3, 3)
@@ -129,7 +129,7 @@ def flange_poses(tcp_poses: Array, tcp_offsets: Array) -> tuple[Array, Array]:
 
 
 def forward(kinematics: Kinematics, q_rad: Sequence[float] | Array) -> Pose:
-    """Return the flange in base for the joint angles `q_rad` (6,)."""
+    """Return the pose of the flange in the base for the joint angles `q_rad` (6,)."""
     flange = Pose(np.eye(3), np.zeros(3))
     turned = zip(q_rad, kinematics.theta_rad, kinematics.alpha_rad, kinematics.links_m, strict=True)
     for q, theta, alpha, link_m in turned:
@@ -141,15 +141,15 @@ def forward(kinematics: Kinematics, q_rad: Sequence[float] | Array) -> Pose:
 
 
 def kinematics_of(info: DeviceInfo) -> Kinematics | None:
-    """Return the kinematics that an arm reports among its facts, or None."""
+    """Return the kinematics in the facts of an arm, or None if it reports none."""
     fact = info.facts.get("kinematics")
     return Kinematics.of(fact.value) if fact is not None and isinstance(fact.value, tuple) else None
 
 
 def model_named(name: str, controller_major: int) -> str | None:
-    """Find the key of `MODELS` for the name of an arm in a configuration or on the dashboard, or None.
+    """Return the key of `MODELS` for the name of an arm in a configuration or on the dashboard, or None.
 
-    The dashboard drops the e of e-Series arms ("UR5" may be a UR5e), so the controller's generation decides.
+    The dashboard omits the e of e-Series arms: "UR5" may be a UR5e. The controller's generation distinguishes them.
     """
     key = name.strip().lower()
     names = {name.lower(): name for name in MODELS}

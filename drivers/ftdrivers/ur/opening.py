@@ -1,4 +1,4 @@
-"""Open an arm: its own program, connections, recipe, control path."""
+"""Taking control of an arm: checks, control path, and the control program."""
 
 import logging
 import platform
@@ -26,40 +26,40 @@ log = logging.getLogger(__name__)
 
 
 class OwnProgram:
-    """Remembers whether a program of ours may run, and ends it through the services of the controller."""
+    """Remembers whether the control program may run, and ends it through the services of the controller."""
 
     def __init__(self, timing: UrTiming) -> None:
         self._timing = timing
         self._services: ServicesOf | None = None
-        self._starting = False  # it was sent and has not been seen to play: it may still start after a stop
+        self._starting = False  # true between sending and starting: the program may start after a stop was requested
         self._stops_itself = False
-        self._stop_wanted = threading.Event()  # by an attempt in the background
+        self._stop_wanted = threading.Event()  # set for an attempt in the background
         self.left_behind = False
-        """Whether a program of ours may run on the controller."""
+        """Whether the control program may run on the controller."""
 
     def is_sent(self, services: ServicesOf, *, stops_itself: bool) -> None:
-        """Note that a program is on its way to the controller; `services` can end it."""
+        """Remember that the program was sent to the controller, where `services` can end it."""
         self._services, self._stops_itself = services, stops_itself
         self.left_behind = self._starting = True
 
     def has_started(self) -> None:
-        """Note that it runs."""
+        """Remember that the program runs."""
         self._starting = False
 
     def is_stopped(self) -> None:
-        """Note that no program runs: one that runs later is not ours, unless ours is still to start."""
+        """Remember that no program runs. A later one is that of another client, unless ours has not started yet."""
         self.left_behind = self._starting
 
     def is_gone(self) -> None:
-        """Note that it was not taken, has ended or was replaced."""
+        """Remember that the program was rejected, has ended or was replaced."""
         self.left_behind = self._starting = False
 
     def cancel_stop(self) -> None:
-        """Let no attempt in the background stop the next program."""
+        """Cancel attempts in the background to stop the program, which would stop the next one."""
         self._stop_wanted.clear()
 
     def stop(self, *, silent: bool = False) -> None:
-        """End it; an attempt that takes longer than its limit goes on in the background. Never raises `DeviceError`."""
+        """End the program. After a time-out the attempt continues in the background. Never raises `DeviceError`."""
 
         def stop(services: Services) -> None:
             if self._stop_wanted.is_set():
@@ -81,8 +81,8 @@ class OwnProgram:
 
 
 SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
-"""Addresses of URSim, at which ur_rtde does not require remote control."""
-# Minor version by major: of the control script of ur_rtde; of the registers 24 to 47, and of the Robot API.
+"""Addresses of URSim, for which ur_rtde does not require remote control."""
+# Oldest minor version by major version: the control script of ur_rtde; registers 24 to 47, and the Robot API.
 _LEAST: Final[dict[ControlPath, dict[int, int]]] = {"ur-rtde": {3: 4, 5: 4}, "script": {3: 9, 5: 3, POLYSCOPE_X: 11}}
 _LOCAL: Final = (
     "press Local, Remote Control at the top right of the pendant (enable it first under Settings, System, Remote "
@@ -92,7 +92,7 @@ _LOCAL_X: Final = "set Control mode to Remote in the Safety overview of the pend
 
 
 def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[ControlPath, str]:
-    """Return the control path, and in words why it is taken."""
+    """Return the control path and the reason for the choice."""
     # ur-rtde needs a dashboard server, which PolyScope X does not have.
     if setting != "auto":
         return setting, "as configured"
@@ -105,7 +105,7 @@ def path_for(setting: ControlSetting, version: tuple[int, ...]) -> tuple[Control
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Opens the control of one arm, which `reader` reads."""
+    """Takes control of one arm, which `reader` reads."""
 
     host: str
     setting: ControlSetting
@@ -121,9 +121,9 @@ class Opening:
         return path_for(self.setting, self.reader.version)[0]
 
     def open(self) -> Control:
-        """Start our program; another one is never stopped, except one that the same object has started before.
+        """Start the control program. Another program is never stopped, unless the same object has started it before.
 
-        Raises `ConnectError`, also when a safety stop prevents it, and what the reader raises.
+        Raises `ConnectError`, also if a safety stop prevents the start, and the exceptions of the reader.
         """
         self._look_out()
         path, why = path_for(self.setting, self.reader.version)
@@ -132,7 +132,7 @@ class Opening:
         self.require_version()
         self.require_port()
         self.require_registers()
-        self.program.cancel_stop()  # an attempt in the background would stop the new program
+        self.program.cancel_stop()  # a stop in the background would end the new program
         self.reader.services.ask(self._prepare, timeout_s=self.timing.connect_s)
         self._require_no_program()
         control = self._start(path)
@@ -142,7 +142,7 @@ class Opening:
         except ProgramRefused:
             control.kill()
             self.program.is_gone()
-            self._look_out()  # a control path seldom knows the reason
+            self._look_out()  # the controller may report the reason, which the control path seldom knows
             raise
         except (StreamBroken, DeviceTimeout) as error:
             control.kill()
@@ -155,7 +155,7 @@ class Opening:
         return control
 
     def diagnose(self) -> list[Diagnosis]:
-        """Check what control needs; change nothing."""
+        """Check the requirements of control, without changing anything."""
 
         def diagnosis(name: str, require: Callable[[], None], found: str) -> Diagnosis:
             try:
@@ -166,9 +166,9 @@ class Opening:
 
         path, why = path_for(self.setting, self.reader.version)
         stops = (
-            "; its program begins to brake within 0.3 s when computer or network fail"
+            "; its program begins to brake within 0.3 s if computer or network fail"
             if path == "script"
-            else "; if computer and network fail, the arm ends its present move"
+            else "; if computer and network fail, the arm finishes its current move"
         )
         version = "PolyScope {}.{} can be controlled".format(*self.reader.version)
         free = "the RTDE registers are free: no other client controls the arm"
@@ -176,28 +176,28 @@ class Opening:
             diagnosis("control", self.require_path, f"control path {path}: {why}{stops}"),
             diagnosis("version", self.require_version, version),
             diagnosis("registers", self.require_registers, free),
-            diagnosis("programs", self.require_port, f"port {self._port}, which takes programs, is open"),
+            diagnosis("programs", self.require_port, f"port {self._port}, which accepts programs, is open"),
         ]
 
     def require_path(self) -> None:
-        """Raise `ConnectError` where ur_rtde is configured and cannot be used."""
+        """Raise `ConnectError` if ur_rtde is configured but cannot be used."""
         if self.path != "ur-rtde":
             return
         if self.reader.version[0] >= POLYSCOPE_X:
             raise ConnectError(
                 f"{self.host} runs PolyScope X, which has no dashboard server, and ur_rtde needs one",
-                "take the control path script or auto",
+                "select the control path script or auto",
             )
         if find_spec("rtde_control") is None:
             raise ConnectError(
                 f"ur_rtde is not installed for Python {platform.python_version()} on {platform.system()} "
                 f"{platform.machine()}",
-                "take the control path script or auto, or CPython 3.11 or 3.12 on 64-bit x86 Linux, for which ur_rtde "
-                "has wheels",
+                "select the control path script or auto, or use CPython 3.11 or 3.12 on 64-bit x86 Linux, for which "
+                "ur_rtde has wheels",
             )
 
     def require_version(self) -> None:
-        """Raise `ConnectError` for a PolyScope that can be read but not controlled."""
+        """Raise `ConnectError` for a version of PolyScope that can be read but not controlled."""
         major, minor = self.reader.version[:2]
         least = _LEAST[self.path].get(major, 0)
         if minor < least:
@@ -207,11 +207,11 @@ class Opening:
             )
 
     def require_port(self) -> None:
-        """Raise `ConnectError` when the port that takes programs is closed."""
+        """Raise `ConnectError` if the port that accepts programs is closed."""
         find_program_port(self.host, self._port, timeout_s=self.timing.connect_s)
 
     def require_registers(self) -> None:
-        """Raise `ConnectError` when another client keeps the registers, before any of its programs is stopped."""
+        """Raise `ConnectError` if another client owns the registers. It is called before any program is stopped."""
         inputs = control_process.INPUTS if self.path == "ur-rtde" else tuple(script_control.INPUTS)
         deadline_s = self.clock.now_s() + self.timing.release_s
         while taken := registers_in_use(self.host, inputs, timeout_s=self.timing.connect_s, clock=self.clock):
@@ -233,7 +233,7 @@ class Opening:
             raise ConnectError(f"the arm at {self.host} cannot move: {fault.found}", fault.fix)
 
     def _prepare(self, services: Services) -> None:
-        """Check that the controller accepts programs, and end one that we have left there."""
+        """Check that the controller accepts programs, and end a control program that this object has left there."""
         version = self.reader.version
         asks = version[:2] >= (5, 6) and self.host not in SIMULATORS
         if asks and services.in_remote_control() is False:
@@ -244,22 +244,22 @@ class Opening:
             services.stop()
 
     def _require_no_program(self) -> None:
-        """Raise `ConnectError` when a program stays on the controller: ours would replace it."""
-        # A program whose child was killed looks like one of another client, and writing to its registers could
-        # command it, so none is stopped at the start.
+        """Raise `ConnectError` if a program stays on the controller, which the control program would replace."""
+        # A control program whose process was killed cannot be distinguished from a program of another client, which
+        # could react to its registers. Therefore no program is stopped here.
         deadline_s = self.clock.now_s() + self.timing.release_s
         while self.reader.look().program_state != PROGRAM_STOPPED:
             if self.clock.now_s() > deadline_s:
                 program = self.reader.reported_program()
                 raise ConnectError(
-                    f"another program is on {self.host}{f' ({program})' if program else ''} and is not stopped "
+                    f"another program is on {self.host}{f' ({program})' if program else ''}, and is not stopped "
                     "automatically",
                     "stop it at the pendant, then start again",
                 )
 
 
 def _refusal(host: str, path: ControlPath, error: DeviceError) -> ConnectError:
-    """Convert why a control path did not start to an error with a fix."""
+    """Return the error of a control path that did not start, with a fix."""
     return ConnectError(
         f"{path} cannot control {host}: {error.found}",
         "check at the pendant that it is in remote control, that no dialog is open, and that no other program starts "

@@ -1,7 +1,7 @@
-"""The primary interface: takes programs, and reports how they start, end and fail.
+"""The primary interface of a controller, which accepts programs and reports when they start, end or fail.
 
-A connection that was opened in local control is read-only. The controller ignores a program on it and reports error
-code 210; a connection that was open before the pendant was switched to local control is closed.
+A connection that was opened in local control is read-only: the controller ignores programs on it and reports error code
+210. When the pendant is switched to local control, the controller closes the existing connections.
 
 Ref: Universal Robots, "Primary and Secondary Interfaces" and "Client Interfaces" (messages, sub-packages);
 `robot_message/*.cpp`, `robot_state/configuration_data.cpp` and `datatypes.h` of Universal Robots' client library; issue
@@ -33,12 +33,12 @@ _TEXT, _ERROR_CODE, _KEY, _EXCEPTION = 0, 6, 7, 10
 _KEY_HEAD: Final = struct.Struct(">iiB")  # code, argument, length of the title
 _EXCEPTION_HEAD: Final = struct.Struct(">ii")  # line, column
 _CODE_HEAD: Final = struct.Struct(">iiiBI")  # code, argument, level, type of the data (4 bytes in old documents), data
-# A controller in local control refuses the program with this code, or closes the connection.
+# Error code of a controller in local control that refuses a program. It may also close the connection.
 _READ_ONLY_CODE: Final = 210
 _KINEMATICS, _CONFIGURATION = 5, 6
-# Behind six checksums: theta, a, d and alpha of all joints.
+# Theta, a, d and alpha of all joints, after six checksums.
 _KINEMATIC_DATA: Final = struct.Struct(">24x24d")
-# In the configuration data, behind limits, defaults and lengths of the arm.
+# Robot type in the configuration data, after limits, defaults and lengths of the arm.
 _ROBOT_TYPE: Final = struct.Struct(">432xi")
 _ROBOT_TYPES: Final = MappingProxyType(
     {1: "UR5", 2: "UR10", 3: "UR3", 4: "UR16", 5: "UR18", 6: "UR8long", 7: "UR20", 8: "UR30", 9: "UR15"}
@@ -63,7 +63,7 @@ class Stopped:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """A program does not compile, or has ended with a runtime error."""
+    """A program does not compile, or has ended with a run-time error."""
 
     line: int
     column: int
@@ -80,27 +80,27 @@ class Code:
 
     @property
     def is_read_only(self) -> bool:
-        """Whether it says that this connection cannot send programs."""
+        """Whether the code means that this connection is read-only."""
         return self.code == _READ_ONLY_CODE
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """A text of a program."""
+    """A text that a program has sent."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class RobotType:
-    """The model without its generation; None for a number that is not known here."""
+    """The model of the arm without its generation; None if its number is unknown."""
 
     model: str | None
 
 
 @dataclass(frozen=True, slots=True)
 class FactoryKinematics:
-    """The measured parameters of the arm; None if the controller sends what no arm has."""
+    """The measured kinematic parameters of the arm; None if the controller sends impossible values."""
 
     kinematics: Kinematics | None
 
@@ -109,9 +109,9 @@ Message = Started | Stopped | Failed | Code | Note | RobotType | FactoryKinemati
 
 
 def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
-    """Remove the first package from `buffer` as (type, payload); None while it is incomplete.
+    """Remove the first package from `buffer` and return (type, payload); return None while it is incomplete.
 
-    Raises `ProtocolError` when the buffer cannot begin with a package.
+    Raises `ProtocolError` if the buffer does not begin with a package.
     """
     if len(buffer) < _HEADER.size:
         return None
@@ -126,7 +126,7 @@ def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
 
 
 def decode(kind: int, payload: bytes) -> Iterator[Message]:
-    """Yield what a package reports, as far as it is of use here; what is cut short or unknown is left out."""
+    """Yield the messages of a package that are used here. Truncated or unknown ones are skipped."""
     with suppress(struct.error):
         if kind == _ROBOT_STATE:
             yield from _decode_state(payload)
@@ -178,11 +178,11 @@ def _text(data: bytes) -> str:
 
 
 class Primary:
-    """One connection, with a time-out to connect and for each sending. Raises `ConnectError` when it cannot be made."""
+    """A connection with a time-out for connecting and for each send. Raises `ConnectError` if it fails."""
 
     def __init__(self, host: str, *, timeout_s: float) -> None:
         self.closed = False
-        """Whether the controller has closed the connection, as it does when the pendant is switched to local."""
+        """Whether the controller has closed the connection, for example because the pendant was switched to local."""
         try:
             self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
         except OSError as error:
@@ -191,12 +191,12 @@ class Primary:
         self._buffer = bytearray()
 
     def send(self, program: str) -> None:
-        """Send a program, which replaces the one that runs. Raises `OSError` on a lost connection."""
+        """Send a program, which replaces the running one. Raises `OSError` if the connection was lost."""
         self._socket.settimeout(self._timeout_s)
         self._socket.sendall(program.encode("ascii") + b"\n")
 
     def read(self, timeout_s: float = 0.0) -> list[Message]:
-        """Return what has arrived, or arrives within `timeout_s`; nothing from a connection that has ended."""
+        """Return the messages that have arrived or arrive within `timeout_s`; none if the connection has ended."""
         messages: list[Message] = []
         try:
             self._socket.settimeout(timeout_s)
@@ -220,9 +220,9 @@ class Primary:
 
 
 def read_arm(host: str, *, timeout_s: float, clock: Clock) -> tuple[str | None, Kinematics | None]:
-    """Return the model that the controller reports, without its generation, and the arm's measured kinematics.
+    """Return model, without its generation, and measured kinematics of the arm; None for a missing value.
 
-    Both come in the first robot state of a connection. None for what does not come.
+    Both are part of the first robot state that the controller sends on a connection.
     """
     model, kinematics = None, None
     try:
@@ -246,7 +246,7 @@ def read_arm(host: str, *, timeout_s: float, clock: Clock) -> tuple[str | None, 
 
 
 def find_program_port(host: str, port: int, *, timeout_s: float) -> None:
-    """Check that the controller accepts programs on a port, without sending one. Raises `ConnectError`."""
+    """Check that the port for programs can be reached, without sending a program. Raises `ConnectError`."""
     try:
         socket.create_connection((host, port), timeout=timeout_s).close()
     except OSError as error:

@@ -1,11 +1,11 @@
-"""The reader of a Universal Robots arm: new samples, and a flange pose that does not depend on the TCP setting.
+"""The reader of a Universal Robots arm: new samples, and a flange pose that does not depend on the active TCP.
 
-One RTDE subscription carries everything. After a suspension of this process or a stall of the network, samples arrive
-that are seconds old, and their time stamps advance like new ones. So the controller's clock is compared with ours, and
-a late sample is never used for a state or a status, which are updated 125 times a second: a move and its guards need no
-more. Followers get every sample, 500 a second of an e-Series arm. The TCP offset of the same sample is
-removed from its pose, and the flange pose is compared with the arm's own forward kinematics, which the controller sends
-over the primary interface, or with nominal ones where it sends none.
+One RTDE subscription carries all values. After a suspension of this process or a stall of the network, samples arrive
+that are seconds old, although their time stamps advance normally. Therefore the controller's clock is compared with the
+host's clock, and late samples are never used for a state or a status. These are updated at 125 Hz, which is enough for
+a move and its guards. Followers receive every sample, 500 Hz from an e-Series arm. The TCP offset of a sample is
+removed from its pose, and the resulting flange pose is checked against the arm's forward kinematics, with the
+parameters that the controller sends over the primary interface, or nominal ones if it sends none.
 
 Checked on hardware: no.
 """
@@ -45,28 +45,27 @@ from ftdrivers.ur.timing import Patience, UrTiming
 
 log = logging.getLogger(__name__)
 
-# Until the first `follow()`, 125 Hz suffice.
 STATES_HZ: Final = 125.0
-"""Rate of states and status: the full rate of the CB3 generation, a quarter of that of the e-Series."""
-# Samples that may wait for one follower: 33 minutes at 500 Hz.
+"""Rate before the first `follow()`, Hz: the full rate of the CB3 generation, a quarter of that of the e-Series."""
+# Largest number of samples in the queue of one follower, 33 minutes at 500 Hz.
 _MOST_UNREAD: Final = 1_000_000
 Received = tuple[int, list[bytes]]
-"""Samples of one read, and their `t_host_ns`."""
-# A reader that has had no turn for so long was suspended, or starved.
+"""`t_host_ns` of one read, and its samples."""
+# After a longer time between two turns, the reader was suspended or got no CPU time.
 _PAUSE_S: Final = 0.1
-# The first output, after the number of the recipe.
+# The first output, which follows the number of the recipe.
 _TIMESTAMP: Final = struct.Struct(">xd")
 _QUICKEST_OF_S: Final = 0.5
 _MODEL_M: Final = 0.020
-# Of 30 real arms, none is more than 7.5 mm and 1.32 degrees from its nominal model. Another model of a similar arm is
-# at least 8.5 mm from it in every posture, and real arms are always nearest to their own.
+# None of 30 real arms differs from its nominal model by more than 7.5 mm and 1.32 degrees. The flange poses of two
+# similar models differ by at least 8.5 mm in every posture, and real arms are always nearest to their own model.
 _MODEL_RAD: Final = radians(3.0)
 _OWN_M: Final = 0.001
-# The controller calculates its pose with the parameters that it sends, and both are rounded to micrometres at most.
+# Tolerances for the parameters that the controller sends, with which it computes its pose.
 _OWN_RAD: Final = radians(0.1)
-# Joint angles and pose of one sample may be a control cycle apart; a CB3 has the longest.
+# Joint angles and pose of one sample may differ by one control cycle, of which that of a CB3 is the longest.
 _LAG_S: Final = 0.008
-# Between two comparisons of followed poses with the model: one takes as long as reading ten samples.
+# Interval between two checks of followed poses. A check takes as long as reading ten samples.
 _CHECK_S: Final = 0.1
 
 
@@ -75,15 +74,16 @@ def _apart(one: Pose, other: Pose) -> tuple[float, float]:
 
 
 def _apart_as_share(one: Pose, other: Pose) -> float:
-    """Return how far apart two poses are, as a share of what a real arm of the model may be."""
+    """Return the difference of two poses, as a fraction of the tolerance for a real arm of the model."""
     distance_m, angle_rad = _apart(one, other)
     return max(distance_m / _MODEL_M, angle_rad / _MODEL_RAD)
 
 
 class _Lateness:
-    """How late samples are by the controller's clock, compared with the quickest of the last 0.5 to 1 s with samples.
+    """Estimates the delay of samples from the controller's clock, relative to the fastest sample of the last second.
 
-    A clock that is up to 4 % slow, as that of a simulator, is not late. One that stood still is late for 1 s at most.
+    A clock that is up to 4 % slow, such as that of a simulator, causes no delay. After a clock has stood still, samples
+    are late for 1 s at most.
     """
 
     def __init__(self) -> None:
@@ -91,9 +91,7 @@ class _Lateness:
         self._since_s: float | None = None
 
     def late_s(self, t_device_s: float, heard_s: float) -> float:
-        """Return how late a sample is; `heard_s` is the time of its receipt. Only differences of both clocks count."""
-        # After a stall, samples arrive that are seconds old with stamps that advance like new ones: the quickest of
-        # the last second is the measure.
+        """Return the delay of a sample, s, that was received at `heard_s`. The epochs of the clocks may differ."""
         lead_s = t_device_s - heard_s
         if self._since_s is None or heard_s - self._since_s > _QUICKEST_OF_S:
             self._quickest_before_s, self._quickest_s, self._since_s = self._quickest_s, lead_s, heard_s
@@ -102,9 +100,9 @@ class _Lateness:
 
 
 class Reader:
-    """The reading side of one arm; connected while it exists.
+    """Reads one arm, and is connected while it exists.
 
-    Raises `ConnectError` when the arm cannot be reached, or is not the `model` (a key of `MODELS`) it should be.
+    Raises `ConnectError` if the arm cannot be reached, or if it is not a `model`, a key of `MODELS`.
     """
 
     def __init__(
@@ -121,29 +119,29 @@ class Reader:
         self._clock = clock
         self._timing = timing
         self._changed = threading.Condition()
-        # The newest sample for a state or a status, and its `t_host_ns`.
+        # `t_host_ns` of the newest sample for a state or a status, and the sample.
         self._live: tuple[int, bytes] | None = None
-        # Samples after it.
+        # Number of samples after it.
         self._since_live = 0
-        # When a read last returned, when with a sample, and when with `_live`.
+        # Times of the last read, of the last read with a sample, and of the read with `_live`.
         self._turn_s = self._read_s = self._live_s = clock.awake_s()
         self._t_device_s = math.nan
         self._lateness, self._late_s = _Lateness(), 0.0
         self._followers: list[Unread[Received]] = []
-        # When a followed pose is compared with the model again.
+        # Time of the next check of a followed pose.
         self._check_s = -math.inf
-        # Whether a pose has agreed with the kinematics of this arm.
+        # Whether any pose has agreed with the kinematics of this arm.
         self._fits = False
         self._failure: DeviceError | None = None
         self.silent = False
-        """Whether no sample has arrived since `DeviceTimeout` was raised."""
+        """Whether `DeviceTimeout` was raised and no sample has arrived since then."""
         self._stream = Subscription(host, OUTPUTS, rate_Hz, timeout_s=timing.connect_s, clock=clock)
         self.version = self._stream.version
         """Version of the controller: major, minor, bugfix, build."""
         self.services = ServicesOf(host, self.version, clock, api_port)
         missing = set(self._stream.missing)
         self.reports_tcp = "tcp_offset" not in missing
-        """Whether the controller reports its TCP offset over RTDE; old ones do not."""
+        """Whether the controller reports its TCP offset over RTDE, which old ones do not."""
         self._thread = Follower(clock, self._run, "ur-reader")
         try:
             self._thread.start()
@@ -154,12 +152,12 @@ class Reader:
 
     @property
     def reads_all(self) -> bool:
-        """Whether it reads at the full rate of the controller."""
+        """Whether samples are read at the full rate of the controller."""
         return self._stream.is_full_rate
 
     @cached_property
     def kinematics(self) -> Kinematics | None:
-        """Those that the controller sends."""
+        """The kinematics that the controller sends, or None."""
         return kinematics_of(self.info)
 
     def close(self) -> None:
@@ -171,19 +169,19 @@ class Reader:
     def look(self, *, limit_s: float | None = None) -> Sample:
         """Wait for a sample taken after this call.
 
-        Raises `StreamBroken` when the connection is lost and `DeviceTimeout` when no sample arrives for `limit_s`
-        (default `stale_s` of the timing).
+        Raises `StreamBroken` if the connection was lost, and `DeviceTimeout` if no sample arrives for `limit_s`, by
+        default `UrTiming.stale_s`.
         """
         before = self._live
         return self._wait(lambda: self._live is not before, self._timing.stale_s if limit_s is None else limit_s)
 
     def status(self) -> ArmStatus:
-        """Return the controller's modes and settings, of one sample at most `status_s` old. Raises as `look`."""
+        """Return modes and settings of a sample that is at most `UrTiming.status_s` old. Raises like `look`."""
         oldest_s = self._clock.awake_s() - self._timing.status_s
         return self._wait(lambda: self._live_s >= oldest_s, self._timing.stale_s).status()
 
     def state(self, ask_tcp: Callable[[], Sequence[float]]) -> ArmState:
-        """Read a state; `ask_tcp` asks for the TCP offset (6,) if samples lack it. Errors as `UrArm.state`."""
+        """Read a state; `ask_tcp` returns the TCP offset (6,) if samples lack it. Raises like `UrArm.state`."""
         sample, tcp_offset = self._look_with_tcp(ask_tcp)
         self._check_measures(sample)
         flange = sample.flange(tcp_offset)
@@ -199,7 +197,7 @@ class Reader:
 
     @contextmanager
     def follow(self) -> Iterator[Follow[ArmStates]]:
-        """Read every sample from now on, late ones too. The controller has to report its TCP."""
+        """Read every sample from now on, including late ones. The controller must report its TCP."""
         unread: Unread[Received] = Unread(self._host, _MOST_UNREAD)
         with self._changed:
             self._raise_failure()
@@ -225,7 +223,7 @@ class Reader:
         return self._states(received)
 
     def _states(self, received: list[Received]) -> ArmStates:
-        """Convert samples to flange poses; those without power over the joints are left out."""
+        """Convert samples to flange poses. Samples of an arm without power are left out."""
         outputs = self._stream.decode([sample for _, samples in received for sample in samples])
         t_host_ns = [t_ns for t_ns, samples in received for _ in samples]
         R_base_flange, p_base_flange_m = flange_poses(outputs["actual_TCP_pose"], outputs["tcp_offset"])
@@ -260,12 +258,12 @@ class Reader:
             sample = self.look()
             if sample.tcp_offset is not None:
                 return sample, sample.tcp_offset
-            if before is not None and before == tuple(ask_tcp()):  # so it was active when the sample was taken
+            if before is not None and before == tuple(ask_tcp()):  # it was active when the sample was taken
                 return sample, before
         raise DeviceFault(f"the TCP of {self._host} changes repeatedly", "stop the program or client that sets it")
 
     def _check_pose(self, q_rad: Sequence[float] | Array, flange: Pose, qd_rad_s: Sequence[float] | Array) -> None:
-        """Raise `DeviceFault` unless the flange is where the kinematics of this arm have it."""
+        """Raise `DeviceFault` unless the flange pose agrees with the kinematics of this arm."""
         model, own = self.info.model, self.kinematics
         lag_rad = float(np.abs(qd_rad_s).sum()) * _LAG_S
         distance_m, angle_rad = _apart(flange, forward(own or MODELS[model], q_rad))
@@ -277,13 +275,13 @@ class Reader:
         off = f"the flange of {self._host} is {1e3 * distance_m:.1f} mm and {math.degrees(angle_rad):.2f} degrees"
         if self._fits:
             raise DeviceFault(
-                f"{off} from where it was: its TCP is changing", "stop what sets the TCP, then read again"
+                f"{off} from its last pose: the active TCP changes", "stop what sets the TCP, then read again"
             )
         shares = {name: _apart_as_share(flange, forward(nominal, q_rad)) for name, nominal in MODELS.items()}
         nearest = min(shares, key=shares.__getitem__)
         if shares[nearest] > 1:
             raise DeviceFault(
-                f"{off} from the pose of a {model}, and no known model is near: its TCP is changing, or not set here",
+                f"{off} from the pose of a {model}, and no known model is near: the TCP changes or is not reported",
                 "check model and TCP, then read again",
             )
         if MODELS[nearest] != MODELS[model]:
@@ -293,13 +291,13 @@ class Reader:
             )
         if not fits:
             raise DeviceFault(
-                f"{off} from where the kinematics that the controller sends have it: the two contradict each other",
+                f"{off} from the pose by the kinematics that the controller sends, so that the two contradict",
                 "restart the controller; if that does not help, have the arm calibrated again",
             )
         self._fits = True
 
     def reported_program(self) -> str | None:
-        """Ask the controller for the program's state and name; None where it does not answer."""
+        """Return state and name of the program on the controller; None if the controller does not answer."""
         try:
             return self.services.ask(lambda services: services.program(), timeout_s=self._timing.connect_s)
         except DeviceError as error:
@@ -320,7 +318,7 @@ class Reader:
         except NoDashboard as error:
             if not self.services.has_api:
                 raise
-            log.info("%s", error)  # the Robot API is younger than PolyScope X, and reading does not need it
+            log.info("%s", error)  # the first versions of PolyScope X have no Robot API, which reading does not need
             reported = serial = polyscope = None
         named, kinematics = read_arm(self._host, timeout_s=self._timing.connect_s, clock=self._clock)
         if reported is None and self.services.has_api:
@@ -382,9 +380,8 @@ class Reader:
             pass
 
     def _follow(self) -> bool:
-        """Read what has arrived; return whether to continue. An error is raised at the next look."""
-        # Followers receive late samples too, because a recording must not miss them; only `state` and `status` leave
-        # them out.
+        """Read the samples that have arrived; return whether to continue. An error is raised by the next call."""
+        # Followers also receive late samples, which a recording must not miss. `state` and `status` never use them.
         try:
             samples = self._stream.read(self._clock.poll_s)
         except TimeoutError:
@@ -420,7 +417,7 @@ class Reader:
         return False
 
     def _end(self, failure: DeviceError) -> None:
-        """Let every later call raise this failure; the first one counts."""
+        """Let every later call raise this failure, unless there was an earlier one."""
         with self._changed:
             self._failure = self._failure or failure
             self._changed.notify_all()

@@ -1,8 +1,9 @@
-"""A small RTDE client: everything that is read from a controller passes through it.
+"""A small RTDE client, which reads all values from a controller.
 
-The receiving side of ur_rtde freezes the interpreter when the controller accepts and sends nothing. It repeats its last
-values when a link is lost, has no snapshot, and cannot parse `tcp_offset`, which the flange pose needs. Only a
-subscription that claims inputs writes to the controller, so no other can disturb a program.
+The receiving side of ur_rtde is not used: it blocks the interpreter if the controller accepts a connection and sends
+nothing, repeats its last values after a lost connection, has no consistent snapshot, and cannot parse `tcp_offset`,
+which the flange pose needs. Only a subscription with inputs writes to the controller; the others cannot disturb a
+program.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol version 2, general-purpose registers.
 Checked on hardware: no.
@@ -46,35 +47,35 @@ _FORMATS: Final[Mapping[str, tuple[str, tuple[int, ...]]]] = {
 }
 _INPUTS: Final[Mapping[str, str]] = {"INT32": "i", "DOUBLE": "d"}
 _RECEIVE_BYTES: Final = 65536
-# Of the CB3 generation, and from the e-Series on.
+# Full rates of the CB3 generation, and of the e-Series and later ones.
 _FULL_RATE_HZ: Final = (125.0, 500.0)
-# RTDE clients own these registers from PolyScope 3.9 and 5.3 on, fieldbuses and PLCs those below.
+# Registers for RTDE clients since PolyScope 3.9 and 5.3. Those below are for fieldbuses and PLCs.
 FIRST_REGISTER: Final = 24
 LAST_REGISTER: Final = 47
-# Of the outputs in which a program writes its requests.
+# Rate at which the requests of a program are read.
 _REQUESTS_HZ: Final = 125.0
 _SILENT_S: Final = 1.0
 
 
 def encode(kind: int, payload: bytes = b"") -> bytes:
-    """Build one package."""
+    """Return the bytes of a package."""
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
 def encode_setup_outputs(frequency_Hz: float, names: tuple[str, ...]) -> bytes:
-    """Build the request for one recipe of outputs."""
+    """Return the bytes of the request for a recipe of outputs."""
     return encode(SETUP_OUTPUTS, struct.pack(">d", frequency_Hz) + ",".join(names).encode("ascii"))
 
 
 def _encode_setup_inputs(names: tuple[str, ...]) -> bytes:
-    """Build the request for one recipe of inputs."""
+    """Return the bytes of the request for a recipe of inputs."""
     return encode(SETUP_INPUTS, ",".join(names).encode("ascii"))
 
 
 def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
-    """Remove the first package from `buffer` as (type, payload); None while it is incomplete.
+    """Remove the first package from `buffer` and return (type, payload); return None while it is incomplete.
 
-    Raises `ProtocolError` when the buffer cannot begin with a package.
+    Raises `ProtocolError` if the buffer does not begin with a package.
     """
     if len(buffer) < _HEADER.size:
         return None
@@ -91,7 +92,7 @@ def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
 
 
 def decode_version(payload: bytes) -> tuple[int, int, int, int]:
-    """Decode the controller's version: major, minor, bugfix, build."""
+    """Decode the version of the controller: major, minor, bugfix, build."""
     if len(payload) != 16:
         raise ProtocolError(f"RTDE version of {len(payload)} bytes, 16 expected: {payload.hex(' ')}")
     major, minor, bugfix, build = struct.unpack(">4I", payload)
@@ -100,7 +101,7 @@ def decode_version(payload: bytes) -> tuple[int, int, int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How the controller packs the requested outputs."""
+    """The layout in which the controller sends the requested outputs."""
 
     id: int
     types: tuple[str, ...]
@@ -114,7 +115,7 @@ class Recipe:
             raise ProtocolError(f"RTDE recipe cannot be read: {payload.hex(' ')}") from error
 
     def check(self, payload: bytes) -> None:
-        """Raise `ProtocolError` when a data package does not fit."""
+        """Raise `ProtocolError` if a data package does not have the length of this recipe."""
         size = _layout(self.types).itemsize
         if len(payload) != size or payload[0] != self.id:
             raise ProtocolError(
@@ -122,48 +123,48 @@ class Recipe:
             )
 
     def taken(self, names: Sequence[str]) -> list[str]:
-        """Return which of these inputs belong to another client or a fieldbus."""
+        """Return those of the inputs that belong to another client or a fieldbus."""
         return [name for name, kind in zip(names, self.types, strict=False) if kind == "IN_USE"]
 
     def columns(self, payloads: Sequence[bytes]) -> list[NDArray[Any]]:
-        """Decode n checked data packages: one array for each output, (n,) or (n, length of the vector)."""
+        """Decode n checked data packages; return one array per output, (n,) or (n, length of the vector)."""
         table = np.frombuffer(b"".join(payloads), _layout(self.types))
         return [table[str(k)].astype(table[str(k)].dtype.newbyteorder("=")) for k in range(len(self.types))]
 
 
 @lru_cache(maxsize=16)
 def _layout(types: tuple[str, ...]) -> np.dtype[Any]:
-    """Return the layout of a data package, which begins with the recipe's number."""
+    """Return the layout of a data package, which begins with the number of the recipe."""
     if unknown := [kind for kind in types if kind not in _FORMATS]:
         raise ProtocolError(f"RTDE outputs have unknown types: {', '.join(unknown)}")
     return np.dtype([("recipe", "u1"), *((str(k), *_FORMATS[kind]) for k, kind in enumerate(types))])
 
 
 class _Connection:
-    """One connection, one package at a time. Raises `OSError` when there is none within `timeout_s`."""
+    """A connection to the RTDE server. The constructor raises `OSError` if it is not established within `timeout_s`."""
 
     def __init__(self, host: str, timeout_s: float, clock: Clock) -> None:
         self._clock = clock
         self._deadline_s = clock.now_s() + timeout_s
         self._socket = socket.create_connection((host, PORT), timeout=timeout_s)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a package must not wait for the next
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a package must not wait for the next one
         self._timeout_s = timeout_s
         self._buffer = bytearray()
 
     def read(self, timeout_s: float) -> tuple[int, bytes]:
-        """Read the next package as (type, payload)."""
+        """Read the next package and return (type, payload)."""
         while (package := take_package(self._buffer)) is None:
             self._receive(timeout_s)
         return package
 
     def read_all(self, timeout_s: float) -> list[tuple[int, bytes]]:
-        """Read every package that has arrived, at least one; the socket is empty then."""
+        """Read all packages that have arrived, at least one. The socket is empty afterwards."""
         while not (packages := list(iter(lambda: take_package(self._buffer), None))):
             self._receive(timeout_s)
         return packages
 
     def _receive(self, timeout_s: float) -> None:
-        """Wait for bytes, then empty the socket."""
+        """Wait for bytes, then read all that have arrived."""
         if timeout_s != self._timeout_s:
             self._socket.settimeout(timeout_s)  # a system call
             self._timeout_s = timeout_s
@@ -175,9 +176,9 @@ class _Connection:
             self._buffer += received
 
     def ask(self, request: bytes) -> bytes:
-        """Send a request and return the payload of its answer, which has the type of the request.
+        """Send a request and return the payload of the answer, which has the type of the request.
 
-        All answers have to arrive within the time-out of the connection.
+        The time-out of the connection applies to all its requests together.
         """
         self._socket.sendall(request)
         while True:
@@ -191,14 +192,14 @@ class _Connection:
         self._socket.sendall(package)
 
     def close(self) -> None:
-        """Close, and wake a thread that reads."""
-        with contextlib.suppress(OSError):  # it may be gone already
+        """Close the connection, and wake a thread that reads."""
+        with contextlib.suppress(OSError):  # the connection may be lost already
             self._socket.shutdown(socket.SHUT_RDWR)
         self._socket.close()
 
 
 class Subscription:
-    """Outputs of one controller, sent `frequency_Hz` times a second; connected while the object exists.
+    """Receives outputs of a controller at `frequency_Hz`, and is connected while it exists.
 
     It may also own inputs, which no other client can write meanwhile.
 
@@ -209,20 +210,20 @@ class Subscription:
     outputs : mapping of str to str
         Name and type of every output, such as ``{"timestamp": "DOUBLE"}``.
     frequency_Hz : float
-        A higher one than the controller's own rate gives that rate: 500 Hz, 125 Hz of the CB3 generation.
+        Rate, at most that of the controller: 500 Hz, or 125 Hz of the CB3 generation.
     timeout_s : float
-        Limit of the whole start-up.
+        Time-out of the complete start-up.
     clock : Clock
-        Measures it.
+        Clock of the time-outs.
     inputs : mapping of str to str
         Name and type of every input that `write` sets; INT32 or DOUBLE.
 
     Raises
     ------
     Unreachable
-        Nothing answers at the address.
+        No device answers at the address.
     ConnectError
-        No RTDE, outputs or inputs of other types, or inputs of another client.
+        There is no RTDE server, outputs or inputs have other types, or another client owns the inputs.
     """
 
     def __init__(
@@ -242,7 +243,7 @@ class Subscription:
         """Rate at which the controller sends."""
         self.is_full_rate = False
         self.missing: list[str] = []
-        """Outputs that this controller does not know; samples lack them."""
+        """Outputs that this controller does not know. Samples do not have them."""
         try:
             self._connection = _Connection(host, timeout_s, clock)
         except OSError as error:
@@ -263,9 +264,9 @@ class Subscription:
             ) from error
 
     def read(self, timeout_s: float) -> list[bytes]:
-        """Read every sample that has arrived, at least one, for `decode`. All arrived since the last call.
+        """Read all samples that have arrived since the last call, at least one, for `decode`.
 
-        Raises `TimeoutError` when none arrives, `OSError` or `StreamBroken` on a lost connection, `ProtocolError`.
+        Raises `TimeoutError` if none arrives, `OSError` or `StreamBroken` after a lost connection, or `ProtocolError`.
         """
         while True:
             if samples := [payload for kind, payload in self._connection.read_all(timeout_s) if kind == DATA]:
@@ -274,11 +275,11 @@ class Subscription:
                 return samples
 
     def decode(self, samples: Sequence[bytes]) -> dict[str, NDArray[Any]]:
-        """Decode n samples: by the name of each known output, an array (n,) or (n, length of the vector)."""
+        """Decode n samples; return arrays (n,) or (n, length of the vector) by the name of each known output."""
         return dict(zip(self._names, self._recipe.columns(samples), strict=True))
 
     def write(self, values: Sequence[float]) -> None:
-        """Set all inputs, in the order given. Not from two threads at once. Raises `OSError` on a lost connection."""
+        """Set all inputs, in their order. Not thread-safe. Raises `OSError` if the connection was lost."""
         self._connection.send(encode(DATA, self._inputs.pack(self._input_recipe, *values)))
 
     def close(self) -> None:
@@ -337,7 +338,7 @@ def _fix_of(error: OSError, host: str) -> str:
 
 
 def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clock: Clock = REAL) -> list[str]:
-    """Return which of these inputs belong to another client or a fieldbus; change none.
+    """Return those of the inputs that belong to another client or a fieldbus. No input is changed.
 
     Raises `StreamBroken`, `DeviceTimeout` or `ProtocolError`.
     """
@@ -356,7 +357,7 @@ def registers_in_use(host: str, names: tuple[str, ...], *, timeout_s: float, clo
 
 
 def registers_taken(host: str, names: Sequence[str]) -> ConnectError:
-    """Return the error for inputs of another client; not all names have to be known."""
+    """Return the error for inputs that belong to another client. `names` may be incomplete."""
     which = f" ({names[0]} and {len(names) - 1} more)" if names else ""
     return ConnectError(
         f"another client controls {host} and holds its RTDE registers{which}",
@@ -365,25 +366,26 @@ def registers_taken(host: str, names: Sequence[str]) -> ConnectError:
 
 
 class ProgramRegisters:
-    """Input registers with which this client answers a program on the controller, and two outputs that it writes.
+    """Registers for a program on the controller: inputs with the answers of this client, and two outputs with requests.
 
     Parameters
     ----------
     host : str
     first : int
-        Of the registers of each kind.
+        Number of the first register of each kind.
     integers, doubles : int
-        How many inputs are owned.
+        Number of inputs of each kind.
     timeout_s : float
-        Of the connection.
+        Time-out of the connection.
     clock : Clock
+        Clock of the time-out.
 
     Raises
     ------
     ValueError
-        The registers are not those of RTDE clients.
+        The registers are not reserved for RTDE clients.
     ConnectError
-        Nothing answers, another client or a fieldbus owns a register, or this version has none.
+        No device answers, another client or a fieldbus owns a register, or this version has no such registers.
     """
 
     def __init__(
@@ -405,28 +407,28 @@ class ProgramRegisters:
 
     @property
     def request(self) -> tuple[int, int] | None:
-        """Number and command of the last request, as the program has written them; None before the first sample.
+        """Number and command of the last request of the program; None before the first sample.
 
-        Raises `DeviceError` when the connection is lost.
+        Raises `DeviceError` if the connection was lost.
         """
         if self._failure is not None:
             raise self._failure
         return self._request
 
     def write(self, integers: Sequence[int], doubles: Sequence[float]) -> None:
-        """Set all inputs at once. Raises `DeviceError` when the connection is lost."""
+        """Set all inputs in one cycle. Raises `DeviceError` if the connection was lost."""
         try:
             with self._lock:
-                # One package, which the controller takes in one cycle: the IO client of ur_rtde writes one for each
-                # register, so a program could read half of an answer.
+                # One package is processed in one cycle of the controller. The IO client of ur_rtde writes one package
+                # per register, so that a program could read half of an answer.
                 self._link.write([*integers, *doubles])
         except OSError as error:
-            raise StreamBroken(f"the controller does not take registers ({error})", "check the cable") from error
+            raise StreamBroken(f"the registers cannot be written ({error})", "check robot and cable") from error
         if self._failure is not None:
             raise self._failure
 
     def close(self) -> None:
-        """Close the connection; the registers keep their last values. Idempotent."""
+        """Close the connection. The registers keep their last values. Idempotent."""
         self._link.close()
         self._reader.join(1.0)
 

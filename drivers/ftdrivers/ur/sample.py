@@ -38,7 +38,7 @@ OUTPUTS: Final = MappingProxyType(
 )
 """Names and types of the subscribed outputs."""
 OPTIONAL: Final = frozenset({"tcp_offset", "payload", "payload_cog"})
-"""Older controllers do not know these."""
+"""Outputs that older controllers do not know."""
 
 PROGRAM_STOPPED: Final = 1
 PROGRAM_PLAYING: Final = 2
@@ -83,7 +83,7 @@ _SAFETY_MODES: Final = {
     22: "safety API safeguard stop",
 }
 _ENABLING: Final = "hold the enabling device in its middle position, or switch to automatic mode at the pendant"
-# What to do in modes whose source the status bits do not name.
+# Fixes for safety modes whose source is not shown by the status bits.
 _MODE_FIXES: Final = {
     12: "close the safeguard of automatic mode and reset it",
     13: _ENABLING,
@@ -96,7 +96,7 @@ _MODE_FIXES: Final = {
     20: "clear the emergency stop in the safety PLC, then power the arm on at the pendant",
     22: "clear the stop in the program that uses the safety API",
 }
-_SAFETY: Final = (  # the first that applies is the most specific
+_SAFETY: Final = (  # the first row whose bits are set is the most specific one
     (0b0_1110_0000, "emergency stop", "make the cell safe, release the button, power the arm on at the pendant"),
     (0b0_0000_0100, "protective stop", "find and remove its cause, then clear it at the pendant"),
     (0b0_0001_0000, "safeguard stop", "close the safeguard and reset it"),
@@ -108,7 +108,7 @@ _SAFETY: Final = (  # the first that applies is the most specific
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """One report of the controller. Vectors are tuples of radians, m and rotation vectors."""
+    """One sample of the controller. Vectors are tuples in rad and m; orientations are rotation vectors."""
 
     t_host_ns: int
     t_device_s: float
@@ -129,7 +129,7 @@ class Sample:
 
     @classmethod
     def of(cls, t_host_ns: int, outputs: Mapping[str, NDArray[Any]]) -> Self:
-        """Build the last of n samples from outputs by their names; those of `OPTIONAL` may be missing."""
+        """Build the last of n samples from outputs by their names. Those of `OPTIONAL` may be missing."""
         last: dict[str, Any] = {name: column[-1].tolist() for name, column in outputs.items()}
 
         def vector(name: str) -> tuple[float, ...]:
@@ -160,7 +160,7 @@ class Sample:
         return MEASURING[0] <= self.robot_mode <= MEASURING[1]
 
     def safety_fault(self) -> DeviceFault | None:
-        """Return why safety system or robot mode forbid motion."""
+        """Return the reason why the safety system or the robot mode prevents motion, or None."""
         if fix := _MODE_FIXES.get(self.safety_mode):
             return DeviceFault(f"{_SAFETY_MODES[self.safety_mode]} (safety mode {self.safety_mode})", fix)
         for bits, meaning, fix in _SAFETY:
@@ -173,7 +173,7 @@ class Sample:
         return None
 
     def program_fault(self) -> DeviceFault | None:
-        """Return why our program on the controller does not move the arm."""
+        """Return the reason why the control program does not move the arm, or None."""
         if self.program_state == PROGRAM_PLAYING:
             return None
         state = f"(state {self.program_state}, {_PROGRAM_STATES.get(self.program_state, 'unknown')})"
@@ -186,7 +186,7 @@ class Sample:
         )
 
     def flange(self, tcp_offset: Sequence[float]) -> Pose:
-        """Return the pose of the flange in base: `tcp_pose` without the TCP offset, (6,)."""
+        """Return the pose of the flange in the base: `tcp_pose` without the TCP offset (6,)."""
         R, p_m = flange_poses(np.array([self.tcp_pose]), np.array([tcp_offset]))
         return Pose(R[0], p_m[0])
 

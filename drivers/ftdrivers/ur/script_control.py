@@ -1,9 +1,10 @@
-"""The control path `script`: our program on the controller, and the commands to it over RTDE registers.
+"""The control path `script`: a control program on the controller, which receives commands in RTDE registers.
 
-`program.script` describes the registers; tests compare both. Its constructs are those of programs that are known to run
-on controllers: docs/reference/urscript-constructs.md. A thread answers every sample of the controller with a heartbeat,
-on the connection that owns the inputs. If the heartbeat stands still for 0.2 s of the controller's time, the program
-stops the arm and ends: after a crash, a suspension, a cut cable or a power failure of this computer.
+`program.script` describes the registers, and tests compare both files. It only uses constructs of programs that are
+known to run on controllers, see docs/reference/urscript-constructs.md. A thread answers every sample of the controller
+with a heartbeat, on the connection that owns the inputs. If the heartbeat does not change for 0.2 s of the controller's
+time, the program stops the arm and ends. This happens after a crash, a suspension or a power failure of this computer,
+or if the cable is cut.
 
 Ref: Universal Robots, URScript manual, "Real-Time Data Exchange (RTDE) Guide".
 Checked on hardware: no.
@@ -34,15 +35,15 @@ INPUTS: Final = MappingProxyType(
     {f"input_int_register_{k}": "INT32" for k in range(32, 36)}
     | {f"input_double_register_{k}": "DOUBLE" for k in range(24, 34)}
 )
-"""Heartbeat, token, sequence number, command; numbers of the command."""
+"""Inputs of the program: heartbeat, token, sequence number and command, then the numbers of the command."""
 OUTPUTS: Final = MappingProxyType(
     {"timestamp": "DOUBLE"}
     | {f"output_int_register_{k}": "INT32" for k in range(32, 36)}
     | {f"output_double_register_{k}": "DOUBLE" for k in range(24, 30)}
 )
-"""The controller's time; token, state, sequence number and answer of the last command; the TCP."""
+"""Outputs: the controller's time, then token, state, sequence number and answer of the last command, then the TCP."""
 NUMBERS: Final = 10
-"""Most numbers of one command."""
+"""Number of registers for the numbers of one command."""
 COMMANDS: Final = MappingProxyType(
     {
         "move": 1,
@@ -56,17 +57,17 @@ COMMANDS: Final = MappingProxyType(
         "sweep": 9,
     }
 )
-"""By the names of `control_child.Calls`, which has no sweep."""
-# A command counts once, if its sequence number is higher than the last, so nothing moves late.
+"""Codes of the commands, by the names of `control_child.Calls`, which has no sweep."""
+# A command is executed once, if its sequence number is higher than the last one. No motion can therefore start late.
 MOVING: Final = ("move", "sweep")
-"""Commands that begin a motion."""
+"""Commands that start a motion."""
 _MOVING: Final = 2
 _NO_HEARTBEAT: Final = -2
 
 
 @dataclass(frozen=True, slots=True)
 class _Report:
-    """What the program has written into its output registers."""
+    """The content of the output registers of the program."""
 
     token: int = 0
     state: int = 0
@@ -76,7 +77,7 @@ class _Report:
 
     @classmethod
     def of(cls, numbers: Sequence[Any]) -> Self:
-        """Read the values of `OUTPUTS` after the first."""
+        """Build a report from the values of `OUTPUTS` after the first."""
         token, state, sequence, answer, *tcp_offset = numbers
         return cls(token, state, sequence, answer, tuple(tcp_offset))
 
@@ -86,7 +87,7 @@ class _Report:
 
     @property
     def has_ended(self) -> bool:
-        """Whether it has ended by itself."""
+        """Whether the program has ended by itself."""
         return self.state < 0
 
     @property
@@ -95,13 +96,13 @@ class _Report:
 
 
 def without_comments(text: str) -> str:
-    """Return a program without its lines of comment and empty lines, as UR's client library sends it too."""
+    """Return a program without comment lines and empty lines, which UR's client library removes too."""
     return "".join(f"{line}\n" for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#"))
 
 
 def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
-    """Return the program for one session on a controller of this version, with the deceleration of its stops."""
-    # set_target_payload exists from 5.10 on, and takes the inertia too.
+    """Return the control program for one session on a controller of this version; stops decelerate by `stop_rad_s2`."""
+    # set_target_payload exists since 5.10, and also sets the inertia.
     # The token stands in the text of the program: one that starts late finds another token, or no heartbeat, and
     # ends.
     com, inertia = (", ".join(f"ft_number({k})" for k in numbers) for numbers in (range(1, 4), range(4, 10)))
@@ -117,16 +118,16 @@ def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
 
 log = logging.getLogger(__name__)
 
-# In 400 trials the arm decelerated 0.23 s after the last heartbeat at most.
+# In 400 trials the arm began to decelerate at most 0.23 s after the last heartbeat.
 STOPS_ITSELF_S: Final = 0.3
-"""The arm decelerates within this time after the last heartbeat: 0.2 s, and the cycles of both ends."""
+"""Longest time from the last heartbeat to the begin of the deceleration, s: 0.2 s and the cycles of both ends."""
 _RATE_HZ: Final = 125.0
 _LOOK_OUT_S: Final = 0.05
 _LARGEST: Final = 2**31 - 1
 
 
 class ScriptControl(Control):
-    """Our program on the controller, and the connections to it."""
+    """The control program `program.script`, and the connections to it."""
 
     stops_itself = True
 
@@ -139,14 +140,14 @@ class ScriptControl(Control):
         self._token = 1 + secrets.randbelow(_LARGEST - 1)
         self._program = program_text(self._token, version, stop_rad_s2)
         self._changed = threading.Condition(threading.RLock())
-        self._calling = threading.RLock()  # re-entrant: a signal handler may stop the arm during a call
+        self._calling = threading.RLock()  # re-entrant, because a signal handler may stop the arm during a call
         self._beat = secrets.randbelow(_LARGEST)
-        # Sequence number, command, numbers.
+        # The last command: sequence number, code, numbers.
         self._command: tuple[int, int, tuple[float, ...]] = (0, 0, (0.0,) * NUMBERS)
         self._report = _Report()
         self._beats = 0
         self._failure: DeviceError | None = None
-        # The last program error on the controller, of whatever program.
+        # The last error of any program on the controller.
         self._error: DeviceFault | None = None
         self._end_reason: DeviceError | None = None
         self._refusal: ProgramRefused | None = None
@@ -162,7 +163,7 @@ class ScriptControl(Control):
 
     @property
     def alive(self) -> bool:
-        """Whether it accepts calls."""
+        """Whether the program accepts calls."""
         return not self._killed and self._failure is None
 
     @property
@@ -171,9 +172,9 @@ class ScriptControl(Control):
         return self._report.token == self._token and self._report.has_ended
 
     def wait_until_ready(self, look_out: LookOut) -> None:
-        """Send the program, and return when it answers to heartbeats of this session; see `Control`."""
+        """Send the program, and return when it reacts to heartbeats of this session; see `Control`."""
         wait = partial(self._wait, timeout_s=self._timing.starting_s, look_out=look_out, what="start")
-        wait(lambda: self._beats >= 2 or self._refusal is not None)  # token and sequence number are in the registers
+        wait(lambda: self._beats >= 2 or self._refusal is not None)  # then the registers hold token and sequence number
         if self._refusal is not None:
             raise self._refusal
         try:
@@ -192,7 +193,7 @@ class ScriptControl(Control):
             raise self._refusal
 
     def call(self, name: str, *args: object, timeout_s: float | None = None, look_out: LookOut = lambda: None) -> Any:
-        """Send a command and wait for its answer; see `Control`."""
+        """Send a command and wait for its answer, see `Control`."""
         with held(self._calling, self._clock):
             self._asked_s = self._clock.now_s()
             if name == "progress":
@@ -217,14 +218,14 @@ class ScriptControl(Control):
             return bool(report.answer)
 
     def kill(self) -> None:
-        """Request the end of the program once more, then fall silent; the arm brakes within 0.3 s. Idempotent.
+        """Request the end of the program once more, then end the heartbeat; the arm brakes within 0.3 s. Idempotent.
 
-        A program that is paused finds the request in the registers when it is resumed, and does not move.
+        A paused program finds the request in the registers when it is resumed, and does not move.
         """
         with self._changed:
             if not self._killed:
                 self._killed = True
-                with suppress(OSError):  # it may be gone
+                with suppress(OSError):  # the connection may be lost
                     self._request(COMMANDS["quit"], ())
             self._changed.notify_all()
         self._close_stream()
@@ -234,11 +235,11 @@ class ScriptControl(Control):
             self._primary.close()
 
     def end_reason(self) -> DeviceError | None:
-        """Return why the program has ended: a runtime error, no heartbeat, or a lost link."""
+        """Return why the program has ended: a run-time error, a missing heartbeat, or a lost connection."""
         return copy(self._end_reason or self._failure)
 
     def explained(self, error: DeviceError) -> DeviceError:
-        """Return the error of a lost controller: its program stops the arm."""
+        """Return the error of a lost controller, completed by the information that its program stops the arm."""
         return type(error)(
             f"{error.found}, so the control program begins to stop the arm by itself within {STOPS_ITSELF_S} s",
             "check the robot and the cable, then open the arm again",
@@ -291,15 +292,15 @@ class ScriptControl(Control):
             while self._turn(stream):
                 pass
         finally:
-            self._fail("its thread has ended")  # unless the reason is known
+            self._fail("its thread has ended")  # no effect if the reason is known
 
     def _connect(self) -> Subscription:
         timeout_s = self._timing.connect_s
         return Subscription(self._host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=self._clock, inputs=INPUTS)
 
     def _turn(self, stream: Subscription) -> bool:
-        """Read what has arrived and answer it with a heartbeat; return whether to continue."""
-        # A new number answers each new sample, so the heartbeat shows that samples arrive and that this process runs.
+        """Read the samples that have arrived and answer with a heartbeat; return whether to continue."""
+        # The heartbeat only advances with a new sample: it shows that samples arrive and that this process runs.
         try:
             outputs = stream.decode(stream.read(self._clock.poll_s)[-1:])
         except TimeoutError:
@@ -310,7 +311,7 @@ class ScriptControl(Control):
             return self._fail(str(error))
         t_device_s, *numbers = (column[-1].item() for column in outputs.values())
         if t_device_s == self._t_device_s:
-            return self._pause()  # a repeated sample is no sign of life
+            return self._pause()  # a repeated sample does not show that the controller runs
         self._t_device_s, self._silent_s, self._heard_s = t_device_s, 0.0, self._clock.now_s()
         with self._changed:
             if self._killed:
@@ -318,7 +319,7 @@ class ScriptControl(Control):
             self._report = _Report.of(numbers)
             if self.has_ended and self._report.missed_heartbeat:
                 self._end_reason = self._end_reason or DeviceTimeout(
-                    "the control program has stopped the arm and ended, because it saw no heartbeat for 0.2 s",
+                    "the control program has stopped the arm and ended, because it received no heartbeat for 0.2 s",
                     "keep the computer awake, check the network, then open the arm again",
                 )
             try:
@@ -333,7 +334,7 @@ class ScriptControl(Control):
         return True
 
     def _pause(self) -> bool:
-        """Count the silence of the controller; a suspension of this process counts as two turns at most."""
+        """Measure the silence of the controller. A suspension of this process adds two turns at most."""
         now_s = self._clock.now_s()  # an emulated cell waits for this thread
         self._silent_s += min(now_s - self._heard_s, 2 * self._clock.poll_s)
         self._heard_s = now_s
@@ -348,7 +349,7 @@ class ScriptControl(Control):
                     StreamBroken(f"the connection to the control program on {self._host} was lost ({why})")
                 )
             self._changed.notify_all()
-        self._close_stream()  # so that no command can arrive later
+        self._close_stream()  # no command can arrive later
         return False
 
     def _close_stream(self) -> None:
@@ -370,7 +371,7 @@ class ScriptControl(Control):
         for message in primary.read():
             log.log(logging.DEBUG if isinstance(message, RobotType) else logging.INFO, "%s: %s", self._host, message)
             if isinstance(message, Failed):
-                fix = "take the other control path, and report this error"
+                fix = "select the other control path, and report this error"
                 self._error = DeviceFault(f"the control program failed in line {message.line}: {message.text}", fix)
                 self._refuse(self._error)
             elif isinstance(message, Code) and message.is_read_only:
@@ -382,7 +383,7 @@ class ScriptControl(Control):
             self._refuse(self._read_only("the controller closed the connection"))
 
     def _refuse(self, error: DeviceError) -> None:
-        """Note why the program does not start, if it has not."""
+        """Store the reason why the program does not start, unless it has started."""
         with self._changed:
             if self._report.token != self._token and self._refusal is None:
                 self._refusal = ProgramRefused(error.found, error.fix)
@@ -390,14 +391,14 @@ class ScriptControl(Control):
 
     def _read_only(self, how: str) -> ConnectError:
         return ConnectError(
-            f"{self._host} takes no programs from the network ({how})",
+            f"{self._host} accepts no programs from the network ({how})",
             "switch the pendant to remote control (PolyScope X: Safety overview, Control mode, Remote)",
         )
 
     # ------------------------------------------------------------------ the registers
 
     def _request(self, command: int, numbers: Sequence[float]) -> int:
-        """Send a command at once; return its sequence number."""
+        """Send a command immediately; return its sequence number."""
         self._set(command, numbers)
         try:
             self._write()
@@ -414,14 +415,14 @@ class ScriptControl(Control):
         self._command = (self._command[0] + 1, command, (*numbers, *padding))
 
     def _write(self) -> None:
-        # Heartbeat, token, sequence and command go in one package, so the program never sees a part of a command.
+        # One package holds heartbeat, token, sequence number and command, so that the program never reads half of them.
         sequence, command, numbers = self._command
         if self._stream is not None:
             self._stream.write((self._beat, self._token, sequence, command, *numbers))
 
 
 def _flat(values: Sequence[object]) -> Iterator[float]:
-    """Yield the numbers of an argument list; None stands for none."""
+    """Yield the numbers of an argument list, in which nested sequences are flattened and None is skipped."""
     for value in values:
         if isinstance(value, Sequence):
             yield from _flat(value)

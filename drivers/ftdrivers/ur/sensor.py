@@ -1,11 +1,11 @@
-"""The force/torque sensor inside an e-Series wrist.
+"""The force/torque sensor in the wrist of an e-Series arm.
 
-The controller reports two wrenches. `actual_TCP_force` is in base axes at the active TCP. The controller has already
-subtracted the configured payload and the reading at its last zeroing. This cannot be undone, so a gravity calibration
-has nothing to find in it. `ft_raw_wrench` (PolyScope 5.9 and later) is in flange axes, neither compensated nor zeroed.
-Universal Robots documents neither its unit nor its reference point. So this driver reads only `ft_raw_wrench`, and
-requires a scale that the user has measured with a known weight. Recordings have zeros of about 1,800, 400, 25,400 N and
--76 N·m, and a drift of 7 N in the first ten minutes, so its zero counts as arbitrary.
+The controller reports two wrenches. `actual_TCP_force` is in base axes at the active TCP. The controller subtracts the
+configured payload and the reading at the last zeroing from it, which cannot be undone, so that it is useless for a
+gravity calibration. `ft_raw_wrench` (PolyScope 5.9 and later) is in flange axes, neither compensated nor zeroed.
+Universal Robots documents neither its unit nor its reference point. Therefore this driver reads `ft_raw_wrench`, and
+requires a scale that the user has measured with a known weight. Its zero is arbitrary: recordings have zeros of about
+1,800, 400 and 25,400 N and -76 N·m, and a drift of 7 N in the first ten minutes.
 
 Ref: Universal Robots, "Real-Time Data Exchange (RTDE) Guide": `ft_raw_wrench`, `actual_TCP_force`.
 Checked on hardware: no. Verified against: tests/unit/drivers/ur/test_wrist_sensor.py.
@@ -40,11 +40,11 @@ class UrWristSensor(StreamingSensor):
     host : str
         Address of the controller.
     counts_per_N, counts_per_Nm : float
-        `ft_raw_wrench` at 1 N and at 1 N·m. Measure them: see docs/how-to/connect-a-sensor.md.
+        Value of `ft_raw_wrench` at 1 N and at 1 N·m; docs/how-to/connect-a-sensor.md describes how to measure it.
     sign : int
         -1 for a sensor that reports the reaction.
     clock : Clock
-        Measures and waits; an emulated cell has its own.
+        Clock of the time stamps and time-outs.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class UrWristSensor(StreamingSensor):
 
     @classmethod
     def from_url(cls, address: str, options: "Options", *, sign: int = 1, clock: Clock = REAL) -> Self:
-        """Build from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both are required."""
+        """Build the driver from ``ur-ft://192.168.1.10?counts_per_N=…&counts_per_Nm=…``; both options are required."""
         why = "measure the undocumented unit of ft_raw_wrench as described in docs/how-to/connect-a-sensor.md"
         return cls(
             address,
@@ -106,7 +106,7 @@ class UrWristSensor(StreamingSensor):
             raise ProtocolError(f"{self.name}: the wrench at {t_device_s[-1]} s is not finite: {raw[-1].tolist()}")
         seq = np.rint(t_device_s * _RATE_Hz).astype(np.int64)
         before = seq[0] - 1 if self._seq is None else self._seq
-        steps = seq - np.concatenate([[before], seq[:-1]])  # `np.diff` takes four times as long
+        steps = seq - np.concatenate([[before], seq[:-1]])  # four times as fast as `np.diff`
         if (steps <= 0).any():
             raise StreamBroken(
                 f"{self.name}: the controller's clock went back to {t_device_s[steps <= 0][0]:.3f} s", "open it again"

@@ -1,12 +1,12 @@
-"""The services of a controller beside RTDE: the dashboard server, or the Robot API of PolyScope X.
+"""Services of a controller other than RTDE: the dashboard server, or the Robot API of PolyScope X.
 
 Ref: Universal Robots, "Dashboard Server, e-Series" and "Dashboard Server, CB-Series" manuals;
 "Robot API" (OpenAPI document of PolyScope X); `dashboard_client_implementation_x.cpp` of
-Universal Robots' client library, which lists since when there is each path: `program/v1/state` 10.11,
+Universal Robots' client library, which lists the first version with each path: `program/v1/state` 10.11,
 `system/v1/controlmode` 10.12, `system/v1/information` and `versions/v1` 10.14.
 Checked on hardware: no.
 
-A call to a dead controller takes seconds. So every request runs in its own thread.
+Every request runs in a thread of its own, because a request to a dead controller takes seconds.
 """
 
 import json
@@ -26,16 +26,16 @@ DASHBOARD_PORT: Final = 29999
 _REPLY_S: Final = 2.5
 
 
-# Our own client: that of ur_rtde does not exist on most platforms.
+# The client of ur_rtde is not used, because it does not exist on most platforms.
 class _Dashboard:
-    """One connection; see `services.Services`. Raises `OSError` when it is lost or silent for 2.5 s."""
+    """A connection to the dashboard server, see `Services`. Raises `OSError` if it is lost or silent for 2.5 s."""
 
     def __init__(self, host: str, connect_s: float) -> None:
         self._socket = socket.create_connection((host, DASHBOARD_PORT), timeout=connect_s)
         self._socket.settimeout(_REPLY_S)
         self._lines = self._socket.makefile("r", encoding="utf-8", errors="replace", newline="\n")
         try:
-            self._read()  # a line of greeting
+            self._read()  # the greeting
         except BaseException:
             self.close()
             raise
@@ -45,12 +45,12 @@ class _Dashboard:
             raise RuntimeError(reply)
 
     def model(self) -> str | None:
-        """Return the model without its generation, such as UR5; from PolyScope 3.12 and 5.6 on."""
+        """Return the model without its generation, such as UR5; reported since PolyScope 3.12 and 5.6."""
         reply = self._ask("get robot model")
         return reply if reply.startswith("UR") else None
 
     def serial(self) -> str | None:
-        """Return the serial number, in digits; from PolyScope 3.12 and 5.6 on."""
+        """Return the digits of the serial number; reported since PolyScope 3.12 and 5.6."""
         reply = self._ask("get serial number")
         return reply if reply.isdigit() else None
 
@@ -62,7 +62,7 @@ class _Dashboard:
         return self._ask("programState") or None
 
     def in_remote_control(self) -> bool | None:
-        """Return whether programs sent over the network are accepted; e-Series from 5.6 on."""
+        """Return whether programs from the network are accepted; reported by the e-Series since 5.6."""
         return {"true": True, "false": False}.get(self._ask("is in remote control").lower())
 
     def close(self) -> None:
@@ -76,7 +76,7 @@ class _Dashboard:
     def _read(self) -> str:
         line = self._lines.readline()
         if not line.endswith("\n"):
-            raise ConnectionError("it closed the connection")
+            raise ConnectionError("the server closed the connection")
         return line.strip()
 
 
@@ -85,7 +85,7 @@ _PATH: Final = "/universal-robots/robot-api"
 
 
 class _RobotApi:
-    """Requests to one controller; see `services.Services`. Raises `OSError` when it does not answer."""
+    """Requests to the Robot API of one controller, see `Services`. Raises `OSError` if it does not answer."""
 
     def __init__(self, host: str, port: int, connect_s: float) -> None:
         self._connection = HTTPConnection(host, port, timeout=connect_s)
@@ -93,7 +93,7 @@ class _RobotApi:
         self._connection.sock.settimeout(_REPLY_S)
 
     def stop(self) -> None:
-        """Stop the program, and the arm with it; refused in local control."""
+        """Stop the program and the arm, which is refused in local control."""
         self._request("PUT", "/program/v1/state", {"action": "stop"})
 
     def model(self) -> str | None:
@@ -101,7 +101,7 @@ class _RobotApi:
         return self._value("/system/v1/information", "robotType")
 
     def serial(self) -> str | None:
-        # Reported from 10.14 on; the control mode from 10.12 on.
+        # Reported since 10.14; the control mode since 10.12.
         return self._value("/system/v1/information", "serialNumber")
 
     def polyscope(self) -> str | None:
@@ -124,7 +124,7 @@ class _RobotApi:
         return value if isinstance(value, str) and value else None
 
     def _request(self, method: str, path: str, content: dict[str, str] | None = None) -> Any:
-        """Return the answer; None for a path that this version does not have."""
+        """Return the answer, or None if this version does not have the path."""
         body = None if content is None else json.dumps(content)
         try:
             self._connection.request(method, _PATH + path, body, {"Content-Type": "application/json"})
@@ -139,7 +139,7 @@ class _RobotApi:
         try:
             return json.loads(text) if text else None
         except ValueError as error:
-            raise RuntimeError(f"the answer to {method} {path} is no JSON: {text[:200]}") from error
+            raise RuntimeError(f"the answer to {method} {path} is not JSON: {text[:200]}") from error
 
 
 T = TypeVar("T")
@@ -149,64 +149,63 @@ _ENABLE: Final = (
 )
 _ENABLE_API: Final = "check the address, and that PolyScope X is 10.11 or later and has finished starting"
 POLYSCOPE_X: Final = 10
-"""The first major version that has a Robot API in place of a dashboard server."""
+"""First major version with a Robot API instead of a dashboard server."""
 
 
 class Services(Protocol):
-    """Questions and requests. None where this version of the controller does not report it.
+    """Questions and requests to a controller. An answer is None if this version does not report it.
 
-    Every refusal is a RuntimeError with the controller's message.
+    A refusal raises RuntimeError with the message of the controller.
     """
 
     def stop(self) -> None:
-        """Stop the program, and the arm with it."""
+        """Stop the program and the arm."""
 
     def model(self) -> str | None:
-        """Return the model; a dashboard server leaves out the generation, such as UR5."""
+        """Return the model. A dashboard server omits the generation: UR5 for a UR5e."""
 
     def serial(self) -> str | None:
         """Return the serial number."""
 
     def polyscope(self) -> str | None:
-        """Return the version, such as 5.15.0.1261331."""
+        """Return the version of PolyScope, such as 5.15.0.1261331."""
 
     def program(self) -> str | None:
-        """Return state and name, such as "PLAYING pick.urp"."""
+        """Return state and name of the program, such as "PLAYING pick.urp"."""
 
     def in_remote_control(self) -> bool | None:
-        """Return whether programs sent over the network are accepted."""
+        """Return whether programs from the network are accepted."""
 
     def close(self) -> None:
         """Disconnect."""
 
 
-# PolyScope X has a Robot API in place of the dashboard, and neither reports everything: what is not known is None.
 @dataclass(frozen=True, slots=True)
 class ServicesOf:
-    """Asks the services of one controller."""
+    """Sends requests to the services of one controller."""
 
     host: str
     version: tuple[int, int, int, int]
-    """As RTDE reports it."""
+    """Version of the controller, as RTDE reports it."""
     clock: Clock
     api_port: int = ROBOT_API_PORT
 
     @property
     def name(self) -> str:
-        """In words."""
+        """Name of the service for messages."""
         return "Robot API" if self.has_api else "dashboard server"
 
     @property
     def has_api(self) -> bool:
-        """Whether the controller is one of PolyScope X."""
+        """Whether the controller has a Robot API, as PolyScope X does."""
         return self.version[0] >= POLYSCOPE_X
 
     def ask(self, question: Callable[[Services], T], *, timeout_s: float, connect_s: float | None = None) -> T:
-        """Connect, ask, disconnect.
+        """Connect, return the answer to a question, and disconnect.
 
-        After `timeout_s` the request continues in its thread: it tries to connect for `connect_s` (default
-        `timeout_s`), then it waits 2.5 s for each answer. Raises `NoDashboard` where there is no server, no answer in
-        time, or a refusal.
+        Raises `NoDashboard` if there is no server, no answer in time, or a refusal. After `timeout_s` the request
+        continues in its thread: it tries to connect for `connect_s` (default `timeout_s`), then waits 2.5 s for each
+        answer.
         """
         limit_s = timeout_s if connect_s is None else connect_s
 
@@ -219,7 +218,7 @@ class ServicesOf:
             finally:
                 services.close()
 
-        pool = ThreadPoolExecutor(1, "ur-services")  # no daemon: an exit of the interpreter still stops the arm
+        pool = ThreadPoolExecutor(1, "ur-services")  # not a daemon: a requested stop is completed before exit
         answered = threading.Event()
         future = pool.submit(session)
         future.add_done_callback(lambda _: answered.set())

@@ -1,4 +1,4 @@
-"""Every time limit of a Universal Robots arm; waits for an event and for a lock."""
+"""Time-outs of a Universal Robots arm, and waits for an event or a lock."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,65 +13,64 @@ _TURN_NS: Final = 50_000_000
 
 @dataclass(frozen=True)
 class UrTiming:
-    """Limits in seconds. The defaults are for a real cell; docs/explanation/ur-controller.md has their effects."""
+    """Time-outs in seconds. The defaults are for a real cell; docs/explanation/ur-controller.md has their effects."""
 
-    # Limits on samples of the controller, the same in every cell.
+    # Limits on samples of the controller are equal in real and emulated cells.
     stale_s: float = 0.2
-    """The longest time without a sample."""
+    """Longest time without a sample."""
     status_s: float = 0.05
-    """The greatest age of a status, from its receipt."""
+    """Largest age of a status since its receipt."""
     late_s: float = 0.05
-    """A sample that is later than this by the controller's clock is too old for a state or a status."""
+    """Largest delay of a sample by the controller's clock; later samples are too old for a state or a status."""
     glance_s: float = 0.1
-    """The wait of a stop for a sample, before it uses the dashboard server."""
+    """Time for which a stop waits for a sample before it uses the dashboard server."""
     reason_s: float = 0.05
-    """A program may end some cycles before the controller reports the reason."""
+    """Time from the end of a program until the controller reports the reason."""
     still_s: float = 0.3
-    """Rest without a break, after which the structure no longer rings."""
+    """Time of uninterrupted rest after which vibrations of the structure have decayed."""
     ours_every_s: float = 0.1
-    """Period of the question to the control program during a move."""
+    """Interval between questions to the control program during a move."""
 
-    # Limits on other processes, threads and servers: generous in an emulated cell.
+    # Time-outs of other processes, threads and servers are long in an emulated cell.
     connect_s: float = 2.0
-    """Start-up of RTDE, one request to the dashboard server, connection to the script port."""
+    """Time-out for starting RTDE, for one request to the dashboard server, and for connecting to the program port."""
     release_s: float = 1.0
-    """Until another client releases registers and program; one whose parent was killed takes 0.5 s."""
+    """Time-out until another client releases registers and program. A client whose parent was killed takes 0.5 s."""
     starting_s: float = 4.5
-    """Start of the control process, until its program plays."""
+    """Time-out from the start of the control process until its program plays."""
     call_s: float = 2.0
-    """A reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
+    """Time-out for a reply of the control process, which takes 10 ms. Motion is watched meanwhile."""
     progress_s: float = 0.4
-    """Such a reply about the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
+    """Time-out for the progress of a move, which takes 0.03 ms. The guard is not called meanwhile."""
     ours_s: float = 0.4
-    """A question to the control program, which answers within two control cycles."""
+    """Time-out for the answer of the control program, which takes two control cycles at most."""
     ours_again_s: float = 1.0
-    """This question when the arm is reopened."""
+    """The same time-out when the arm is reopened."""
     ours_closing_s: float = 0.3
-    """This question when the arm is closed."""
+    """The same time-out when the arm is closed."""
     quit_s: float = 0.7
-    """End of the control program and of its process when the arm is closed."""
+    """Time-out for ending the control program and its process when the arm is closed."""
     braking_s: float = 0.5
-    """A `stopJ`, beyond the time in which the joints decelerate."""
+    """Time-out of `stopJ`, in addition to the time in which the joints decelerate."""
     stop_s: float = 0.4
-    """A stop through the dashboard server, which takes 0.02 s; it continues in the background afterwards."""
+    """Time-out of a stop through the dashboard server, which takes 0.02 s. Then it continues in the background."""
     stop_silent_s: float = 0.15
-    """Such a stop when no sample has arrived for `stale_s`."""
+    """The same time-out if no sample has arrived for `stale_s`."""
     reach_s: float = 1.5
-    """How long the attempt in the background tries to connect: one retransmission of TCP."""
+    """Time for which the attempt in the background tries to connect, enough for one retransmission of TCP."""
     unwatched_s: float = 0.5
-    """The control process stops a move after this time without a request."""
+    """Time without a request after which the control process stops a move."""
     child_starting_s: float = 9.0
-    """The control process ends itself when ur_rtde, which gives up after 5 s, has not connected by then."""
+    """Time-out after which the control process ends if ur_rtde, which gives up after 5 s, has not connected."""
     child_leaving_s: float = 3.0
-    """The control process ends itself if its exit takes longer after the parent has gone."""
+    """Time-out for the exit of the control process after the parent has ended."""
 
     @classmethod
     def emulated(cls) -> Self:
-        """Return the limits of an emulated cell, whose processes may be starved."""
-        # Limits on samples are the same in every cell; those on other processes are generous.
+        """Return the time-outs of an emulated cell, whose processes may get little CPU time."""
         return cls(
             connect_s=30.0,
-            release_s=5.0,  # another client gives no answer, so this wait always ends at its limit
+            release_s=5.0,  # shorter than the others, because this wait always lasts until the time-out
             starting_s=30.0,
             call_s=30.0,
             progress_s=30.0,
@@ -89,13 +88,13 @@ class UrTiming:
 
 
 STRICT: Final = UrTiming()
-"""Limits of a real cell."""
+"""Time-outs of a real cell."""
 
 
 class Patience:
-    """Waits in turns, `limit_s` in total. A turn in which this process was suspended counts as two at most.
+    """Waits in turns until `limit_s` has passed. A turn in which this process was suspended adds two turns at most.
 
-    A suspended process cannot receive, so its silence proves nothing.
+    A suspended process receives nothing, so that the silence does not show that the other side is dead.
     """
 
     def __init__(self, clock: Clock, limit_s: float) -> None:
@@ -109,7 +108,7 @@ class Patience:
         return self._left_ns <= 0
 
     def wait(self, changed: Waitable) -> None:
-        """Wait until `changed` is notified, for one turn at most; the time since the last turn counts too."""
+        """Wait for one turn at most until `changed` is notified. The time since the last turn is included."""
         self._clock.wait(changed, min(self._left_ns, _TURN_NS) / 1e9)
         now_ns = self._clock.now_ns()
         self._left_ns -= min(now_ns - self._counted_ns, 2 * _TURN_NS)
@@ -118,7 +117,7 @@ class Patience:
 
 @contextmanager
 def held(lock: RLock, clock: Clock) -> Iterator[None]:
-    """Hold a lock; a thread that waits for it keeps following the clock of an emulated cell."""
+    """Hold a lock. A thread that waits for the lock continues to follow the clock of an emulated cell."""
     while not lock.acquire(timeout=0.02):
         clock.now_ns()
     try:

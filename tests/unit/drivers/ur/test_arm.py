@@ -148,7 +148,7 @@ def test_an_arm_that_is_not_in_remote_control_is_not_moved(
 
 def test_a_whole_turn_is_within_the_range_of_a_joint(arm: UrArm) -> None:
     arm.within_safety_limits([0, -1.5, 1.5, 0, 0, radians(360)])
-    with pytest.raises(ValueError, match="every joint ends at 360 degrees"):
+    with pytest.raises(ValueError, match="limit of every joint is 360 degrees"):
         arm.within_safety_limits([0, -1.5, 1.5, 0, 0, -radians(360.001)])
 
 

@@ -46,7 +46,7 @@ def test_before_5_10_the_payload_has_no_inertia(
     monkeypatch.setattr(arm._reader, "version", version)
     arm.set_payload(1.0, (0, 0, 0.05))
     assert controller.did == ["payload 1 [0.0, 0.0, 0.05]"]
-    with pytest.raises(DeviceFault, match="takes no inertia"):
+    with pytest.raises(DeviceFault, match="accepts no inertia"):
         arm.set_payload(1.0, (0, 0, 0.05), INERTIA)
     assert len(controller.did) == 1
 

@@ -209,7 +209,7 @@ def test_a_move_paused_by_a_protective_stop_does_not_go_on(
     ("message", "read_only", "found", "fix"),
     [
         (Failed(17, 3, "compile_error_name_not_found:stopq:"), False, "line 17: compile_error", "other control path"),
-        (Code(210, 0, ""), False, "takes no programs", "remote control"),
+        (Code(210, 0, ""), False, "accepts no programs", "remote control"),
         (Note("hello"), True, "closed the connection", "remote control"),
     ],
 )

@@ -135,7 +135,7 @@ def test_an_early_robot_api_does_not_know_everything() -> None:
 
 @pytest.mark.parametrize(
     ("status", "answer", "says"),
-    [(403, {"message": "Forbidden"}, "status 403.*Forbidden"), (200, b"<html>", "no JSON"), (500, {}, "status 500")],
+    [(403, {"message": "Forbidden"}, "status 403.*Forbidden"), (200, b"<html>", "not JSON"), (500, {}, "status 500")],
 )
 def test_a_robot_api_that_refuses(status: int, answer: Any, says: str) -> None:
     with (
