@@ -1,1 +1,1 @@
-"""The far side of the wire: an emulated robot cell. Imports nothing of the other packages."""
+"""An emulated robot cell, which real drivers reach over real wires. It imports no other package of the project."""

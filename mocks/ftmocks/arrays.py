@@ -1,4 +1,4 @@
-"""The array type of this package."""
+"""The type of arrays in this package."""
 
 import numpy as np
 from numpy.typing import NDArray

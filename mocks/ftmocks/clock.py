@@ -1,8 +1,9 @@
-"""The clock of an emulated cell: it follows real time, and waits for every thread that must keep up with it.
+"""The clock of an emulated cell, which follows real time and waits for every thread that must keep up with it.
 
-A page of shared memory holds the time. A client that must not miss a stretch of it, such as the thread that reads a
-stream, claims a slot in the page and writes there the time up to which it has followed. The clock never passes the
-slowest slot by more than `LEAD_NS`: a computer that stalls makes an emulated cell slow, never late.
+A page of shared memory holds the time. A client that must see time advance in small steps, such as the thread that
+reads a stream, claims a slot in the page and writes into it the time up to which it has followed. The clock never
+passes the slowest slot by more than `LEAD_NS`. A busy computer therefore slows the emulated cell down, but no data are
+late.
 
 The page holds signed 64-bit integers in native order:
 
@@ -11,7 +12,7 @@ The page holds signed 64-bit integers in native order:
 | 0 | version, `PAGE_VERSION` |
 | 1 | the time, ns |
 | 2 | number of slots |
-| 4 + 2 k | slot k: process id of its owner, 0 where the slot is free |
+| 4 + 2 k | slot k: process id of its owner, 0 if the slot is free |
 | 5 + 2 k | slot k: the time up to which its owner has followed, ns |
 
 To claim a slot, take a POSIX record lock (`lockf`) on the first 8 bytes, write the time, then the process id, and
@@ -32,17 +33,17 @@ from pathlib import Path
 PAGE_VERSION = 1
 SLOTS = 30
 LEAD_NS = 10_000_000
-"""Less than any limit a client may have, and no less than the period of the slowest sensor."""
+"""Lead of the clock over the slowest slot, ns: less than any time-out, at least the period of the slowest sensor."""
 DEBT_NS = 200_000_000
-"""The clock makes up for at most so much of the real time in which it was held."""
+"""Largest delay behind real time that the clock catches up, ns."""
 PATIENCE_S = 10.0
-"""The clock no longer waits for a process that has not followed for so long, until it follows again."""
+"""Time after which the clock no longer waits for a process, until the process follows again, s of real time."""
 SUSPECT_S = 0.1
-"""After each such time in which a slot holds the clock, the clock checks whether its owner lives."""
+"""Interval at which the clock checks whether the owner of a slot that holds it is alive, s of real time."""
 LOOK_S = 0.005
-"""A thread that keeps up reads the clock at least this often."""
+"""Longest time between two readings of the clock by a thread that keeps up, s of real time."""
 REST_S = 0.0005
-"""It waits at least so long between two readings, or it would spin while the clock is held."""
+"""Shortest time between two readings, s: without it, a thread would wait in a busy loop while the clock is held."""
 _HEAD = 4
 
 
@@ -52,12 +53,12 @@ class CellClock:
     Parameters
     ----------
     real_ns
-        The computer's clock; a test passes one that it moves itself.
+        The computer's clock, ns. A test passes a clock that it advances itself.
     """
 
     def __init__(self, real_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.real_ns = real_ns
-        """The computer's clock, for limits of clients that count in real time."""
+        """The computer's clock, for time-outs of clients in real time."""
         self._descriptor = os.memfd_create("emulated-cell-clock")
         os.ftruncate(self._descriptor, 8 * (_HEAD + 2 * SLOTS))
         fcntl.flock(self._descriptor, fcntl.LOCK_EX)
@@ -67,30 +68,30 @@ class CellClock:
         self._page[2] = SLOTS
         self._page[0] = PAGE_VERSION
         self._lost_ns = 0
-        """How far the real clock is ahead, without the time to be made up for."""
+        """Real time that the clock has lost and does not catch up, ns."""
         self._lock = threading.Lock()
         self._own: dict[int, int] = {}
-        """Time up to which the station's own threads have followed, by thread."""
+        """Time up to which each thread of the station has followed."""
         self._held: dict[int, tuple[int, int]] = {}
-        """Slots that hold the clock: the time at which they stand, and for how long (real time, ns)."""
+        """Slots that hold the clock: their time, and for how long they have held it, ns of real time."""
         self._end = weakref.finalize(self, _end, self._descriptor)
 
     @property
     def path(self) -> str:
-        """Path under which a process of the same user opens the page, until this process ends."""
+        """Path with which a process of the same user opens the page while this process lives."""
         return f"/proc/{os.getpid()}/fd/{self._descriptor}"
 
     def now_ns(self) -> int:
-        """Move the clock on as far as real time and the slowest follower allow, publish the time and return it."""
+        """Advance the clock as far as real time and the slowest follower allow; publish the time and return it, ns."""
         with self._lock:
             return self._move_on()
 
     def now_s(self) -> float:
-        """Return the same in seconds."""
+        """Return `now_ns()` in seconds."""
         return self.now_ns() * 1e-9
 
     def follow(self) -> int:
-        """Return `now_ns()`; a thread that keeps up confirms by this that it has done all that was due before."""
+        """Return `now_ns()`. With this call a thread that keeps up confirms that it has done all its work so far."""
         with self._lock:
             now_ns = self._move_on()
             thread = threading.get_ident()
@@ -100,7 +101,7 @@ class CellClock:
 
     @contextmanager
     def keeping_up(self) -> Iterator[None]:
-        """Let the clock wait for this thread, which calls `follow` every `LOOK_S`; blocks may be nested."""
+        """Let the clock wait for this thread, which must call `follow` every `LOOK_S`. Blocks may be nested."""
         thread = threading.get_ident()
         if thread in self._own:
             yield
@@ -114,7 +115,7 @@ class CellClock:
                 del self._own[thread]
 
     def close(self) -> None:
-        """End the clock: clients see that the station has ended. May be called twice."""
+        """End the clock, so that clients detect the end of the station. Idempotent."""
         self._end()
 
     def _move_on(self) -> int:
@@ -127,8 +128,8 @@ class CellClock:
         return now_ns
 
     def _slots(self, real_ns: int) -> list[int]:
-        """Return how far the owners of the slots have followed, without those the clock has given up."""
-        # A stall of this process is not a delay of the others.
+        """Return the times up to which the owners of slots have followed, except those that are no longer awaited."""
+        # The time for which this process itself was suspended is not counted against the others.
         elapsed_ns = min(real_ns - self._looked_ns, round(SUSPECT_S * 1e9))
         self._looked_ns = real_ns
         slots = self._page[_HEAD:].tolist()
@@ -154,17 +155,17 @@ class CellClock:
 
 
 def time_out_s(wait_s: float | None) -> float:
-    """Return how long a thread that keeps up may wait, when the next thing to do is due in `wait_s` (None: nothing)."""
+    """Return the longest wait of a thread that keeps up, whose next task is due in `wait_s` (None: no task), s."""
     return LOOK_S if wait_s is None else min(max(wait_s, REST_S), LOOK_S)
 
 
 def _end(descriptor: int) -> None:
-    fcntl.flock(descriptor, fcntl.LOCK_UN)  # the mapping has a copy of the descriptor, which would keep the lock
+    fcntl.flock(descriptor, fcntl.LOCK_UN)  # explicitly, because the mapping holds a copy of the descriptor
     os.close(descriptor)
 
 
 def _lives(pid: int) -> bool:
-    """Whether a process exists and is no zombie."""
+    """Return whether a process exists and is not a zombie."""
     with suppress(OSError):
         state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
         return state not in ("Z", "X")

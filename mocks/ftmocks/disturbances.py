@@ -1,6 +1,6 @@
-"""Disturbances: pushes and cables that touch the tool, and drift of the sensor's zero.
+"""Disturbances: contacts and cables that pull at the tool, and drift of the bias.
 
-Does not model: masses on springs, friction, anything that depends on how fast the arm moves.
+Not modelled: masses on springs, friction, forces that depend on the speed of the arm.
 """
 
 import math
@@ -16,10 +16,10 @@ FOREVER_S = math.inf
 
 
 class Contact(Protocol):
-    """Something that touches the tool."""
+    """A contact of the tool."""
 
     def wrench(self, now_s: float, q: Vector6, R_base_sensor: Array) -> Array | None:
-        """Wrench (6,) on the sensor at this moment, sensor axes about its origin; None when it is over."""
+        """Return the wrench (6,) on the sensor, in sensor axes about its origin; None after the contact has ended."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Push:
     Parameters
     ----------
     given
-        (6,) N and N·m, in the axes of the base, or of the sensor when `in_sensor`.
+        (6,) wrench, N and N·m, in base axes, or in sensor axes if `in_sensor`.
     until_s
-        On the cell's clock.
+        End of the contact on the cell's clock, s.
     """
 
     given: Array
@@ -49,16 +49,16 @@ class Push:
 
 @dataclass(frozen=True)
 class Ramp:
-    """A force at a point of the tool that changes evenly, and then stays.
+    """A force at a point of the tool that changes linearly and then remains constant.
 
     Parameters
     ----------
     before_N, after_N
-        (3,) in base axes.
+        (3,) force before and after the change, in base axes.
     p_sensor_m
-        The point, (3,) in the sensor frame.
+        (3,) point of the tool in sensor coordinates.
     start_s, seconds
-        When it changes, on the cell's clock.
+        Begin of the change on the cell's clock, and its duration.
     """
 
     before_N: Array
@@ -76,19 +76,20 @@ class Ramp:
 
 @dataclass(frozen=True)
 class Cable:
-    """A cable that pulls at a point of the tool when it is taut.
+    """A cable that pulls at a point of the tool while it is taut.
 
     Parameters
     ----------
     force_base_N
-        (3,) in base axes: per degree of `joint` beyond its threshold; constant with `towards`.
+        (3,) force in base axes: per degree of `joint` beyond its threshold, or constant with `towards`.
     p_sensor_m
-        Where the cable is fixed, (3,) in the sensor frame.
+        (3,) point in sensor coordinates at which the cable is fixed.
     joint, beyond_rad
-        Number 0 to 5 of a joint, and the angle at which the cable becomes taut: beyond it upwards for a positive one,
-        downwards for a negative one.
+        Index of a joint, 0 to 5, and the angle beyond which the cable is taut. The cable is taut above a positive angle
+        and below a negative one.
     towards, within_rad
-        Instead of a joint: taut while the sensor's z axis is so near to this direction in base, (3,).
+        Alternative to a joint: the cable is taut while the angle between the sensor's z axis and this direction (3,) in
+        the base is smaller than `within_rad`.
     """
 
     force_base_N: Array
@@ -115,13 +116,13 @@ class Cable:
 
 @dataclass(frozen=True)
 class SensorDrift:
-    """A zero that moves linearly by `total` (6,), N and N·m in sensor axes, in `seconds`, and stays there."""
+    """A drift of the bias by `total` (6,), N and N·m in sensor axes, which is linear and lasts `seconds`."""
 
     total: Array
     start_s: float
     seconds: float
 
     def at(self, now_s: float) -> Array:
-        """Return the drift so far, (6,)."""
+        """Return the current drift (6,), N and N·m."""
         share = (now_s - self.start_s) / self.seconds if self.seconds > 0.0 else 1.0
         return self.total * min(1.0, share)

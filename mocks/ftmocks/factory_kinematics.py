@@ -1,11 +1,11 @@
-"""Kinematics of one arm as its factory calibration leaves them: drawn from a seed, or read from a file.
+"""Calibrated kinematics of one arm: drawn from a seed, or read from a file.
 
-An arm is drawn as a chain, whose values are all small deviations, and converted to Denavit-Hartenberg parameters, which
-the controller reports. The axes of joints 2, 3 and 4 are nearly parallel, so their common normals are far away: the
-offsets d of these joints are metres to hundreds of metres, and cancel.
+An arm is drawn as a chain of transforms with small deviations, and converted to the Denavit-Hartenberg parameters that
+the controller reports. The axes of joints 2, 3 and 4 are nearly parallel, so that their common normals are far away:
+the offsets d of these joints may be hundreds of metres long, and cancel each other.
 
-Source: Universal Robots ROS 2 driver, package ur_calibration (README and calibration_consumer: which parameters the
-controller reports, why d is so large, the chain that its output is).
+Source: Universal Robots ROS 2 driver, package ur_calibration (README and calibration_consumer), which describes the
+reported parameters, the reason for large values of d, and the chain of its output.
 """
 
 import json
@@ -28,7 +28,7 @@ class Chain(NamedTuple):
     d: Vector6
 
 
-# Root mean square of the deviations of 20 real arms, UR3 to UR16e, whose owners published the output of ur_calibration.
+# RMS deviations of 20 real arms, UR3 to UR16e, whose owners have published the output of ur_calibration.
 DEVIATIONS = Chain(
     a=(0.0, 1.2e-4, 3.5e-4, 3.2e-4, 6e-5, 1.0e-4),
     pitch=(0.0, 0.0, 1.5e-3, 1.7e-3, 0.0, 0.0),
@@ -36,11 +36,11 @@ DEVIATIONS = Chain(
     d=(2.8e-4, 0.0, 0.0, 6.3e-4, 1.0e-4, 6.4e-4),
 )
 LARGEST_SIGMA = 2.3
-"""The largest deviation of the 20 arms: a draw beyond it is drawn again."""
+"""Largest deviation of the 20 arms in standard deviations. Larger draws are repeated."""
 
 
 def drawn(model: str, seed: int) -> Dh:
-    """Return one arm of a model, with the spread of real arms."""
+    """Return the random kinematics of one arm of a model, with the deviations of real arms."""
     rng = np.random.default_rng([seed, 6])
     noise = rng.standard_normal((4, 6))
     while (beyond := np.abs(noise) > LARGEST_SIGMA).any():
@@ -56,7 +56,7 @@ def drawn(model: str, seed: int) -> Dh:
 
 
 def link_frames(chain: Chain) -> list[Array]:
-    """Return frames of links in base at joint angles of zero, (4, 4) each, z on the axis; the last is the flange."""
+    """Return the frames (4, 4) of links in the base at zero joint angles, with z on the joint axis; last the flange."""
     frames, X = [], np.eye(4)
     for a, pitch, roll, d in zip(*chain, strict=True):
         link = np.eye(4)
@@ -69,9 +69,10 @@ def link_frames(chain: Chain) -> list[Array]:
 
 
 def to_dh(model: str, frames: list[Array]) -> Dh:
-    """Convert a chain, given as `link_frames`, to Denavit-Hartenberg parameters; no two successive axes are parallel.
+    """Convert the frames of a chain to Denavit-Hartenberg parameters. No two successive axes may be parallel.
 
-    Each step uses the frame that the rounded parameters before it lead to, so that errors do not grow with d.
+    Each step starts from the frame that results from the rounded parameters before it, so that rounding errors do not
+    grow with d.
     """
     rows, X = [], np.eye(4)
     for axis in (*frames[1:], None):
@@ -80,7 +81,7 @@ def to_dh(model: str, frames: list[Array]) -> Dh:
             rows.append((math.atan2(last[1, 0], last[0, 0]), 0.0, last[2, 3], 0.0))
             break
         (zx, zy, zz), (px, py, pz) = (inverse_matrix(X) @ axis)[:3, 2:].T.tolist()
-        theta = math.atan(-zx / zy)  # of the common normal, nearest to zero
+        theta = math.atan(-zx / zy)  # direction of the common normal, nearest to zero
         c, s = math.cos(theta), math.sin(theta)
         alpha = math.atan2(zx * s - zy * c, zz)
         a, d = px * c + py * s, pz + zz * (py * c - px * s) / math.sin(alpha)
@@ -104,7 +105,7 @@ def read(path: Path) -> Dh:
     Raises
     ------
     ValueError
-        When the file cannot be read, or is no such object.
+        The file cannot be read, or it does not contain such an object.
     """
     try:
         arm: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -1,9 +1,9 @@
 """A load that hangs on a string from a hook of the tool, and swings when the hook moves.
 
-A point mass on a string without mass, which is always taut. Its swing decays with 0.5 % of the critical damping. It
-lives in the time of the arm, which `--time-scale` makes faster.
+The load is a point mass on a massless string that is always taut. The damping ratio of the pendulum is 0.5 %. The load
+uses the time of the arm, which `--time-scale` makes faster.
 
-Does not model: a string that twists, a load that touches something, vibration of the tool.
+Not modelled: twist of the string, contacts of the load, vibration of the tool.
 """
 
 import math
@@ -15,26 +15,26 @@ from ftmocks.kinematics import Vector6, cross
 
 DAMPING_RATIO = 0.005
 STEPS = 125
-"""At least so many steps a period: it is right to 1e-4."""
+"""Least number of integration steps per period, which gives a relative error of 1e-4."""
 
 
 class HungLoad:
-    """A load on a string; see `Contact`.
+    """A load on a string, see `Contact`.
 
     Parameters
     ----------
     mass_kg
-        Of the load.
+        Mass of the load.
     p_flange_hook_m, p_sensor_hook_m
-        The hook, (3,) in the flange frame and in that of the sensor.
+        (3,) position of the hook in flange and in sensor coordinates.
     string_m
-        From the hook to the centre of mass.
+        Length of the string from the hook to the centre of mass.
     gravity_m_s2
-        (3,) in base axes.
+        (3,) gravitational acceleration in base axes.
     hook_m
-        Where the hook is, (3,) in base.
+        (3,) position of the hook in the base.
     aside
-        How far it swings, (3,) in base: a horizontal vector whose length is the angle, rad.
+        (3,) initial deflection: a horizontal vector in the base whose norm is the angle, rad.
     """
 
     def __init__(
@@ -60,19 +60,19 @@ class HungLoad:
         self._hook = (hook_m, np.zeros(3))
         self._velocity_m_s: Array = np.zeros(3)
         self.force_base_N: Array = mass_kg * math.cos(angle) * g_m_s2 / string_m * self._string
-        """With which the string pulls at the hook, (3,) in base axes, in the last control cycle."""
+        """(3,) force of the string on the hook in the last control cycle, in base axes."""
 
     @property
     def swing_deg(self) -> float:
-        """Angle between the string and the vertical."""
+        """Angle between the string and the vertical, rad."""
         along = float(self._string @ self._down)
         return math.degrees(math.atan2(float(np.linalg.norm(self._string - along * self._down)), along))
 
     def follow(self, seconds: float, hook_m: Array, hook_m_s: Array) -> None:
-        """Let time pass, in which the hook has moved to a place with a velocity, (3,) each, in base.
+        """Integrate the motion up to a new position and velocity of the hook, (3,) each, in the base.
 
         Source: Ryckaert, Ciccotti, Berendsen, "Numerical integration of the cartesian equations of motion of a system
-        with constraints", 1977 (SHAKE). It keeps the energy, and needs no acceleration of the hook.
+        with constraints", 1977 (SHAKE). The method conserves energy and does not need the acceleration of the hook.
         """
         steps = math.ceil(seconds * self._rate_rad_s * STEPS / (2 * math.pi))
         (before_m, before_m_s), self._hook = self._hook, (hook_m, hook_m_s)
@@ -91,7 +91,7 @@ class HungLoad:
             hook = after
 
     def _pulled(self, free: Array) -> float:
-        """Return by what share of itself the string pulls the load, from where it would be, (3,) from the hook."""
+        """Return the constraint correction as a fraction of the string vector, for an unconstrained position (3,)."""
         square = self._string_m**2
         along = float(free @ self._string)
         return (along - math.sqrt(along * along - square * (float(free @ free) - square))) / square
@@ -103,7 +103,7 @@ class HungLoad:
 
 
 def _between(p0: Array, v0: Array, p1: Array, v1: Array, seconds: float, share: float) -> Array:
-    """Return where the hook is after a share of the time, (3,): a cubic with these places and velocities."""
+    """Return the position (3,) of the hook after a fraction of the time, by cubic Hermite interpolation."""
     s, left = share, 1.0 - share
     point: Array = left * left * ((1 + 2 * s) * p0 + s * seconds * v0) + s * s * (
         (1 + 2 * left) * p1 - left * seconds * v1

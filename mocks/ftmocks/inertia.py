@@ -1,4 +1,4 @@
-"""The inertia of a payload: a body of one mass, and the wrench that it exerts when it is moved."""
+"""Rigid bodies: mass, centre of mass and inertia of a payload, and the wrench that a moved payload exerts."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,18 +9,18 @@ from ftmocks.arrays import Array
 from ftmocks.kinematics import FlangeMotion, rotation
 
 SYMMETRIC = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])
-"""Where the six elements ixx, iyy, izz, ixy, ixz, iyz of an inertia tensor stand."""
+"""Row and column indices of the elements ixx, iyy, izz, ixy, ixz, iyz of an inertia tensor."""
 
 
 class Body(NamedTuple):
-    """A body: mass, centre of mass (3,) in the sensor frame, inertia tensor per mass about it, (3, 3), sensor axes."""
+    """A rigid body: mass, centre of mass (3,), and inertia tensor per mass (3, 3) about it, in sensor coordinates."""
 
     mass_kg: float
     p_sensor_com_m: Array
     gyration_m2: Array
 
     def joined(self, other: "Body") -> "Body":
-        """Return both as one."""
+        """Return the body that consists of both bodies."""
         mass_kg = self.mass_kg + other.mass_kg
         shares = [(body, body.mass_kg / (mass_kg or 1.0)) for body in (self, other)]
         com_m = sum((share * body.p_sensor_com_m for body, share in shares), np.zeros(3))
@@ -32,10 +32,10 @@ class Body(NamedTuple):
 
 
 def drawn_gyration(rng: np.random.Generator, reach_m: float) -> Array:
-    """Draw the inertia tensor per mass of a plausible tool, about its centre of mass, (3, 3) in m².
+    """Draw the inertia tensor per mass (3, 3), m², of a plausible tool about its centre of mass.
 
-    The tool is an evenly filled box 50 to 120 mm wide and deep, as long as twice the distance `reach_m` of its centre,
-    give or take a third, turned at random.
+    The tool is a homogeneous box in a random orientation, 50 to 120 mm wide and deep. Its length is twice the distance
+    `reach_m` of its centre, plus or minus a third.
     """
     x, y = rng.uniform(0.05, 0.12, 2)
     z = 2 * reach_m * rng.uniform(2 / 3, 4 / 3)
@@ -46,12 +46,12 @@ def drawn_gyration(rng: np.random.Generator, reach_m: float) -> Array:
 
 
 def inertia_tensor(elements: Array) -> Array:
-    """Return the tensor (3, 3) of its elements ixx, iyy, izz, ixy, ixz, iyz.
+    """Return the tensor (3, 3) with the elements ixx, iyy, izz, ixy, ixz, iyz.
 
     Raises
     ------
     ValueError
-        When no body has it: a principal moment is negative, or larger than the sum of the other two.
+        No body has this tensor: a principal moment is negative, or larger than the sum of the other two.
     """
     tensor = np.zeros((3, 3))
     tensor[SYMMETRIC] = elements
@@ -75,18 +75,18 @@ def moved_load(
     Parameters
     ----------
     motion
-        Of the flange.
+        Motion of the flange.
     gravity_m_s2
-        (3,) in base axes.
+        (3,) gravitational acceleration in base axes.
     gyration_m2
-        Inertia tensor per mass about the centre of mass, (3, 3), sensor axes.
+        (3, 3) inertia tensor per mass about the centre of mass, in sensor axes.
 
     Returns
     -------
-    (6,) N/kg and N·m/kg, sensor axes, about the sensor origin.
+    (6,) wrench per mass, N/kg and N·m/kg, in sensor axes about the sensor origin.
 
-    Source: Newton and Euler, as in Craig, "Introduction to Robotics", equations 6.39 and 6.44, with the sign of a
-    reaction. Small products of numpy would take three times as long, which counts at 500 Hz.
+    Source: Newton-Euler equations, Craig, "Introduction to Robotics", equations 6.39 and 6.44, with the sign of a
+    reaction. Written in scalars, because small products of numpy take three times as long in the 500 Hz loop.
     """
     in_base = np.array([motion.angular_velocity, motion.angular_acceleration, gravity_m_s2 - motion.acceleration])
     in_sensor = in_base @ motion.R_base_flange @ R_flange_sensor
