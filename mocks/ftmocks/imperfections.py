@@ -1,4 +1,4 @@
-"""What a real arm and its sensors do beside the model: vibration, noise, delay, friction. The values are settings.
+"""Imperfections of a real arm and its sensors: vibration, noise, delay, friction. Their sizes are settings.
 
 Sources: sizes and spectrum of the ripple are those of a recording of an LBR with .93 kg on an ATI Gamma, which turns
 at .78 rad/s. It has 1.4, .6 and .4 N rms on x, y and z, at rest no more than the noise. Its 40, 80 and 120 Hz move with
@@ -33,37 +33,37 @@ from ftmocks.arrays import Array
 from ftmocks.kinematics import Vector6
 
 RIPPLE_M_S2 = (1.5, 0.7, 0.45)
-"""Root of the mean square on the axes of the sensor."""
+"""RMS acceleration of the ripple on the axes of the sensor, m/s²."""
 HARMONICS, POWERS = (2, 4, 6), (0.6, 0.3, 0.1)
 FULL_SPEED_RAD_S = 0.3
 RING_HZ = (8.0, 20.0)
 RING_DECAY_S = 0.1
-"""Time constant: 5 % are left after .3 s."""
+"""Time constant with which links stop ringing, s: 5 % remain after 0.3 s."""
 RUNG_OUT_RAD_S2 = 1e-3
 FRICTION_RAD_S = 0.01
-"""Friction has its full size above this speed, about."""
+"""Approximate joint speed above which friction has its full size, rad/s."""
 DRIFT_S, DRIFT_TIME_CONSTANT_S = 600.0, 180.0
 WRIST_DRIFT_N = 7.0
 
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Settings of a cell, with the values of a real one; `IDEAL` has none of them.
+    """Sizes of the imperfections. The defaults are those of a real cell; `IDEAL` has no imperfections.
 
     Parameters
     ----------
     ripple, ring
-        Vibration while joints turn and after they accelerate, as multiples of the size above.
+        Vibration while joints turn, and after they accelerate, as multiples of the sizes above.
     gear_ratio
-        Turns of the motor for one of the joint.
+        Revolutions of the motor per revolution of the joint.
     servo_lag_s
-        Time constant with which the joints follow the set-point; also of the ideal cell.
+        Time constant with which the joints follow the set-point. An ideal cell has it too.
     joint_noise_rad
-        Standard deviation of a joint angle that the controller reports.
+        Standard deviation of the joint angles that the controller reports.
     wrench_delay_s
-        How long before it is sent a sensor measures, beside the delay of its link.
+        Time between measuring and sending of a sample, in addition to the delay of the link.
     wrist_friction_Nm
-        Of wrist 3 in the built-in sensor.
+        Friction of wrist 3 in the readings of the built-in sensor.
     wrist_drift_N
         Drift of the built-in sensor in z in the first 10 minutes.
     """
@@ -78,12 +78,12 @@ class Imperfections:
     wrist_drift_N: float = 0.0
 
     def changed(self, text: str) -> Self:
-        """Return the settings with those of ``name=value,…`` changed; "none" changes them to those of `IDEAL`.
+        """Return settings changed by ``name=value,…``; "none" selects those of `IDEAL`.
 
         Raises
         ------
         ValueError
-            When a name is unknown, or a value is negative or no number.
+            A name is unknown, or a value is negative or not a number.
         """
         changes: dict[str, float] = {}
         for part in text.split(",") if text else ():
@@ -92,11 +92,11 @@ class Imperfections:
                 changes = {field.name: getattr(IDEAL, field.name) for field in fields(self)}
             elif not sign or name not in {field.name for field in fields(self)}:
                 known = ", ".join(field.name for field in fields(self))
-                raise ValueError(f"{part!r} is no setting of a real cell: give none, or NAME=VALUE with {known}")
+                raise ValueError(f"{part!r} is not a setting of a real cell: give none, or NAME=VALUE with {known}")
             else:
                 changes[name] = float(value)
         if not all(0.0 <= value < math.inf for value in changes.values()) or changes.get("servo_lag_s") == 0.0:
-            raise ValueError(f"settings of a real cell are not negative, and servo_lag_s is positive: {text!r}")
+            raise ValueError(f"settings must not be negative, and servo_lag_s must be positive: {text!r}")
         return replace(self, **changes)
 
 
@@ -106,19 +106,19 @@ IDEAL = Imperfections(
 
 
 class WarmUp(NamedTuple):
-    """Drift of the built-in sensor after a start of the arm: `drift_N` in z within 10 minutes."""
+    """Drift of the built-in sensor after the arm was started: `drift_N` in z within 10 minutes."""
 
     drift_N: float
     start_s: float
 
     def at(self, now_s: float) -> Array:
-        """Return the drift so far, (6,), flange axes."""
+        """Return the current drift (6,), N and N·m, in flange axes."""
         done, whole = (-math.expm1(-s / DRIFT_TIME_CONSTANT_S) for s in (now_s - self.start_s, DRIFT_S))
         return np.array([0.0, 0.0, self.drift_N * done / whole, 0.0, 0.0, 0.0])
 
 
 class Ripple:
-    """Vibration of the tool that the gears of turning joints cause; phases by `seed`."""
+    """Vibration of the tool, caused by the gears of turning joints. `seed` draws the phases."""
 
     def __init__(self, settings: Imperfections, seed: int) -> None:
         self._orders = settings.gear_ratio * np.array(HARMONICS)
@@ -127,7 +127,7 @@ class Ripple:
         self._waves = (sizes * np.exp(1j * phases)).reshape(-1, 3)
 
     def at(self, q_rad: Array, qd_rad_s: Array) -> Array:
-        """Return accelerations of the tool, (n, 3) in m/s², sensor axes, for joints (n, 6) and their speeds."""
+        """Return accelerations (n, 3) of the tool in sensor axes, m/s², for joint angles and speeds (n, 6)."""
         speed = np.linalg.norm(qd_rad_s, axis=1, keepdims=True)
         shares = qd_rad_s / np.maximum(speed, 1e-12) * -np.expm1(-((qd_rad_s / FULL_SPEED_RAD_S) ** 2))
         turns = np.exp(1j * q_rad[:, :, None] * self._orders) * shares[:, :, None]
@@ -135,20 +135,20 @@ class Ripple:
 
 
 class Ringing(NamedTuple):
-    """How the links ring from one control cycle on: each is a mass on a spring behind its joint.
+    """State of ringing links after a control cycle. Each link is a mass on a spring behind its joint.
 
-    Its distance from where the joint's acceleration holds it is the real part of ``amplitudes exp(rates t)``.
+    The deflection from the quasi-static one is the real part of ``amplitudes exp(rates t)``.
 
     Parameters
     ----------
     rates
-        (6,) complex, 1/s.
+        (6,) complex eigenvalues, 1/s.
     size
-        Multiple of the acceleration of the joints that moves the links.
+        Factor on the acceleration of the joints.
     amplitudes
-        (6,) complex, rad; None while the links rest.
+        (6,) complex amplitudes, rad; None while the links are at rest.
     held_rad
-        (6,) where the joints' acceleration holds the links.
+        (6,) quasi-static deflection due to the acceleration of the joints.
     """
 
     rates: NDArray[np.complex128]
@@ -158,20 +158,20 @@ class Ringing(NamedTuple):
 
     @classmethod
     def at_rest(cls, settings: Imperfections, seed: int) -> "Ringing":
-        """Return links that rest."""
+        """Return the state of links at rest."""
         hertz = np.random.default_rng([seed, 8]).uniform(*RING_HZ, 6)
         rates = np.empty(6, np.complex128)
         rates.real, rates.imag = -1.0 / RING_DECAY_S, 2 * np.pi * hertz
         return cls(rates, settings.ring)
 
     def at(self, t: float) -> Array:
-        """Return the acceleration of the links beside that of their joints `t` seconds later, (6,) rad/s²."""
+        """Return the acceleration (6,) of the links relative to their joints after `t` seconds, rad/s²."""
         if self.amplitudes is None:
             return np.zeros(6)
         return np.asarray((self.amplitudes * self.rates**2 * np.exp(self.rates * t)).real)
 
     def after(self, t: float, qdd: Vector6) -> "Ringing":
-        """Return how they ring `t` seconds later, when the joints accelerate by `qdd` (rad/s²) from there on."""
+        """Return the state after `t` seconds, from where the joints accelerate by `qdd` (rad/s²)."""
         if self.size == 0.0 or (self.amplitudes is None and not any(qdd)):
             return self
         held = -self.size * np.array(qdd) / np.abs(self.rates) ** 2

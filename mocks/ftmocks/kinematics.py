@@ -16,7 +16,7 @@ from ftmocks.arrays import Array
 
 Vector3 = tuple[float, float, float]
 Vector6 = tuple[float, float, float, float, float, float]
-"""Six joint values or a UR pose: plain floats, because the 500 Hz loop is scalar arithmetic."""
+"""Six joint values or a UR pose, as floats instead of an array, because the 500 Hz loop uses scalar arithmetic."""
 
 ZERO6: Vector6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -30,25 +30,25 @@ class JointState(NamedTuple):
 
 
 class FlangeMotion(NamedTuple):
-    """How the flange moves at one instant: orientation (3, 3) and the rest (3,) each, all in base axes, SI units."""
+    """Motion of the flange at one instant, in base axes and SI units: orientation (3, 3), the other fields (3,)."""
 
     R_base_flange: Array
     angular_velocity: Array
     angular_acceleration: Array
     acceleration: Array
-    """Of the flange's origin."""
+    """(3,) acceleration of the origin of the flange, m/s²."""
 
 
 @dataclass(frozen=True)
 class Dh:
-    """Denavit-Hartenberg parameters of one arm (m, rad), six values each, and its joint speed limits (rad/s).
+    """Denavit-Hartenberg parameters (m, rad) and joint speed limits (rad/s) of one arm, six values each.
 
-    ``theta`` are offsets added to the joint angles: zero on a nominal arm. A real one, see `factory_kinematics`, has
-    frames far away from its links.
+    ``theta`` are offsets of the joint angles, which are zero for a nominal arm. The frames of a real arm may be far
+    away from its links, see `factory_kinematics`.
     """
 
     model: str
-    """Name of its nominal arm in `MODELS`."""
+    """Name of the nominal arm in `MODELS`."""
     theta: Vector6
     a: Vector6
     d: Vector6
@@ -57,19 +57,19 @@ class Dh:
 
     @cached_property
     def links(self) -> list[tuple[float, float, float, float, float]]:
-        """theta, a, d, and cosine and sine of alpha, link by link."""
+        """For each link: theta, a, d, cosine of alpha, sine of alpha."""
         rows = zip(self.theta, self.a, self.d, self.alpha, strict=True)
         return [(theta, a, d, math.cos(alpha), math.sin(alpha)) for theta, a, d, alpha in rows]
 
 
 def vector6(values: Sequence[float] | Array) -> Vector6:
-    """Six plain floats out of any sequence of six numbers."""
+    """Return a tuple of six floats."""
     a, b, c, d, e, f = map(float, values)
     return (a, b, c, d, e, f)
 
 
 def vector3(values: Sequence[float] | Array) -> Vector3:
-    """Three plain floats out of any sequence of three numbers."""
+    """Return a tuple of three floats."""
     x, y, z = map(float, values)
     return (x, y, z)
 
@@ -104,21 +104,21 @@ _ARMS: dict[str, tuple[Vector6, Sequence[float]]] = {
 }
 
 MODELS = {model: _nominal(model, lengths, speeds) for model, (lengths, speeds) in _ARMS.items()}
-"""Nominal arms. Source: Universal Robots ROS 2 description, default_kinematics.yaml and joint_limits.yaml."""
+"""Nominal arms by model name. Source: Universal Robots ROS 2 description, default_kinematics and joint_limits."""
 
 
 def forward(dh: Dh, q: Sequence[float], joints: int = 6) -> Array:
-    """Pose of the flange (or of the frame behind joint `joints`) in base, (4, 4)."""
+    """Return the pose (4, 4) of the flange, or of the frame after joint `joints`, in the base."""
     return _stack(_chain(dh, q)[joints])
 
 
 _Rows = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
-"""The upper three rows of a homogeneous matrix, row by row."""
+"""The first three rows of a homogeneous matrix in row-major order."""
 _IDENTITY: _Rows = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 
 
 def _chain(dh: Dh, q: Sequence[float]) -> list[_Rows]:
-    """Frames 0 to 6 in base, scalar arithmetic: a tenth of the cost of twelve small matrix products."""
+    """Return frames 0 to 6 in the base. Scalar arithmetic needs a tenth of the time of twelve small matrix products."""
     frames = [_IDENTITY]
     m = _IDENTITY
     for angle, (offset, a, d, ca, sa) in zip(q, dh.links, strict=True):
@@ -140,13 +140,13 @@ def _stack(m: _Rows) -> Array:
 
 
 def elbow(dh: Dh, q: Sequence[float]) -> Array:
-    """Position of the elbow in base, (3,): the point of the axis of joint 3 in the middle plane of the upper arm."""
+    """Return the position (3,) of the elbow in the base: the point of joint axis 3 in the plane of the upper arm."""
     frame = forward(dh, q, joints=2)
-    return np.asarray(frame[:3, 3] - dh.d[1] * frame[:3, 2])  # back along the axis: d of a real arm is metres
+    return np.asarray(frame[:3, 3] - dh.d[1] * frame[:3, 2])  # undo d, which may be many metres in a real arm
 
 
 def jacobian(dh: Dh, q: Sequence[float]) -> Array:
-    """Geometric Jacobian of the flange in base, (6, 6): ``[v; omega] = J qd``."""
+    """Return the geometric Jacobian (6, 6) of the flange in base axes: ``[v; omega] = J qd``."""
     frames = _chain(dh, q)
     tip_x, tip_y, tip_z = frames[6][3::4]
     columns = []
@@ -158,7 +158,7 @@ def jacobian(dh: Dh, q: Sequence[float]) -> Array:
 
 
 def flange_motion(dh: Dh, state: JointState) -> FlangeMotion:
-    """Orientation, rotation and acceleration of the flange: from joint to joint, as each link turns with those below.
+    """Return the motion of the flange by outward iterations from joint to joint.
 
     Source: Craig, "Introduction to Robotics", section 6.5 (outward iterations), in base axes.
     """
@@ -181,9 +181,9 @@ def flange_motion(dh: Dh, state: JointState) -> FlangeMotion:
 
 
 def closed_form(dh: Dh, target: Array, free_q6: float = 0.0) -> Iterator[Vector6]:
-    """All (up to eight) joint vectors in (-pi, pi] that put a *nominal* arm's flange at `target` (4, 4).
+    """Return all joint vectors in (-pi, pi], at most eight, with which a nominal arm has its flange at `target` (4, 4).
 
-    Shoulder left and right, wrist both ways, elbow both ways. At ``sin q5 = 0`` joint 6 is free: `free_q6` is taken.
+    They differ by shoulder, wrist and elbow. If ``sin q5 = 0``, joint 6 is free and set to `free_q6`.
     """
     a2, a3 = dh.a[1], dh.a[2]
     d4, d6 = dh.d[3], dh.d[5]
@@ -243,10 +243,10 @@ def _wrap(angle: float) -> float:
 
 
 def inverse(dh: Dh, target: Array, near: Sequence[float]) -> Vector6 | None:
-    """Joint vector nearest to `near` that puts the flange at `target` (4, 4), or None when there is none.
+    """Return the joint vector nearest to `near` with which the flange is at `target` (4, 4), or None if there is none.
 
-    The closed form of the nominal arm seeds Newton steps on the real chain, so calibrated arms work too.
-    Joints are returned within one turn of `near` and within two pi.
+    The closed-form solution of the nominal arm is refined by Newton steps with the real parameters. The joints differ
+    by at most one revolution from `near`, and are within two pi.
     """
 
     def distance(q: Vector6) -> float:
@@ -255,7 +255,7 @@ def inverse(dh: Dh, target: Array, near: Sequence[float]) -> Vector6 | None:
     branches = closed_form(MODELS[dh.model], target, near[5])
     seeds = [vector6([_nearest_turn(v, n) for v, n in zip(q, near, strict=True)]) for q in branches]
     seeds.sort(key=distance)
-    if not seeds:  # just outside the nominal arm's reach, perhaps not outside this one's
+    if not seeds:  # just out of reach of the nominal arm, and perhaps within reach of this one
         seeds = [vector6(near)]
     for seed in seeds:
         q = refine(dh, target, seed)
@@ -270,7 +270,7 @@ def _nearest_turn(angle: float, near: float) -> float:
 
 
 def refine(dh: Dh, target: Array, seed: Sequence[float], tolerance: float = 1e-11) -> Vector6 | None:
-    """Newton's method from `seed` to `target`, staying on the seed's branch; None when it does not converge."""
+    """Return the solution of Newton's method from `seed` on the same branch, or None if it does not converge."""
     q = np.array(seed, dtype=float)
     for _ in range(12):
         here = forward(dh, q.tolist())
@@ -288,7 +288,7 @@ def refine(dh: Dh, target: Array, seed: Sequence[float], tolerance: float = 1e-1
 
 
 def rotation(rotation_vector: Sequence[float] | Array) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector (rad)."""
+    """Return the rotation matrix (3, 3) of a rotation vector (3,), rad."""
     x, y, z = map(float, rotation_vector)
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < 1e-12:
@@ -306,14 +306,14 @@ def rotation(rotation_vector: Sequence[float] | Array) -> Array:
 
 
 def rotvec(R: Array) -> Array:
-    """Rotation vector (3,) of a rotation matrix, of length at most pi."""
+    """Return the rotation vector (3,) of a rotation matrix, with an angle of at most pi."""
     (a, b, c), (d, e, f), (g, h, i) = R.tolist()
     x, y, z = h - f, c - g, d - b
     sin2 = math.sqrt(x * x + y * y + z * z)  # 2 sin(angle)
     angle = math.atan2(sin2, a + e + i - 1.0)
     if angle < 1e-6:
         return np.array([x, y, z]) / 2
-    if math.pi - angle < 1e-4:  # the antisymmetric part fades: take the axis from the symmetric part
+    if math.pi - angle < 1e-4:  # the antisymmetric part vanishes: use the symmetric part
         S = (R + R.T) / 2 + np.eye(3)
         column = S[:, int(np.argmax(np.diag(S)))]
         axis = column / np.linalg.norm(column)
@@ -324,18 +324,18 @@ def rotvec(R: Array) -> Array:
 
 
 def cross(a: Sequence[float] | Array, b: Sequence[float] | Array) -> Array:
-    """Vector product (3,); a quarter of the time of `numpy.cross`, which counts at 500 Hz."""
+    """Return the vector product (3,), four times as fast as `numpy.cross`."""
     (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def pose_of(X: Array) -> Vector6:
-    """UR pose of a homogeneous matrix (4, 4)."""
+    """Return the UR pose of a homogeneous matrix (4, 4)."""
     return vector6(np.concatenate((X[:3, 3], rotvec(X[:3, :3]))))
 
 
 def matrix_of(pose: Sequence[float]) -> Array:
-    """Homogeneous matrix (4, 4) of a UR pose."""
+    """Return the homogeneous matrix (4, 4) of a UR pose."""
     X = np.eye(4)
     X[:3, :3] = rotation(pose[3:6])
     X[:3, 3] = pose[0:3]
@@ -343,7 +343,7 @@ def matrix_of(pose: Sequence[float]) -> Array:
 
 
 def inverse_matrix(X: Array) -> Array:
-    """Inverse of a homogeneous matrix (4, 4)."""
+    """Return the inverse of a homogeneous matrix (4, 4)."""
     out = np.eye(4)
     out[:3, :3] = X[:3, :3].T
     out[:3, 3] = -X[:3, :3].T @ X[:3, 3]

@@ -1,4 +1,4 @@
-"""A recording that an emulated cell plays back: the sensor sends its raw wrench, the arm has its joints.
+"""A recording that an emulated cell plays: the sensor sends the recorded wrench, the arm has the recorded joints.
 
 The file is a CSV table with a header. Columns are found by name, with or without their unit, and others are ignored:
 ``t_s``; ``raw_fx`` to ``raw_fz`` in N and ``raw_tx`` to ``raw_tz`` in N·m; ``q0`` to ``q5`` in rad. Lines that begin
@@ -24,26 +24,26 @@ _ROUNDING_S = 1e-9
 
 
 class Recording:
-    """Raw wrench and joints over time, and the place up to which they have been played.
+    """Raw wrench and joint angles over time, and the current position of the playback.
 
     Parameters
     ----------
     t_s
-        (n,) rising.
+        (n,) increasing times.
     wrench
-        (n, 6) N and N·m, sensor axes.
+        (n, 6) wrench in sensor axes, N and N·m.
     q_rad
-        (n, 6).
+        (n, 6) joint angles.
 
     Raises
     ------
     ValueError
-        When there are no two rows, a value is not finite or the time does not rise.
+        There are less than two rows, a value is not finite, or the time does not increase.
     """
 
     def __init__(self, t_s: Array, wrench: Array, q_rad: Array) -> None:
         if len(t_s) < 2:
-            raise ValueError(f"{len(t_s)} rows are no recording")
+            raise ValueError(f"{len(t_s)} rows are not a recording, which needs two or more")
         finite = np.isfinite(t_s) & np.isfinite(wrench).all(axis=1) & np.isfinite(q_rad).all(axis=1)
         if not finite.all():
             raise ValueError(f"row {int(np.argmin(finite)) + 1} holds a value that is not finite")
@@ -60,9 +60,9 @@ class Recording:
         Raises
         ------
         ValueError
-            When a column is missing or a value is no number.
+            A column is missing, or a value is not a number.
         OSError
-            When the file cannot be read.
+            The file cannot be read.
         """
         with path.open(encoding="utf-8-sig") as file:
             line = next((line for line in file if line.strip() and not line.startswith("#")), "")
@@ -80,38 +80,38 @@ class Recording:
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last row."""
+        """Time from the first to the last row, s."""
         return float(self._t_s[-1])
 
     @property
     def pace(self) -> float:
-        """Seconds of the recording that pass in a second of the cell."""
+        """Speed of the playback: recorded time per time of the cell."""
         return self._played[2]
 
     def play(self, now_s: float, at_s: float, pace: float) -> None:
-        """Continue at `at_s` of the recording from `now_s` of the cell's clock on.
+        """Continue at `at_s` of the recording when the cell's clock is at `now_s`.
 
         Raises
         ------
         ValueError
-            When `at_s` is not in the recording, or the pace is negative or not finite.
+            `at_s` is not in the recording, or the pace is negative or not finite.
         """
         if not (0.0 <= at_s <= self.duration_s and 0.0 <= pace < np.inf):
-            raise ValueError(f"at_s is 0 to {self.duration_s} and pace not negative, not {at_s} and {pace}")
+            raise ValueError(f"at_s is {at_s} and pace {pace}; give 0 to {self.duration_s}, and a pace from 0 on")
         self._played = (now_s, at_s, pace)
 
     def at_s(self, t_s: float) -> float:
-        """Return the time in the recording at a time of the cell; it ends at the last row."""
+        """Return the time in the recording at a time of the cell, s, at most that of the last row."""
         return float(self._at_s(np.array([t_s]))[0])
 
     def wrench(self, t_s: Array) -> Array:
-        """Return the raw wrench at times of the cell, (n, 6): that of the last row so far."""
+        """Return the raw wrench (n, 6) at times of the cell: that of the latest row."""
         rows = np.searchsorted(self._t_s, self._at_s(t_s) + _ROUNDING_S, side="right") - 1
         wrench: Array = self._wrench[rows]
         return wrench
 
     def joints(self, t_s: float) -> JointState:
-        """Return the joints at a time of the cell, linear between two rows, with their speed."""
+        """Return joint angles and speeds at a time of the cell, by linear interpolation."""
         at_s = self.at_s(t_s)
         row = min(int(np.searchsorted(self._t_s, at_s, side="right")), len(self) - 1)
         (before, after), (a, b) = self._t_s[row - 1 : row + 1].tolist(), self._q_rad[row - 1 : row + 1]
@@ -126,9 +126,9 @@ class Recording:
 
 
 class RecordedWorld(World):
-    """The cell of a recording: what its sensor felt, and what touches the tool now.
+    """The cell of a recording, with the recorded wrench and the current contacts.
 
-    Its bias, noise and drift come on top of those in the recording.
+    Bias, noise and drift of this cell are added to those in the recording.
     """
 
     def __init__(self, recording: Recording, truth: Truth, dh: Dh, seed: int, clock: CellClock) -> None:
@@ -136,7 +136,7 @@ class RecordedWorld(World):
         self.recording = recording
 
     def load_wrench(self, t_s: float | None = None) -> Array:
-        """Return the recorded wrench, (6,)."""
+        """Return the recorded wrench (6,)."""
         wrench: Array = self.recording.wrench(np.array([self.now_s if t_s is None else t_s]))[0]
         return wrench
 
@@ -146,7 +146,7 @@ class RecordedWorld(World):
 
 
 class RecordedArm(Arm):
-    """An arm that follows a recording and nothing else."""
+    """An arm that follows a recording and accepts no command."""
 
     obstacle = "the arm follows a recording"
 
@@ -155,9 +155,9 @@ class RecordedArm(Arm):
         self._recording = recording
 
     def step(self, dt: float, t_s: float = 0.0) -> None:
-        """Take the joints of the recording at `t_s` of the cell's clock."""
+        """Set the joints to those of the recording at `t_s` of the cell's clock."""
         q, qd, _qdd = self._recording.joints(t_s)
-        if q != self.q:  # else the same object stays: readers recognise a resting arm by it
+        if q != self.q:  # keep the object of an arm at rest, by which readers recognise it
             self.q = self.actual_q = q
         self.qd = self.actual_qd = qd if any(qd) else ZERO6
         self.still_s = 0.0 if any(qd) else self.still_s + dt

@@ -1,9 +1,10 @@
-"""Errors of a sensor that is not perfect: gain, cross-talk and a response that is not linear.
+"""Errors of a sensor: gain, cross-talk and non-linearity.
 
-The sensor reads ``(I + E) w + b + noise`` of a load w, with errors that grow as its square and its cube. They are
-relative to the ranges of the axes. Mounted sensors have 2 to 5 % of gain, and .1 to .3 % of range that is not linear.
+The reading of a load w is ``(I + E) w + b + noise``, plus errors that grow with its square and its cube. Errors are
+relative to the ranges of the axes. Mounted sensors have gain errors of 2 to 5 %, and a non-linearity of 0.1 to 0.3 % of
+the range.
 
-Does not model: hysteresis, temperature, the end of the range.
+Not modelled: hysteresis, temperature, saturation.
 """
 
 from dataclasses import dataclass
@@ -14,23 +15,22 @@ import numpy as np
 from ftmocks.arrays import Array
 
 RANGE: Array = np.repeat([150.0, 10.0], 3)
-"""N and N·m: a torque of full range is a force of full range with a lever of 67 mm."""
+"""(6,) ranges of the axes, N and N·m."""
 POWERS: Array = np.array([2, 3])
 GAIN_PERCENT, CROSS_TALK_PERCENT = 2.0, 1.0
-"""Of the sensor of a cell, unless the command line says otherwise: as of mounted sensors."""
+"""Default errors of the sensor of a cell, which are those of mounted sensors."""
 
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """What a sensor adds to a load, in its axes about its origin.
+    """Errors of a sensor, in its axes about its origin.
 
     Parameters
     ----------
     error
-        E, (6, 6), N and N·m.
+        (6, 6) matrix E, N and N·m.
     nonlinearity
-        (6, 2) error of each axis at the end of its range that grows as the square and as the cube of its load,
-        relative to the range.
+        (6, 2) coefficients of the square and the cube of each axis, as errors at full range relative to the range.
     """
 
     error: Array
@@ -38,9 +38,10 @@ class SensorErrors:
 
     @classmethod
     def drawn(cls, seed: int, gain: float, cross_talk: float, nonlinear: float) -> Self:
-        """Draw errors of these sizes: one standard deviation each, relative to the ranges.
+        """Draw errors with these standard deviations, relative to the ranges.
 
-        Half of the variance of the gain is common to all axes, as of calibration masses, ageing and temperature.
+        Half of the variance of the gain is common to all axes, as it is if calibration masses, ageing or temperature
+        are its cause.
         """
         rng = np.random.default_rng([seed, 12])
         drawn, bent, common = rng.standard_normal((6, 6)), rng.standard_normal((6, 2)), rng.standard_normal()
@@ -49,7 +50,7 @@ class SensorErrors:
         return cls(sizes * drawn, nonlinear * bent)
 
     def of(self, load: Array) -> Array:
-        """Return the errors of readings, with the shape of the loads (6,) or (n, 6), N and N·m."""
+        """Return the errors of the readings of loads (6,) or (n, 6), N and N·m, in the same shape."""
         bent = (self.nonlinearity * (load / RANGE)[..., None] ** POWERS).sum(axis=-1)
         errors: Array = load @ self.error.T + RANGE * bent
         return errors

@@ -1,6 +1,6 @@
-"""One robot cell in one process: a UR controller and a wrist sensor that share one physical world.
+"""A robot cell in one process: a UR controller and a wrist sensor that share one physical world.
 
-Standard output carries one JSON line when everything listens, then one JSON line for each line of standard input.
+The process prints one JSON line when all servers listen, then one JSON line for each line of standard input.
 """
 
 import contextlib
@@ -42,13 +42,13 @@ WITHOUT_EFFECT_ON_A_RECORDING = {
 }
 
 START_Q_DEG = (45.0, -100.0, 60.0, -50.0, 90.0, 45.0)
-"""Near the first pose of the tour: q4 = -90° - q2 - q3."""
+"""Default start posture, near the first pose of the tour: q4 = -90° - q2 - q3."""
 
 SENSOR_MASS_KG = 0.25
-"""Of a sensor with its adapter."""
+"""Default mass of a sensor with its adapter."""
 
 START_SCATTER_DEG = 5.0
-"""The wrist starts this far off at most, so that the arm moves to the first pose."""
+"""Largest random offset of the wrist at the start, so that the arm has to move to the first pose."""
 
 
 VECTORS = {
@@ -59,11 +59,11 @@ VECTORS = {
     "force_drift": "force_drift_N_min",
     "torque_drift": "torque_drift_Nm_min",
 }
-"""Options that give a vector of the truth, by its name."""
+"""Names of the vectors of the truth by option."""
 
 
 def truth_from(options: Namespace) -> Truth:
-    """Draw the truth from the seed, then replace every quantity given on the command line."""
+    """Draw the truth from the seed, then replace the quantities that are given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
     if options.sensor == WRIST:
         truth = truth.with_wrist_sensor(options.seed)
@@ -72,7 +72,7 @@ def truth_from(options: Namespace) -> Truth:
         truth = replace(
             truth, force_bias_N=force_scale * truth.force_bias_N, torque_bias_Nm=torque_scale * truth.torque_bias_Nm
         )
-    if options.recording is not None:  # has its own bias and noise
+    if options.recording is not None:  # a recording has its own bias and noise
         nothing = np.zeros(3)
         truth = replace(truth, force_bias_N=nothing, torque_bias_Nm=nothing, noise_force_N=0.0, noise_torque_Nm=0.0)
     given = {name: getattr(options, option) for option, name in VECTORS.items()}
@@ -96,7 +96,7 @@ def truth_from(options: Namespace) -> Truth:
 
 
 def _sensor_errors(options: Namespace) -> SensorErrors:
-    """Draw the errors of the sensor; those that a recording has are in its values."""
+    """Draw the errors of the sensor. The readings of a recording contain the errors of its sensor already."""
     gain, cross_talk, nonlinear = options.gain, options.cross_talk, options.nonlinear
     if options.recording is not None:
         if gain or cross_talk or nonlinear:
@@ -109,7 +109,7 @@ def _sensor_errors(options: Namespace) -> SensorErrors:
 
 
 def _gyration(inertia: str, mass_kg: float) -> Array | None:
-    """Return the inertia tensor per mass of what --inertia gives; the payload has none for "none"."""
+    """Return the inertia tensor per mass according to --inertia; None for "none"."""
     if inertia == "none":
         return None
     tensor = inertia_tensor(parse_vector(inertia, 6))
@@ -119,7 +119,7 @@ def _gyration(inertia: str, mass_kg: float) -> Array | None:
 
 
 def _sensor_mass_kg(options: Namespace) -> float:
-    """Return the mass of sensor and adapter, which the sensor in the arm's wrist does not add."""
+    """Return the mass of sensor and adapter, which is 0 for the sensor in the arm's wrist."""
     if options.sensor == WRIST:
         if options.sensor_mass_kg:
             raise ValueError(f"the sensor {WRIST} is part of the arm: leave --sensor-mass-kg out")
@@ -130,7 +130,7 @@ def _sensor_mass_kg(options: Namespace) -> float:
 def _recording(options: Namespace) -> Recording | None:
     if options.recording is None:
         if options.pace is not None:
-            raise ValueError("--pace is that of a --recording")
+            raise ValueError("--pace needs --recording")
         return None
     if options.time_scale != 1.0 or options.start_q_deg is not None:
         raise ValueError("--recording gives time and joints: leave --time-scale and --start-q-deg out")
@@ -141,7 +141,7 @@ def _recording(options: Namespace) -> Recording | None:
 
 
 def kinematics_from(options: Namespace) -> Dh:
-    """Return the real arm: drawn from the seed, nominal or from a file, as --kinematics says."""
+    """Return the real arm according to --kinematics: drawn from the seed, nominal, or from a file."""
     model = options.model or ("UR5" if options.polyscope[0] <= 3 else "UR5e")
     if options.kinematics == "drawn":
         return factory_kinematics.drawn(model, options.seed)
@@ -154,7 +154,7 @@ def kinematics_from(options: Namespace) -> Dh:
 
 
 def start_posture(options: Namespace) -> Vector6:
-    """Return joint angles (rad) at power-up: as given, or near the tour's first pose with the wrist off by chance."""
+    """Return joint angles at power-up, rad: as given, or near the first pose of the tour with a random wrist."""
     if options.start_q_deg is not None:
         return vector6(np.radians(options.start_q_deg))
     scatter = np.random.default_rng([options.seed, 3]).uniform(-START_SCATTER_DEG, START_SCATTER_DEG, 3)
@@ -162,7 +162,7 @@ def start_posture(options: Namespace) -> Vector6:
 
 
 def free_hosts() -> Iterator[str]:
-    """Yield loopback addresses to try, different for every process."""
+    """Yield loopback addresses to try, which differ between processes."""
     rng = np.random.default_rng([os.getpid(), 4])
     yield f"127.{64 + os.getpid() // 64516 % 64}.{1 + os.getpid() // 254 % 254}.{1 + os.getpid() % 254}"
     for _ in range(HOST_TRIALS):
@@ -178,7 +178,7 @@ class Station:
     options
         Parsed command line, see `ftmocks.__main__`.
     clock
-        Of the cell; None makes one.
+        Clock of the cell; None creates one.
     """
 
     def __init__(self, options: Namespace, clock: CellClock | None = None) -> None:
@@ -215,7 +215,7 @@ class Station:
         if options.kinematics_message != "true":
             other = factory_kinematics.drawn(dh.model, options.seed + 1)
             self.robot.reported_dh = {"none": None, "wrong": other}[options.kinematics_message]
-        self._selector = selectors.SelectSelector()  # the only one that waits for less than a millisecond
+        self._selector = selectors.SelectSelector()  # other selectors cannot wait for less than a millisecond
         self.server = self._listen()
         self._sensors: dict[str, Sensor] = {}
         self._ended = False
@@ -298,7 +298,7 @@ class Station:
         }
 
     def _content(self) -> dict[str, Any]:
-        """Return what is known about the cell: its truth, or the recording, whose truth is unknown."""
+        """Return the truth of the cell, or the recording, whose truth is unknown."""
         recording = self._recording
         if recording is None:
             return {"truth": self.world.truth.to_json(), "imperfections": asdict(self.world.imperfections)}
@@ -336,17 +336,17 @@ class Station:
             return {"error": f"{request['do']}: {error!r}"}
 
     def _delays(self) -> list[str]:
-        """Return the request that the options stand for."""
+        """Return the request for these options."""
         delays = {"sensor_ms": self._options.sensor_delay_ms, "rtde_ms": self._options.rtde_delay_ms}
         given = {link: delay_ms for link, delay_ms in delays.items() if delay_ms is not None}
         return [json.dumps({"do": "delay", **given})] if given else []
 
     def _loads(self) -> list[str]:
-        """Return the request that --load stands for."""
+        """Return the request for --load."""
         return [] if self._options.load is None else [json.dumps({"do": "hang", **self._options.load})]
 
     def _delay(self, request: dict[str, Any]) -> None:
-        """Set the time between measurement and sending."""
+        """Set the delay between measuring and sending."""
         given = {link: float(request[link]) for link in ("sensor_ms", "rtde_ms") if link in request}
         if not given:
             raise KeyError("sensor_ms")
@@ -362,7 +362,7 @@ class Station:
         self.robot.note("network", "delay", why=json.dumps(given))
 
     def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
-        """Continue the recording at another place, at another pace."""
+        """Continue the recording at another time, at another pace."""
         now_s = self._clock.now_s()
         at_s = float(request.get("at_s", recording.at_s(now_s)))
         recording.play(now_s, at_s, float(request.get("pace", recording.pace)))
@@ -405,7 +405,7 @@ def parse_vector(text: str, length: int) -> Array:
     Raises
     ------
     ValueError
-        When there are not exactly `length` finite numbers.
+        The text does not contain exactly `length` finite numbers.
     """
     values = np.array([float(part) for part in text.split(",")])
     if values.shape != (length,) or not np.isfinite(values).all():

@@ -1,4 +1,4 @@
-"""Control requests that act on the tool and on the sensor: the verbs that are not about the arm."""
+"""Control requests that act on the tool and on the sensor."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -21,9 +21,9 @@ BUMP_S = 0.3
 CABLE_POINT_M = (0.04, 0.0, 0.06)
 STRING_MM = 250.0
 SWING_DEG = 2.0
-"""An operator who hangs a load leaves this swing."""
+"""Swing of a load that an operator has hung, degrees."""
 GRIPPED_M = 0.06
-"""Edge of a load in the gripper, a cube."""
+"""Edge length of a load in the gripper, a cube."""
 NO_NUMBER: Array = np.full(6, np.nan)
 
 
@@ -33,11 +33,11 @@ class Workcell:
     Parameters
     ----------
     world
-        The truth, which changes.
+        The emulated world, which the requests change.
     sensors
-        By name.
+        Sensors by name.
     swing_deg
-        Swing of a load after it is hung.
+        Swing of a load after it was hung.
     """
 
     def __init__(self, world: World, sensors: Mapping[str, Sensor], swing_deg: float = SWING_DEG) -> None:
@@ -45,7 +45,7 @@ class Workcell:
         self._sensors = sensors
         self._swing_deg = swing_deg
         self._empty: Truth | None = None
-        """The cell before a load was gripped."""
+        """The truth before a load was gripped."""
         self.verbs: dict[str, Callable[[Request], dict[str, Any] | None]] = {
             "push": self._push,
             "bump": self._bump,
@@ -61,7 +61,7 @@ class Workcell:
             "sensor-faults": self._sensor_faults,
             "unplug": self._unplug,
         }
-        """By the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
+        """Methods by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
     def _push(self, request: Request) -> None:
         wrench = _numbers(request["wrench"], 6)
@@ -166,10 +166,10 @@ class Workcell:
 
 
 def _load(request: Request) -> tuple[float, Array]:
-    """Return mass and place of a load: kg, and (3,) m in the flange frame."""
+    """Return mass, kg, and position (3,) of a load in flange coordinates, m."""
     mass_kg = float(request["mass_kg"])
     if not 0.0 < mass_kg < math.inf:
-        raise ValueError(f"a load of {mass_kg} kg")
+        raise ValueError(f"a load of {mass_kg} kg is impossible")
     return mass_kg, 1e-3 * _numbers(request["at_mm"], 3)
 
 

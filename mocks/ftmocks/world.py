@@ -1,8 +1,7 @@
-"""The truth of one robot cell: arm, gravity, payload, sensor mounting, bias and noise.
+"""The truth of a robot cell: arm, gravity, payload, mounting of the sensor, bias and noise.
 
-Every quantity that a calibration has to find is drawn or set here and nowhere else. A wrench is exerted *on the sensor*
-by what hangs on it or pushes on it, about the sensor origin, force first. A sensor whose z axis points down reads
-``+m g`` on z.
+Every quantity that a calibration estimates is drawn or set in this module only. A wrench is exerted *on the sensor* by
+its load and by contacts, about the sensor origin, force first. A sensor whose z axis points down reads ``+m g`` on z.
 """
 
 import math
@@ -26,11 +25,11 @@ MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 """Tilt beta of the base for each mounting."""
 
 AHEAD_S = 0.02
-"""The arm of a controller that has run no cycle for so long stands still."""
+"""Time without a control cycle after which the arm stands still, s."""
 BURST_GAP_S = 0.001
-"""A burst begins so soon behind the last one, where it is measured from: half the work."""
+"""Largest gap between two bursts for which the truth at the end of the first one is used again, s."""
 REMEMBERED = 16
-"""Control cycles whose motion is known: a sensor may be later than the controller."""
+"""Number of control cycles whose motion is stored, because a sensor may be later than the controller."""
 WRIST_BIAS_N, WRIST_BIAS_SPREAD = (1800.0, 400.0, 25400.0), 0.1
 WRIST_BIAS_NM, WRIST_BIAS_SPREAD_NM = (-76.0, 0.0, 0.0), 3.0
 WRIST_NOISE_N = 0.1
@@ -44,7 +43,7 @@ def _zero3() -> Array:
 
 @dataclass(frozen=True)
 class Truth:
-    """The true quantities of the cell. Angles in rad, SI units, axes in the names; noise per reading."""
+    """True quantities of the cell, in SI units and rad. Names have the axes; noise is that of one reading."""
 
     mass_kg: float
     p_sensor_com_m: Array
@@ -60,14 +59,14 @@ class Truth:
     g_m_s2: float = 9.80665
     p_flange_sensor_m: Array = field(default_factory=_zero3)
     gyration_m2: Array | None = None
-    """Inertia tensor per mass about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+    """(3, 3) inertia tensor per mass about the centre of mass, sensor axes; None for a payload without inertia."""
     sensor_mass_kg: float = 0.0
-    """Sensor and adapter, which the sensor does not feel: a point mass halfway between flange and sensor origin."""
+    """Mass of sensor and adapter, which the sensor does not measure: a point halfway from flange to sensor origin."""
     sensor_errors: SensorErrors = PERFECT
 
     @classmethod
     def drawn(cls, seed: int, mount: str = "floor") -> "Truth":
-        """Draw a plausible cell: 0.5 to 2.5 kg, centre of mass 30 to 100 mm away, any yaw, base up to 2 degrees off."""
+        """Draw a plausible cell: 0.5 to 2.5 kg, centre of mass at 30 to 100 mm, any yaw, base tilted by up to 2°."""
         rng = np.random.default_rng([seed, 1])
         reach = rng.uniform(0.030, 0.100)
         direction = np.append(rng.normal(scale=0.15, size=2), 1.0)
@@ -85,7 +84,7 @@ class Truth:
         )
 
     def with_wrist_sensor(self, seed: int) -> "Truth":
-        """Return the cell with the sensor in the wrist of a UR5e, whose ft_raw_wrench has large zeros."""
+        """Return the cell with the sensor in the wrist of a UR5e, whose ft_raw_wrench has a large bias."""
         rng = np.random.default_rng([seed, 10])
         return replace(
             self,
@@ -98,54 +97,54 @@ class Truth:
 
     @property
     def weight_N(self) -> float:
-        """Weight of what hangs on the sensor."""
+        """Weight of the load on the sensor, N."""
         return self.mass_kg * self.g_m_s2
 
     @property
     def inertia_kg_m2(self) -> Array | None:
-        """Inertia tensor about the centre of mass, (3, 3), sensor axes; None for a payload without inertia."""
+        """(3, 3) inertia tensor about the centre of mass, kg·m², sensor axes; None for a payload without inertia."""
         return None if self.gyration_m2 is None else self.mass_kg * self.gyration_m2
 
     @property
     def gravity_m_s2(self) -> Array:
-        """Acceleration of gravity in base axes, (3,): ``R_base_gravity = Ry(beta) Rx(alpha)`` applied to -z."""
+        """(3,) gravitational acceleration in base axes: ``R_base_gravity = Ry(beta) Rx(alpha)`` applied to -z."""
         return -self.g_m_s2 * up_of(self.tilt_alpha_rad, self.tilt_beta_rad)
 
     @property
     def gravity_force_base_N(self) -> Array:
-        """Weight as a force vector in base axes, (3,)."""
+        """(3,) gravity force of the load in base axes, N."""
         return self.mass_kg * self.gravity_m_s2
 
     @property
     def p_flange_sensor_com_m(self) -> Array:
-        """Centre of mass of sensor and adapter in the flange frame, (3,)."""
+        """(3,) centre of mass of sensor and adapter in flange coordinates, m."""
         return self.p_flange_sensor_m / 2
 
     @property
     def payload_kg(self) -> float:
-        """Mass of all that hangs on the flange: tool, sensor and adapter."""
+        """Mass of all that is mounted on the flange: tool, sensor and adapter."""
         return self.mass_kg + self.sensor_mass_kg
 
     @property
     def payload_cog_m(self) -> Array:
-        """Centre of mass of all that hangs on the flange, (3,), flange frame; zeros where nothing does."""
+        """(3,) centre of mass of all that is mounted on the flange, in flange coordinates; zeros if there is none."""
         p_flange_tool_m = self.p_flange_sensor_m + self.R_flange_sensor @ self.p_sensor_com_m
         moment = self.mass_kg * p_flange_tool_m + self.sensor_mass_kg * self.p_flange_sensor_com_m
         return moment / (self.payload_kg or 1.0)
 
     def in_sensor(self, p_flange_m: Array) -> Array:
-        """Return a point of the flange frame, (3,), in the sensor frame."""
+        """Return a point (3,) in sensor coordinates that is given in flange coordinates."""
         return np.asarray(self.R_flange_sensor.T @ (p_flange_m - self.p_flange_sensor_m))
 
     def holding(self, part: Body) -> "Truth":
-        """Return the cell with a part in the gripper."""
+        """Return the truth of the cell with a part in the gripper."""
         own_m2 = self.gyration_m2
         tool = Body(self.mass_kg, self.p_sensor_com_m, np.zeros((3, 3)) if own_m2 is None else own_m2)
         mass_kg, com_m, gyration_m2 = tool.joined(part)
         return replace(self, mass_kg=mass_kg, p_sensor_com_m=com_m, gyration_m2=None if own_m2 is None else gyration_m2)
 
     def to_json(self) -> dict[str, Any]:
-        """The truth as plain numbers and row-major lists."""
+        """Return the truth as numbers and row-major lists."""
         return {
             "mass_kg": self.mass_kg,
             "weight_N": self.weight_N,
@@ -172,7 +171,7 @@ class Truth:
 
 
 def up_of(alpha_rad: float, beta_rad: float) -> Array:
-    """Return the direction away from the earth in base axes, (3,), for a tilted base."""
+    """Return the direction (3,) opposite to gravity in the axes of a tilted base."""
     a, b = alpha_rad, beta_rad
     return np.array([math.cos(a) * math.sin(b), -math.sin(a), math.cos(a) * math.cos(b)])
 
@@ -183,34 +182,34 @@ def _on_circle(rng: np.random.Generator) -> Array:
 
 
 class Cycle(NamedTuple):
-    """What the arm does from a control cycle on."""
+    """Motion of the arm from a control cycle on."""
 
     t_s: float
-    """When, on the cell's clock."""
+    """Time of the cycle on the cell's clock."""
     q: Vector6
     motion: Callable[[float], JointState] | None
-    """Joints at a time of the cell's clock; None for an arm that stands at `q`."""
+    """Returns the joint state at a time of the cell's clock; None for an arm that stands at `q`."""
 
 
 class World:
-    """The cell at this instant. The arm emulator moves it; sensor emulators call `measure` from their own threads.
+    """The current state of the cell. The emulated arm moves it; emulated sensors call `measure` from their threads.
 
-    A change replaces a value as a whole, so that other threads read one instant.
+    A change replaces a value as a whole, so that other threads read a consistent state.
 
     Parameters
     ----------
     truth
         The true quantities.
     dh
-        The real arm, calibration deviations included.
+        Kinematics of the real arm, with its deviations from the model.
     q
-        Joint angles (rad) to start with.
+        Initial joint angles, rad.
     seed
-        Seed of the noise and of the imperfections.
+        Seed of noise and imperfections.
     clock
-        Of the cell, for drift and pushes, whatever the speed of the arm; None makes one.
+        Clock of the cell, for drift and contacts, which do not depend on the speed of the arm; None creates one.
     imperfections
-        What the arm and its sensors do beside the model.
+        Imperfections of arm and sensors.
     """
 
     def __init__(
@@ -229,13 +228,13 @@ class World:
         self.imperfections = imperfections
         self.q = q
         self.contacts: dict[str, Contact] = {}
-        """What touches the tool, by name."""
+        """Contacts of the tool by name."""
         self.drifts: tuple[SensorDrift, ...] = ()
-        """Drifts of the zero besides the drift of the truth."""
+        """Drifts of the bias in addition to the drift of the truth."""
         self.hung: HungLoad | None = None
-        """What hangs on a string; it is a contact too."""
+        """The load on a string, which is also one of the contacts."""
         self.wrist_error: Callable[[], Array] | None = None
-        """What friction and drift add to each reading of a sensor in the wrist, (6,)."""
+        """Returns the error (6,) that friction and drift add to each reading of the sensor in the wrist."""
         self._t0_s = self.now_s
         self._lock = threading.Lock()
         self._ripple = Ripple(imperfections, seed)
@@ -245,16 +244,16 @@ class World:
         self._moved: tuple[JointState, FlangeMotion] | None = None
         self._override: Array | None = None
         self._known: tuple[float, Array] = (-math.inf, _NOTHING)
-        """The truth at the end of the last burst, where the next one begins."""
+        """Time and wrench at the end of the last burst, where the next one begins."""
 
     @property
     def now_s(self) -> float:
-        """The clock of pushes and drift."""
+        """The clock of the cell."""
         return self.clock.now_s()
 
     @property
     def q(self) -> Vector6:
-        """Actual joint angles (rad) in the last control cycle; setting them lets the arm stand there."""
+        """Actual joint angles in the last control cycle, rad. Setting them stops the arm there."""
         return self._cycles[-1].q
 
     @q.setter
@@ -263,19 +262,19 @@ class World:
         self._joints_at: dict[float, tuple[JointState, bool]] = {}
 
     def move(self, t_s: float, q: Vector6, motion: Callable[[float], JointState] | None) -> None:
-        """Set what the arm does from a control cycle on, see `Cycle`."""
+        """Set the motion of the arm from a control cycle on, see `Cycle`."""
         last = self._cycles[-1]
         if motion is not None or last.motion is not None or last.q is not q:
             self._cycles = (*self._cycles[1 - REMEMBERED :], Cycle(t_s, q, motion))
             self._joints_at = {}
 
     def true_wrench(self, t_s: float | None = None) -> Array:
-        """Return the wrench on the sensor without noise, (6,): N and N·m, sensor axes, bias and drift included.
+        """Return the wrench (6,) on the sensor without noise, N and N·m, in sensor axes, including bias and drift.
 
         Parameters
         ----------
         t_s
-            On the cell's clock, near the present; None for now.
+            Time on the cell's clock, near the current time; None for the current time.
         """
         t_s = self.now_s if t_s is None else t_s
         wrench: Array = self._without_ripple(t_s) + self.ripple_wrench(np.array([t_s]))[0]
@@ -285,7 +284,7 @@ class World:
         return self.load_wrench(t_s) + self.contact_wrench(t_s) + self.bias(t_s)
 
     def bias(self, t_s: float) -> Array:
-        """Return the bias with its drift, (6,), sensor axes; time as above."""
+        """Return the bias (6,) with its drift, in sensor axes."""
         truth = self.truth
         minutes = (t_s - self._t0_s) / _MINUTE_S
         force_bias_N = truth.force_bias_N + minutes * truth.force_drift_N_min
@@ -293,7 +292,7 @@ class World:
         return np.concatenate((force_bias_N, torque_bias_Nm)) + sum((d.at(t_s) for d in self.drifts), _NOTHING)
 
     def _joints(self, t_s: float) -> tuple[JointState, bool]:
-        """Return the joints at a time, and whether they move; several parts of a wrench need them."""
+        """Return the joint state at a time, and whether the joints move."""
         known = self._joints_at
         if t_s not in known:
             if len(known) >= REMEMBERED:
@@ -309,7 +308,7 @@ class World:
         return cycle.motion(t_s), True
 
     def load_wrench(self, t_s: float | None = None) -> Array:
-        """Return the wrench of gravity and inertia, (6,), sensor axes, about the sensor origin; time as above."""
+        """Return the wrench (6,) of gravity and inertia on the sensor, in sensor axes about the sensor origin."""
         joints, moves = self._joints(self.now_s if t_s is None else t_s)
         if not moves:
             return self._still_loads(joints.q)[0]
@@ -327,7 +326,7 @@ class World:
         return load
 
     def ripple_wrench(self, t_s: Array) -> Array:
-        """Return the wrench of the vibration that turning joints cause, (n, 6) or (1, 6), at rising times (n,)."""
+        """Return the wrench (n, 6) or (1, 6) of the vibration of turning joints, at increasing times (n,)."""
         first_s, last_s = float(t_s[0]), float(t_s[-1])
         (first, moved), (last, moves) = self._joints(first_s), self._joints(last_s)
         if not (self.imperfections.ripple and (moved or moves)):
@@ -340,7 +339,7 @@ class World:
         return wrenches
 
     def sensor_load(self, t_s: float) -> Array:
-        """Return the wrench of sensor and adapter on the flange, (6,), its axes and origin; time as above."""
+        """Return the wrench (6,) of sensor and adapter on the flange, in flange axes about the flange origin."""
         joints, moves = self._joints(t_s)
         truth = self.truth
         if not moves or truth.gyration_m2 is None:
@@ -350,7 +349,7 @@ class World:
         return load
 
     def _still_loads(self, q: Vector6) -> tuple[Array, Array]:
-        """Return the wrench of gravity alone on the sensor, and that of the sensor on the flange."""
+        """Return the wrench of gravity on the sensor, and the wrench of gravity of the sensor on the flange."""
         truth, known = self.truth, self._still
         if known is not None and known[0] is q and known[1] is truth:
             return known[2]
@@ -362,14 +361,14 @@ class World:
         return loads
 
     def _motion(self, joints: JointState) -> FlangeMotion:
-        """Return the motion of the flange, which one control cycle needs several times."""
+        """Return the motion of the flange; it is stored, because a control cycle needs it several times."""
         known = self._moved
         if known is None or known[0] != joints:
             self._moved = known = (joints, flange_motion(self.dh, joints))
         return known[1]
 
     def contact_wrench(self, t_s: float | None = None) -> Array:
-        """Return the wrench of all contacts, (6,), sensor axes, about the sensor origin; time as above."""
+        """Return the wrench (6,) of all contacts, in sensor axes about the sensor origin."""
         contacts = self.contacts
         if not contacts:
             return _NOTHING
@@ -380,16 +379,17 @@ class World:
         return sum((wrench for wrench in felt.values() if wrench is not None), _NOTHING)
 
     def measure(self, n: int) -> Array:
-        """Return `n` successive noisy readings at this instant, (n, 6): N and N·m, sensor axes. Thread-safe."""
+        """Return `n` noisy readings (n, 6) at the current time, N and N·m, in sensor axes. Thread-safe."""
         return self.measure_at(np.full(n, self.now_s))
 
     def measure_at(self, t_s: Array) -> Array:
-        """Return noisy readings at rising times near the present, (n, 6): N and N·m, sensor axes. Thread-safe.
+        """Return noisy readings (n, 6) at increasing times, N and N·m, in sensor axes. Thread-safe.
 
         Parameters
         ----------
         t_s
-            (n,) on the cell's clock. The truth without ripple is exact at the ends of a burst, linear in between.
+            (n,) times on the cell's clock, near the current time. The truth without ripple is computed at both ends of
+            a burst and interpolated linearly.
         """
         override = self._override
         if override is not None:
@@ -404,7 +404,7 @@ class World:
         return readings if self.wrist_error is None else readings + self.wrist_error()
 
     def _true_wrenches(self, t_s: Array) -> Array:
-        """Return the wrench on the sensor at these times, (n, 6), or (6,) where it is the same."""
+        """Return the wrench on the sensor at these times (n, 6), or (6,) if it is constant."""
         first_s, last_s = float(t_s[0]), float(t_s[-1])
         last = self._without_ripple(last_s)
         if first_s == last_s:
@@ -419,7 +419,7 @@ class World:
         return wrenches + self.ripple_wrench(t_s)
 
     def touch(self, name: str, contact: Contact | None) -> None:
-        """Set the contact of that name; None removes it."""
+        """Set the contact with this name; None removes it."""
         others = {key: value for key, value in self.contacts.items() if key != name}
         self.contacts = others if contact is None else {**others, name: contact}
 
@@ -435,12 +435,12 @@ class World:
         self.touch("load", self.hung)
 
     def unhang(self) -> None:
-        """Take the load from its hook."""
+        """Remove the load from its hook."""
         self.hung = None
         self.touch("load", None)
 
     def swing(self, seconds: float, qd: Vector6) -> None:
-        """Let what hangs follow its hook for a control cycle; `qd` are the speeds of the joints (rad/s) at its end."""
+        """Move the load on the string for a control cycle; `qd` are the joint speeds at its end, rad/s."""
         if self.hung is None:
             return
         lever_m, hook_m = self._hook(self.hung.p_flange_hook_m)
@@ -451,31 +451,31 @@ class World:
         self.hung.follow(seconds, hook_m, velocity_m_s)
 
     def _hook(self, p_flange_hook_m: Array) -> tuple[Array, Array]:
-        """Return where a hook is, (3,) in base axes: from the flange, and from the base."""
+        """Return the position (3,) of a hook relative to the flange and to the base, in base axes."""
         X = forward(self.dh, self.q)
         lever_m = X[:3, :3] @ p_flange_hook_m
         return lever_m, X[:3, 3] + lever_m
 
     def change_load(self, truth: Truth, name: str, contact: Contact) -> None:
-        """Set truth and contact at once: a part that is grasped is still carried by what it lies on."""
+        """Set truth and contact together: a grasped part is still supported by the table on which it lies."""
         with self._lock:
             self.truth = truth
             self.touch(name, contact)
 
     def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
-        """Change the true payload from now on, as when a part is lost, added or slips."""
+        """Change the true payload, as if a part was lost, added or has slipped."""
         if mass_kg is not None:
             self.truth = replace(self.truth, mass_kg=mass_kg)
         if p_sensor_com_m is not None:
             self.truth = replace(self.truth, p_sensor_com_m=p_sensor_com_m)
 
     def read_always(self, reading: Array | None) -> None:
-        """Fix every reading to this one, (6,); None measures again."""
+        """Repeat this reading (6,) from now on; None measures again."""
         self._override = reading
 
 
 def _weight(truth: Truth, R_base_flange: Array) -> Array:
-    """Return the wrench of gravity alone, (6,), sensor axes, about the sensor origin."""
+    """Return the wrench (6,) of gravity, in sensor axes about the sensor origin."""
     R_base_sensor = R_base_flange @ truth.R_flange_sensor
     force_N = R_base_sensor.T @ truth.gravity_force_base_N
     return np.concatenate((force_N, cross(truth.p_sensor_com_m, force_N)))

@@ -1,6 +1,6 @@
-"""What every emulated sensor has: settings, a paced stream, a faulty wire, and the thread that serves it.
+"""Base class of emulated sensors: settings, a stream with a schedule, a wire with faults, and the serving thread.
 
-Does not model: the time a frame takes on the wire, which is short beside the sampling period at every documented rate.
+Not modelled: the transmission time of a frame, which is short compared with the sample period at every documented rate.
 """
 
 import os
@@ -20,15 +20,12 @@ from ftmocks.wires.faults import Faults, FaultyWire, Frame
 
 Measure = Callable[[int], Array]
 MIN_WAIT_S = 2e-3
-"""Samples above 1 kHz come in bursts, as a USB adapter delivers them."""
+"""Shortest wait of the serving thread, s. Faster samples are sent in bursts, as a USB adapter delivers them."""
 _END, _RESET = b"!", b"r"
 
 
 class Pacer:
-    """The absolute schedule of a stream: the first sample at its start, then one per period.
-
-    `made` counts the samples of this stream.
-    """
+    """Schedule of a stream: the first sample at the start, then one sample per period. `made` counts the samples."""
 
     def __init__(self, clock: CellClock) -> None:
         self.made = 0
@@ -38,11 +35,11 @@ class Pacer:
 
     @property
     def running(self) -> bool:
-        """Whether there is a stream."""
+        """Whether the stream runs."""
         return self._rate_hz is not None
 
     def start(self, rate_hz: float) -> None:
-        """Start a stream, or restart it."""
+        """Start or restart the stream."""
         self._rate_hz, self._start_s, self.made = rate_hz, self._clock.now_s(), 0
 
     def stop(self) -> None:
@@ -50,7 +47,7 @@ class Pacer:
         self._rate_hz = None
 
     def due(self, now_s: float) -> int:
-        """Return how many samples must be sent now."""
+        """Return the number of samples that are due."""
         if self._rate_hz is None or now_s < self._start_s:
             return 0
         count = int((now_s - self._start_s) * self._rate_hz) + 1 - self.made
@@ -58,13 +55,13 @@ class Pacer:
         return count
 
     def times_s(self, count: int) -> Array:
-        """Return when the last samples that were due had to be measured, (count,) on the cell's clock."""
+        """Return the times (count,) on the cell's clock at which the last due samples were to be measured."""
         if self._rate_hz is None:
             return np.full(count, self._clock.now_s())
         return self._start_s + np.arange(self.made - count, self.made) / self._rate_hz
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until the next sample is due."""
+        """Return the time until the next sample is due, s."""
         if self._rate_hz is None:
             return None
         return max(self._start_s + self.made / self._rate_hz - now_s, MIN_WAIT_S if self._rate_hz > 1000 else 0.0)
@@ -72,19 +69,19 @@ class Pacer:
 
 @dataclass(eq=False)
 class Device(ABC, Generic[Frame]):
-    """An emulated sensor. Its fields may be changed while it runs, except addresses.
+    """An emulated sensor. All fields except addresses may be changed while it runs.
 
     Parameters
     ----------
     measure
-        Returns (n, 6) successive noisy readings in N and N·m, sensor axes; thread-safe. The device calls it once for
-        every sample that it makes.
+        Thread-safe function that returns n noisy readings (n, 6), N and N·m, in sensor axes. It is called once per
+        sample.
     seed, faults
-        Of the wire.
+        Random seed and faults of the wire.
     clock
-        Of the cell; without one the device makes its own.
+        Clock of the cell; None creates one.
     saturated_axis
-        Number 0 to 5 of an axis that always reads the end of its range; of a gauge where the sensor sends gauges.
+        Index 0 to 5 of an axis, or of a gauge if the sensor sends gauges, that always reads the end of its range.
     """
 
     measure: Measure
@@ -102,11 +99,11 @@ class Device(ABC, Generic[Frame]):
 
     @property
     def streaming(self) -> bool:
-        """Whether the sensor sends samples by itself."""
+        """Whether the sensor sends samples without requests."""
         return self._pacer.running
 
     def sample_times_s(self, count: int) -> Array:
-        """Return when the readings that the device asks for now are measured, (count,) on the cell's clock."""
+        """Return the measuring times (count,) of the next readings, on the cell's clock."""
         return self._pacer.times_s(count)
 
     @abstractmethod
@@ -116,13 +113,13 @@ class Device(ABC, Generic[Frame]):
         Raises
         ------
         RuntimeError
-            If the device is running already.
+            The device is running already.
         OSError
-            If an address cannot be had.
+            An address is not available.
         """
 
     def unplug(self) -> None:
-        """Close the wire as a pulled cable does: the client's next read or write fails."""
+        """Close the wire, as if the cable was pulled: the next read or write of the client fails."""
         if not self._threads:
             return
         os.write(self._wake_write, _END)
@@ -133,57 +130,57 @@ class Device(ABC, Generic[Frame]):
         os.close(self._wake_read)
 
     def stop(self) -> None:
-        """End the device; harmless when it has ended already."""
+        """End the device. Idempotent."""
         self.unplug()
 
     def reset(self) -> None:
-        """Interrupt the device's supply for a moment: it restarts on the same wire."""
+        """Interrupt the supply of the device for a moment, so that it restarts on the same wire."""
         if self._threads:
             os.write(self._wake_write, _RESET)
 
     @abstractmethod
     def _power_up(self) -> None:
-        """Set the state the device has after power-up."""
+        """Set the state after power-up."""
 
     def _restart(self) -> None:
-        """Set the state after the supply was interrupted."""
+        """Set the state after an interruption of the supply."""
         self._power_up()
 
     @abstractmethod
     def _receive(self) -> None:
-        """Read what the client has sent and act on it."""
+        """Read and process the bytes that the client has sent."""
 
     def _work(self, _now_s: float) -> float | None:
-        """Do what else is due and return the seconds until it is due again."""
+        """Do other due tasks; return the time until the next one, s."""
         return None
 
     @abstractmethod
     def _sample(self, count: int) -> None:
-        """Make the next samples of the stream and put them on the wire."""
+        """Send the next samples of the stream."""
 
     @abstractmethod
     def _deliver(self, frames: list[Frame]) -> None:
-        """Pass on the frames that arrive at the client now."""
+        """Deliver the frames that arrive at the client now."""
 
     @property
     def _readable(self) -> list[int]:
-        """Files on which something may come from the client."""
+        """Files on which the client may send."""
         return [self._file]
 
     @property
     def _unfinished(self) -> bool:
-        """Whether something waits until the client reads."""
+        """Whether bytes are waiting until the client reads."""
         return False
 
     def _finish_record(self) -> None:
-        """Send what was left over."""
+        """Send the waiting bytes."""
 
     @abstractmethod
     def _close(self) -> None:
         """Close the wire."""
 
     def _readings(self, count: int, limit: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Return (count, 6) readings clipped at `limit` (6,), and (count,) whether one is at its limit."""
+        """Return readings (count, 6), clipped at `limit` (6,), and whether each is at the limit (count,)."""
         readings = self.measure(count)
         if self.saturated_axis is not None:
             readings = readings.copy()
@@ -195,7 +192,7 @@ class Device(ABC, Generic[Frame]):
             raise RuntimeError(f"{type(self).__name__} runs already: stop it before starting it again")
 
     def _launch(self, *more: Callable[[], None]) -> None:
-        """Power the device up and start its thread, and threads for what else it serves."""
+        """Power the device up and start its threads."""
         self._wake_read, self._wake_write = os.pipe()
         self._power_up()
         for target in (self._serve, *more):
@@ -211,7 +208,7 @@ class Device(ABC, Generic[Frame]):
             self._close()
 
     def _turn(self) -> bool:
-        """Do what is due, then wait for the client and take what it sent; False when the device was unplugged."""
+        """Do due tasks, then wait for the client and process its bytes; return False if the device was unplugged."""
         wait_s = time_out_s(self._tick(self.clock.follow() * 1e-9))
         writers = [self._file] if self._unfinished else []
         readable, writable, _ = select.select([*self._readable, self._wake_read], writers, [], wait_s)
@@ -226,7 +223,7 @@ class Device(ABC, Generic[Frame]):
         return True
 
     def _tick(self, now_s: float) -> float | None:
-        """Do what is due and return the seconds until the next call is needed, None for not before the client sends."""
+        """Do due tasks; return the time until the next call, s, or None if only the client can cause one."""
         waits_s = [self._work(now_s)]
         if count := self._pacer.due(now_s):
             self._sample(count)

@@ -1,6 +1,6 @@
-"""Faults between a sensor and its client, the same for every emulated sensor.
+"""Faults of the wire between a sensor and its client, for all emulated sensors.
 
-Does not model: damaged frames on CAN (its controllers discard them: use `drop`), noise bursts, slow drift of a clock.
+Not modelled: damaged frames on CAN, which its controllers discard (use `drop`), noise bursts, drift of a clock.
 """
 
 import random
@@ -18,27 +18,27 @@ Frame = TypeVar("Frame", bytes, CanFrame)
 
 @dataclass
 class Faults:
-    """Probabilities per frame, and delays; every field may be changed while the emulator runs.
+    """Probabilities of faults per frame, and delays. All fields may be changed while the emulator runs.
 
-    A frame is what the device sends as a unit: a reply, a sample, a CAN frame, a datagram.
+    A frame is a unit that the device sends: a reply, a sample, a CAN frame, a datagram.
 
     Parameters
     ----------
     drop, duplicate
         A frame is lost, or sent twice.
     corrupt
-        One byte of a frame is changed (serial and UDP); its parity is wrong when an odd number of bits is.
+        One byte of a frame is changed (serial and UDP). Its parity is wrong if an odd number of bits is changed.
     byte_slip
         One byte of a frame is lost (serial and UDP).
     swap
-        A frame changes places with the next one of the same answer (CAN) or of the stream (UDP).
+        A frame is exchanged with the next one of the same answer (CAN) or of the stream (UDP).
     foreign
-        Another node's frame precedes it (CAN).
+        A frame of another node precedes it (CAN).
     delay_s, jitter_s
-        Transmission delay, and the largest random delay added to it for each frame. Neither changes the order, and a
-        stream does not fall behind.
+        Transmission delay, and the largest additional random delay of a frame. The order does not change, and the
+        delays do not accumulate in a stream.
     stall
-        Nothing is sent, as with a broken wire; the device itself goes on.
+        Nothing is transmitted, as with a broken wire. The device itself continues.
     """
 
     drop: float = 0.0
@@ -53,21 +53,21 @@ class Faults:
 
     @property
     def harm_frames(self) -> bool:
-        """Whether faults act on single frames: if not, many may be sent as one."""
+        """Whether faults act on single frames. Otherwise many frames may be sent as one."""
         return any((self.drop, self.duplicate, self.corrupt, self.byte_slip, self.swap, self.foreign, self.jitter_s))
 
 
 class FaultyWire(Generic[Frame]):
-    """The frames on their way to the client, in order, with their faults.
+    """Queue of the frames on their way to the client, with faults.
 
     Parameters
     ----------
     faults
-        Read at every `put`.
+        Faults, which are read at every `put`.
     clock
-        Of the cell, for delays.
+        Clock of the delays.
     seed
-        Of all random faults.
+        Seed of the random faults.
     """
 
     def __init__(self, faults: Faults, clock: CellClock, seed: int = 0) -> None:
@@ -75,7 +75,7 @@ class FaultyWire(Generic[Frame]):
         self._clock = clock
         self._random = random.Random(seed)
         self.foreign: Callable[[random.Random], Frame] | None = None
-        """Makes another node's frame."""
+        """Returns a frame of another node."""
         self._outbox: deque[tuple[float, Frame]] = deque()
         self._held: list[Frame] = []
 
@@ -85,7 +85,7 @@ class FaultyWire(Generic[Frame]):
         Parameters
         ----------
         frames
-            In the order of sending.
+            Frames in the order of sending.
         stream
             Whether frames of the next call may overtake the last one.
         """
@@ -99,18 +99,18 @@ class FaultyWire(Generic[Frame]):
             self._outbox.append((max(last_s, due_s + self._faults.jitter_s * self._random.random()), frame))
 
     def due(self, now_s: float) -> list[Frame]:
-        """Remove and return the frames that arrive now."""
+        """Remove and return the frames that arrive at the client now."""
         arrived: list[Frame] = []
         while self._outbox and self._outbox[0][0] <= now_s:
             arrived.append(self._outbox.popleft()[1])
         return arrived
 
     def wait_s(self, now_s: float) -> float | None:
-        """Return the time until the next frame arrives, None when there is none."""
+        """Return the time until the next frame arrives, s; None if there is none."""
         return max(0.0, self._outbox[0][0] - now_s) if self._outbox else None
 
     def clear(self) -> None:
-        """Discard the frames on their way."""
+        """Discard all frames in the queue."""
         self._outbox.clear()
         self._held.clear()
 
