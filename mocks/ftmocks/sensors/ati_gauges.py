@@ -1,8 +1,8 @@
-"""Six strain gauges and their calibration, shared by both emulated ATI interfaces.
+"""Six strain gauges and their calibration, for both emulated ATI interfaces.
 
 Ref: ATI 9610-05-1030-04 (NETCANOEM): runtime matrix, counts per unit, unit codes; ATI 9620-05-Digital FT, section 8.
 
-Does not model: drift, temperature, hysteresis, crosstalk beyond the matrix, and noise, which comes with the readings.
+Not modelled: drift, temperature, hysteresis, cross-talk beyond the matrix, and noise, which the readings contain.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ WIRE_ORDER = np.array([0, 2, 4, 1, 3, 5])  # both interfaces send the even gauge
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scale:
-    """What the counts of an ATI interface mean.
+    """Scale of the counts of an ATI interface.
 
     Parameters
     ----------
@@ -39,25 +39,25 @@ class Scale:
 
     @cached_property
     def units_SI(self) -> Array:
-        """(6,) force unit in newtons (three) and torque unit in newton metres (three)."""
+        """(6,) one unit of force in N (three times) and one unit of torque in N·m (three times)."""
         return np.repeat([UNIT_N[self.force_unit], UNIT_NM[self.torque_unit]], 3)
 
     @cached_property
     def counts_per_SI(self) -> Array:
-        """(6,) counts per newton (three) and per newton metre (three)."""
+        """(6,) counts per N (three times) and per N·m (three times)."""
         return np.repeat([self.counts_per_force, self.counts_per_torque], 3) / self.units_SI
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Scale):
-    """What an ATI interface stores about one transducer.
+    """Calibration of a transducer, as an ATI interface stores it.
 
     Parameters
     ----------
     matrix
         (6, 6) runtime matrix, rows Fx Fy Fz Tx Ty Tz, columns gauge 0 to 5: counts per gauge count.
     gauge_gains, gauge_offsets
-        (6,) analogue settings at which the matrix holds, u16; the NETCANOEM keeps them to itself.
+        (6,) analogue settings, u16, for which the matrix is valid. A NETCANOEM does not report them.
     serial, part_number, date
         ASCII, at most 8, 32 and 20 characters.
     max_rating
@@ -74,7 +74,7 @@ class Calibration(Scale):
 
     @cached_property
     def gauges_per_SI(self) -> Array:
-        """(6, 6) gauge counts per newton (columns 0 to 2) and per newton metre (columns 3 to 5)."""
+        """(6, 6) gauge counts per N (columns 0 to 2) and per N·m (columns 3 to 5)."""
         return np.linalg.inv(self.matrix) * self.counts_per_SI
 
     def gauges(
@@ -84,14 +84,14 @@ class Calibration(Scale):
         gain: Array | float = 1.0,
         shift: Array | float = 0.0,
     ) -> NDArray[np.int16]:
-        """Gauge counts of wrenches, rounded and clipped as the converter does.
+        """Return gauge counts of wrenches, rounded and clipped as by the converter.
 
         Parameters
         ----------
         wrench
-            (n, 6) in N and N·m, sensor axes.
+            (n, 6) wrench in sensor axes, N and N·m.
         gain, shift
-            (6,) or scalar: `gain * gauges + shift`, in gauge counts, before rounding.
+            (6,) or scalar values of ``gain * gauges + shift``, which is applied before rounding, in gauge counts.
 
         Returns
         -------
@@ -106,7 +106,7 @@ class Calibration(Scale):
         return counts.astype(np.int16)
 
 
-# Every value is exact in float32, and the size is that of a small real transducer: one gauge count is 4 to 8 mN.
+# All values are exact in float32. One gauge count is 4 to 8 mN, as in a small real transducer.
 REFERENCE = Calibration(
     np.array(
         [

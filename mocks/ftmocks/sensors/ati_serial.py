@@ -51,14 +51,14 @@ BAUD_RATES = (1_250_000, 19_200, 115_200)
 
 
 def stream_records(gauges: NDArray[np.int16], *, error: bool = False) -> NDArray[np.uint8]:
-    """Stream records of gauge counts.
+    """Return stream records of gauge counts.
 
     Parameters
     ----------
     gauges
-        (n, 6) gauge counts, natural order.
+        (n, 6) gauge counts in natural order.
     error
-        Bit 7 of the checksum byte: something is wrong, read the status word.
+        Error bit, which is bit 7 of the checksum byte.
 
     Returns
     -------
@@ -72,7 +72,7 @@ def stream_records(gauges: NDArray[np.int16], *, error: bool = False) -> NDArray
 
 
 def calibration_block(calibration: Calibration) -> bytes:
-    """The 338 bytes of a calibration slot; resolution, range, scale factors, user and spare fields are zero."""
+    """Return the 338 bytes of a calibration slot. Resolution, range, scale factors, user and spare fields are zero."""
     block = b"".join(
         (
             calibration.serial.encode("ascii").ljust(8, b"\0"),
@@ -92,27 +92,27 @@ def calibration_block(calibration: Calibration) -> bytes:
 
 @dataclass(eq=False, kw_only=True)
 class AtiSerialBox(ModbusSensor):
-    """The sensor's RS-485 interface.
+    """The RS-485 interface of the sensor.
 
-    A frame is a reply or a record. The stream has no sync byte: the
-    noise must reach a gauge count, or shifted records validate.
+    A frame is a reply or a record. The stream has no sync byte: without noise of at least one gauge count, shifted
+    records would have correct checksums.
 
     Parameters
     ----------
     calibrations
-        What each slot 1 to 16 holds; a slot not named is empty. The lowest one describes the transducer.
+        Calibrations by slot, 1 to 16. The lowest one describes the transducer.
     loads_gains
-        Whether gains and offsets of the lowest calibration are in force from power-up on; if not, they are 0.
+        Whether gains and offsets of the lowest calibration are active after power-up; otherwise they are 0.
     status
         Status word; its bit 15 is the error bit of every record.
     gauge_offset
-        (6,) or scalar, added to every gauge, in counts.
+        (6,) or scalar offset of the gauges, counts.
     streaming_at_start
-        Streams from power-up on, as after a crash of the last client.
+        Whether the sensor streams after power-up, as after a crash of the last client.
     refuse_start
-        Answers the start command with "refused".
+        Whether the sensor refuses the start command.
     bad_checksum
-        Probability of a record to carry a wrong checksum and right data.
+        Probability that a record has a wrong checksum and correct data.
     """
 
     address = 0x0A
@@ -158,7 +158,7 @@ class AtiSerialBox(ModbusSensor):
         self._last_byte_s = now_s
         self._remember(data)
         if self.streaming and len(self._burst) >= JAM_BYTES:
-            self._fall_silent()  # and what follows without a pause still belongs to the jam
+            self._fall_silent()  # bytes that follow without a pause belong to the jamming sequence
 
     def _deliver(self, frames: list[bytes]) -> None:
         for data in frames:
@@ -216,7 +216,7 @@ class AtiSerialBox(ModbusSensor):
         return self.calibrations[min(self.calibrations)]
 
     def _gauges(self, count: int) -> NDArray[np.int16]:
-        """(count, 6) gauges at the gains and offsets in force, which are right only when they are the calibration's."""
+        """Return gauges (count, 6) with the active gains and offsets, which may not be those of the calibration."""
         calibration = self._transducer
         active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)
         gain: Array = active[:6] / calibration.gauge_gains

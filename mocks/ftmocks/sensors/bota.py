@@ -57,7 +57,7 @@ _X25 = [_x25_entry(byte) for byte in range(256)]
 
 
 def crc16_x25(data: bytes) -> bytes:
-    """Return the CRC-16/X-25 as it goes on the wire, low byte first."""
+    """Return the CRC-16/X-25, low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc = (crc >> 8) ^ _X25[(crc ^ byte) & 0xFF]
@@ -65,13 +65,13 @@ def crc16_x25(data: bytes) -> bytes:
 
 
 def stream_frame(status: int, wrench: list[float], timestamp_us: int, temperature_C: float) -> bytes:
-    """One sample: header, 34 bytes of payload, all little-endian, and their CRC."""
+    """Return the frame of a sample: header, 34 bytes of data (little-endian), and their CRC."""
     payload = struct.pack("<H6fIf", status, *wrench, timestamp_us & 0xFFFFFFFF, temperature_C)
     return HEADER + payload + crc16_x25(payload)
 
 
 def banner(serial: int) -> bytes:
-    """Return what the sensor prints when it has booted."""
+    """Return the text that the sensor prints after it has booted."""
     return b"App Init\r\nname: %b\r\nS/N: %d\r\nFW version: 1.2.0\r\n" % (NAME, serial)
 
 
@@ -82,19 +82,19 @@ class BotaBox(SerialSensor):
     Parameters
     ----------
     sinc_length
-        Of the filter at power-up: a sample takes 19.53125 µs times this.
+        Length of the filter at power-up. The sample period is 19.53125 µs times this.
     baud_code
-        Of the serial speed in force, the index in `BAUD_RATES`.
+        Index of the active baud rate in `BAUD_RATES`.
     serial
-        Number of the sensor.
+        Serial number.
     capacity
-        (6,) in N and N·m: readings are clipped there and marked as overrange.
+        (6,) largest force and torque, N and N·m, at which readings are clipped and marked as overrange.
     temperature_C
-        Reported with every sample.
+        Temperature that is sent with every sample.
     status
-        Status bits set besides those that follow from the readings and the configuration.
+        Status bits in addition to those that follow from readings and configuration.
     streaming_at_start
-        Has its own supply and streams already: it does not restart when a client opens the port.
+        Whether the sensor has its own supply and streams, so that it does not restart when a client opens the port.
     boot_s
         Time from the opening of the port, or a restart, to the end of the banner and the first sample.
     """
@@ -119,12 +119,12 @@ class BotaBox(SerialSensor):
         self._line = b""
         self._was_open = False
         self._boot_texts: list[tuple[float, bytes, int]] = []
-        """What it prints before it streams: when, the text, and the code of its speed."""
+        """Texts that the sensor prints before it streams: time, text, and code of the baud rate."""
         self._powered_s = self._stream_start_us = 0.0
 
     @property
     def sample_s(self) -> float:
-        """Sampling period."""
+        """Sample period, s."""
         return SINC_UNIT_S * self.sinc_length
 
     @property
@@ -185,7 +185,7 @@ class BotaBox(SerialSensor):
             self._execute(command[0])
 
     def _refuse_what_is_no_command(self) -> None:
-        """Keep the beginning of a command, and answer anything else with an error."""
+        """Keep the beginning of a command, and answer other bytes with an error."""
         if self._line and (self._line[:1] not in b"cfp" or len(self._line) > LONGEST_COMMAND):
             self._answer(self._line[:1], error=1)
             self._line = b""
@@ -220,11 +220,11 @@ class BotaBox(SerialSensor):
         self._wire.put(self._as_received([text], self.baud_code))
 
     def _client_has(self, baud_code: int) -> bool:
-        """Whether the client's speed is this one; a box without a terminal has a client with any speed."""
+        """Return whether the client has this baud rate; without a terminal, the client has every baud rate."""
         return self._file < 0 or termios.tcgetattr(self._file)[5] == _SPEEDS[baud_code]
 
     def _as_received(self, frames: list[bytes], baud_code: int) -> list[bytes]:
-        """Return what the client receives of frames sent at a speed: noise when its own is another."""
+        """Return what the client receives of frames at this baud rate: noise if the client has another one."""
         if self._client_has(baud_code):
             return frames
         return [self._noise.randbytes(len(frame) // 2) for frame in frames]
@@ -247,6 +247,6 @@ class BotaBox(SerialSensor):
         return f"{status},{numbers},{timestamp_us},{self.temperature_C:.2f}\r\n".encode("ascii")
 
     def _run(self) -> None:
-        """Stream, with the timestamp that counts since power-up."""
+        """Start the stream, whose time stamps count from power-up."""
         self._stream_start_us = (self.clock.now_s() - self._powered_s) * 1e6
         self._pacer.start(1 / self.sample_s)

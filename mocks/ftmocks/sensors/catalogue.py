@@ -1,6 +1,6 @@
-"""The sensors a station can start, by name, with the emulator and the address of each.
+"""The sensors that a station can start, by name, with the emulator and the address of each.
 
-The addresses have the form of docs/reference/sensors.md; another client takes the path or port from them.
+Addresses have the form of docs/reference/sensors.md. Other clients use the path or port in them.
 """
 
 from collections.abc import Callable
@@ -25,21 +25,21 @@ class Kind:
     Parameters
     ----------
     emulator
-        Module and class.
+        Module and class of the emulator.
     scheme, query
-        Of its address, around the path of its pseudo-terminal.
+        Scheme and options of the address; the path of the pseudo-terminal is between them.
     endpoint
-        Settings for a client that does not know such addresses.
+        Settings for a client that does not use such addresses.
     options
-        Of the emulator.
+        Options of the emulator.
     settings
-        What `--sensor-setting` can change: the option of the emulator, and what makes its value of the text.
+        Settings of `--sensor-setting`: the option of the emulator, and the function that converts the text.
     at_host
-        Whether it listens at the address of the station, not behind a pseudo-terminal.
+        Whether the emulator listens at the address of the station instead of using a pseudo-terminal.
     bias_scale
-        Multiples of the forces and torques of the drawn bias, which reach 15 N and 1 N·m.
+        Factors on force and torque of the random bias, which has up to 15 N and 1 N·m.
     floats
-        Whether its wire can carry NaN.
+        Whether the wire can carry NaN.
     """
 
     emulator: str
@@ -92,7 +92,7 @@ def _model(name: str) -> robotous.Model:
 FT300_BIAS_SCALE = (3.3, 1.2)
 """One at rest reads (-20.7, 22.0, -48.7) N and (-0.10, 1.17, -0.32) N·m: ros-industrial-attic/robotiq, request 215."""
 NETFT_BIAS_SCALE = (1.1, 2.1)
-"""One has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
+"""A real one has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
 
 KINDS = {
     "can": Kind(
@@ -136,22 +136,22 @@ KINDS = {
         bias_scale=NETFT_BIAS_SCALE,
     ),
 }
-"""Sensors on a wire of their own."""
+"""Sensors with a wire of their own, by name."""
 
 WRIST = "ur-ft"
-"""The sensor in the arm's wrist, which the controller reports."""
+"""Name of the sensor in the wrist of the arm, whose readings the controller reports."""
 
 CHOICES = (*KINDS, WRIST, "both", "none")
-"""Values of --sensor; "both" is can and serial."""
+"""Values of --sensor. "both" means can and serial."""
 
 
 def parse_settings(name: str, settings: list[str]) -> dict[str, Any]:
-    """Return the options of an emulator that settings ``NAME=VALUE`` stand for.
+    """Return the options of an emulator for settings ``NAME=VALUE``.
 
     Raises
     ------
     ValueError
-        When the sensor `name` has no such setting, or the value is none.
+        The sensor `name` has no such setting, or the value is invalid.
     """
     known = KINDS[name].settings if name in KINDS else {}
     options: dict[str, Any] = {}
@@ -161,7 +161,7 @@ def parse_settings(name: str, settings: list[str]) -> dict[str, Any]:
             raise ValueError(f"the sensor {name} has no settings: leave --sensor-setting out")
         if not sign or key not in known:
             choices = " or ".join(f"{choice}=VALUE" for choice in known)
-            raise ValueError(f"{setting!r} is no setting of the sensor {name}: give {choices}")
+            raise ValueError(f"{setting!r} is not a setting of the sensor {name}: give {choices}")
         option, parse = known[key]
         options[option] = parse(value)
     return options
@@ -173,15 +173,15 @@ class Sensor:
     Parameters
     ----------
     name
-        One of `KINDS`, or `WRIST`.
+        A key of `KINDS`, or `WRIST`.
     measure_at
-        Readings (n, 6) in N and N·m at times (n,) of the cell's clock.
+        Function that returns readings (n, 6), N and N·m, at times (n,) of the cell's clock.
     host
         Loopback address of the station.
     clock
-        Of the cell.
+        Clock of the cell.
     options
-        Of the emulator, see `parse_settings`.
+        Options of the emulator, see `parse_settings`.
     """
 
     def __init__(
@@ -210,7 +210,7 @@ class Sensor:
         self.endpoint = self._endpoint(self._kind, emulator.start())
 
     def _endpoint(self, kind: Kind, where: Any) -> dict[str, Any]:
-        """Return what the station reports about it, its address under "url"."""
+        """Return the description that the station prints; the address is under "url"."""
         if isinstance(where, dict):
             ports = "&".join(f"{key}={port}" for key, port in where.items() if key != "host")
             return {"url": f"{kind.scheme}://{where['host']}?{ports}", **where}
@@ -219,24 +219,24 @@ class Sensor:
 
     @property
     def carries_nan(self) -> bool:
-        """Whether its wire can carry NaN."""
+        """Whether the wire can carry NaN."""
         return self._kind is None or self._kind.floats
 
     @property
     def emulator(self) -> Device[Any]:
-        """The emulator behind the wire.
+        """The emulator.
 
         Raises
         ------
         ValueError
-            For the sensor in the wrist, which has no wire.
+            The sensor is the one in the wrist, which has no wire of its own.
         """
         if self._emulator is None:
             raise ValueError(f"{self.name} is part of the arm and has no wire of its own")
         return self._emulator
 
     def saturate(self, axis: int | None) -> None:
-        """Let an axis, or a gauge where the sensor sends gauges, read the end of its range; None ends it."""
+        """Let an axis, or a gauge if the sensor sends gauges, read the end of its range; None ends the saturation."""
         if axis is not None and not 0 <= axis < 6:
             raise ValueError(f"axis {axis} is not 0 to 5")
         self.emulator.saturated_axis = axis

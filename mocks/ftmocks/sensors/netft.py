@@ -53,7 +53,7 @@ TRANSFORM_KEYS, BIAS_KEYS = ([f"{name}{i}" for i in range(6)] for name in ("cfgt
 
 
 class Command(IntEnum):
-    """Command code of a request."""
+    """Command codes of requests."""
 
     STOP = 0x0000
     ONE_SHOT = 0x0001
@@ -73,14 +73,14 @@ class Endpoint(TypedDict):
 
 @dataclass(frozen=True, eq=False)
 class Calibration(Scale):
-    """What the box reports over HTTP about its transducer.
+    """Data of the transducer that the box reports over HTTP.
 
     Parameters
     ----------
     serial, part_number
-        Of the transducer.
+        Serial number and part number of the transducer.
     rating
-        (6,) in N and N·m; readings are clipped there.
+        (6,) rated load, N and N·m, at which readings are clipped.
     """
 
     serial: str = "FT12345"
@@ -89,12 +89,12 @@ class Calibration(Scale):
 
 
 def transform_matrix(displacement_m: Array, angles_rad: Array) -> Array:
-    """Return what turns wrenches about the transducer's origin into those of a tool frame, (6, 6).
+    """Return the matrix (6, 6) that transforms wrenches from the transducer frame to a tool frame.
 
     Parameters
     ----------
     displacement_m
-        (3,) origin of the tool frame, in the axes of the transducer.
+        (3,) origin of the tool frame in transducer coordinates.
     angles_rad
         (3,) rotations about x, the new y and the new z.
     """
@@ -119,7 +119,7 @@ def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], co
     Parameters
     ----------
     first
-        RDT sequence number of the first one.
+        RDT sequence number of the first record.
     ft, status, counts
         (n,) internal sequence numbers, (n,) status words, (n, 6) counts.
     """
@@ -133,38 +133,38 @@ def rdt_records(first: int, ft: NDArray[np.int64], status: NDArray[np.int64], co
 
 @dataclass(eq=False, kw_only=True)
 class NetFtBox(Device[bytes]):
-    """The box: one thread for RDT, one for HTTP. A box whose wire is stalled by `faults` does not answer HTTP either.
+    """The box, with one thread for RDT and one for HTTP. If `faults` stalls the wire, HTTP is not answered either.
 
     Parameters
     ----------
     host
-        Address to listen at.
+        Address on which the box listens.
     rdt_port, http_port
-        0 picks a free one. The real ones are 49152 and 80, which needs privileges.
+        Ports; 0 selects a free one. The real ports are 49152 and 80, which needs privileges.
     calibration
-        Scale and identity.
+        Scale and identity of the transducer.
     product
-        Name the box gives itself.
+        Product name that the box reports.
     firmware
-        Version of its firmware.
+        Firmware version.
     tool_transform
-        (6,) displacements dx dy dz and rotations rx ry rz, in these units; zeros for none.
+        (6,) displacements dx dy dz and rotations rx ry rz in these units; zeros for none.
     distance_unit, angle_unit
-        Codes, the keys of `DISTANCE_UNITS` and `ANGLE_UNITS`.
+        Codes of the units, keys of `DISTANCE_UNITS` and `ANGLE_UNITS`.
     bias
-        (6,) software bias in gauge counts at power-up; zeros for none.
+        (6,) software bias at power-up, gauge counts; zeros for none.
     gauge_offset
-        (6,) or scalar, what the gauges read without load; None for `bias`, which then leaves the readings as measured.
+        (6,) or scalar readings of the gauges without load. None selects `bias`, which cancels them.
     rate_hz
-        Of samples, 1 to 7000.
+        Sample rate, 1 to 7000 Hz.
     buffer_size
-        Records in a datagram of the buffered mode, 1 to 40.
+        Number of records per datagram in buffered mode, 1 to 40.
     rdt_enabled
-        Whether the box answers at its UDP port at all.
+        Whether the box answers at its UDP port.
     status
-        Status bits sent with every sample.
+        Status bits that are sent with every sample.
     streaming_at_start
-        Address and port of the last client, which crashed while it streamed.
+        Address and port of a client to which the box streams after power-up, as after a crash of that client.
     """
 
     host: str = "127.0.0.1"
@@ -202,9 +202,9 @@ class NetFtBox(Device[bytes]):
         Raises
         ------
         RuntimeError
-            If it is running already.
+            The box is running already.
         OSError
-            If a port cannot be had.
+            A port is not available.
         """
         self._require_stopped()
         with contextlib.ExitStack() as stack:
@@ -231,7 +231,7 @@ class NetFtBox(Device[bytes]):
             self._request(Command.REAL_TIME, 0, self.streaming_at_start)
 
     def _receive(self) -> None:
-        with contextlib.suppress(OSError):  # a client that is gone is reported as a refused connection
+        with contextlib.suppress(OSError):  # a client that has ended causes a refused connection
             data, client = self._socket.recvfrom(256)
             if len(data) == REQUEST.size and self.rdt_enabled:
                 header, command, count = REQUEST.unpack(data)
@@ -258,12 +258,12 @@ class NetFtBox(Device[bytes]):
 
     def _deliver(self, frames: list[bytes]) -> None:
         for datagram in frames:
-            with contextlib.suppress(OSError):  # no room, or nothing listens there: a datagram is lost
+            with contextlib.suppress(OSError):  # the buffer is full or nobody listens: the datagram is lost
                 if self._client is not None:
                     self._socket.sendto(datagram, self._client)
 
     def _sample(self, count: int) -> None:
-        first = self._pacer.made - count  # of this stream, from 0
+        first = self._pacer.made - count  # number within this stream, from 0
         if self._left is not None:
             count = max(0, min(count, self._left - first))
             self._pacer.made = first + count
@@ -277,11 +277,11 @@ class NetFtBox(Device[bytes]):
             self._pacer.stop()
 
     def _measured(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
-        """(count, 6) wrenches on the transducer in N and N·m, and (count,) whether one is at its rating."""
+        """Return wrenches (count, 6) on the transducer, N and N·m, and whether each is at its rating (count,)."""
         return self._readings(count, np.asarray(self.calibration.rating))
 
     def _counts(self, measured: Array) -> Array:
-        """(n, 6) counts of (n, 6) wrenches on the transducer: without the software bias, in the tool frame."""
+        """Return counts (n, 6) of wrenches on the transducer, after software bias and tool transformation."""
         bias = np.linalg.solve(REFERENCE.gauges_per_SI, self._bias - self._gauge_offset)
         metres, radians = DISTANCE_UNITS[self.distance_unit][1], ANGLE_UNITS[self.angle_unit][1]
         displacement, angles = np.reshape(self.tool_transform, (2, 3))
@@ -296,7 +296,7 @@ class NetFtBox(Device[bytes]):
         self._buffer = data[full:]
 
     def page(self, path: str) -> bytes | None:
-        """Content of a page, None when there is none; pages that set something do so."""
+        """Return the content of a page, or None if it does not exist. Pages for settings change the settings."""
         url = urlsplit(path)
         query = dict(parse_qsl(url.query))
         match url.path:

@@ -30,13 +30,13 @@ ONE_G = (0, 0, 1000)
 
 
 def raw_values(wrench: Array) -> NDArray[np.int16]:
-    """Counts of (n, 6) wrenches in N and N·m: hundredths of N, thousandths of N·m, clipped."""
+    """Return counts (n, 6) of wrenches (n, 6): hundredths of N and thousandths of N·m, clipped."""
     counts: Array = np.rint(wrench * COUNTS_PER_SI)
     return counts.clip(-32768, 32767).astype(np.int16)
 
 
 def stream_frame(raw: list[int]) -> bytes:
-    """One sample: header, six little-endian int16, CRC-16/MODBUS over both."""
+    """Return the frame of a sample: header, six little-endian int16, CRC-16/MODBUS over both."""
     return modbus.with_crc(HEADER + struct.pack("<6h", *raw))
 
 
@@ -47,13 +47,13 @@ class RobotiqBox(ModbusSensor):
     Parameters
     ----------
     firmware
-        Three letters, the first an F, then three numbers.
+        Three letters, of which the first is F, then three numbers.
     serial
-        Three letters and a number; 0 means the sensor does not know it.
+        Three letters and a number, which is 0 if the sensor does not know it.
     year
-        Of production.
+        Year of production.
     streaming_at_start
-        Streams from power-up on, as some sensors do, and as after a crash of the last client.
+        Whether the sensor streams after power-up, as some sensors do, or as after a crash of the last client.
     """
 
     address = 0x09
@@ -85,7 +85,7 @@ class RobotiqBox(ModbusSensor):
             self._stop_bytes = self._stop_bytes + 1 if byte == STOP_BYTE else 0
             if self._stop_bytes == STOP_COUNT:
                 self._stop_bytes = 0
-                self._pacer.stop()  # what follows without a pause is no request either: its CRC is wrong
+                self._pacer.stop()  # bytes that follow without a pause are not a request: their CRC is wrong
 
     def _work(self, now_s: float) -> float | None:
         wait_s = super()._work(now_s)

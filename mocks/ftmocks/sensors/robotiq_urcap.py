@@ -30,7 +30,7 @@ class Endpoint(TypedDict):
 
 
 def reading_text(wrench: list[float]) -> bytes:
-    """Return the text of a wrench, (6,) in N and N·m."""
+    """Return the text of a wrench (6,), N and N·m."""
     return f"( {' , '.join(f'{value:f}' for value in wrench)} )".encode("ascii")
 
 
@@ -41,7 +41,7 @@ class RobotiqUrcap(Device[bytes]):
     Parameters
     ----------
     host, port
-        Address to listen at; port 0 picks a free one.
+        Address on which the URCap listens; port 0 selects a free one.
     """
 
     host: str = "127.0.0.1"
@@ -50,7 +50,7 @@ class RobotiqUrcap(Device[bytes]):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._clients: dict[socket.socket, bytes] = {}
-        """The rest of a reading that each could not take yet."""
+        """Remaining bytes of a reading for each client that did not accept all of it."""
 
     def start(self) -> Endpoint:
         """Start the URCap.
@@ -58,9 +58,9 @@ class RobotiqUrcap(Device[bytes]):
         Raises
         ------
         RuntimeError
-            If it is running already.
+            The URCap is running already.
         OSError
-            If the port cannot be had.
+            The port is not available.
         """
         self._require_stopped()
         self._socket = socket.create_server((self.host, self.port))
@@ -79,7 +79,7 @@ class RobotiqUrcap(Device[bytes]):
         self._pacer.start(STREAM_HZ)
 
     def _receive(self) -> None:
-        with contextlib.suppress(OSError):  # a client that is gone already
+        with contextlib.suppress(OSError):  # the client may have ended
             client, _ = self._socket.accept()
             client.setblocking(False)
             client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -96,13 +96,13 @@ class RobotiqUrcap(Device[bytes]):
             for client, rest in tuple(self._clients.items()):
                 try:
                     self._clients[client] = _sent(client, rest, frame)
-                except OSError:  # it has closed the connection
+                except OSError:  # the client has closed the connection
                     client.close()
                     del self._clients[client]
 
 
 def _sent(client: socket.socket, rest: bytes, frame: bytes) -> bytes:
-    """Send a reading behind the rest of the last one; return what is left of the one that left in part."""
+    """Send the rest of the last reading, then a new one; return the bytes that were not accepted."""
     with contextlib.suppress(BlockingIOError):
         while rest:
             rest = rest[client.send(rest) :]

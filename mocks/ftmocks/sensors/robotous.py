@@ -42,7 +42,7 @@ UNSUPPORTED, OUT_OF_RANGE = 1, 2
 
 
 class Command(IntEnum):
-    """First byte of a command field, and of its response."""
+    """First bytes of command fields and of their responses."""
 
     MODEL_NAME = 0x01
     SERIAL_NUMBER = 0x02
@@ -64,14 +64,14 @@ class Command(IntEnum):
 
 @dataclass(frozen=True)
 class Model:
-    """A member of the series.
+    """A model of the series.
 
     Parameters
     ----------
     force_divisor, torque_divisor
-        Counts per newton and per newton metre.
+        Counts per N and per N·m.
     capacity
-        (6,) rated load in N and N·m; from 120 % of it on an axis is overloaded.
+        (6,) rated load, N and N·m. An axis is overloaded from 120 % of it.
     """
 
     name: str = "RFT60-HA01"
@@ -93,33 +93,33 @@ MODELS = {
         Model("RFT82-HA02", torque_divisor=1000.0),
     )
 }
-"""By the name that the sensor reports."""
+"""Models by the name that the sensor reports."""
 
 
 def raw_values(wrench: Array, model: Model) -> NDArray[np.int16]:
-    """Counts of wrenches, rounded and clipped.
+    """Return rounded and clipped counts of wrenches.
 
     Parameters
     ----------
     wrench
-        (n, 6) in N and N·m.
+        (n, 6) wrenches, N and N·m.
     """
     counts = np.rint(wrench * ([model.force_divisor] * 3 + [model.torque_divisor] * 3))
     return np.clip(counts, -32768, 32767).astype(np.int16)
 
 
 def sample_field(response: int, raw: Sequence[int], overload: int) -> bytes:
-    """Response field of a sample: identifier, six big-endian int16, overload bits, two bytes of padding."""
+    """Return the response field of a sample: identifier, six big-endian int16, overload bits, two padding bytes."""
     return struct.pack(">B6hB2x", response, *raw, overload)
 
 
 def packet(field: bytes) -> bytes:
-    """A command or response field as the UART carries it."""
+    """Return the UART packet of a command or response field."""
     return bytes((START_OF_PACKET, *field, sum(field) & 0xFF, END_OF_PACKET))
 
 
 def fields(stream: bytearray) -> list[bytes]:
-    """Remove received bytes and return the whole command packets in them."""
+    """Remove received bytes and return the complete command packets in them."""
     found = []
     size = COMMAND_BYTES + 3
     while (start := stream.find(START_OF_PACKET)) >= 0 and len(stream) >= start + size:
@@ -135,7 +135,7 @@ def fields(stream: bytearray) -> list[bytes]:
 
 @dataclass(eq=False)
 class RobotousSensor(PtyDevice[Frame]):
-    """The device behind either wire: commands in, response fields out.
+    """The device, independent of the wire: it converts command fields to response fields.
 
     Parameters
     ----------
@@ -144,13 +144,13 @@ class RobotousSensor(PtyDevice[Frame]):
     serial, firmware
         At most 15 ASCII characters each.
     baud_code
-        Of the UART in force, the index in `BAUD_RATES`; a pty does not notice a client at another rate.
+        Index of the active baud rate in `BAUD_RATES`. A pseudo-terminal does not show the baud rate of the client.
     ids
-        CAN identifiers in force: of commands, and of the first and second frame of a response.
+        Active CAN identifiers: of commands, and of the first and second frame of a response.
     overload
-        Overload bits set besides those of the readings: bit 5 to 0 are Fx to Tz.
+        Overload bits in addition to those of the readings; bits 5 to 0 are Fx to Tz.
     streaming_at_start
-        Streams from power-up on, as after a crash of the last client.
+        Whether the sensor streams after power-up, as after a crash of the last client.
     """
 
     unsupported: ClassVar[frozenset[Command]] = frozenset()
@@ -175,7 +175,7 @@ class RobotousSensor(PtyDevice[Frame]):
 
     @property
     def rate_hz(self) -> float:
-        """Samples a second of a stream."""
+        """Sample rate of a stream, Hz."""
         return RATES_HZ[self.rate_code]
 
     def boot(self) -> None:
@@ -218,7 +218,7 @@ class RobotousSensor(PtyDevice[Frame]):
         return []
 
     def samples(self, count: int, response: int = Command.START) -> list[bytes]:
-        """Response fields of the next samples."""
+        """Return the response fields of the next samples."""
         wrench = self.measure(count)
         raw = raw_values(wrench - self._bias, self.model)
         if self.saturated_axis is not None:
@@ -240,7 +240,7 @@ class RobotousSensor(PtyDevice[Frame]):
         self._overloaded = overload
 
     def _set(self, code: int, first: int, second: int, third: int) -> int:
-        """Change a setting; return the error code, 0 for success."""
+        """Change a setting; return the error code, which is 0 after success."""
         if code in self.unsupported:
             return UNSUPPORTED
         match code:
@@ -258,7 +258,7 @@ class RobotousSensor(PtyDevice[Frame]):
 
     @property
     def _fastest_hz(self) -> float:
-        """The highest rate that can be set."""
+        """Highest rate that can be set, Hz."""
         return max(RATES_HZ)
 
     def _response(self, code: int, *values: int) -> bytes:
@@ -267,7 +267,7 @@ class RobotousSensor(PtyDevice[Frame]):
 
 @dataclass(eq=False)
 class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
-    """The sensor on a CAN bus: 8 bytes of command, and a response in two frames of 8 bytes."""
+    """The sensor on a CAN bus. A command has 8 bytes, a response two frames of 8 bytes."""
 
     unsupported = frozenset({Command.SET_BAUD})
 
@@ -295,7 +295,7 @@ class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
 
 @dataclass(eq=False)
 class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
-    """The sensor on a UART: packets with start byte, checksum and end byte."""
+    """The sensor on a UART, with packets of start byte, field, checksum and end byte."""
 
     unsupported = frozenset({Command.SET_IDS})
 
@@ -305,7 +305,7 @@ class RobotousSerialBox(RobotousSensor[bytes], SerialSensor):
 
     @property
     def rate_hz(self) -> float:
-        """Samples a second of a stream, and no more than the line carries."""
+        """Sample rate of a stream, Hz, at most what the line can transmit."""
         return min(super().rate_hz, BAUD_RATES[self.baud_code] / (10 * (RESPONSE_BYTES + 3)))
 
     @property

@@ -1,1 +1,1 @@
-"""The UR controller: RTDE, primary interface, dashboard, Robot API and script ports, and the arm behind them."""
+"""An emulated UR controller: RTDE, primary interface, dashboard server, Robot API and script ports, and the arm."""

@@ -1,4 +1,4 @@
-"""The Robot API of PolyScope X: one HTTP request in, one JSON document out. No sockets.
+"""The Robot API of PolyScope X: converts an HTTP request to a JSON document. It uses no sockets.
 
 Source: the PolyScope X side of Universal Robots' client library and its tests (resources, bodies, the version of the
 API with which each appeared, names of modes); "Remote Robot Controller" by an engineer of Universal Robots (status
@@ -28,7 +28,7 @@ from ftmocks.ur.robot import Robot
 POLYSCOPE_X = 10
 BASE = "/universal-robots/robot-api"
 API_VERSIONS = {(10, 11): (3, 0, 0), (10, 12): (3, 1, 4), (10, 13): (3, 1, 6), (10, 14): (5, 0, 107)}
-"""Version of the API by the first version of PolyScope that has it."""
+"""Version of the API, by the first version of PolyScope that has it."""
 
 Document = dict[str, object]
 Answer = tuple[int, Document]
@@ -39,7 +39,7 @@ _SAFETY_NAMES = {
     SafetyMode.RECOVERY: "REDUCED",
     SafetyMode.VIOLATION: "FAULT",
 }
-"""Names of the modes that have another one here."""
+"""Names of modes that differ from those of RTDE."""
 
 FORBIDDEN: Document = {
     "message": "Forbidden - Operation Not Allowed",
@@ -87,13 +87,13 @@ _PROGRAM: dict[str, Callable[[Robot], bool]] = {
 
 
 class Resource(NamedTuple):
-    """What the API knows under one path: since which version, how it reads, which actions it takes."""
+    """A resource of the API: first version, function that reads it, and actions."""
 
     since: tuple[int, int, int]
     get: Callable[[Robot], Document] | None
     actions: dict[str, Callable[[Robot], bool]] | None = None
     refusal: HTTPStatus = HTTPStatus.CONFLICT
-    """Status of an action that is not possible now."""
+    """HTTP status of an action that is not possible in the current state."""
 
 
 def _robot_mode(robot: Robot) -> Document:
@@ -122,11 +122,11 @@ RESOURCES: dict[str, Resource] = {
         (5, 0, 107), lambda r: {"robotType": r.settings.model, "serialNumber": r.settings.serial_number}
     ),
 }
-"""Resources by their path behind `BASE`."""
+"""Resources by their path after `BASE`."""
 
 
 def respond(robot: Robot, method: str, path: str, body: bytes) -> Answer:
-    """Carry out one request and return the status and the document of the answer."""
+    """Process a request; return status and document of the answer."""
     place = path.partition("?")[0].rstrip("/")
     resource = RESOURCES.get(place.removeprefix(BASE)) if place.startswith(BASE) else None
     if resource is None or resource.since > _version_of(robot):

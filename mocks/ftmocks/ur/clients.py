@@ -1,4 +1,4 @@
-"""Connections of clients to the controller: one class for each kind of port but RTDE."""
+"""Connections of clients to the controller: one class per kind of port, except RTDE."""
 
 import socket
 import struct
@@ -9,11 +9,11 @@ from ftmocks.ur import api, dashboard, http_wire, primary
 from ftmocks.ur.robot import Robot
 from ftmocks.ur.uploads import start_upload, take_uploads
 
-BACKLOG_LIMIT_S = 10.0  # a client that does not read for so long is disconnected
+BACKLOG_LIMIT_S = 10.0  # time after which a client that does not read is disconnected
 
 
 class Client(ABC):
-    """One TCP connection: bytes in, bytes out, never blocking. It calls `forget` with itself when it has ended."""
+    """A non-blocking TCP connection. It calls `forget` with itself after it has ended."""
 
     kind = ""
 
@@ -29,24 +29,24 @@ class Client(ABC):
         self._stuck_since: float | None = None
 
     def fileno(self) -> int:
-        """The socket's."""
+        """File descriptor of the socket."""
         return self._socket.fileno()
 
     @property
     def lagging(self) -> bool:
-        """Whether the client has not yet read what was sent before."""
+        """Whether bytes are waiting that the client has not read."""
         return bool(self._out)
 
     def greeting(self) -> bytes:
-        """Return what the port sends first."""
+        """Return the bytes that are sent first on this port."""
         return b""
 
     def on_cycle(self) -> None:
-        """Send what a control cycle has brought, and what is left."""
+        """Send the bytes of a control cycle and the waiting bytes."""
         self.flush()
 
     def on_ready(self) -> None:
-        """Read what has arrived and act on it."""
+        """Read and process the bytes that have arrived."""
         try:
             data = self._socket.recv(65536)
         except BlockingIOError:
@@ -61,15 +61,15 @@ class Client(ABC):
 
     @abstractmethod
     def on_bytes(self, buffer: bytearray) -> None:
-        """Consume what is complete at the start of `buffer`."""
+        """Process and remove complete units at the start of `buffer`."""
 
     def send(self, data: bytes) -> None:
-        """Send what the socket takes, keep the rest."""
+        """Send as many bytes as the socket accepts, and keep the others."""
         self._out += data
         self.flush()
 
     def flush(self) -> None:
-        """Send what is left; disconnect a client that has not read for `BACKLOG_LIMIT_S`."""
+        """Send waiting bytes; disconnect a client that has not read for `BACKLOG_LIMIT_S`."""
         if not self._out or not self.open:
             return
         try:
@@ -89,7 +89,7 @@ class Client(ABC):
             self._stuck_since = None
 
     def close(self, *, reset: bool = False) -> None:
-        """Close the connection: in order, or with a TCP reset."""
+        """Close the connection, regularly or with a TCP reset."""
         if self.open:
             self.open = False
             self._forget(self)
@@ -99,7 +99,7 @@ class Client(ABC):
 
 
 class ScriptClient(Client):
-    """Port 30003: receives programs, sends nothing."""
+    """Port 30003, which receives programs and sends nothing."""
 
     kind = "script"
 
@@ -110,10 +110,10 @@ class ScriptClient(Client):
 
 
 class PrimaryClient(Client):
-    """Port 30001: receives programs; sends the state, messages of programs, and errors.
+    """Port 30001, which receives programs and sends the state, messages of programs, and errors.
 
-    A connection that was opened in local control can only read, also when the pendant is switched to remote control
-    later. A connection that was opened in remote control ends when the pendant is switched to local control.
+    A connection that was opened in local control remains read-only, also after the pendant was switched to remote
+    control. A connection that was opened in remote control ends when the pendant is switched to local control.
     """
 
     kind = "primary"
@@ -124,7 +124,7 @@ class PrimaryClient(Client):
         self._switches = self.robot.remote_switches
         self._every = self.robot.frequency_hz // primary.STATES_HZ
         self._seen = len(self.robot.events)
-        """Entries of the event log that were sent, or are older than this connection."""
+        """Number of entries of the event log that were sent or are older than this connection."""
 
     def greeting(self) -> bytes:
         """Return version, tolerances and a complete state."""
@@ -145,7 +145,7 @@ class PrimaryClient(Client):
                 start_upload(self.robot, upload, by=by)
 
     def on_cycle(self) -> None:
-        """Send what has happened, and the state when it is due."""
+        """Send messages of new events, and the state if it is due."""
         super().on_cycle()
         if self._can_write and self._switches != self.robot.remote_switches:
             self.close()
@@ -161,7 +161,7 @@ class PrimaryClient(Client):
 
 
 class SecondaryClient(PrimaryClient):
-    """Port 30002: as port 30001, but without messages behind the greeting."""
+    """Port 30002, which equals port 30001 except that it sends no messages after the greeting."""
 
     kind = "secondary"
 
@@ -170,7 +170,7 @@ class SecondaryClient(PrimaryClient):
 
 
 class DashboardClient(Client):
-    """Port 29999: a banner, then one line for each line."""
+    """Port 29999, which sends a banner, then one line per received line."""
 
     kind = "dashboard"
 
@@ -185,7 +185,7 @@ class DashboardClient(Client):
 
     @property
     def trusted(self) -> bool:
-        """Whether the pendant was in remote control since this client connected; else it can only query."""
+        """Whether the pendant has been in remote control since this client connected. Otherwise it can only query."""
         return self._opened_remote and self._switches == self.robot.remote_switches
 
     def on_bytes(self, buffer: bytearray) -> None:
@@ -200,7 +200,7 @@ class DashboardClient(Client):
 
 
 class ApiClient(Client):
-    """The port of the Robot API: HTTP requests, answered in their order."""
+    """The port of the Robot API, which answers HTTP requests in their order."""
 
     kind = "api"
 

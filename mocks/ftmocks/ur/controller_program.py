@@ -1,37 +1,37 @@
-"""A program as the controller runs it, and its errors."""
+"""Programs of the controller, and their errors."""
 
 from typing import Any, NamedTuple
 
 
 class Place(NamedTuple):
-    """Where in a program something stands: line and column, both from 1."""
+    """A position in the text of a program: line and column, both counted from 1."""
 
     line: int = 1
     column: int = 1
 
 
 class ScriptError(Exception):
-    """A run-time error of the program; it ends."""
+    """A run-time error, which ends the program."""
 
 
 class ControllerProgram:
-    """A program as the controller runs it. This one was loaded at the pendant, and loops there until it is stopped."""
+    """A program on the controller. This base class is a program of the pendant that loops until it is stopped."""
 
     reads_registers = False
-    """Whether it obeys the commands that a client writes into `COMMAND_REGISTERS`."""
+    """Whether the program executes the commands that a client writes into `COMMAND_REGISTERS`."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.doubts: list[str] = []
-        """What a controller is reported to reject in its text."""
+        """Constructs in its text that real controllers are reported to reject."""
 
     @property
     def place(self) -> Place:
-        """Where it is in its text."""
+        """Current position in the text."""
         return Place()
 
     def step(self) -> bool:
-        """Run one control cycle; return False when the program has ended."""
+        """Run one control cycle; return False if the program has ended."""
         return True
 
     def close(self) -> None:
@@ -39,5 +39,5 @@ class ControllerProgram:
 
 
 def error_at(place: Place, text: str) -> dict[str, Any]:
-    """Return what the event log keeps of an error in a program."""
+    """Return the fields of the event log for an error in a program."""
     return {"error": text, "line": place.line, "column": place.column}

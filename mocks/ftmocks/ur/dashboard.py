@@ -1,7 +1,7 @@
-"""The dashboard server's answers: one line in, one line out.
+"""Answers of the dashboard server to command lines.
 
-Source: Universal Robots, "Dashboard Server e-Series, port 29999" and its CB-Series page. Wording matters: clients
-compare it. `load` and the name in `programState`: issues 89 and 268 of its client library.
+Source: Universal Robots, "Dashboard Server e-Series, port 29999" and its CB-Series page, with their exact wording,
+which clients compare. `load` and the name in `programState`: issues 89 and 268 of its client library.
 """
 
 from collections.abc import Callable
@@ -26,7 +26,7 @@ _SAFETY_MODES = {
     SafetyMode.AUTOMATIC_MODE_SAFEGUARD_STOP: SafetyMode.SAFEGUARD_STOP,
     SafetyMode.SYSTEM_THREE_POSITION_ENABLING_STOP: SafetyMode.SAFEGUARD_STOP,
 }
-"""What `safetymode` does not distinguish; `safetystatus` does."""
+"""Safety modes that `safetymode` does not distinguish, and the mode that it reports instead."""
 
 _QUERIES: dict[str, Callable[[Robot], str]] = {
     "polyscopeversion": lambda r: f"URSoftware {'.'.join(map(str, r.settings.polyscope))}.{BUILD} (Mar 24 2022)",
@@ -56,7 +56,7 @@ _SINCE = {
     "is in remote control": {5: 6},
     "safetystatus": {3: 11, 5: 4},
 }
-"""First minor version of each major one that knows a command."""
+"""First minor version with a command, by major version."""
 
 
 def _play(robot: Robot) -> str | None:
@@ -116,11 +116,11 @@ _COMMANDS: dict[str, Callable[[Robot], str | None]] = {
     "brake release": _brake_release,
     "restart safety": _restart_safety,
 }
-"""Commands that change something: the reply, or None when the controller refuses."""
+"""Commands that change the state. They return the reply, or None if the controller refuses."""
 
 
 def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = True) -> str:
-    """Carry out one dashboard command and return the reply, without line end.
+    """Execute a dashboard command and return the reply without line end.
 
     Parameters
     ----------

@@ -11,20 +11,20 @@ class Event:
     Parameters
     ----------
     t_host_ns
-        The cell's clock.
+        Time on the cell's clock.
     t_robot_s
-        The controller's clock, as on the wire.
+        Time on the controller's clock, as it is sent.
     by
         Source: ``dashboard``, ``api``, ``script port``, ``primary port``, ``rtde`` (clients), ``operator``,
         ``network`` (control channel), ``program``, ``safety``, ``power``, ``arm`` (the controller itself).
     what
-        Name of the event, in fixed words.
+        Name of the event.
     accepted
-        False when the controller refused it.
+        False if the controller refused the command.
     why
-        The reason or the reply, in words.
+        Reason or reply.
     detail
-        More fields, by name.
+        Further fields by name.
     """
 
     t_host_ns: int

@@ -1,7 +1,7 @@
-"""An operator who turns the sensor to all sides: by hand, or with a program on the pendant.
+"""An operator who turns the sensor to many orientations, by hand or with a program on the pendant.
 
-Only the wrist turns. The operator holds the arm above the sensor, which does not measure the hand. A tool from which a
-load hangs is only tilted, and the operator waits longer until the load hangs still.
+Only the wrist turns. The operator holds the arm above the sensor, so that the sensor does not measure the hand. A tool
+with a hanging load is only tilted, and the operator waits longer until the load is at rest.
 """
 
 import math
@@ -15,22 +15,22 @@ from ftmocks.ur.uploads import Upload
 SPEED_RAD_S = 0.6
 ACCELERATION_RAD_S2 = 1.5
 REST_S = 3.5
-"""Rest at each orientation on the cell's clock, independent of the speed of the arm."""
+"""Rest at each orientation, s of the cell's clock, which does not depend on the speed of the arm."""
 REST_WITH_LOAD_S = 15.0
 TILT_RAD = math.radians(60)
 
 TIPS: tuple[tuple[int, int], ...] = ((0, 0), (0, 1), (1, 0), (2, 0), (0, -1), (-1, 0))
-"""Quarter turns of joints 4 and 5: the tool points in six directions."""
+"""Quarter turns of joints 4 and 5, with which the tool points in six directions."""
 SPINS = (0, -1, 1, 2)
 """Quarter turns of joint 6."""
 IN_A_PROGRAM = 12
-"""Number of orientations in the program: all tips, with two of the spins."""
+"""Number of orientations in the program: all directions of the tool, each with two of the spins."""
 
 
 def orientations(robot: Robot) -> list[Vector6]:
-    """Return postures (rad) of the wrist: all 24 turns of a cube, or with a load that hangs the tool down and tilted.
+    """Return joint angles, rad, for the 24 rotations of a cube; with a hanging load, for the tool down and tilted.
 
-    The first has joint 5 at a right angle.
+    In the first posture joint 5 is at a right angle.
     """
     q1, q2, q3, q4, q5, q6 = robot.arm.q
     right, step, tips = math.copysign(math.pi / 2, q5), math.pi / 2, TIPS
@@ -46,12 +46,12 @@ def orientations(robot: Robot) -> list[Vector6]:
 
 
 def usual_rest_s(robot: Robot) -> float:
-    """Return how long the operator rests at each orientation, s."""
+    """Return the rest of the operator at each orientation, s."""
     return REST_S if robot.world.hung is None else REST_WITH_LOAD_S
 
 
 def guided_by_hand(robot: Robot, rest_s: float) -> Iterator[None]:
-    """Move the arm through the `orientations` over and over and rest at each; one control cycle per `next`.
+    """Move the arm through the `orientations` repeatedly and rest at each. Each `next` is one control cycle.
 
     The operator waits while the arm cannot be moved.
     """
@@ -74,6 +74,6 @@ def pendant_program(robot: Robot, rest_s: float) -> Upload:
 
 
 def _turned(angle: float, by: float) -> float:
-    """Turn an angle and keep it within one turn."""
+    """Return a rotated angle within one revolution."""
     turned = angle + by
     return turned if abs(turned) <= 2 * math.pi else math.remainder(turned, 2 * math.pi)

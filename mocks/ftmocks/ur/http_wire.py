@@ -1,6 +1,6 @@
-"""HTTP/1.1 as far as a server of small JSON documents needs it: requests from bytes, bytes of responses. No sockets.
+"""The part of HTTP/1.1 that a server of small JSON documents needs. It uses no sockets.
 
-Source: RFC 9112. Does not model: chunked bodies, ``Expect``, pipelined answers out of order.
+Source: RFC 9112. Not modelled: chunked bodies, ``Expect``, pipelined answers out of order.
 """
 
 import json
@@ -12,11 +12,11 @@ LONGEST_HEAD = 65536
 
 
 class HttpError(Exception):
-    """The bytes are no request that this server understands."""
+    """The bytes are not a request that this server supports."""
 
 
 class Request(NamedTuple):
-    """One request; `is_last` when the client wants the connection to end behind the answer."""
+    """A request. `is_last` is true if the client wants the connection to end after the answer."""
 
     method: str
     path: str
@@ -25,12 +25,12 @@ class Request(NamedTuple):
 
 
 def take_request(buffer: bytearray) -> Request | None:
-    """Remove and return the request at the start of `buffer`; None while it is not complete.
+    """Remove and return the request at the start of `buffer`; return None while it is incomplete.
 
     Raises
     ------
     HttpError
-        When the bytes are no request.
+        The bytes are not a request.
     """
     end = buffer.find(b"\r\n\r\n")
     if end < 0:
@@ -57,7 +57,7 @@ def take_request(buffer: bytearray) -> Request | None:
 
 
 def response(status: int, document: Mapping[str, object]) -> bytes:
-    """Return an answer with a JSON document."""
+    """Return the bytes of an answer with a JSON document."""
     body = json.dumps(document).encode()
     head = f"HTTP/1.1 {status} {HTTPStatus(status).phrase}\r\nContent-Type: application/json\r\n"
     return f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body

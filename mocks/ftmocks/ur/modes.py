@@ -1,4 +1,4 @@
-"""The modes the controller reports: program, robot and safety modes, and their status bits.
+"""Modes that the controller reports: program, robot and safety modes, and their status bits.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", and "Dashboard Server e-Series, port 29999" (names).
 Safety modes above 9: datatypes of its client library, and the message SafetyStatus of its ROS 2 driver.
@@ -10,7 +10,7 @@ from enum import IntEnum
 
 
 class Runtime(IntEnum):
-    """RTDE runtime_state, without the transitional ones."""
+    """RTDE runtime_state, without transitional states."""
 
     STOPPED = 1
     PLAYING = 2
@@ -18,7 +18,7 @@ class Runtime(IntEnum):
 
 
 class RobotMode(IntEnum):
-    """RTDE robot_mode; the arm moves in RUNNING only."""
+    """RTDE robot_mode. The arm only moves in RUNNING."""
 
     NO_CONTROLLER = -1
     DISCONNECTED = 0
@@ -33,7 +33,7 @@ class RobotMode(IntEnum):
 
 
 class SafetyMode(IntEnum):
-    """RTDE safety_mode and safety_status; 21 is not known."""
+    """RTDE safety_mode and safety_status. The meaning of 21 is unknown."""
 
     NORMAL = 1
     REDUCED = 2
@@ -84,7 +84,7 @@ EMERGENCY = frozenset(
     }
 )
 PAUSING = SAFEGUARDED | {SafetyMode.PROTECTIVE_STOP}
-"""Safety modes that hold a program where it is; the others that are not permitted end it."""
+"""Safety modes that pause a program. Other modes that are not permitted end it."""
 POWERLESS = EMERGENCY | {SafetyMode.VIOLATION, SafetyMode.FAULT}
 """Safety modes that cut the power of the arm."""
 
@@ -101,8 +101,8 @@ SAFETY_BITS = {
     SafetyMode.VIOLATION: 0x500,
     SafetyMode.FAULT: 0x600,
 }
-"""RTDE safety_status_bits of each mode: one bit for the mode, 7 any emergency stop, 10 stopped due to safety."""
+"""RTDE safety_status_bits of each mode: one bit for the mode, bit 7 for any emergency stop, bit 10 for any stop."""
 
 JOINT_MODES = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255, RobotMode.POWER_ON: 255, RobotMode.BACKDRIVE: 238}
 JOINT_POWER_OFF = 239
-"""RTDE joint_mode of each robot mode; joints without an entry are off."""
+"""RTDE joint_mode by robot mode. In other modes the joints are off."""

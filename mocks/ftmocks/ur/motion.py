@@ -1,11 +1,11 @@
-"""How the arm moves: the paths of motion commands, and an arm that follows them.
+"""Motion of the arm: paths of motion commands, and an arm that follows them.
 
-A path is a function of *path time*, which runs slower when the speed slider is down and stands still while the program
-is paused. A motion that meets a moving arm first brings it to rest: position and velocity never jump.
+A path is a function of *path time*, which is scaled by the speed slider and stops while the program is paused. If the
+arm moves when a motion starts, it is first brought to rest, so that position and velocity never jump.
 
-Chosen here, where the script manual is silent: `Servo` is a spring of stiffness `gain` (1/s²), damped so that the
-set-point is `lookahead_time` behind a target that moves evenly. The speed slider does not act on it. A target that a
-joint cannot reach in its time at its largest speed is a protective stop.
+Chosen here, where the script manual is silent: `Servo` is a spring of stiffness `gain` (1/s²), with a damping for which
+the set-point lags a target of constant velocity by `lookahead_time`. The speed slider does not act on it. A target that
+exceeds the maximum speed of a joint causes a protective stop.
 """
 
 import cmath
@@ -35,33 +35,33 @@ from ftmocks.kinematics import (
 )
 
 SETTLED_RAD = 1e-9
-"""Joints that are so near to a set-point at rest are there."""
+"""Distance from a set-point at rest below which joints have arrived, rad."""
 
 PAUSE_TIME_S = 0.15
-"""Time in which the arm comes to rest on its path when the program pauses, or follows the speed slider."""
+"""Time for a change of the pace, when the program pauses or the speed slider changes, s."""
 
 IDLE_DECELERATION_RAD_S2 = 8.0
-"""Deceleration of an arm that lost its path."""
+"""Deceleration of an arm without a path."""
 
 
 NO_WAY_ON = "the straight line leaves the workspace or meets a singularity"
 
 
 class MotionError(ValueError):
-    """The motion cannot be executed; the running program ends."""
+    """The motion cannot be executed, which ends the program."""
 
 
 class CannotFollow(Exception):
-    """The path leads where the arm cannot follow; the safety system stops it."""
+    """The arm cannot follow the path, so that the safety system stops it."""
 
 
 class Trapezoid:
-    """Distance over time from rest to rest, with a speed limit and constant acceleration.
+    """Trapezoidal velocity profile from rest to rest.
 
     Parameters
     ----------
     length, speed, acceleration
-        In any one unit of length and seconds; speed and acceleration positive.
+        Length, maximum speed and acceleration in one unit of length and s. Speed and acceleration must be positive.
     """
 
     def __init__(self, length: float, speed: float, acceleration: float) -> None:
@@ -74,7 +74,7 @@ class Trapezoid:
         self.duration_s = length / self.peak + self.ramp_s if length > 0.0 else 0.0
 
     def at(self, t: float) -> tuple[float, float, float]:
-        """Distance covered `t` seconds after the start, speed and acceleration."""
+        """Return distance, speed and acceleration `t` seconds after the start."""
         left, acceleration = self.duration_s - t, self.acceleration
         if left <= 0.0:
             return self.length, 0.0, 0.0
@@ -86,34 +86,34 @@ class Trapezoid:
 
 
 class Path(Protocol):
-    """One motion, planned when the arm starts it."""
+    """A motion that is planned when the arm starts it."""
 
     duration_s: float
     real_time: bool
-    """Whether it ignores speed slider and limiter."""
+    """Whether speed slider and limiter are ignored."""
 
     def begin(self, q: Vector6, qd: Vector6, /) -> None:
-        """Plan from the present set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
+        """Plan the motion from the current set-point: angles (rad) and speeds (rad/s). Sets `duration_s`."""
 
     def at(self, t: float) -> JointState:
-        """Return the set-point at path time `t` with its derivatives, called with rising `t` up to `duration_s`."""
+        """Return the set-point at path time `t` with its derivatives. `t` must not decrease between calls."""
 
 
 class JointMove:
-    """movej: all joints start and end together, the one with the longest travel leads.
+    """movej: all joints start and end together. The leading joint has the longest travel.
 
     Parameters
     ----------
     goal
         Joint angles, rad.
     speed, acceleration
-        Of the leading joint, rad/s and rad/s²; no joint exceeds its own speed limit.
+        Speed and acceleration of the leading joint, rad/s and rad/s². No joint exceeds its speed limit.
     """
 
     real_time = False
 
     def __init__(self, dh: Dh, goal: Vector6, speed: float, acceleration: float) -> None:
-        Trapezoid(0.0, speed, acceleration)  # refuses impossible values now, not in mid-motion
+        Trapezoid(0.0, speed, acceleration)  # rejects impossible values before the motion
         self._dh, self._goal, self._speed, self._acceleration = dh, goal, speed, acceleration
 
     def begin(self, q: Vector6, _qd: Vector6, /) -> None:
@@ -141,14 +141,14 @@ class JointMove:
 
 
 class LineMove:
-    """movel: the TCP moves along a straight line and turns about a fixed axis, on the present branch of the arm.
+    """movel: the TCP moves along a straight line and rotates about a fixed axis. The arm keeps its configuration.
 
     Parameters
     ----------
     X_flange_tcp, goal
-        Active TCP and its goal in base, (4, 4).
+        (4, 4) pose of the active TCP in the flange, and goal of the TCP in the base.
     speed, acceleration
-        m/s and m/s²; a turn of one radian counts as one metre where it is the longer of the two.
+        Speed and acceleration, m/s and m/s². If it takes longer, the rotation determines the duration, 1 rad as 1 m.
     """
 
     real_time = False
@@ -187,7 +187,7 @@ class LineMove:
             raise CannotFollow(NO_WAY_ON) from None
 
     def _derived(self, q: Vector6, lever: Array, speed: float, acceleration: float) -> JointState:
-        """Return the joints with their derivatives; `lever` (3,) is the flange from the TCP, in base."""
+        """Return joint angles with their derivatives; `lever` (3,) is the vector from TCP to flange in the base."""
         turning = speed * self._turn
         moving = speed * self._travel + cross(turning, lever)
         J = jacobian(self._dh, q)
@@ -217,13 +217,13 @@ class Command(NamedTuple):
 
     q: Vector6
     seconds: float
-    """In which the target moves there from the one before."""
+    """Time from the previous target to this one, s."""
     lookahead_s: float
     gain: float
 
 
 class Servo:
-    """servoj: the set-point follows targets that the program commands one after the other.
+    """servoj: the set-point follows a sequence of targets.
 
     Parameters
     ----------
@@ -242,16 +242,16 @@ class Servo:
 
     @property
     def ahead_s(self) -> float:
-        """How much time the commanded targets will still take."""
+        """Remaining time of the commanded targets, s."""
         return sum(command.seconds for command in self._commands) - self._into_s
 
     def command(self, command: Command) -> None:
-        """Go on to a target.
+        """Continue to a target.
 
         Raises
         ------
         CannotFollow
-            When a joint cannot be so fast.
+            A joint would exceed its maximum speed.
         """
         for joint, (a, b, limit) in enumerate(zip(self.target, command.q, self._dh.max_speed, strict=True), 1):
             if abs(b - a) > limit * command.seconds * (1 + 1e-9):
@@ -283,7 +283,7 @@ class Servo:
         return self._state
 
     def _pass(self, t: float, target: Vector6, rate: Vector6) -> None:
-        """Let time pass in which the target moves evenly."""
+        """Advance the time while the target moves with constant velocity."""
         gain, damping = self._gain, self._gain * self._lookahead_s
         states = []
         for q, v, goal, u in zip(*self._state[:2], target, rate, strict=True):
@@ -296,13 +296,13 @@ class Servo:
 
 
 class HandMove(JointMove):
-    """The operator pushes the arm: as movej, but slider and limiter do not act on it."""
+    """A motion by the hand of the operator: like movej, but independent of slider and limiter."""
 
     real_time = True
 
 
 class Stop:
-    """stopj and stopl: slow down linearly along the present direction, within `duration_s` at any slider."""
+    """stopj and stopl: decelerate in the current direction within `duration_s`, independent of the slider."""
 
     real_time = True
 
@@ -326,18 +326,18 @@ class Stop:
 
 
 class Following(NamedTuple):
-    """The actual joints from one control cycle on: they follow a set-point that accelerates evenly.
+    """Actual joints after a control cycle, which follow a set-point with constant acceleration.
 
     Parameters
     ----------
     lag_s
-        Time constant with which they follow.
+        Time constant of the lag.
     target
         The set-point in that cycle.
     qd
-        Speeds of the joints in that cycle, rad/s, with which they are `lag_s` behind the set-point.
+        Joint speeds in that cycle, rad/s; the joints lag the set-point by ``lag_s * qd``.
     off_rad
-        How far the joints are pushed off.
+        Deflection of the joints by a push.
     """
 
     lag_s: float
@@ -346,7 +346,7 @@ class Following(NamedTuple):
     off_rad: Vector6 = ZERO6
 
     def at(self, t: float) -> JointState:
-        """Return the actual joints `t` seconds later, or earlier; exact as long as the acceleration stays."""
+        """Return the actual joints after `t` seconds, which may be negative. The acceleration must be constant."""
         T = self.lag_s
         target_qd = [v + c * t for v, c in zip(self.target.qd, self.target.qdd, strict=True)]
         qd = _followed(self.qd, self.target.qd, target_qd, self.target.qdd, t, T)
@@ -359,20 +359,20 @@ class Following(NamedTuple):
 
 
 class Arm:
-    """Set-point and actual joints, and the path being followed.
+    """Set-point and actual joints of the arm, and its current path.
 
     Parameters
     ----------
     dh
-        The real arm.
+        Kinematics of the real arm.
     q
-        Joint angles (rad) to start with.
+        Initial joint angles, rad.
     lag_s
         Time constant with which the joints follow the set-point.
     """
 
     obstacle: str | None = None
-    """Why this arm cannot be moved."""
+    """Reason why this arm cannot be moved, or None."""
 
     def __init__(self, dh: Dh, q: Vector6, lag_s: float = IDEAL.servo_lag_s) -> None:
         self.dh = dh
@@ -380,22 +380,22 @@ class Arm:
         self.q = self.actual_q = q
         self.qd = self.actual_qd = self.qdd = ZERO6
         self.motion: Following | None = None
-        """The actual joints from the last cycle on, None while they rest."""
+        """Motion of the actual joints after the last cycle; None while they are at rest."""
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
         self.pushed_rad = ZERO6
-        """How far the operator pushes the joints off their set-points."""
+        """Deflection of the joints from their set-points by a push of the operator, rad."""
         self.scaling = 1.0
         """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
         self.paused = False
         """Whether the arm should stand still on its path."""
         self.pace = 1.0
-        """Present speed of path time, without the slider: `scaling` running, 0 paused, between while it changes."""
+        """Current speed of path time without the slider: `scaling`, 0 if paused, or a transition between them."""
         self.still_s = 0.0
-        """How long the set-point has stood still."""
+        """Time for which the set-point has been at rest, s."""
         self._slider = 1.0
         self._rates = (1.0, 1.0)
-        """Of path time: for servoj, and for all other paths, on which the slider acts."""
+        """Speeds of path time: for servoj, and for all other paths, on which the slider acts."""
         self._off_rad = ZERO6
         self._paths: deque[Path] = deque()
         self._planned: Path | None = None
@@ -404,34 +404,34 @@ class Arm:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the set-point stands still."""
+        """Whether the set-point is at rest."""
         return not any(self.qd)
 
     @property
     def busy(self) -> bool:
-        """Whether a path is not yet finished."""
+        """Whether the arm has a path that has not ended."""
         return bool(self._paths)
 
     def start(self, path: Path, owner: str) -> None:
-        """Follow `path` for the program thread `owner`, from rest.
+        """Follow `path` from rest, for the program thread `owner`.
 
         Raises
         ------
         MotionError
-            When another thread of the program controls the arm.
+            Another thread of the program controls the arm.
         """
         self._seize(owner)
         self._follow([self._rundown(), path] if not self.at_rest else [path])
 
     def servo(self, command: Command, owner: str) -> Servo:
-        """Follow a target of servoj, from the present motion on.
+        """Follow a target of servoj from the current motion.
 
         Raises
         ------
         MotionError
-            When another thread of the program controls the arm.
+            Another thread of the program controls the arm.
         CannotFollow
-            When the target jumps; the arm goes on to the last one.
+            The target jumps. The arm continues to the last one.
         """
         self._seize(owner)
         if not isinstance(servo := self._paths[-1] if self._paths else None, Servo):
@@ -443,16 +443,16 @@ class Arm:
         return servo
 
     def stop_joints(self, deceleration: float, owner: str) -> None:
-        """stopj: the fastest joint slows down by `deceleration` (rad/s²)."""
+        """stopj: decelerate the fastest joint by `deceleration`, rad/s²."""
         self._brake(max(abs(v) for v in self.qd), deceleration, owner)
 
     def stop_tool(self, deceleration: float, owner: str) -> None:
-        """stopl: the tool slows down by `deceleration` (m/s² or rad/s², whichever takes longer)."""
+        """stopl: decelerate the tool by `deceleration`, m/s² or rad/s², whichever takes longer."""
         twist = jacobian(self.dh, self.q) @ self.qd
         self._brake(max(math.hypot(*twist[:3]), math.hypot(*twist[3:])), deceleration, owner)
 
     def until_finished(self, owner: str) -> Generator[None, None, None]:
-        """Wait a cycle at a time until the path has ended; closing this generator takes the arm from its path."""
+        """Yield once per cycle until the path has ended. Closing this generator cancels the path."""
         try:
             while self.busy:
                 yield
@@ -460,18 +460,18 @@ class Arm:
             self.release(owner)
 
     def release(self, owner: str | None = None) -> None:
-        """Drop the path of `owner` (None: of any owner); a moving arm comes to rest by itself."""
+        """Cancel the path of `owner` (None: of any owner). A moving arm comes to rest."""
         if owner is None or owner == self._owner:
             self._owner = None
             self._follow([self._rundown()] if not self.at_rest else [])
 
     def step(self, dt: float, _t_s: float = 0.0) -> None:
-        """Let `dt` seconds pass, up to a time of the cell's clock.
+        """Advance by `dt` seconds to a time of the cell's clock.
 
         Raises
         ------
         CannotFollow
-            When the path leads out of the workspace; the arm stands where it is.
+            The path leaves the workspace. The arm stops where it is.
         """
         change = dt / PAUSE_TIME_S
         self.pace = _towards(0.0 if self.paused else self.scaling, self.pace, change)
@@ -485,7 +485,7 @@ class Arm:
                 self._paths.clear()
                 self.qd = self.qdd = ZERO6
                 raise
-        if state.q != self.q:  # else the same object stays: readers recognise a resting arm by it
+        if state.q != self.q:  # keep the object of an arm at rest, by which readers recognise it
             self.q = state.q
         self.qd, self.qdd = (value if any(value) else ZERO6 for value in state[1:])
         self.still_s = 0.0 if any(self.qd) else self.still_s + dt
@@ -510,7 +510,7 @@ class Arm:
         self._follow([Stop(speed / deceleration)] if not self.at_rest else [])
 
     def _along(self, dt: float, before_rates: tuple[float, float]) -> JointState:
-        """Let path time pass, whose rates changed evenly in this cycle; return the new set-point."""
+        """Advance path time, whose speed changes linearly in this cycle; return the new set-point."""
         path = self._paths[0]
         others = not isinstance(path, Servo)
         if path is not self._planned:
@@ -530,7 +530,7 @@ class Arm:
         )
 
     def _lag(self, dt: float, before_qd: Vector6) -> None:
-        """Let the joints follow the set-point, and give way to the hand that pushes them."""
+        """Let the joints follow the set-point and a push of the operator."""
         if self.motion is None and self.qd is ZERO6 and before_qd is ZERO6 and self._off_rad is self.pushed_rad:
             self.actual_qd = ZERO6
             return
@@ -550,7 +550,7 @@ class Arm:
         self.actual_qd = vector6([v + push for v, push in zip(qd, pushed, strict=True)])
 
     def _yielded(self, left: float) -> Vector6:
-        """Return how far the joints are pushed off one cycle later."""
+        """Return the deflection of the joints after one cycle, rad."""
         before, goal = self._off_rad, self.pushed_rad
         after = vector6([g + (off - g) * left for off, g in zip(before, goal, strict=True)])
         return goal if max(abs(off - g) for off, g in zip(after, goal, strict=True)) < SETTLED_RAD else after
@@ -559,16 +559,16 @@ class Arm:
 def _followed(
     qd: Vector6, before: Vector6, target: Sequence[float], qdd: Sequence[float], t: float, lag_s: float
 ) -> list[float]:
-    """Return the speeds of joints that follow a set-point for a time.
+    """Return the speeds of joints that have followed a set-point for a time.
 
     Parameters
     ----------
     qd
-        Speeds of the joints before.
+        Initial joint speeds.
     before, target, qdd
-        Speeds of the set-point before and now, and its acceleration meanwhile.
+        Initial and final speeds of the set-point, and its acceleration.
     t, lag_s
-        The time, and the time constant with which they follow.
+        Duration, and time constant of the lag.
     """
     T, left = lag_s, math.exp(-t / lag_s)
     return [v - T * c + (own - old + T * c) * left for own, old, v, c in zip(qd, before, target, qdd, strict=True)]

@@ -1,4 +1,4 @@
-"""Control requests that act on the arm: the operator, other clients and the network."""
+"""Control requests that act on the arm, as the operator, other clients and the network do."""
 
 import math
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from ftmocks.ur.uploads import Upload, start_upload
 
 Request = dict[str, Any]
 Verb = Callable[[Request], dict[str, Any] | None]
-"""Carries out a request; returns what there is to report of it."""
+"""Executes a request, and returns the fields of its answer or None."""
 
 FOREIGN_PROGRAM_S = 5.0
 FOREIGN_SPEED_RAD_S = 0.3
@@ -25,12 +25,12 @@ SWING_LIMITS = ("speed_rad_s", "acceleration_rad_s2", "acceleration_m_s2")
 
 
 class Operator:
-    """Acts on the arm in place of the operator, of other clients and of the network.
+    """Acts on the arm like the operator, other clients and the network.
 
     Parameters
     ----------
     robot, server
-        The controller and its network side.
+        The controller and its TCP ports.
     """
 
     def __init__(self, robot: Robot, server: UrServer) -> None:
@@ -67,7 +67,7 @@ class Operator:
             "listen": self._listen,
             "claim-registers": self._claim_registers,
         }
-        """By the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
+        """Methods by the value of "do". A wrong request raises ValueError, TypeError or KeyError and does nothing."""
 
     def _mode(self, request: Request) -> dict[str, Any]:
         robot = self._robot

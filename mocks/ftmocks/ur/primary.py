@@ -1,4 +1,4 @@
-"""Wire format of the primary and the secondary interface (ports 30001, 30002): what the controller sends. No sockets.
+"""Wire format of the packages that the controller sends on ports 30001 and 30002. It uses no sockets.
 
 Every package starts with its size (int32, this field included) and its type (uint8): 16 is a robot state, a sequence
 of sub-packages with a size (uint32) and a type (uint8) each; 20 is a message with a timestamp (uint64), a source (int8)
@@ -45,7 +45,7 @@ BUILD_DATE = "24-03-2022, 12:00:00"
 ROBOT_STATE, ROBOT_MESSAGE, TOLERANCES = 16, 20, 24
 MODE_DATA, JOINT_DATA, CARTESIAN_INFO, KINEMATICS_INFO, CONFIGURATION_DATA = 0, 1, 4, 5, 6
 NOT_MODELLED = {2: 32, 3: 70, 7: 56, 8: 4, 9: 48, 10: 38, 11: 21, 12: 3}
-"""Other parts of a state, all zeros here: type and size of their content."""
+"""Sub-packages of a state that are filled with zeros: type, and size of the content."""
 TEXT, VERSION, SAFETY_MODE, ERROR_CODE, KEY, RUNTIME_EXCEPTION, UNEXPLAINED = 0, 3, 5, 6, 7, 10, 12
 FROM_CONTROLLER, FROM_PROGRAM = -2, -3
 NO_TIMESTAMP = 2**64 - 1
@@ -54,13 +54,13 @@ WARNING = 2
 
 ROBOT_TYPES = {"UR5": 1, "UR10": 2, "UR3": 3, "UR16": 4, "UR20": 7, "UR30": 8}
 SUB_TYPES = {False: 2, True: 3}
-"""Of a CB3 arm and of an e-Series one."""
+"""Sub-type of the robot for a CB3 arm and for an e-Series arm."""
 JOINT_ACCELERATION_RAD_S2 = 40.0
 DEFAULTS = (1.0471975511965976, 1.3962634015954636, 0.25, 1.2, 0.25)
-"""Joint speed and acceleration, tool speed and acceleration, radius of a joint: rad and m."""
+"""Default joint speed and acceleration, tool speed and acceleration, and radius of a joint, in rad, m and s."""
 
 COMPLIANCE = (0.15, 25.0, 0.0, 3.0, *[0.2] * 6, *[0.052359878] * 6, 0.0, 0.0, 0.0, 0.01745329, 0.001, 0.01)
-"""What package 24 of the log of 3.10 contains."""
+"""Content of package 24 in the log of version 3.10."""
 
 _MESSAGE = struct.Struct(">iBQbB")
 _EMERGENCY_BIT, _PROTECTIVE_BIT = 0x80, 0x04
@@ -72,16 +72,16 @@ COMMANDS: dict[str, Callable[[Robot], object]] = {
     "set robotmode run": Robot.brake_release,
     "set unlock protective stop": Robot.unlock,
 }
-"""Lines that are commands to the controller instead of programs."""
+"""Commands to the controller that are sent like programs."""
 
 
 def message(kind: int, payload: bytes, timestamp: int, source: int = FROM_CONTROLLER) -> bytes:
-    """Frame one message."""
+    """Return the package of a message."""
     return _MESSAGE.pack(_MESSAGE.size + len(payload), ROBOT_MESSAGE, timestamp, source, kind) + payload
 
 
 def greeting(robot: Robot) -> bytes:
-    """Return what a client receives first: version, message 12, tolerances, and a complete state."""
+    """Return the greeting: version, message 12, tolerances, and a complete state."""
     second = message(UNEXPLAINED, struct.pack(">iiB", 0, 0, 1), NO_TIMESTAMP)
     tolerances = struct.pack(">iB", 5 + 8 * len(COMPLIANCE), TOLERANCES) + _doubles(COMPLIANCE)
     return version_message(robot) + second + tolerances + state_package(robot, complete=True)
@@ -96,12 +96,12 @@ def version_message(robot: Robot) -> bytes:
 
 
 def read_only_error(robot: Robot) -> bytes:
-    """Return the answer to a program from a connection that can only read."""
+    """Return the answer to a program on a read-only connection."""
     return message(ERROR_CODE, struct.pack(">iiiII", READ_ONLY_CODE, 0, WARNING, 0, 0), _us(robot.timestamp_s))
 
 
 def messages_of(event: Event) -> bytes:
-    """Return what clients receive about an entry of the event log: messages, or nothing."""
+    """Return the messages that clients receive for an entry of the event log, possibly none."""
     at = _us(event.t_robot_s)
     word, _, name = event.what.partition(" ")
     if event.by == "safety":
@@ -131,7 +131,7 @@ def _key(title: str, text: str, timestamp: int) -> bytes:
 
 
 def _text(text: str) -> bytes:
-    """Return the bytes of a text that may quote a program, whose bytes are read one character each."""
+    """Return the bytes of a text that may quote a program, which was decoded as Latin-1."""
     return text.encode("latin-1", "replace")
 
 
@@ -140,7 +140,7 @@ def _us(seconds: float) -> int:
 
 
 def state_package(robot: Robot, *, complete: bool = False) -> bytes:
-    """Return the robot state; a complete one has kinematics and configuration."""
+    """Return the robot state. A complete state includes kinematics and configuration."""
     parts = {MODE_DATA: _mode_data(robot), JOINT_DATA: _joint_data(robot), CARTESIAN_INFO: _cartesian_info(robot)}
     if complete:
         if robot.reported_dh is not None:
@@ -154,7 +154,7 @@ def state_package(robot: Robot, *, complete: bool = False) -> bytes:
 def _mode_data(robot: Robot) -> bytes:
     bits = SAFETY_BITS[robot.safety_mode]
     flags = (
-        True,  # a real robot is connected, and enabled
+        True,  # real robot connected; real robot enabled
         True,
         robot.robot_mode in POWERED,
         bool(bits & _EMERGENCY_BIT),

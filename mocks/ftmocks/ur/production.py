@@ -1,14 +1,14 @@
-"""A production program on the pendant, which picks, places and touches without end, and writes down what is true.
+"""A production program on the pendant, which picks, places and touches repeatedly, and records the truth.
 
-The file has one JSON object a line, each with the state that holds from its time on: ``t_host_ns`` on the cell's clock,
-``event``, whether the tool is in ``contact``, ``part_kg``, ``bias`` (6,) with its drift, and ``truth`` as in the first
-line of the station, of tool and part as one. Events are start, contact, grasp, release, slip, free and end. Readings
-are later than this by the delay of the sensor.
+The file has one JSON object per line with the state from its time on: ``t_host_ns`` on the cell's clock, ``event``,
+whether the tool is in ``contact``, ``part_kg``, ``bias`` (6,) with its drift, and ``truth`` of tool and part together,
+as in the first line of the station. Events are start, contact, grasp, release, slip, free and end. Readings are later
+by the delay of the sensor.
 
 Between the sites, the wrist turns at random. A part is pressed against its support before it is grasped or released,
-and the support carries its weight meanwhile. The tool is in contact for about a third of the time.
+and the support then carries its weight. The tool is in contact for about a third of the time.
 
-Does not model: the closing gripper, the friction of contacts, springs.
+Not modelled: closing of the gripper, friction of contacts, springs.
 """
 
 import json
@@ -30,18 +30,18 @@ from ftmocks.ur.robot import Robot
 
 FORMAT = "mocks.production/1"
 SITES_DEG = {"pick": -35.0, "place": 35.0, "touch": 10.0}
-"""Turn of the first joint."""
+"""Angle of the first joint at each site."""
 WRIST_DEG = (50.0, 50.0, 90.0)
-"""How far the wrist turns between the sites, either way."""
+"""Largest rotation of the wrist joints between the sites, in both directions."""
 APPROACH_M = 0.05
 SPEED_RAD_S, ACCELERATION_RAD_S2 = (0.8, 1.6), 2.5
 SPEED_M_S, ACCELERATION_M_S2 = 0.15, 1.0
 PRESS_N, PRESS_S = (4.0, 20.0), (0.8, 2.0)
 RISE_S = 0.04
-"""In which a contact begins or ends."""
+"""Duration of the begin and the end of a contact."""
 GRASP_S = 0.2
 PART_M = 0.04
-"""Edge of a part, a cube."""
+"""Edge length of a part, a cube."""
 NO_PART = Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 Cycles = Generator[None, None, None]
@@ -49,20 +49,20 @@ Cycles = Generator[None, None, None]
 
 @dataclass(frozen=True)
 class Job:
-    """What the program does.
+    """Settings of the program.
 
     Parameters
     ----------
     file
-        Path for the truth; None for none.
+        Path of the file with the truth; None for no file.
     seed
-        Of parts, forces, times and turns.
+        Seed of parts, forces, times and rotations.
     parts_kg
         Smallest and largest mass of a part.
     contacts
-        Without them the tool moves as with them, and touches nothing.
+        Whether the tool touches anything. The motion is the same.
     slip_m
-        How far a part slips in the gripper while it is carried.
+        Distance by which a part slips in the gripper while it is carried.
     """
 
     file: str | None
@@ -78,12 +78,12 @@ class Job:
 
 
 class Production(ControllerProgram):
-    """The program; it starts where the arm stands, which is above its middle.
+    """The program, which starts at the current posture.
 
     Raises
     ------
     OSError
-        When the file cannot be written.
+        The file cannot be written.
     """
 
     def __init__(self, robot: Robot, job: Job) -> None:
@@ -102,12 +102,12 @@ class Production(ControllerProgram):
         self._steps = self._run()
 
     def step(self) -> bool:
-        """Run one control cycle; it never ends by itself."""
+        """Run one control cycle. The program never ends by itself."""
         next(self._steps)
         return True
 
     def close(self) -> None:
-        """End the program; a part stays in the gripper."""
+        """End the program. A part stays in the gripper."""
         self._steps.close()
         self._write("end")
 
@@ -173,12 +173,12 @@ class Production(ControllerProgram):
             self._hold("slip", self._part._replace(p_sensor_com_m=p_sensor_m), np.zeros(3))
 
     def _support_N(self, part: Body) -> Array:
-        """Return the force of a support that carries a part, (3,) in base axes."""
+        """Return the force (3,) of a support that carries a part, in base axes."""
         force_N: Array = -part.mass_kg * self._tool.gravity_m_s2
         return force_N
 
     def _drawn_press(self) -> Array:
-        """Draw the force of a support on the tool, (3,) in base axes: against the approach, and up to a third aside."""
+        """Draw the force (3,) of a support on the tool in base axes, with a lateral part of up to a third."""
         size_N, aside = self._rng.uniform(*PRESS_N), self._rng.uniform(-0.33, 0.33, 2)
         force_N: Array = forward(self._robot.arm.dh, self._robot.arm.q)[:3, :3] @ [*(size_N * aside), -size_N]
         return force_N
@@ -190,13 +190,13 @@ class Production(ControllerProgram):
         yield from self._wait(RISE_S)
 
     def _leave(self) -> None:
-        """Let the contact end while the arm retreats."""
+        """End the contact while the arm retreats."""
         contact = self._contact(np.zeros(3))
         self._world.touch(self.name, contact)
         self._write("free", later_s=contact.seconds)
 
     def _hold(self, event: str, part: Body, force_N: Array) -> None:
-        """Change the part in the gripper, and in the same moment the force of the contact."""
+        """Change the part in the gripper and the force of the contact at the same time."""
         self._part, self._force_N = part, force_N
         truth, robot = self._tool.holding(part), self._robot
         self._world.change_load(truth, self.name, self._contact(force_N))

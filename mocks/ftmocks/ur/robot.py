@@ -1,8 +1,8 @@
-"""The controller without its sockets: arm, modes, safety, program and registers, one step per control cycle.
+"""The controller without its sockets: arm, modes, safety, program and registers, advanced once per control cycle.
 
-Time: a cycle takes one control period on the cell's clock; the controller and its arm live through `time_scale` times
-as much in it (clock, motion, settling, the waiting times of the controller). The watchdog, which watches the client,
-keeps the cell's time, and so does the controller's clock when the arm's own sensor is the station's sensor.
+Time: a cycle takes one control period of the cell's clock, in which the time of the controller (clock, motion,
+settling, waiting times) advances by `time_scale` control periods. The watchdog of a client uses the cell's time, as
+does the controller's clock if the arm's own sensor is the sensor of the station.
 """
 
 import math
@@ -42,11 +42,11 @@ PROGRAM_START_S = 0.1
 POWER_STEP_S = 0.5
 COMMAND_REGISTERS = {"input_int_register_0", "input_int_register_24"}
 STOP_SCRIPT = 255
-"""The command in such a register that ends the control script."""
+"""Command in a register that ends the control script."""
 HAND_ACCELERATION_RAD_S2 = 1.5
 NO_ERROR: Array = np.zeros(6)
 INSTALLED_G_M_S2 = 9.82
-"""Gravity in an installation, wherever on earth."""
+"""Gravitational acceleration in an installation, which does not depend on the place."""
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,11 @@ class Limits:
     Parameters
     ----------
     dh
-        The real arm.
+        Kinematics of the real arm.
     joint_rad
-        Largest angle of any joint either way.
+        Largest absolute angle of each joint.
     plane
-        ``(nx, ny, nz, d)`` in base: flange, TCP and elbow must keep ``n · p >= d`` (m); None for no plane.
+        ``(nx, ny, nz, d)`` in the base: ``n · p >= d`` (m) for flange, TCP and elbow; None for no plane.
     """
 
     dh: Dh
@@ -68,7 +68,7 @@ class Limits:
     plane: tuple[float, float, float, float] | None = None
 
     def allow(self, q: Vector6, X_flange_tcp: Array) -> bool:
-        """Whether the arm may stand at `q`."""
+        """Return whether the arm may be at `q`."""
         if any(abs(v) > self.joint_rad for v in q):
             return False
         if self.plane is None:
@@ -92,11 +92,11 @@ class RobotSettings:
     tcp
         Active TCP at power-up as a UR pose, m and rad.
     gravity_m_s2
-        Of the installation, away from the earth: what its mounting implies, base axes.
+        (3,) negative gravitational acceleration in base axes, according to the mounting in the installation.
     unknown_outputs
-        RTDE outputs this controller answers with NOT_FOUND although its version knows them.
+        RTDE outputs that this controller reports as NOT_FOUND although its version has them.
     time_scale
-        How many times faster than real the physics runs.
+        Factor by which the physics is faster than real time.
     """
 
     model: str = "UR5e"
@@ -138,9 +138,9 @@ class Robot:
     Parameters
     ----------
     world
-        The shared truth; its `q` is written in every cycle. Its clock is the controller's.
+        The physical world, to which joint angles are written in every cycle, and whose clock is used.
     arm
-        None makes one that stands where the world has it.
+        The arm; None creates one at the joint angles of the world.
     """
 
     popup: str | None = None
@@ -158,38 +158,38 @@ class Robot:
         self._joint_noise = np.random.default_rng([world.seed, 9])
         self._wrist_drift = WarmUp(imperfections.wrist_drift_N, world.now_s)
         self.reported_dh: Dh | None = world.dh
-        """The kinematics that the primary interface sends; None for none."""
+        """Kinematics that the primary interface sends; None for none."""
         self.limits = Limits(world.dh, settings.joint_limit_rad, settings.plane)
         self.frequency_hz = 125 if settings.polyscope[0] <= 3 else 500
         self.period_s = 1.0 / self.frequency_hz
         self.cycle = 0
         self.cycle_s = world.now_s
-        """When the present cycle was due, on the cell's clock."""
+        """Time of the current cycle on the cell's clock."""
         self.runtime = Runtime.STOPPED
         self.robot_mode = RobotMode.RUNNING
         self.safety_mode = SafetyMode.NORMAL
         self.remote_switches = 0
-        """How often the pendant changed between local and remote control."""
-        self.loaded_program: str | None = None  # its path
+        """Number of changes between local and remote control at the pendant."""
+        self.loaded_program: str | None = None  # path of the program
         self.payload_kg = settings.payload_kg
         self.payload_cog_m = settings.payload_cog_m
         self.payload_inertia: Vector6 = ZERO6
         self.target_gravity_m_s2 = settings.gravity_m_s2
-        """What the controller takes for the acceleration away from the earth, base axes."""
+        """Negative gravitational acceleration that the controller assumes, in base axes."""
         self.tcp_offset = settings.tcp
         self.inputs: dict[str, Value] = {}
         self.output_ints = [0] * 48
         self.output_doubles = [0.0] * 48
         self.signals = Signals()
         self.events: list[Event] = []
-        """The event log, newest last: commands accepted and refused, program, safety, start and end of motion."""
+        """Event log: accepted and refused commands, program, safety, begin and end of motion. The newest is last."""
         self.hand: Iterator[None] | None = None
-        """The operator who guides the arm by hand; one `next` per control cycle."""
+        """The operator who guides the arm by hand. Each `next` is one control cycle."""
         self._remote_control = True
         self._reduced = False
         self._program: ControllerProgram | None = None
         self.wrist_sensor: Callable[[int], Array] | None = None
-        """Readings (n, 6) of a wrist sensor with bias and noise; without one `ft_raw_wrench` is exact."""
+        """Returns readings (n, 6) of a wrist sensor with bias and noise; if it is None, `ft_raw_wrench` is exact."""
         self._physical_s = self._stopped_at_s = self._watchdog_age_s = 0.0
         self._later: list[tuple[float, Callable[[], object]]] = []
         self._watchdog: tuple[str, float] | None = None
@@ -201,12 +201,12 @@ class Robot:
 
     @property
     def timestamp_s(self) -> float:
-        """Controller clock on the wire; it is the cell's clock where it stamps the samples of the station's sensor."""
+        """Time that the controller sends. If it stamps samples of the station's sensor, it is the cell's time."""
         scale = 1.0 if self.wrist_sensor else self.settings.time_scale
         return 100.0 + self.cycle * self.period_s * scale
 
     def tick(self, t_s: float | None = None) -> None:
-        """One control cycle, due at `t_s` of the cell's clock (None: now): program, then motion."""
+        """Run a control cycle at `t_s` of the cell's clock (None: now): first the program, then the motion."""
         self.cycle_s = self.clock.now_s() if t_s is None else t_s
         self.cycle += 1
         dt = self.period_s * self.settings.time_scale
@@ -236,7 +236,7 @@ class Robot:
         self._move_world(dt)
 
     def _move_world(self, dt: float) -> None:
-        """Let the world follow the arm, whose time runs `time_scale` times faster, and let its links ring."""
+        """Set the motion of the arm in the world, whose time is `time_scale` times slower, including ringing links."""
         begun_s, scale, motion, q = self.cycle_s, self.settings.time_scale, self.arm.motion, self.arm.actual_q
         ringing = self._ringing = self._ringing.after(dt, ZERO6 if motion is None else motion.at(0.0).qdd)
 
@@ -252,7 +252,7 @@ class Robot:
 
     @property
     def measured_q(self) -> Vector6:
-        """Joint angles that the controller reports as actual, rad: a new reading in every cycle."""
+        """Actual joint angles that the controller reports, rad, with new noise in every cycle."""
         sd_rad = self.world.imperfections.joint_noise_rad
         if not sd_rad:
             return self.arm.actual_q
@@ -267,12 +267,12 @@ class Robot:
         self.events.append(Event(self.clock.now_ns(), self.timestamp_s, by, what, accepted, why, detail))
 
     def _leaves_limits(self, before: Vector6) -> bool:
-        """Whether the last step crossed a safety limit outwards; a move back inside is allowed."""
+        """Return whether the last step crossed a safety limit outwards. A move back inside is allowed."""
         X = self.X_flange_tcp
         return not self.limits.allow(self.arm.q, X) and self.limits.allow(before, X)
 
     def _watch(self) -> None:
-        """Age the watchdog by a cycle; stop the program when its client has not written in time."""
+        """Advance the watchdog by a cycle; stop the program if its client has not written in time."""
         if self._watchdog is None or self.runtime != Runtime.PLAYING:
             return
         self._watchdog_age_s += self.period_s
@@ -300,7 +300,7 @@ class Robot:
 
     @property
     def obstacle(self) -> str | None:
-        """Why no program may start now; None when one may."""
+        """Reason why no program may start now, or None."""
         if self.robot_mode != RobotMode.RUNNING:
             return f"robot mode {self.robot_mode.name}"
         if self.safety_mode not in PERMITTED:
@@ -308,7 +308,7 @@ class Robot:
         return self.arm.obstacle
 
     def start_soon(self, program: ControllerProgram, *, by: str, obstacle: str | None, **detail: Any) -> bool:
-        """Start a program, which replaces the running one, unless an obstacle refuses it; return whether it starts."""
+        """Start a program, which replaces the running one, unless there is an obstacle; return whether it started."""
         self.note(by, f"program {program.name}", accepted=obstacle is None, why=obstacle or "", **detail)
         if obstacle is None:
             self.stop_program("replaced")
@@ -327,12 +327,12 @@ class Robot:
         self.note("program", f"started {program.name}")
 
     def crash(self, error: str) -> bool:
-        """End the program with a run-time error, which is logged with its place; return False when there was none."""
+        """End the program with a run-time error and log its position; return False if no program was running."""
         place = Place() if self._program is None else self._program.place
         return self.stop_program(f"run-time error: {error}", **error_at(place, error))
 
     def stop_program(self, reason: str, **detail: Any) -> bool:
-        """End the program; a moving arm comes to rest by itself. Return False when there was none."""
+        """End the program. A moving arm comes to rest. Return False if no program was running."""
         program, self._program = self._program, None
         if program is not None:
             program.close()
@@ -345,7 +345,7 @@ class Robot:
         return program is not None
 
     def pause(self, reason: str) -> bool:
-        """Hold the program where it is, and the arm on its path; False when no program plays."""
+        """Pause the program and hold the arm on its path; return False if no program plays."""
         if self.runtime != Runtime.PLAYING:
             return False
         self.runtime = Runtime.PAUSED
@@ -354,7 +354,7 @@ class Robot:
         return True
 
     def play(self) -> bool:
-        """Resume a paused program or start the loaded one; return False when neither is possible."""
+        """Resume a paused program or start the loaded one; return False if neither is possible."""
         if self.obstacle is not None:
             return False
         if self.runtime == Runtime.PAUSED:
@@ -369,7 +369,7 @@ class Robot:
 
     @property
     def hand_obstacle(self) -> str | None:
-        """Why the arm cannot be moved by hand now; None when it can."""
+        """Reason why the arm cannot be moved by hand now, or None."""
         return "a program plays" if self.runtime == Runtime.PLAYING else self.obstacle
 
     def hand_move(self, q: Vector6, speed_rad_s: float) -> None:
@@ -378,7 +378,7 @@ class Robot:
         Raises
         ------
         ValueError
-            When a program plays or the arm has no power.
+            A program plays, or the arm has no power.
         """
         if self.hand_obstacle:
             raise ValueError(f"the arm cannot be moved by hand: {self.hand_obstacle}")
@@ -391,7 +391,7 @@ class Robot:
             self.set_safety(SafetyMode.PROTECTIVE_STOP, reason)
 
     def unlock(self) -> bool:
-        """Leave the protective stop, with the program still paused; False when it is too early."""
+        """Leave the protective stop, while the program remains paused; return False if it is too early."""
         if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
             return True
         if self._physical_s - self._stopped_at_s < UNLOCK_AFTER_S:
@@ -409,7 +409,7 @@ class Robot:
                 self.play()
 
     def reduced_mode(self, on: bool) -> None:
-        """Switch to the reduced safety limits or back; programs continue."""
+        """Switch to reduced safety limits or back. Programs continue."""
         self._reduced = on
         if self.safety_mode in PERMITTED:
             self.set_safety(SafetyMode.NORMAL, "reduced limits" if on else "normal limits")
@@ -422,13 +422,13 @@ class Robot:
             self.set_safety(SafetyMode.NORMAL, "emergency stop released")
 
     def restart_safety(self) -> None:
-        """Restart the safety system after a violation or fault; the arm has no power then."""
+        """Restart the safety system after a violation or fault. The arm has no power afterwards."""
         if self.safety_mode in (SafetyMode.VIOLATION, SafetyMode.FAULT):
             self.set_safety(SafetyMode.NORMAL, "safety restarted")
             self.set_mode(RobotMode.POWER_OFF)
 
     def set_safety(self, mode: SafetyMode, reason: str) -> None:
-        """Enter a safety mode, with its effects on program and power; NORMAL means REDUCED when that is on."""
+        """Enter a safety mode, with its effects on program and power. In reduced mode, NORMAL means REDUCED."""
         if mode in PERMITTED:
             mode = SafetyMode.REDUCED if self._reduced else SafetyMode.NORMAL
         self.safety_mode = mode
@@ -444,7 +444,7 @@ class Robot:
             self.stop_program(mode.name)
 
     def set_mode(self, mode: RobotMode) -> None:
-        """Enter a robot mode; any but RUNNING ends the program, and loss of power cancels what was under way."""
+        """Enter a robot mode. Any mode except RUNNING ends the program, and a loss of power cancels pending changes."""
         if mode != RobotMode.RUNNING:
             self.stop_program(f"robot mode {mode.name}")
         if mode not in POWERED:
@@ -457,7 +457,7 @@ class Robot:
         self.set_mode(RobotMode.POWER_OFF)
 
     def power_on(self) -> bool:
-        """Go from off to idle, brakes closed; return False when safety does not allow it."""
+        """Change from off to idle, with closed brakes; return False if the safety mode does not allow it."""
         if self.safety_mode in POWERLESS:
             return False
         if self.robot_mode == RobotMode.POWER_OFF:
@@ -466,7 +466,7 @@ class Robot:
         return True
 
     def brake_release(self) -> bool:
-        """Go up to running from any mode; return False when safety does not allow it."""
+        """Change to running from any mode; return False if the safety mode does not allow it."""
         if not self.power_on():
             return False
         if self.robot_mode == RobotMode.POWER_ON:
@@ -476,7 +476,7 @@ class Robot:
         return True
 
     def set_watchdog(self, name: str, min_frequency_hz: float) -> None:
-        """Stop the program when input `name` is not written at least this often (Hz)."""
+        """Stop the program if input `name` is written at a lower rate than this, Hz."""
         if not min_frequency_hz > 0.0:
             raise ScriptError(f"rtde_set_watchdog: frequency {min_frequency_hz} must be positive")
         self._watchdog = (name, 1.0 / min_frequency_hz)
@@ -503,18 +503,18 @@ class Robot:
                 self.note("rtde", f"command {command}", accepted=False, why=why)
 
     def input_int(self, index: int) -> int:
-        """Present value of input_int_register_`index`."""
+        """Return the value of input_int_register_`index`."""
         value = self.inputs.get(f"input_int_register_{index}", 0)
         return value if isinstance(value, int) else 0
 
     def input_double(self, index: int) -> float:
-        """Present value of input_double_register_`index`."""
+        """Return the value of input_double_register_`index`."""
         value = self.inputs.get(f"input_double_register_{index}", 0.0)
         return value if isinstance(value, float) else 0.0
 
     @property
     def tcp_offset(self) -> Vector6:
-        """Active TCP as a UR pose in the flange frame, m and rad."""
+        """Pose of the active TCP in the flange as a UR pose, m and rad."""
         return self._tcp_offset
 
     @tcp_offset.setter
@@ -523,7 +523,7 @@ class Robot:
         self.X_flange_tcp = matrix_of(pose)
 
     def tcp_pose(self, which: str) -> Vector6:
-        """UR pose in base of the active TCP, at the "actual" joints or at their "target"."""
+        """Return the UR pose of the active TCP in the base, at the "actual" or the "target" joint angles."""
         q = self.measured_q if which == "actual" else self.arm.q
         known = self._poses.get(which)
         if known is None or known[0] is not q or known[1] is not self._tcp_offset:
@@ -532,7 +532,7 @@ class Robot:
         return known[2]
 
     def tcp_speed(self, which: str) -> Vector6:
-        """Velocity of the active TCP and angular velocity, m/s and rad/s, base axes."""
+        """Return velocity of the active TCP and angular velocity in base axes, m/s and rad/s."""
         arm = self.arm
         q, qd = (arm.actual_q, arm.actual_qd) if which == "actual" else (arm.q, arm.qd)
         if not any(qd):
@@ -543,14 +543,11 @@ class Robot:
 
     @property
     def steady(self) -> bool:
-        """Whether the set-point has stood still for half a second."""
+        """Whether the set-point has been at rest for 0.5 s."""
         return self.arm.still_s >= STEADY_AFTER_S
 
     def flange_wrench(self) -> Array:
-        """Return the wrench on the arm's own sensor, (6,): N and N·m, exerted on the flange, its axes and origin.
-
-        What hangs on the flange are the tool and the station's sensor.
-        """
+        """Return the wrench (6,) of tool and sensor on the arm's own sensor, in flange axes about the flange origin."""
         truth = self.world.truth
         world, t_s = self.world, self.cycle_s
         felt = world.load_wrench(t_s) + world.contact_wrench(t_s) + world.ripple_wrench(np.array([t_s]))[0]
@@ -560,7 +557,7 @@ class Robot:
         return wrench + self.wrist_error()
 
     def wrist_error(self) -> Array:
-        """Return what friction and drift add to the arm's own sensor, (6,), flange axes."""
+        """Return the error (6,) of the arm's own sensor due to friction and drift, in flange axes."""
         if not (self.world.imperfections.wrist_drift_N or self.arm.actual_qd[5]):
             return NO_ERROR
         turning = math.tanh(self.arm.actual_qd[5] / FRICTION_RAD_S)
@@ -569,7 +566,7 @@ class Robot:
         return error
 
     def raw_wrench(self) -> Vector6:
-        """ft_raw_wrench: a new reading in every cycle, flange axes."""
+        """Return ft_raw_wrench: a new reading in every cycle, in flange axes."""
         if self.wrist_sensor is None:
             return vector6(self.flange_wrench())
         if self._reading is None or self._reading[0] != self.cycle:
@@ -577,7 +574,7 @@ class Robot:
         return self._reading[1]
 
     def tcp_wrench(self) -> Vector6:
-        """actual_TCP_force: payload-compensated and zeroed, base axes, at the TCP, exerted on the tool."""
+        """Return actual_TCP_force: the wrench on the tool at the TCP in base axes, compensated for payload and zero."""
         world = self.world
         load, contact = world.load_wrench(self.cycle_s), world.contact_wrench(self.cycle_s)
         felt_now = (world.q, load, contact, self.wrist_error())
@@ -591,7 +588,7 @@ class Robot:
         return self._wrench[1]
 
     def zero_ft(self) -> None:
-        """zero_ftsensor: take the present reading as zero."""
+        """zero_ftsensor: use the current reading as zero."""
         self._ft_zero = self._compensated()
 
     def _compensated(self) -> Array:

@@ -1,4 +1,4 @@
-"""RTDE wire format, protocol version 2: packages, types and recipes. No sockets.
+"""RTDE wire format, protocol version 2: packages, types and recipes. It uses no sockets.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide". All numbers are big-endian.
 """
@@ -23,7 +23,7 @@ TYPES = {
     "VECTOR6INT32": "6i",
     "VECTOR6UINT32": "6I",
 }
-"""RTDE type name and its packing."""
+"""Packing by RTDE type name."""
 
 Number = bool | int | float
 Value = Number | Sequence[Number]
@@ -34,17 +34,17 @@ class RtdeError(Exception):
 
 
 def package(kind: int, payload: bytes = b"") -> bytes:
-    """Frame one package: size of everything, type, payload."""
+    """Return the bytes of a package: total size, type, payload."""
     return _HEADER.pack(_HEADER.size + len(payload), kind) + payload
 
 
 def take_packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
-    """Yield and remove every complete package (type, payload) at the start of `buffer`.
+    """Remove and yield every complete package (type, payload) at the start of `buffer`.
 
     Raises
     ------
     RtdeError
-        When a header announces a size smaller than itself: the stream cannot be followed any more.
+        The size in a header is smaller than the header, so that the next package cannot be found.
     """
     while len(buffer) >= _HEADER.size:
         size, kind = _HEADER.unpack_from(buffer)
@@ -58,17 +58,17 @@ def take_packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
 
 
 def names_in(text: bytes) -> list[str]:
-    """Variable names of a setup request; clients may leave a comma at the end."""
+    """Return the variable names of a set-up request, which may end with a comma."""
     return [name for name in text.decode("ascii", "replace").split(",") if name]
 
 
 class Recipe:
-    """The order and packing of the variables in one kind of data package.
+    """Order and packing of the variables in a data package.
 
     Parameters
     ----------
     names, types
-        Variables and their RTDE types, in order; NOT_FOUND and IN_USE make the recipe invalid.
+        Variables and their RTDE types in their order. NOT_FOUND and IN_USE make the recipe invalid.
     """
 
     def __init__(self, recipe_id: int, names: Sequence[str], types: Sequence[str]) -> None:
@@ -79,14 +79,14 @@ class Recipe:
         self._packing = struct.Struct(">" + "".join(TYPES[kind] for kind in types) if self.valid else ">")
         self._widths = [struct.Struct(">" + TYPES[kind]) for kind in types] if self.valid else []
         self.size = self._packing.size
-        """Bytes of one data payload behind the recipe id."""
+        """Number of bytes of a payload after the recipe id."""
 
     def answer(self) -> bytes:
-        """Payload of the reply to the setup request."""
+        """Return the payload of the reply to the set-up request."""
         return bytes([self.recipe_id]) + ",".join(self.types).encode("ascii")
 
     def pack(self, values: Sequence[Value]) -> bytes:
-        """Encode one data package, header included."""
+        """Return the bytes of a data package with its header."""
         flat: list[Number] = []
         for value in values:
             if isinstance(value, (bool, int, float)):
@@ -96,7 +96,7 @@ class Recipe:
         return package(DATA, bytes([self.recipe_id]) + self._packing.pack(*flat))
 
     def unpack(self, payload: bytes) -> dict[str, Value]:
-        """Decode the fields of a data payload (behind the recipe id, at least `size` bytes)."""
+        """Decode the fields of a payload of at least `size` bytes, which follows the recipe id."""
         fields: dict[str, Value] = {}
         offset = 0
         for name, width in zip(self.names, self._widths, strict=True):

@@ -1,4 +1,4 @@
-"""An RTDE client's connection: its recipes, its samples and their delay."""
+"""The connection of an RTDE client: recipes, samples and their delay."""
 
 import socket
 import struct
@@ -14,19 +14,19 @@ from ftmocks.ur.variables import INPUTS, OUTPUTS, Reader, output_type
 
 @dataclass
 class RtdeLink:
-    """What all RTDE clients of a controller share."""
+    """State that all RTDE clients of a controller share."""
 
     input_owners: dict[str, "RtdeClient"] = field(default_factory=dict)
     claimed: set[str] = field(default_factory=set)
-    """Input variables that a fieldbus holds, without those a client had before."""
+    """Input variables that a fieldbus owns, except those that a client owned before."""
     bad_inputs: list[str] = field(default_factory=list)
-    """Packages that break the protocol."""
+    """Descriptions of packages that violate the protocol."""
     delay_s: float = 0.0
-    """Time between the cycle in which a sample is taken and its sending."""
+    """Delay from the cycle of a sample to its sending, s."""
 
 
 class RtdeClient(Client):
-    """Port 30004: one output recipe, any number of input recipes."""
+    """A client of port 30004, with one output recipe and any number of input recipes."""
 
     kind = "rtde"
 
@@ -41,11 +41,11 @@ class RtdeClient(Client):
         self._inputs: list[rtde.Recipe] = []
         self._started = False
         self._outbox: deque[tuple[float, bytes]] = deque()
-        """Samples on their way, and when each is sent, on the cell's clock."""
+        """Samples that are waiting, with the time on the cell's clock at which each is sent."""
         self._last = b""
 
     def close(self, *, reset: bool = False) -> None:
-        """Close the connection; its input variables are free again."""
+        """Close the connection, which releases its input variables."""
         super().close(reset=reset)
         owned = [name for name, owner in self._link.input_owners.items() if owner is self]
         for name in owned:
@@ -61,7 +61,7 @@ class RtdeClient(Client):
             self.close()
 
     def sample(self) -> None:
-        """Take the outputs if this cycle is due; they are sent after the delay of the link."""
+        """Sample the outputs if this cycle is due. They are sent after the delay of the link."""
         if self._started and self.robot.cycle % self._every == 0 and self._outputs is not None:
             self._outbox.append((self.robot.cycle_s + self._link.delay_s, self._packed(self._outputs)))
 
@@ -69,11 +69,11 @@ class RtdeClient(Client):
         return outputs.pack([read(self.robot) for read in self._readers])
 
     def deliver(self, now_s: float) -> float | None:
-        """Send the samples that are due, without those a lagging client has no room for.
+        """Send the due samples, except those for which a lagging client has no room.
 
         Returns
         -------
-        Seconds until the next one is due, None when there is none.
+        Time until the next one is due, s; None if there is none.
         """
         while self._outbox and self._outbox[0][0] <= now_s:
             self._last = self._outbox.popleft()[1]
@@ -82,7 +82,7 @@ class RtdeClient(Client):
         return self._outbox[0][0] - now_s if self._outbox else None
 
     def repeat(self) -> None:
-        """Send the last sample again to a client that commands."""
+        """Send the last sample again to a client that sends commands."""
         if self._started and self._inputs and not self.lagging and self._outputs is not None:
             self._last = self._last or self._packed(self._outputs)
             self.send(self._last)

@@ -1,7 +1,7 @@
-"""A behavioural twin of the ur_rtde control script.
+"""A state machine with the behaviour of the control script of ur_rtde.
 
-The control script is recognised by its name and not interpreted: this twin runs instead, one step per control cycle,
-with the same loop, registers and blocking behaviour.
+The control script is recognised by its name and not interpreted. This state machine runs instead, one step per control
+cycle, with the same loop, registers and blocking behaviour.
 
 Source: the control script inside ur_rtde 1.6.5 (`ScriptClient.getScript()`), read for behaviour.
 """
@@ -16,30 +16,30 @@ from ftmocks.ur.motion import JointMove, LineMove, Path
 from ftmocks.ur.robot import STOP_SCRIPT, Robot
 
 NAME = "rtde_control"
-"""By which its upload is recognised."""
+"""Program name by which an upload is recognised."""
 READY, DONE = 1, 2
 REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, 66, 67, 68, 69, 70, 71})
-"""Commands executed in every cycle as long as the register holds their number."""
+"""Commands that are executed in every cycle while the register holds their number."""
 
 MOVING = {1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 33: "stopL", 34: "stopJ"}
 SETTING = {8: "zeroFtSensor", 17: "setPayload", 29: "setTcp", 31: "triggerProtectiveStop", 35: "setWatchdog"}
 SETTING |= {59: "setGravity", 65: "setTargetPayload", STOP_SCRIPT: "stopScript"}
 LOGGED = MOVING | SETTING
-"""Commands that enter the event log: those that move the arm or change a setting."""
+"""Commands that are logged, because they move the arm or change a setting."""
 
 Steps = Generator[None, None, None]
-"""A thread of a program: one `next()` is one control cycle."""
+"""A thread of a program. Each `next()` is one control cycle."""
 
 
 class ControlScript(ControllerProgram):
-    """Register machine with the behaviour of the ur_rtde control script.
+    """The state machine of the control script.
 
     Parameters
     ----------
     robot
-        The controller whose registers it reads and writes.
+        The controller whose registers are used.
     int_offset, double_offset
-        First general purpose registers in use.
+        Numbers of the first general-purpose registers.
     """
 
     reads_registers = True
@@ -85,17 +85,17 @@ class ControlScript(ControllerProgram):
         }
 
     def step(self) -> bool:
-        """One control cycle; False when the program has ended.
+        """Run one control cycle; return False if the program has ended.
 
         Raises
         ------
         ScriptError, MotionError
-            When the program stops with a run-time error.
+            The program ends with a run-time error.
         """
         for thread in [("main", self._main), *self._threads.items()]:
             name, steps = thread
             if name != "main" and self._threads.get(name) is not steps:
-                continue  # killed in this cycle
+                continue  # the thread was killed in this cycle
             try:
                 next(steps)
             except StopIteration:
@@ -105,7 +105,7 @@ class ControlScript(ControllerProgram):
         return True
 
     def close(self) -> None:
-        """End the program and its threads; a moving arm comes to rest."""
+        """End the program and its threads. A moving arm comes to rest."""
         for steps in (self._main, *self._threads.values()):
             steps.close()
         self._threads.clear()
@@ -142,7 +142,7 @@ class ControlScript(ControllerProgram):
             yield from steps
 
     def _accept(self) -> None:
-        """Ignore a setting that has no counterpart here."""
+        """Ignore a setting that is not modelled."""
 
     def _read_int(self, index: int) -> int:
         return self._robot.input_int(index + self._int_offset)
@@ -170,7 +170,7 @@ class ControlScript(ControllerProgram):
         self._write_vector(pose_of(X))
 
     def _report_async(self, progress: int) -> None:
-        """Output register 2: operation id, change counter, running bit and progress; -1 is the end, 0 a new start."""
+        """Return output register 2: operation id, change counter, running bit and progress (-1: end, 0: new start)."""
         self._writes = (self._writes + 1) % 128
         if progress == 0:
             self._operation = (self._operation + 1) % 128
@@ -223,7 +223,7 @@ class ControlScript(ControllerProgram):
         return True
 
     def _stop(self) -> Steps:
-        """Both stops: an asynchronous one is always linear, and so is every synchronous one after it."""
+        """Execute a stop. An asynchronous one is always linear, and so are all synchronous ones after it."""
         deceleration = self._read(0)
         if self._kill("stop"):
             self._report_async(-1)
@@ -250,7 +250,7 @@ class ControlScript(ControllerProgram):
 
     def _protective_stop(self) -> Steps:
         self._robot.protective_stop("requested by the program")
-        yield  # paused from here on: the command is not reported done
+        yield  # the program is paused here, so that the end of the command is not reported
 
     def _solve(self, qnear: Vector6) -> Vector6 | None:
         X_base_flange = matrix_of(self._vector(0)) @ inverse_matrix(self._robot.X_flange_tcp)
@@ -269,7 +269,7 @@ class ControlScript(ControllerProgram):
     def _set_payload(self) -> None:
         self._robot.payload_kg = self._read(0)
         cog = (self._read(1), self._read(2), self._read(3))
-        if any(cog):  # all zero keeps the old one: a special case of the script
+        if any(cog):  # the script keeps the old centre if all values are zero
             self._robot.payload_cog_m = cog
 
     def _set_target_payload(self) -> None:

@@ -1,6 +1,6 @@
-"""The controller's TCP ports on one loopback address, and the clock that drives them.
+"""The TCP ports of the controller on one loopback address, and its control cycles.
 
-One thread does everything: between two control cycles it waits for the sockets. Nothing needs a lock.
+A single thread runs the control cycles and waits for the sockets in between, so that no lock is needed.
 """
 
 import select
@@ -16,11 +16,11 @@ from ftmocks.ur.rtde_client import RtdeClient, RtdeLink
 
 PORTS = {30001: "primary", 30002: "secondary", 30003: "script", 30004: "rtde"}
 DASHBOARD_PORT = 29999
-"""Only before PolyScope X."""
+"""Port of the dashboard server, which PolyScope X does not have."""
 API_PORT = 30080
-"""Of the Robot API in place of port 80, which not every user may open. Only PolyScope X has it."""
+"""Port of the Robot API of PolyScope X, instead of port 80, which not every user may open."""
 KEEP_ALIVE_NS = 500_000_000
-"""While the cell's clock is held, clients that command the robot get the last sample again after so much real time.
+"""Interval at which clients with commands receive the last sample again while the cell's clock is held, ns.
 
 After 2.5 s without a sample ur_rtde reconnects, stops the running program and uploads it again.
 """
@@ -28,32 +28,32 @@ After 2.5 s without a sample ur_rtde reconnects, stops the running program and u
 Select = selectors.BaseSelector
 _KINDS: tuple[type[Client], ...] = (PrimaryClient, SecondaryClient, ScriptClient, DashboardClient, ApiClient)
 CLIENTS = {c.kind: c for c in _KINDS}
-"""Those without RTDE."""
+"""Classes of clients by kind, except RTDE."""
 
 
 def _ports_of(polyscope: tuple[int, int, int]) -> dict[int, str]:
-    """Return the ports that not every version has."""
+    """Return the ports that only some versions have."""
     if polyscope < (api.POLYSCOPE_X, 0, 0):
         return {DASHBOARD_PORT: "dashboard"}
     return {API_PORT: "api"} if polyscope[:2] >= min(api.API_VERSIONS) else {}
 
 
 class UrServer:
-    """The controller on the network.
+    """The TCP ports of a controller.
 
     Parameters
     ----------
     robot
         The controller behind the ports.
     host
-        Exact loopback address to listen on.
+        Loopback address on which the ports listen.
     selector
-        Where sockets wait; the data of every key is a callable without arguments.
+        Selector of the sockets. The data of every key is a callable without arguments.
 
     Raises
     ------
     OSError
-        When a port of `host` cannot be had.
+        A port of `host` is not available.
     """
 
     def __init__(self, robot: Robot, host: str, selector: Select) -> None:
@@ -61,9 +61,9 @@ class UrServer:
         self.host = host
         self.rtde = RtdeLink()
         self.frozen = False
-        """While true no cycle runs and no byte is read or sent, but connections stay."""
+        """If true, no cycle runs and no byte is read or sent, but connections stay open."""
         self.streaming = True
-        """While false RTDE clients are answered, but get no samples."""
+        """If false, RTDE clients are answered, but receive no samples."""
         self.ports = {**PORTS, **_ports_of(robot.settings.polyscope)}
         """Kind of client by port."""
         self._silent: set[str] = set()
@@ -96,7 +96,7 @@ class UrServer:
         try:
             connection, _peer = listener.accept()
         except OSError:
-            return  # gone again
+            return  # the client has closed the connection
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client: Client
@@ -123,14 +123,14 @@ class UrServer:
         self.robot.note(client.kind, "disconnected")
 
     def drop(self, kind: str, *, reset: bool = False) -> int:
-        """Disconnect all clients of a kind (see `ports`); the port still listens."""
+        """Disconnect all clients of a kind, see `ports`. The port still listens."""
         clients = self._of_kind(kind)
         for client in clients:
             client.close(reset=reset)
         return len(clients)
 
     def set_listening(self, kind: str, on: bool) -> None:
-        """Open or close the ports of a kind; open connections stay."""
+        """Open or close the ports of a kind. Existing connections stay open."""
         self._of_kind(kind)
         for port in [port for port, its_kind in self.ports.items() if its_kind == kind]:
             if on and port not in self._listeners:
@@ -139,7 +139,7 @@ class UrServer:
                 self._close_listener(port)
 
     def set_silent(self, kind: str, on: bool) -> None:
-        """While on, accept clients of a kind without reading or sending; afterwards serve what has waited."""
+        """Accept clients of a kind without reading or sending while this is on. They are served afterwards."""
         clients = self._of_kind(kind)
         if on and kind not in self._silent:
             self._silent.add(kind)
@@ -182,7 +182,7 @@ class UrServer:
                     key.data()
 
     def _ready(self, time_out_s: float) -> list[selectors.SelectorKey]:
-        """Wait for the network and the control channel; while frozen only for the latter, as sockets stay unread."""
+        """Wait for the sockets and the control channel; while frozen only for the control channel."""
         if not self.frozen:
             return [key for key, _events in self._selector.select(time_out_s)]
         keys = self._selector.get_map().values()
@@ -206,7 +206,7 @@ class UrServer:
                 client.sample()
 
     def _deliver(self, now_s: float) -> list[float]:
-        """Send the samples that are due; return the seconds until others are."""
+        """Send the due samples; return the time until the next one, s."""
         waits_s = [client.deliver(now_s) for client in self._rtde_clients]
         return [wait_s for wait_s in waits_s if wait_s is not None]
 

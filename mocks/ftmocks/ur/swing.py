@@ -1,4 +1,4 @@
-"""A program of the operator that swings the arm without a rest, for tests of a moving sensor."""
+"""A program of the operator that swings the arm continuously, for tests of a moving sensor."""
 
 import math
 from collections.abc import Generator
@@ -15,9 +15,9 @@ ACCELERATION_RAD_S2 = 2.0
 ACCELERATION_M_S2 = 2.0
 
 TURNING = ((3, 1, 1.0), (4, 2, 0.4), (5, 3, 0.3))
-"""Sweeps that turn the flange: index of the joint, swings per period, share."""
+"""Oscillations that rotate the flange: index of the joint, cycles per period, relative amplitude."""
 LIFTING = ((1, 2, 1.0), (3, 2, -1.0), (2, 3, 0.5), (3, 3, -0.5))
-"""Sweeps that move it and leave its orientation, because joint 4 turns back."""
+"""Oscillations that translate the flange with constant orientation, because joint 4 compensates the rotation."""
 
 PHASES = 120
 TRIALS = 60
@@ -25,23 +25,23 @@ TOLERANCE = 1e-3
 
 
 class Swing:
-    """A path on which each joint swings about a middle, from rest at an end of its swing and back to there.
+    """A path on which each joint oscillates, beginning and ending at rest at one end of the oscillation.
 
     Parameters
     ----------
     dh
-        The real arm.
+        Kinematics of the real arm.
     q
-        Where it starts, rad.
+        Joint angles at the start, rad.
     speed_rad_s, acceleration_rad_s2, acceleration_m_s2
-        Largest angular speed, angular acceleration and acceleration of the flange's origin on the path.
+        Largest angular speed, angular acceleration and linear acceleration of the flange on the path.
     seconds
-        At least so long, in whole periods.
+        Shortest duration. It is extended to whole periods.
 
     Raises
     ------
     ValueError
-        When no swing reaches all three, or a joint would be too fast.
+        No oscillation reaches all three values, or a joint would be too fast.
     """
 
     real_time = False
@@ -107,18 +107,18 @@ class Swing:
 
 
 class SwingProgram(ControllerProgram):
-    """The program on the pendant that follows a `Swing`, as the controller runs programs."""
+    """The program on the pendant that follows a `Swing`."""
 
     def __init__(self, robot: Robot, swing: Swing) -> None:
         super().__init__("swing")
         self._steps = self._run(robot, swing)
 
     def step(self) -> bool:
-        """Run one control cycle; return False when the program has ended."""
+        """Run one control cycle; return False if the program has ended."""
         return next(self._steps, "ended") is None
 
     def close(self) -> None:
-        """End the program; a moving arm comes to rest."""
+        """End the program. A moving arm comes to rest."""
         self._steps.close()
 
     def _run(self, robot: Robot, swing: Swing) -> Generator[None, None, None]:

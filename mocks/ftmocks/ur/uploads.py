@@ -1,6 +1,6 @@
-"""Programs that clients upload: found in the bytes of a port, compiled and started.
+"""Programs that clients upload: they are found in the received bytes, compiled and started.
 
-The control script of ur_rtde is not interpreted: its twin runs instead. Any other program is run as it stands.
+The control script of ur_rtde is replaced by a state machine with its behaviour. Any other program is interpreted.
 """
 
 import re
@@ -16,14 +16,14 @@ from ftmocks.ur.urscript.syntax import UrscriptSyntaxError
 
 @dataclass(frozen=True)
 class Upload:
-    """One program of a client."""
+    """A program of a client."""
 
     name: str
     text: str
     secondary: bool
 
     def register_offset(self, kind: str) -> int:
-        """First register of `kind` (int or float) that the control script uses: 0 or 24."""
+        """Return the first register of `kind` (int or float) that the control script uses: 0 or 24."""
         found = re.search(rf"# {kind} register offset\s*\n(\d+)", self.text)
         return int(found.group(1)) if found else 0
 
@@ -35,9 +35,9 @@ class Upload:
 
 
 def take_uploads(buffer: bytearray) -> list[Upload]:
-    """Remove every complete program from `buffer`.
+    """Remove and return all complete programs from `buffer`.
 
-    A program reaches from ``def`` or ``sec`` to the first ``end`` in column 0; a line of its own outside of one is a
+    A program extends from ``def`` or ``sec`` to the first ``end`` in column 0. A line outside of such a block is a
     program too.
     """
     uploads: list[Upload] = []
@@ -59,7 +59,7 @@ def take_uploads(buffer: bytearray) -> list[Upload]:
 
 
 def start_upload(robot: Robot, upload: Upload, *, by: str = "script port") -> bool:
-    """Start a program from a client, which replaces the running one; return False when it is refused."""
+    """Start a program of a client, which replaces the running one; return False if it is refused."""
     if upload.secondary:
         robot.note(by, f"secondary program {upload.name}", accepted=False, why="not interpreted")
         return False

@@ -1,4 +1,4 @@
-"""The RTDE variables: names, types and sources.
+"""RTDE variables: names, types, and functions that read or write them.
 
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", tables of controller outputs and inputs.
 """
@@ -16,7 +16,7 @@ Reader = Callable[[Robot], Value]
 
 
 def _status_bits(robot: Robot) -> int:
-    """Bit 0 power on, bit 1 program running, bit 3 power button pressed."""
+    """Return the robot status bits: bit 0 power on, bit 1 program running, bit 3 power button pressed."""
     return int(robot.robot_mode in POWERED) | (robot.runtime == Runtime.PLAYING) << 1
 
 
@@ -25,7 +25,7 @@ def _joint_mode(robot: Robot) -> Value:
 
 
 def _accelerometer(robot: Robot) -> Value:
-    """Return what a tool accelerometer measures at rest: the support against gravity, tool axes."""
+    """Return the reading (3,) of the tool accelerometer at rest, in tool axes: the negative gravity."""
     R_base_flange = forward(robot.arm.dh, robot.world.q)[:3, :3]
     x, y, z = (-R_base_flange.T @ robot.world.truth.gravity_m_s2).tolist()
     return (x, y, z)
@@ -85,7 +85,7 @@ OUTPUTS: dict[str, tuple[str, Reader]] = {
     "output_bit_registers0_to_31": ("UINT32", lambda r: r.signals.registers & 0xFFFFFFFF),
     "output_bit_registers32_to_63": ("UINT32", lambda r: r.signals.registers >> 32 & 0xFFFFFFFF),
 }
-"""Output name -> RTDE type and reader."""
+"""RTDE type and reading function of each output."""
 
 
 def _register_readers() -> None:
@@ -116,7 +116,7 @@ _SINCE: dict[str, dict[int, tuple[int, int]]] = {
     "actual_current_as_torque": {5: (23, 0), 10: (10, 0)},
     "target_gravity": {5: (26, 0), 10: (13, 0)},
 }
-"""First minor version and bug fix of each major one that knows an output.
+"""First minor and bug-fix version with an output, by major version.
 
 `target_gravity` follows a maintainer of Universal Robots' client library (its pull request 420). PolyScope X has what
 the PolyScope 5 of the same time has: 10.10 came with 5.23. That 10.13 came with 5.26 is assumed.
@@ -139,11 +139,11 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(48)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(48)},
 }
-"""Input name -> RTDE type."""
+"""RTDE type of each input."""
 
 
 def output_type(robot: Robot, name: str) -> str:
-    """RTDE type of an output in the robot's software version, or NOT_FOUND."""
+    """Return the RTDE type of an output in the software version of the robot, or NOT_FOUND."""
     if name not in OUTPUTS or name in robot.settings.unknown_outputs:
         return "NOT_FOUND"
     major, *release = robot.settings.polyscope
