@@ -389,7 +389,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
         instead = "" if found is None else f", found {found!r}"
         raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
     if unknown := sorted(document.keys() - SECTIONS.keys()):
-        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: {_known(unknown[0], 'sections', SECTIONS)}")
+        raise ConfigError(f"{path}: unknown section [{unknown[0]}]: {_suggestion(unknown[0], 'sections', SECTIONS)}")
     values: dict[str, Setting] = {}
     for section, content in document.items():
         if not isinstance(content, dict):
@@ -398,7 +398,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
             )
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
-                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_known(key, 'keys', _names(section))}")
+                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_suggestion(key, 'keys', _key_names(section))}")
             values[f"{section}.{key}"] = Setting(check_value(str(path), f"{section}.{key}", value), str(path))
     return values
 
@@ -418,16 +418,16 @@ def _from_environment() -> dict[str, Setting]:
     names = {variable(key): key for key in _KEYS}
     for name, text in os.environ.items():
         if name in names:
-            values[names[name]] = Setting(check_value(name, names[name], _parsed(name, names[name], text)), name)
+            values[names[name]] = Setting(check_value(name, names[name], _parse_variable(name, names[name], text)), name)
             continue
         for section in SECTIONS:
             if name.startswith(start := variable(section) + "_"):
-                known = _known(name.removeprefix(start).lower(), "keys", _names(section))
+                known = _suggestion(name.removeprefix(start).lower(), "keys", _key_names(section))
                 raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset it")
     return values
 
 
-def _parsed(name: str, key: str, text: str) -> Any:
+def _parse_variable(name: str, key: str, text: str) -> Any:
     """Read a text as it is, and everything else as a file has it."""
     if not text:
         raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
@@ -440,11 +440,11 @@ def _parsed(name: str, key: str, text: str) -> Any:
     return document["value"] if document.keys() == {"value"} else text
 
 
-def _names(section: str) -> list[str]:
+def _key_names(section: str) -> list[str]:
     return [item.name for item in fields(SECTIONS[section])]
 
 
-def _known(unknown: str, kind: str, names: Iterable[str]) -> str:
+def _suggestion(unknown: str, kind: str, names: Iterable[str]) -> str:
     near = get_close_matches(unknown, names, 1)
     return f"{f'did you mean {near[0]}? ' if near else ''}the {kind} are {', '.join(names)}"
 

@@ -36,7 +36,7 @@ def number(what: str, text: str, units: Mapping[str, str]) -> float:
     The first of `units`, which have factors, is that of the result and of a number alone. Raises `ConfigError` for what
     is not a number, or has a comma that may separate thousands.
     """
-    value = _read(what, text, units)
+    value = _parse_value(what, text, units)
     if value is None:
         unit, *others = units
         raise ConfigError(
@@ -49,7 +49,7 @@ def number(what: str, text: str, units: Mapping[str, str]) -> float:
 def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
     """Read lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `number`."""
     parts = _BETWEEN.split(_BEFORE_UNIT.sub("", text.strip()))
-    values = [_read(what, part, MM) for part in parts]
+    values = [_parse_value(what, part, MM) for part in parts]
     found = [value for value in values if value is not None]
     if len(found) != len(values) or len(values) not in counts:
         wanted = " or ".join(map(str, counts))
@@ -89,7 +89,7 @@ def side_of(plane_mm: Sequence[float]) -> str:
     return f"{side} {0.0 - offset_mm:g} mm" if side and offset_mm <= 0 else ""
 
 
-def _read(what: str, text: str, units: Mapping[str, str]) -> float | None:
+def _parse_value(what: str, text: str, units: Mapping[str, str]) -> float | None:
     found = _NUMBER.fullmatch(text.strip().lower().replace("−", "-"))
     if found is None or (found[2] and found[2] not in units):
         return None

@@ -69,7 +69,7 @@ class Question:
         return self.option[2:].replace("-", "_")
 
 
-def _text(_: str, text: str) -> str:
+def _stripped(_: str, text: str) -> str:
     return text.strip()
 
 
@@ -78,12 +78,12 @@ def _in(units: Mapping[str, str]) -> Callable[[str, str], float]:
 
 
 QUESTIONS: Final = (
-    Question(ROBOT, "Robot address", "name or IPv4 address of the controller", _text, in_force=True),
-    Question(MODEL, "Model of the arm", "such as ur5e", _text, in_force=True, choices=tuple(MODELS)),
-    Question(SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _text, in_force=True),
+    Question(ROBOT, "Robot address", "name or IPv4 address of the controller", _stripped, in_force=True),
+    Question(MODEL, "Model of the arm", "such as ur5e", _stripped, in_force=True, choices=tuple(MODELS)),
+    Question(SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _stripped, in_force=True),
     Question("sensor.height_mm", "Sensor height", "above the flange face, mm, measure it", _in(MM)),
     Question("sensor.mass_kg", "Sensor mass", "with its adapter, kg, from scale or data sheet", _in(KG), ""),
-    Question("tool.name", "Name of the tool", "results are found by it", _text, in_force=True),
+    Question("tool.name", "Name of the tool", "results are found by it", _stripped, in_force=True),
     Question(
         TOOL,
         "Cylinder of sensor and tool",
@@ -97,7 +97,7 @@ QUESTIONS: Final = (
         "workcell.mounting",
         "Mounting",
         "floor, wall, ceiling, or degrees that the base leans to its -x",
-        _text,
+        _stripped,
         "floor",
         in_force=True,
         choices=("floor", "wall", "ceiling"),

@@ -388,7 +388,7 @@ def check_push(
     flange = None if R_flange_sensor is None else R_flange_sensor @ change
     base = None if flange is None or R_base_flange is None else R_base_flange @ flange
     moved = {
-        frame: None if force is None else {"force_N": force.tolist(), "axis": _axis(force)}
+        frame: None if force is None else {"force_N": force.tolist(), "axis": _largest_axis(force)}
         for frame, force in (("sensor", change), ("flange", flange), ("base", base))
     }
     words = ", ".join(f"{frame} {'unknown' if it is None else it['axis']}" for frame, it in moved.items())
@@ -407,6 +407,6 @@ def check_push(
     return Check("push.sign", "ok", found), moved
 
 
-def _axis(force: Array) -> str:
+def _largest_axis(force: Array) -> str:
     i = int(np.argmax(np.abs(force)))
     return ("-" if force[i] < 0 else "+") + "XYZ"[i]

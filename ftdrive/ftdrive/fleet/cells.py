@@ -56,7 +56,7 @@ def read_cells(path: Path) -> list[StoredCell]:
     if unknown or not isinstance(cells, Mapping) or not cells:
         what = f"the key {unknown[0]} is unknown" if unknown else "no cell is listed"
         raise ConfigError(f"{path}: {what}: write a table [cells.NAME] for each cell")
-    return [_cell(path, name, table) for name, table in cells.items()]
+    return [_parse_cell(path, name, table) for name, table in cells.items()]
 
 
 def refuse_variables() -> None:
@@ -93,7 +93,7 @@ class Owners:
         return by_serial or (self._by_host.get(result.robot_host) if result.robot_host else None)
 
 
-def _cell(path: Path, name: str, table: Any) -> StoredCell:
+def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     place = f"{path}: [cells.{name}]"
     if not _NAME.fullmatch(name):
         raise ConfigError(f"{place} is no name of a cell: use up to 40 letters, digits, '-', '_' and '.'")
@@ -175,7 +175,7 @@ class Observed:
         for check in recent:
             checks.setdefault(check.calibration_id, []).append(check)
         known = [one for found in results.values() for one in found if one.id in checks]
-        changes = {one.id: found for one in known if (found := _changes(one, checks[one.id])) is not None}
+        changes = {one.id: found for one in known if (found := _bias_changes(one, checks[one.id])) is not None}
         last = {(owners.cell_of(one), one.tool, one.emulated): one for one in weighings}
         return cls(tuple(cells), results, checks, changes, last, now)
 
@@ -194,7 +194,7 @@ class Observed:
                 yield one
 
 
-def _changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Changes | None:
+def _bias_changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Changes | None:
     """Return how the bias has changed since a calibration; None if no verification has this."""
     start = when(result)
     rows = [

@@ -23,7 +23,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     rows = []
     for state in fleet.cells:
         changes = observed.changes.get(state.calibration_id or "")
-        drawn = "" if changes is None or state.calibrated is None else _plot(changes, state.calibrated, observed.now)
+        drawn = "" if changes is None or state.calibrated is None else _bias_plot(changes, state.calibrated, observed.now)
         drift = "-" if state.drift is None else f"{state.drift.level_sigmas:.1f} σ"
         rows.append({"state": state, "plot": Markup(drawn), "drift": drift, **times_in_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(
@@ -37,7 +37,7 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     )
 
 
-def _plot(changes: Changes, start: datetime, now: datetime) -> str:
+def _bias_plot(changes: Changes, start: datetime, now: datetime) -> str:
     """Draw the changes of the six biases over the last 90 days as SVG, in sigmas of each verification.
 
     Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.

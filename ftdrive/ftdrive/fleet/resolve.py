@@ -175,14 +175,14 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
     except (BadCalibration, OSError) as error:
         return describe_error(error)
     finding = None if new.verdict == "good" else new.findings[0]
-    if old is None or _data_of(old) != _data_of(new):
+    if old is None or _data_hash(old) != _data_hash(new):
         return Comparison(None, new.verdict, finding, PARAMETER_NAMES[0], 0.0)
     change = difference(old, new).in_sigmas
     most = int(np.argmax(np.abs(change)))
     return Comparison(old.verdict, new.verdict, finding, PARAMETER_NAMES[most], float(change[most]))
 
 
-def _data_of(result: CalibrationResult) -> object:
+def _data_hash(result: CalibrationResult) -> object:
     """Return the hash of the poses, or of the recording in motion, from which a result was made."""
     return result.provenance.get("dataset_sha256") or result.provenance.get("recording_sha256")
 

@@ -37,11 +37,11 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     """Return the state of what was read; the store is asked for verifications older than that."""
     states = list[CellState]()
     for cell in observed.cells:
-        found = [_state(cell, one, observed, store) for one in observed.newest(cell)]
+        found = [_cell_state(cell, one, observed, store) for one in observed.newest(cell)]
         if not found or cell.tool not in {None, *(one.tool for one in found)}:
             found.append(CellState(cell.name, cell.tool, cell.arm_serial))
         states += sorted(found, key=lambda one: one.tool or "")
-    return Fleet(tuple(states), _findings(observed, states))
+    return Fleet(tuple(states), _fleet_findings(observed, states))
 
 
 def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
@@ -66,7 +66,7 @@ def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
     return BiasDrift(level, found=True, words=words)
 
 
-def _state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
+def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
     check: VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
     if check is None and calibrated < observed.now - WINDOW:  # its verifications may be too old to be read with it
@@ -115,7 +115,7 @@ MANY_WEIGHINGS: Final = 10
 RECENT: Final = timedelta(days=3)
 
 
-def _findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
+def _fleet_findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
     newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
     return (
         *_overdue(states, observed),
@@ -228,14 +228,14 @@ def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFindi
     tools = dict[str, list[_Load]]()
     for cell, one in newest:
         if one.tool is not None and one.payload_kg is not None and one.mass_kg > 0:
-            tools.setdefault(one.tool, []).append(_load(cell, one, one.payload_kg))
+            tools.setdefault(one.tool, []).append(_tool_load(cell, one, one.payload_kg))
     for tool, loads in tools.items():
         if len(loads) > 1:
             yield from _centre(tool, loads)
-            yield from _mass(tool, loads)
+            yield from _mass_findings(tool, loads)
 
 
-def _load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
+def _tool_load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
     """Sensor and adapter drop out of the moment about the axis, whatever their mass and height."""
     R, covariance = one.parameters.R_flange_sensor, one.covariance
     arm_m = R @ one.parameters.p_sensor_com_m
@@ -265,7 +265,7 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     )
 
 
-def _mass(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
+def _mass_findings(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     mass_kg = float(np.median([one.mass_kg for one in loads]))
     wrong = []
     for one in loads:
@@ -309,7 +309,7 @@ FEWEST: Final = 8
 
 
 @dataclass(slots=True, eq=False)
-class _Sums:
+class _SensorSums:
     """Sums over the calibrations of one sensor, (6,) each, and its cells."""
 
     cells: set[str]
@@ -321,7 +321,7 @@ class _Sums:
 
 def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
     """Yield the models of which two sensors or more follow their temperature."""
-    models = dict[str, dict[str, _Sums]]()
+    models = dict[str, dict[str, _SensorSums]]()
     for cell in observed.cells:
         for result in observed.results[cell.name]:
             changes = observed.changes.get(result.id)
@@ -331,12 +331,12 @@ def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
         yield from _finding(model, sensors)
 
 
-def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: Changes) -> None:
+def _add(sensors: dict[str, _SensorSums], serial: str, cell: str, changes: Changes) -> None:
     changes = changes[np.isfinite(changes["temperature_C"])]
     T = changes["temperature_C"]
     if not spans_temperature(T, FEWEST):
         return
-    found = sensors.setdefault(serial, _Sums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
+    found = sensors.setdefault(serial, _SensorSums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
     found.cells.add(cell)
     found.dof += len(T) - 3
     weight = 1 / changes["sigma"].T  # (6, n)
@@ -350,7 +350,7 @@ def _add(sensors: dict[str, _Sums], serial: str, cell: str, changes: Changes) ->
     found.yy += np.sum(y * y, axis=1)
 
 
-def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]:
+def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFinding]:
     following = {
         serial: sums for serial, sums in sorted(sensors.items()) if _p_values(sums).min() < SURE_OF_TEMPERATURE
     }
@@ -372,7 +372,7 @@ def _finding(model: str, sensors: Mapping[str, _Sums]) -> Iterator[FleetFinding]
     )
 
 
-def _p_values(sums: _Sums) -> Array:
+def _p_values(sums: _SensorSums) -> Array:
     """Return p of each component (6,): the larger of those against the stated sigmas and against the scatter."""
     usable = sums.xx > 0
     chi2 = np.where(usable, sums.xy**2 / np.where(usable, sums.xx, 1.0), 0.0)

@@ -62,12 +62,12 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     poses = arm.frames([step.q_rad for step in shown])
     before = np.reshape(np.asarray(way_rad, dtype=np.float64), (-1, 6))[:-1]
     there = _skeletons(arm.frames(before)) if len(before) else np.zeros((0, 7, 3))
-    limits = _limits(plan, poses, there.reshape(-1, 3), scene)
+    limits = _view_corners(plan, poses, there.reshape(-1, 3), scene)
     rows = 1 if plan.sweep is None else 2
     figure = Figure(figsize=(12, 4.9 + 2.6 * (rows - 1)), layout="constrained")
     grid = figure.add_gridspec(rows, 3, height_ratios=[4.9, 2.6][:rows])
     if plan.sweep is not None:
-        _joints(figure.add_subplot(grid[1, :]), plan.sweep)
+        _plot_joints(figure.add_subplot(grid[1, :]), plan.sweep)
     for column, (across, up, title) in enumerate(VIEWS):
         axes = figure.add_subplot(grid[0, column])
         view = [across, up]
@@ -92,7 +92,7 @@ def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) 
     write_new(path, picture.getvalue())
 
 
-def _joints(axes: Any, sweep: Sweep) -> None:
+def _plot_joints(axes: Any, sweep: Sweep) -> None:
     t_s = np.linspace(0.0, sweep.duration_s, 400)
     q_deg = np.degrees(sweep.at(t_s))
     for joint in WRISTS:
@@ -114,7 +114,7 @@ def _title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
     lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")
     if on_its_way:
         lines.append("green: the present posture, and the approach to the first pose")
-    if slanting := sum(not _drawn(plane) for plane in certifier.scene.planes):
+    if slanting := sum(not _is_in_view(plane) for plane in certifier.scene.planes):
         lines.append(f"not drawn: slanting planes ({slanting})")
     return "\n".join(lines)
 
@@ -141,13 +141,13 @@ def _rims(part: Cylinder) -> Array:
     return np.concatenate([np.stack([x, y, np.full_like(x, z)], axis=1) for z in (part.from_m, part.to_m)])
 
 
-def _limits(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
+def _view_corners(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
     """Low and high corner (2, 3) of what is looked at: the arm, the ball, and of the surroundings what is near."""
     centre = np.array(plan.ball_centre_m)
     points = np.concatenate([_skeletons(poses).reshape(-1, 3), before, [centre - plan.ball_m, centre + plan.ball_m]])
     low, high = points.min(axis=0) - _NEAR_M, points.max(axis=0) + _NEAR_M
     around = [np.array(corner) for box in scene.boxes for corner in (box.low_m, box.high_m)]
-    around += [plane.offset_m * np.array(plane.normal) for plane in scene.planes if _drawn(plane)]
+    around += [plane.offset_m * np.array(plane.normal) for plane in scene.planes if _is_in_view(plane)]
     points = np.concatenate([points, np.clip(np.reshape(around, (-1, 3)), low, high)])
     return np.array([points.min(axis=0) - _EDGE_M, points.max(axis=0) + _EDGE_M])
 
@@ -169,7 +169,7 @@ def _surroundings(axes: Any, scene: Scene, view: list[int]) -> None:
             axes.plot(*edge.T, color="tab:red", linewidth=1.5)
 
 
-def _drawn(plane: Plane) -> bool:
+def _is_in_view(plane: Plane) -> bool:
     return any(_seen(plane, [across, up]) for across, up, _ in VIEWS)
 
 

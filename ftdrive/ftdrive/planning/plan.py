@@ -170,7 +170,7 @@ class Plan(Displayed):
         """
         still = ", ".join(f"{angle:.0f}" for angle in np.degrees(self.steps[0].q_rad[:3]))
         rest = [f"Base, shoulder and elbow stay at {still} degrees."] if self.arm_rests else []
-        rows = _table(self) if self.sweep is None else _sweep_table(self.sweep)
+        rows = _table_lines(self) if self.sweep is None else _sweep_table(self.sweep)
         return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *_summary(self)])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
@@ -374,7 +374,7 @@ def make_plan(
         speeds.joint_rad_s2,
         ball_m,
         tuple(ball_centre_m.tolist()),
-        _as_json(prediction),
+        _prediction_json(prediction),
         description_of(certifier, speeds, guess),
     )
 
@@ -431,7 +431,7 @@ def digest(value: Any) -> str:
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
-def _as_json(prediction: Prediction) -> dict[str, Any]:
+def _prediction_json(prediction: Prediction) -> dict[str, Any]:
     """Sigma of each estimate; null if the poses do not determine it."""
     values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
     for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
@@ -462,7 +462,7 @@ def turns_in_words(way_rad: ArrayLike) -> str:
     return ", ".join(turns) or "no joint by half a degree"
 
 
-def _table(plan: Plan) -> list[str]:
+def _table_lines(plan: Plan) -> list[str]:
     q_deg = np.degrees([step.q_rad for step in plan.steps])
     shown = range(3 if plan.arm_rests else 0, 6)
     widths = [max(len(JOINTS[j]), 5) + 1 for j in shown]
@@ -513,16 +513,16 @@ def _accuracy(plan: Plan) -> str:
     sigma, guess = plan.predicted, plan.description["guess"]
     # Plans of version 0.1.0 have no gain.
     gain = f", a sensor whose gain is {100 * guess['gain_sigma']:.2g} % off" if "gain_sigma" in guess else ""
-    tilt_deg = np.degrees(_largest([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
+    tilt_deg = np.degrees(_largest_sigma([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return (
         f"Predicted for {guess['mass_kg']:g} kg{gain}, and averages good to {guess['sigma_force_N']} N, "
-        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest(sigma['mass_kg']):.2g} g, "
-        f"centre of mass {1e3 * _largest(sigma['p_sensor_com_m']):.2g} mm, "
-        f"force bias {_largest(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
-        f"compensation {_largest(sigma['force_rms_N']):.3f} N, {_largest(sigma['torque_rms_Nm']):.4f} N·m."
+        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest_sigma(sigma['mass_kg']):.2g} g, "
+        f"centre of mass {1e3 * _largest_sigma(sigma['p_sensor_com_m']):.2g} mm, "
+        f"force bias {_largest_sigma(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
+        f"compensation {_largest_sigma(sigma['force_rms_N']):.3f} N, {_largest_sigma(sigma['torque_rms_Nm']):.4f} N·m."
     )
 
 
-def _largest(sigma: object) -> float:
+def _largest_sigma(sigma: object) -> float:
     """Largest value; NaN if the poses do not determine one, which is null in the file."""
     return float(np.max(np.array(sigma, dtype=np.float64)))

@@ -96,7 +96,7 @@ def plan_tour(
         No tour has only moves that are proven clear.
     """
     q_now = checked_joints(q_rad)
-    _numbers(poses)
+    _pose_numbers(poses)
     for kind, why, found in _attempts(certifier, q_now, poses, speeds, guess):
         if found is not None:
             return make_plan(kind, why, certifier, *found, speeds, guess)
@@ -166,12 +166,12 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
             "jog the arm to where the load has room below and around it, or hang it from another point of the tool"
         )
     hook_m = found[2]
-    numbers, q = _from_here(q_now, found[:2])
+    numbers, q = _start_nearest(q_now, found[:2])
     share = np.linspace(0, 1, 41)[:, None, None]
     between = ((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)
     away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
     why = [
-        f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_point(hook_m)} at each of them, and within "
+        f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_format_point(hook_m)} at each of them, and within "
         f"{away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
     ]
     plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
@@ -223,10 +223,10 @@ def _plan_box(
     if not 0 <= half_size_m <= 1:
         raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
     centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
-    found = _box(certifier, q_now, _numbers(poses), centre, half_size_m, speeds)
+    found = _box(certifier, q_now, _pose_numbers(poses), centre, half_size_m, speeds)
     if found is None:
         raise PlanRefused(
-            f"with the flange within {1e3 * half_size_m:.0f} mm of {_point(centre)} not all {poses} orientations are "
+            f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} orientations are "
             "in reach, or no tour of them is proven clear: give a larger box, or another centre"
         )
     return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
@@ -272,21 +272,21 @@ def plan_verification(
             f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
             "the surroundings"
         )
-    numbers, q = _from_here(q_now, found)
+    numbers, q = _start_nearest(q_now, found)
     why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
     why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
     plan = make_plan("verification", why, certifier, numbers, q, speeds, guess)
     return replace(plan, why=tuple(why))  # without the accuracy of a calibration from these poses
 
 
-def _from_here(q_now: Array, tour: Found) -> Found:
+def _start_nearest(q_now: Array, tour: Found) -> Found:
     """Return a closed tour from the pose nearest to the present joint angles: there the cable is wound least."""
     numbers, q = tour
     nearest = -int(np.abs(q - q_now).max(axis=1).argmin())
     return np.roll(numbers, nearest).tolist(), np.roll(q, nearest, axis=0)
 
 
-def _numbers(poses: int) -> tuple[int, ...]:
+def _pose_numbers(poses: int) -> tuple[int, ...]:
     if poses not in NUMBERS:
         raise ConfigError(f"a plan of {poses} poses does not exist: choose {', '.join(map(str, NUMBERS))}")
     return NUMBERS[poses]
@@ -336,12 +336,12 @@ def _elsewhere_words(q_rad: Array) -> str:
 
 def _box_words(centre_m: Array, half_size_m: float) -> str:
     return (
-        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_point(centre_m)}: base, shoulder and elbow move too, "
+        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_format_point(centre_m)}: base, shoulder and elbow move too, "
         "and the whole arm needs clear space."
     )
 
 
-def _point(centre_m: Array) -> str:
+def _format_point(centre_m: Array) -> str:
     return "(" + ", ".join(f"{value:.2f}" for value in centre_m) + ") m in base"
 
 
@@ -495,7 +495,7 @@ class _Shoulder:
         if gap_m > -self._radius_m or not same:
             return self._too_near(f"the plane {_plane_words(row)}", gap_m)
         return (
-            f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane {_words(row)}: "
+            f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane {_format_row(row)}: "
             f"the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
             + (f", {opposite} if it is on the other side of the base" if opposite else "")
         )
@@ -505,7 +505,7 @@ class _Shoulder:
         box = box_from_mm(row)
         away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
         gap_m = away_m - self._radius_m
-        return "" if gap_m >= self._margin_m else self._too_near(f"the box {_words(row)}", gap_m)
+        return "" if gap_m >= self._margin_m else self._too_near(f"the box {_format_row(row)}", gap_m)
 
     def _above_m(self, row: Sequence[float]) -> float:
         plane = plane_from_mm(row)
@@ -518,12 +518,12 @@ class _Shoulder:
         )
 
 
-def _words(row: Sequence[float]) -> str:
+def _format_row(row: Sequence[float]) -> str:
     return f"[{', '.join(f'{value + 0.0:g}' for value in row)}]"
 
 
 def _plane_words(row: Sequence[float]) -> str:
-    return f"{_words(row)} ({side})" if (side := side_of(row)) else _words(row)
+    return f"{_format_row(row)} ({side})" if (side := side_of(row)) else _format_row(row)
 
 
 def _cylinder_from_mm(values: Sequence[float]) -> Cylinder:

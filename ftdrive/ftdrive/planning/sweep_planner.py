@@ -80,7 +80,7 @@ def plan_sweep(
         if not certifier.free(centre)[0]:
             continue
         tried += 1
-        best = _candidates(certifier, centre, seconds, speeds=speeds, stop_rad_s2=stop_rad_s2, guess=guess)[:PROVEN]
+        best = _scored_sweeps(certifier, centre, seconds, speeds=speeds, stop_rad_s2=stop_rad_s2, guess=guess)[:PROVEN]
         for sweep in (one.smaller(size) for size in SIZES for _, one in best):
             off_m = certifier.reach_m(_off_curve(sweep, stop_rad_s2))
             path = sweep.at(_times(sweep, PROOF_S))
@@ -105,15 +105,15 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
         yield tour[int(np.abs(tour - q_now).max(axis=1).argmin())]
 
 
-def _candidates(
+def _scored_sweeps(
     certifier: Certifier, centre: Array, seconds: float, *, speeds: Speeds, stop_rad_s2: float, guess: Guess
 ) -> list[tuple[float, Sweep]]:
     """Curves with their scores, the best first: random ones, then changes of the best one that seems clear."""
     arm = certifier.arm
     rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
-    best, least = _drawn(rng), np.inf
+    best, least = _random_shape(rng), np.inf
     for k in range(RANDOM + CHANGED):
-        tried = _drawn(rng)
+        tried = _random_shape(rng)
         if k >= RANDOM:
             share = rng.choice(STEPS)
             tried = (1 - share) * best + share * tried
@@ -135,7 +135,7 @@ def _seems_free(certifier: Certifier, sweep: Sweep, stop_rad_s2: float) -> bool:
     return bool(keeping.free(sweep.at(_times(sweep, _COARSE * PROOF_S))).all())
 
 
-def _drawn(rng: np.random.Generator) -> Array:
+def _random_shape(rng: np.random.Generator) -> Array:
     """Return numbers (3, 6) from 0 to 1: of each wrist, its size, the share of its quick sine, frequencies, phases."""
     return rng.uniform(size=(len(WRISTS), 6))
 
@@ -195,7 +195,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     The noise of 0.12 s of motion counts as that of a pose in the guess.
     """
     load = Load(guess.parameters, guess.g_m_s2, inertia=np.r_[np.full(3, 1e-3), np.zeros(3)])
-    motion, rate = _motion(arm, sweep)
+    motion, rate = _flange_motion(arm, sweep)
     J = (jacobian(load, motion, rate) / guess.wrench_sigma[:, None])[:, :, :23].reshape(-1, 23)
     prior = np.zeros(23)
     prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
@@ -207,7 +207,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     return force_N, torque_Nm, float(np.sqrt(np.diag(covariance)[INERTIA].max()))
 
 
-def _motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
+def _flange_motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
     """Motion of the flange in rows of 0.12 s, and its rate of change, by differences."""
     t, h = _times(sweep, _ROW_S), _MODEL_STEP_S
     places = [arm.frames(sweep.at(t + k * h)) for k in range(-2, 3)]

@@ -95,7 +95,7 @@ class Redaction:
     def learn(self, text: str) -> None:
         """Learn names of hosts and users from a file: from paths, addresses, and the fields that name a host."""
         # A name that one file reveals is replaced in all; a list of fields misses the next field.
-        for value in _strings(text):
+        for value in _texts_of_file(text):
             for user in _HOME.findall(value):
                 self._learn_name("user", user)
             for scheme, host in _URL_HOST.findall(value):
@@ -109,14 +109,14 @@ class Redaction:
 
         Checksums that fitted the content fit the redacted content too; others stay, so that damage is still noticed.
         """
-        if (document := _document(text)) is not None:
+        if (document := _parse_document(text)) is not None:
             if isinstance(document, dict) and "checksum" in document and not is_changed(document):
                 return object_text(self.json(document), allow_nan=True)
             return json.dumps(self.json(document), indent=1) + "\n"
         return "\n".join(map(self._line, text.splitlines())) + ("\n" if text.endswith("\n") else "")
 
     def _line(self, line: str) -> str:
-        document = _document(line)
+        document = _parse_document(line)
         if document is None:
             return self.text(line)
         if isinstance(document, dict) and CRC in document and (event := read_line(line)) is not None:
@@ -190,7 +190,7 @@ def _is_address(text: str) -> bool:
     return not address.is_loopback and not address.is_unspecified
 
 
-def _document(text: str) -> JSON | None:
+def _parse_document(text: str) -> JSON | None:
     """Parse an object or a list of JSON; None for anything else."""
     try:
         document = parsed_json(text)
@@ -199,10 +199,10 @@ def _document(text: str) -> JSON | None:
     return document if isinstance(document, (dict, list)) else None
 
 
-def _strings(text: str) -> Iterator[str]:
+def _texts_of_file(text: str) -> Iterator[str]:
     """Yield the texts of a file: those in its JSON without escapes, and lines that are none."""
-    for part in [text] if _document(text) is not None else text.splitlines():
-        document = _document(part)
+    for part in [text] if _parse_document(text) is not None else text.splitlines():
+        document = _parse_document(part)
         yield from [part] if document is None else _values(document)
 
 
@@ -241,16 +241,16 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         content = read_file(file) if is_readable else None
         if content is not None and file.suffix == ".npz":
             poses[name] = content
-        elif content is not None and (text := _text(content)) is not None:
+        elif content is not None and (text := _decode_text(content)) is not None:
             texts[name] = text
         else:
             left_out.append(file.relative_to(folder).as_posix())
     for number, file in enumerate(transcripts, 1):
-        if (text := _text(read_file(file))) is None:
+        if (text := _decode_text(read_file(file))) is None:
             raise BadBundle(f"{file} is not a text file: give a file of `ftdrive transcript record`")
         texts[f"transcripts/{number}-{file.name}"] = text
     for file in sensor_files():
-        if (text := _text(read_file(file))) is not None:
+        if (text := _decode_text(read_file(file))) is not None:
             texts[file.name] = text
     for text in texts.values():
         redaction.learn(text)
@@ -290,10 +290,10 @@ def unpack(source: Path) -> Iterator[Path]:
         yield source
         return
     with TemporaryDirectory(prefix="ftdrive-") as folder:
-        yield _unpack(source, Path(folder))
+        yield _extract(source, Path(folder))
 
 
-def _unpack(source: Path, folder: Path) -> Path:
+def _extract(source: Path, folder: Path) -> Path:
     if (size := source.stat().st_size) > MOST_BYTES:
         raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle {MOST_BYTES / 1e9:g} GB at most: check the name")
     try:
@@ -333,7 +333,7 @@ def _require_harmless(members: Sequence[zipfile.ZipInfo]) -> None:
         raise BadBundle(f"two files have the same name: {_COPY_AGAIN}")
 
 
-def _text(content: bytes) -> str | None:
+def _decode_text(content: bytes) -> str | None:
     try:
         text = content.decode()
     except UnicodeDecodeError:

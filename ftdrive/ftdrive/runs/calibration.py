@@ -161,16 +161,16 @@ def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreig
 
 def sensor_files(folder: Path = Path()) -> list[Path]:
     """Return the files of a folder, the oldest first."""
-    return sorted(filter(_number, folder.glob("sensor*.json")), key=_number)
+    return sorted(filter(_file_number, folder.glob("sensor*.json")), key=_file_number)
 
 
 def next_sensor_file(folder: Path = Path()) -> Path:
     """Return the name of the next file."""
-    number = 1 + max(map(_number, sensor_files(folder)), default=0)
+    number = 1 + max(map(_file_number, sensor_files(folder)), default=0)
     return folder / (f"sensor-{number}.json" if number > 1 else "sensor.json")
 
 
-def _number(path: Path) -> int:
+def _file_number(path: Path) -> int:
     """Return the number of a sensor's file; 0 of any other."""
     name = _NAME.fullmatch(path.name)
     return int(name[1] or 1) if name else 0

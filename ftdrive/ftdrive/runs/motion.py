@@ -52,8 +52,8 @@ class MotionRecording:
             if str(data.get("format")) != FORMAT:
                 raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
             return cls(
-                FtSamples(*_columns(data, "wrench", _WRENCH)),
-                ArmStates(*_columns(data, "pose", _POSES)),
+                FtSamples(*_signal_columns(data, "wrench", _WRENCH)),
+                ArmStates(*_signal_columns(data, "pose", _POSES)),
                 float(data["nominal_rate_Hz"]),
             )
         except DAMAGE as error:
@@ -101,7 +101,7 @@ def means_of(path: Path) -> tuple[Means, Means]:
     return wrench, poses
 
 
-def _columns(
+def _signal_columns(
     data: Mapping[str, Any], kind: str, shapes: Mapping[str, tuple[int, ...] | None]
 ) -> Iterator[NDArray[Any]]:
     n = len(data[f"{kind}_t_host_ns"])

@@ -309,7 +309,7 @@ class Run(Displayed):
 
     def records(self) -> list[PoseRecord]:
         """Read every pose, in the order of the tour; of a pose taken again, the newest."""
-        return [_read_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
+        return [_read_pose_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
         """Return the stops taken, without reading them."""
@@ -368,7 +368,7 @@ class _Whole(dict[str, Any]):
         raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
 
 
-def _read_record(path: Path) -> PoseRecord:
+def _read_pose_record(path: Path) -> PoseRecord:
     try:
         data = read_arrays(path)
         found = str(data.get("format"))

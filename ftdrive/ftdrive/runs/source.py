@@ -207,7 +207,7 @@ def table_options(
     """Return what the options of a command say of a table. Raises `ConfigError` or `OSError`."""
     offset = [0.0] * 6 if tcp is None else numbers("--tcp", tcp, ",", (3, 6))
     turn = [*offset, 0.0, 0.0, 0.0][3:6]
-    named, text = ({}, {}) if columns is None else _columns(columns)
+    named, text = ({}, {}) if columns is None else _named_columns(columns)
     return TableOptions(
         columns=named,
         separator=text.get("separator", ""),
@@ -222,7 +222,7 @@ def table_options(
     )
 
 
-def _columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
+def _named_columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
     """Return the columns that an option or a TOML file names, and what the file says of the text."""
     if text.endswith(".toml"):
         try:
@@ -244,7 +244,7 @@ def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Arr
     if model is not None and urdf is not None:
         raise ConfigError("--model and --urdf both describe the arm: leave one out")
     if urdf is not None:
-        chain = _chain(urdf)
+        chain = _load_chain(urdf)
         return lambda q_rad: chain.poses(dict(zip(chain.names, q_rad.T, strict=True)))
     if model is None:
         return None
@@ -258,7 +258,7 @@ def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Arr
     return forward
 
 
-def _chain(urdf: str) -> Chain:
+def _load_chain(urdf: str) -> Chain:
     file, _, query = urdf.partition("?")
     links = dict(parse_qsl(query))
     chain = failure = None
@@ -338,7 +338,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         run = Run(source)
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
-        found = _data_of(run, run.records())
+        found = _recorded_data(run, run.records())
     elif source.suffix == ".json":
         found = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
     else:
@@ -518,7 +518,7 @@ def solve_in_motion(
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
     """Solve records of a run, as they are on disk or as a replay gives them."""
-    data = _data_of(run, records)
+    data = _recorded_data(run, records)
     return Outcome(run, data.dataset, data.solve(run.method), drift_check(records))
 
 
@@ -528,7 +528,7 @@ def _earlier_of(run: Run) -> CalibrationResult | None:
     return None if document is None else CalibrationResult.from_dict(document)
 
 
-def _data_of(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
+def _recorded_data(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
     found = circumstances_of(run)

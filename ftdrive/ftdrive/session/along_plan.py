@@ -43,7 +43,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
-    return any(wanted.items() <= _read(line).items() for line in read_file(path).decode(errors="replace").splitlines())
+    return any(wanted.items() <= _parse_entry(line).items() for line in read_file(path).decode(errors="replace").splitlines())
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
@@ -55,7 +55,7 @@ def remember_completed(arm_serial: str, plan_sha256: str) -> None:
         file.write(json.dumps(line) + "\n")
 
 
-def _read(line: str) -> dict[str, object]:
+def _parse_entry(line: str) -> dict[str, object]:
     try:
         found = json.loads(line)
     except ValueError:

@@ -78,7 +78,7 @@ class Event:
         """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
         name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
         return {"schema_version": SCHEMA_VERSION, "event": name} | {
-            each.name: _plain(getattr(self, each.name)) for each in fields(self)
+            each.name: _to_json(getattr(self, each.name)) for each in fields(self)
         }
 
 
@@ -271,15 +271,15 @@ class SensorEvents:
         self._shown = len(events)
 
 
-def _plain(value: Any) -> Any:
+def _to_json(value: Any) -> Any:
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return _to_json(value.tolist())
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _to_json(one) for key, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_to_json(one) for one in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return _to_json(value.item())
     if isinstance(value, float) and not np.isfinite(value):
         return None
     return value

@@ -86,7 +86,7 @@ class RunningFit:
         gravity_flange = down @ R_base_flange
         light = _light(coverage, loaded=self._load is not None)
         tilt_rad = HUNG_TILT_RAD if self._load is not None and not self._load.gripped else np.pi
-        values, sigma = ({}, {}) if self.result is None else _estimates(self.result)
+        values, sigma = ({}, {}) if self.result is None else _values_and_sigmas(self.result)
         return Estimated(
             poses=len(R_base_flange),
             values=values,
@@ -192,7 +192,7 @@ def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: f
     It keeps the tool axis within an angle of straight down, if one does.
     """
     last = R_base_flange[-1]
-    words, candidates = _motions(last, down_base)
+    words, candidates = _simple_motions(last, down_base)
     inside = np.flatnonzero(candidates[:, :, 2] @ down_base >= np.cos(most_tilt_rad))
     if len(inside):
         words, candidates = [words[i] for i in inside], candidates[inside]
@@ -201,7 +201,7 @@ def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: f
     return f"{'keep' if before == after else 'point'} {after} down: {words[best]}"
 
 
-def _motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
+def _simple_motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
     """Return simple motions at the pendant: in words, and the orientations (m, 3, 3) they lead to."""
     words, candidates = list[str](), list[Array]()
     for axis in "zxy":
@@ -247,7 +247,7 @@ def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[flo
     return float(np.max(np.abs(residual) / sigma)), float(np.linalg.norm(residual[:3]))
 
 
-def _estimates(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
+def _values_and_sigmas(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
     """Estimates and sigmas by name; with `drift` where one was found: last pose minus first, (6,) N and N·m."""
     sigma = dict(result.sigma)
     values = {name: getattr(result, name) for name in sigma}

@@ -208,7 +208,7 @@ def _check_safety_limits(before: Before) -> Check:
 
 def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
     """Return where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if none."""
-    for q in _edges(q_rad, step_rad):
+    for q in _points_along(q_rad, step_rad):
         if not arm.within_safety_limits(q.tolist()):
             return (
                 f"the controller's safety limits forbid joints {np.degrees(q).round().astype(int).tolist()} degrees: "
@@ -255,7 +255,7 @@ IN_CONTROL: Final[Sequence[Row]] = (Row("limits", _check_safety_limits),)
 AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
 
 
-def _edges(q_rad: Array, step_rad: float) -> Array:
+def _points_along(q_rad: Array, step_rad: float) -> Array:
     """Return points (m, 6) along straight moves through joint vectors (n, 6), at most `step_rad` apart."""
     parts = []
     for start, end in pairwise(q_rad):

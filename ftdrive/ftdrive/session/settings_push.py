@@ -150,7 +150,7 @@ def propose(
         raise NotAccepted(f"{others[0]}: push the calibration of this cell")
     _require_ready(cell, arm)
     load, old = flange_load(result, mass_kg, height_m), arm.controller_settings()
-    down = down_of(cell.workcell.mounting) if old.up_base_m_s2 is None else -_unit(old.up_base_m_s2)
+    down = down_of(cell.workcell.mounting) if old.up_base_m_s2 is None else -_unit_vector(old.up_base_m_s2)
     lean = lean_from(down, result.gravity_force_base_N, result.covariance[3:6, 3:6])
     return Push(
         old,
@@ -158,7 +158,7 @@ def propose(
             load.mass_kg if payload else None,
             tuple(load.p_flange_com_m.tolist()) if payload else None,
             (old.inertia_kg_m2 or (0.0,) * 6) if payload else None,
-            _gravity(result, lean, old) if gravity else None,
+            _gravity_to_set(result, lean, old) if gravity else None,
         ),
         connected,
         {
@@ -171,7 +171,7 @@ def propose(
         },
         load,
         lean,
-        _contact(arm, sensor, result),
+        _contact_wrench(arm, sensor, result),
     )
 
 
@@ -208,7 +208,7 @@ def _wait_until_still(arm: RobotArm) -> None:
     arm.wait_until_still(timeout_s=_STILL_S, guard=lambda: None)
 
 
-def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult) -> Array | None:
+def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult) -> Array | None:
     """Return the reading beyond a free tool, None where the arm's pose is unknown; raises if it is not steady."""
     for _ in range(_LISTENS):
         wrench = sensor.collect(_LISTEN_S).wrench
@@ -222,7 +222,7 @@ def _contact(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult
     return np.asarray(result.compensate(wrench.mean(axis=0), arm.state().R_base_flange))
 
 
-def _gravity(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
+def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
     """Return the gravity to be set, as large as the controller has it; None if it agrees."""
     # A tilt is pushed only where the controller reports its gravity: elsewhere it could not be read back or restored.
     if old.up_base_m_s2 is None:
@@ -238,10 +238,10 @@ def _gravity(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> 
     if not lean.is_significant:
         return None
     size_m_s2 = float(np.linalg.norm(old.up_base_m_s2))
-    return tuple((-size_m_s2 * _unit(result.gravity_force_base_N)).tolist())
+    return tuple((-size_m_s2 * _unit_vector(result.gravity_force_base_N)).tolist())
 
 
-def _unit(vector: Any) -> Array:
+def _unit_vector(vector: Any) -> Array:
     return np.asarray(vector, np.float64) / np.linalg.norm(vector)
 
 

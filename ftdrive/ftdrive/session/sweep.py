@@ -75,7 +75,7 @@ def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: 
                     drive.confirm(_begin_words(sweep))
                 now.arrive(0)
             drive.obey_keys()
-            _record(drive, sweep, sampling, run)
+            _record_sweep(drive, sweep, sampling, run)
             now.todo.clear()
         except STOPS as error:
             drive.hold(error, _choices)
@@ -83,7 +83,7 @@ def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: 
     drive.show_state(State.CLOSE)
 
 
-def _record(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
+def _record_sweep(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
     """Follow the curve from its centre, where the arm stands, and keep the recording."""
     (centre,), clock = drive.nodes_rad, drive.watcher.clock
     curve = sweep.at(np.arange(0.0, sweep.duration_s + CURVE_S, CURVE_S))

@@ -45,7 +45,7 @@ def take_tour(session: Session) -> Run | None:
         tour = Tour(guarded, driven, quiet_std, book, options)
         tour.run(along.todo)
     missing = "poses are missing" if len(book.run.stops()) <= len(driven.plan.steps) else ""
-    along.judge_completed(f"moves replaced: from {_poses(tour.undriven)} on" if tour.undriven else missing)
+    along.judge_completed(f"moves replaced: from {_list_poses(tour.undriven)} on" if tour.undriven else missing)
     return book.run
 
 
@@ -349,6 +349,6 @@ def _usual_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Arra
     return replace(sampling, average_s=chosen.seconds), chosen.sigma
 
 
-def _poses(numbers: Sequence[int]) -> str:
+def _list_poses(numbers: Sequence[int]) -> str:
     *most, last = map(str, numbers)
     return f"poses {', '.join(most)} and {last}" if most else f"pose {last}"

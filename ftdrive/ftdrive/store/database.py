@@ -53,7 +53,7 @@ schema: Final = Table("ftdrive_schema", metadata, Column("version", Integer, pri
 _TYPES: Final = {str: String, int: Integer, float: Float, bool: Boolean}
 
 
-def _table(
+def _define_table(
     name: str, record: type, *more: Column[Any], key: str = "id", index: Collection[str] = (), without: Collection[str]
 ) -> Table:
     """Make a table with the fields of a record, as JSON where no type of a database fits, and `more` columns."""
@@ -67,14 +67,14 @@ def _table(
     return Table(name, metadata, *columns, *more)
 
 
-results: Final = _table(
+results: Final = _define_table(
     "ftdrive_results",
     StoredResult,
     Column("emulated", Boolean, nullable=False, server_default=false()),
     index=["created_utc"],
     without=["emulated"],
 )
-verifications: Final = _table(
+verifications: Final = _define_table(
     "ftdrive_verifications",
     VerificationRecord,
     *(Column(f"{name}_{axis}", Float) for name in WRENCHES for axis in AXES),
@@ -82,14 +82,14 @@ verifications: Final = _table(
     index=["calibration_id", "created_utc"],
     without=[*WRENCHES, "force_max_N", "torque_max_Nm"],
 )
-weighings: Final = _table(
+weighings: Final = _define_table(
     "ftdrive_weighings",
     WeighingDay,
     *(Column(f"refused_{code}", Integer, nullable=False) for code in REFUSALS),
     index=["day"],
     without=["refusals"],
 )
-cells: Final = _table("ftdrive_cells", StoredCell, key="name", without=[])
+cells: Final = _define_table("ftdrive_cells", StoredCell, key="name", without=[])
 RECORDS: Final[Mapping[type[Record], Table]] = {
     StoredResult: results,
     VerificationRecord: verifications,

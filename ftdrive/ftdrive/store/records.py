@@ -136,13 +136,13 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
     records, unreadable = list[Record](), list[str]()
     for path in paths:
         try:
-            records.append(_read_record(path))
+            records.append(_read_record_file(path))
         except (DataError, OSError) as error:
             unreadable.append(f"{path}: {error}")
     return records, tuple(unreadable)
 
 
-def _read_record(path: Path) -> Record:
+def _read_record_file(path: Path) -> Record:
     """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
 
     Raises `BadCalibration` or `BadDataset` for a damaged file or another format, or `OSError`.

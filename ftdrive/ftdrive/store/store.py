@@ -69,7 +69,7 @@ class Store:
         """
         paths = record_paths(folders)
         with self._current.reading() as connection:
-            known = set() if connection is None else _known(connection, paths)
+            known = set() if connection is None else _paths_in_store(connection, paths)
         return self._add(path for path in paths if str(path) not in known)
 
     def rebuild(self, *folders: Path) -> Indexed:
@@ -169,23 +169,23 @@ class Store:
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(database.verifications).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
-            cells = _rows(connection, select(database.cells), _by_name(StoredCell))
-            results = _rows(connection, _newest_accepted(newest), _by_name(StoredResult))
-            found = _rows(connection, checks, _to_verification)
-            weighings = _rows(connection, _last_weighings(start[:10]), _to_weighings)
+            cells = _query(connection, select(database.cells), _by_name(StoredCell))
+            results = _query(connection, _newest_accepted(newest), _by_name(StoredResult))
+            found = _query(connection, checks, _to_verification)
+            weighings = _query(connection, _last_weighings(start[:10]), _to_weighings)
         cells.sort(key=lambda cell: cell.name)
         return cells, results, sorted(found, key=attrgetter("created_utc")), sum_up(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:
-            return _rows(connection, query, make)
+            return _query(connection, query, make)
 
 
-def _rows(connection: Connection | None, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
+def _query(connection: Connection | None, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
     return [] if connection is None else [make(row) for row in connection.execute(query).all()]
 
 
-def _known(connection: Connection, paths: Sequence[Path]) -> set[str]:
+def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
     """Return those of the paths that have a record of the whole file."""
     texts = [str(path) for path in paths]
     known = {

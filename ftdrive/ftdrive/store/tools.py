@@ -61,11 +61,11 @@ def calibration_of_tool(
     )
     ours = [one for one in accepted if _may_belong(one, arm, sensor)]
     for one in (one for one in ours if one.tool == name):
-        if (loaded := _load(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
+        if (loaded := _load_result(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
             return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), *_of_sensor(store, one, results))
     if force:
         for one in (one for one in accepted if one.tool == name):
-            if loaded := _load(one, accept_edited=True):
+            if loaded := _load_result(one, accept_edited=True):
                 return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
     known = sorted({one.tool for one in ours if one.tool and one.tool != name})
     instead = f", or choose one of {', '.join(known)}" if known else ""
@@ -82,7 +82,7 @@ def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 
 
-def _load(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
+def _load_result(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
     try:
         return with_sensor(CalibrationResult.load(Path(one.path), accept_edited=accept_edited))
     except (BadCalibration, OSError):

@@ -532,7 +532,7 @@ def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
     parts, waiting = list[slice](), [(first, last)]
     while waiting:
         first, last = waiting.pop()
-        step = None if last - first < 2 * LEAST_SAMPLES else _step(wrench[first:last])
+        step = None if last - first < 2 * LEAST_SAMPLES else _largest_step(wrench[first:last])
         if step is None:
             parts.append(slice(first, last))
         else:
@@ -540,7 +540,7 @@ def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
     return parts
 
 
-def _step(wrench: Array) -> int | None:
+def _largest_step(wrench: Array) -> int | None:
     """Return the row (n, 6) from which on the mean differs most, None if it is within the noise."""
     n = len(wrench)
     before = np.arange(LEAST_SAMPLES, n - LEAST_SAMPLES + 1)

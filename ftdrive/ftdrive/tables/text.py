@@ -119,7 +119,7 @@ class TextTable:
         self.comments += comments
         return found
 
-    def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
+    def _count_numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
         """Return some columns of lines as numpy reads them; None if it refuses a cell, as a blank one, or a row."""
         if not (rows := list(filter(None, lines))):
             return None
@@ -237,7 +237,7 @@ def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, s
         count = max(set(counts), key=counts.count) if counts else 0
         rows = [row for row in rows if len(row) == count]
         for point in decimal or ("." if between == "," else ".,"):
-            numbers = [_numbers(row, point) for row in rows]
+            numbers = [_count_numbers(row, point) for row in rows]
             # A cell that is not a number counts against it: `1,5;2,5` has numbers between commas too.
             score = sum(2 * n - sum(map(bool, row)) for n, row in zip(numbers, rows, strict=True) if n)
             if numbers and min(count, max(numbers)) > 1 and score > most:
@@ -254,13 +254,13 @@ def _split(line: str, separator: str) -> list[str]:
         return []
 
 
-def _numbers(row: Sequence[str], decimal: str) -> int:
+def _count_numbers(row: Sequence[str], decimal: str) -> int:
     return sum(bool(_NUMBER[decimal].fullmatch(cell) or _DATE.fullmatch(cell)) for cell in row)
 
 
 def _is_data(line: str, row: Sequence[str], decimal: str, numeric: int) -> bool:
     # Two topics on one clock leave half of the cells blank.
-    return not _COMMENT.match(line) and _numbers(row, decimal) > max(1, numeric // 4)
+    return not _COMMENT.match(line) and _count_numbers(row, decimal) > max(1, numeric // 4)
 
 
 def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, separator: str, decimal: str) -> None:
@@ -268,7 +268,7 @@ def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, s
     for i in above:
         for between, point in ((one, other) for one in _SEPARATORS for other in ".,"):
             cells = [cell for cell in _split(lines[i], between) if cell]
-            if not _COMMENT.match(lines[i]) and len(cells) == _numbers(cells, point) >= max(2, numeric // 2):
+            if not _COMMENT.match(lines[i]) and len(cells) == _count_numbers(cells, point) >= max(2, numeric // 2):
                 ours, theirs = (
                     f"{_SEPARATORS[a]} and a decimal {'comma' if b == ',' else 'point'}"
                     for a, b in ((between, point), (separator, decimal))

@@ -56,7 +56,7 @@ def checked_joints(q_rad: ArrayLike) -> Array:
 
 def frames(kinematics: Kinematics, q_rad: ArrayLike) -> Frames:
     """Forward kinematics of joint vectors (n, 6)."""
-    axes, points, R = _chain(kinematics, np.asarray(q_rad, dtype=np.float64).reshape(-1, 6))
+    axes, points, R = _axes_and_flange(kinematics, np.asarray(q_rad, dtype=np.float64).reshape(-1, 6))
     along = kinematics.links_m[:, 2]
     return Frames(
         lift=axes[1],
@@ -73,7 +73,7 @@ def frames(kinematics: Kinematics, q_rad: ArrayLike) -> Frames:
     )
 
 
-def _chain(kinematics: Kinematics, q_rad: Array) -> tuple[list[Array], list[Array], Array]:
+def _axes_and_flange(kinematics: Kinematics, q_rad: Array) -> tuple[list[Array], list[Array], Array]:
     """Return directions (n, 3) of the six axes, a point (n, 3) on each and the flange, and R_base_flange (n, 3, 3)."""
     turn = q_rad.T + np.array(kinematics.theta_rad)[:, None]
     cosine, sine = np.cos(turn), np.sin(turn)
@@ -204,7 +204,7 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
     first = 3 if p_base_flange_m is None else 0
     q = q_rad.copy()
     for _ in range(_STEPS):
-        axes, points, R = _chain(kinematics, q)
+        axes, points, R = _axes_and_flange(kinematics, q)
         J = np.stack(axes[first:], axis=2)
         off = cross(np.swapaxes(R, 1, 2), np.swapaxes(R_base_flange, 1, 2)).sum(axis=1) / 2
         if p_base_flange_m is not None:

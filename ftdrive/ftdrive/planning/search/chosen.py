@@ -78,16 +78,16 @@ def chosen_tour(
     spins, directions = (SPINS_OF_A_LUMP, DIRECTIONS_OF_A_LUMP) if lumps else (SPINS, DIRECTIONS)
     candidates = cone_candidates(half_angle_rad, spins, directions, certifier.scene.down_base)
     ideal = predicted_sigma(candidates[choose(candidates, poses, guess)], guess).force_rms_N
-    best = _at(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
+    best = _clear_candidates(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
         for posture in _others(certifier, q_now, candidates):
-            found = _at(certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal)
+            found = _clear_candidates(certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal)
             if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
                 best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
     return best
 
 
-def _at(
+def _clear_candidates(
     certifier: Certifier,
     q_now: Array,
     candidates: Array,

@@ -53,7 +53,7 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
     q_now = np.asarray(q_rad, dtype=np.float64)
     solutions = wrist_inverse(certifier.arm.kinematics, q_now[:3], R_base_flange)  # (m, 2, 6)
     group = np.repeat(np.arange(len(solutions)), 2)
-    return _free(certifier, *_within_windows(solutions.reshape(-1, 6), group, q_now, first=3))
+    return _collision_free(certifier, *_within_windows(solutions.reshape(-1, 6), group, q_now, first=3))
 
 
 def box_nodes(
@@ -89,7 +89,7 @@ def _at_places(
     q = q.reshape(-1, 6)
     reached = ~np.isnan(q[:, 0]) & (np.abs(q[:, 2]) <= ELBOW_RAD)
     q_now = np.asarray(q_rad, dtype=np.float64)
-    return _free(certifier, *_within_windows(q[reached], group[reached], q_now, first=0))
+    return _collision_free(certifier, *_within_windows(q[reached], group[reached], q_now, first=0))
 
 
 def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
@@ -114,7 +114,7 @@ def _within_windows(q_rad: Array, group: Nodes, q_now: Array, first: int) -> tup
     return q_rad, group
 
 
-def _free(certifier: Certifier, q_rad: Array, group: Nodes) -> tuple[Array, Nodes]:
+def _collision_free(certifier: Certifier, q_rad: Array, group: Nodes) -> tuple[Array, Nodes]:
     if not len(q_rad):
         return q_rad, group
     shapes, back = distinct(certifier, q_rad)

@@ -179,7 +179,7 @@ def _to_every_group(q_rad: Array, group: Nodes, count: int) -> tuple[Nodes, Node
     return start, end
 
 
-def _length(tour: Nodes, cost: Array) -> float:
+def _tour_length(tour: Nodes, cost: Array) -> float:
     return float(cost[tour, np.concatenate([tour[1:], tour[:1]])].sum())
 
 
@@ -196,7 +196,7 @@ def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
 def _improved(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> tuple[Nodes, float]:
     """Return a tour that no reversed part and no other choice shortens, and its length."""
     tour, length = _choice(tour, group, groups, cost), np.inf
-    while (now := _length(tour, cost)) < length - 1e-9:
+    while (now := _tour_length(tour, cost)) < length - 1e-9:
         length = now
         tour = _choice(_reversed_parts(tour, cost), group, groups, cost)
     return tour, now
