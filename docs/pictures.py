@@ -28,7 +28,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
-from ftdrive.fleet.page import page
+from ftdrive.fleet.page import fleet_page
 from ftdrive.stream.weighing import ScaleState
 from ftdrive.terminal.canvas import Canvas
 from tests.benchmarks.common import show
@@ -196,7 +196,7 @@ def draw_fleet() -> None:
     with TemporaryDirectory() as folder:
         file = Path(folder, "fleet.html")
         records = cells, results, checks
-        file.write_text(page(fleet(*records), observed(*records), "sqlite:///store.sqlite"), encoding="utf-8")
+        file.write_text(fleet_page(fleet(*records), observed(*records), "sqlite:///store.sqlite"), encoding="utf-8")
         footer = "document.querySelector('footer').getBoundingClientRect().top"
         _photograph(file, "fleet", FLEET_PX, footer)
 

@@ -32,7 +32,7 @@ from ftdrive.recording.foreign import TablePair, is_recording, moving_source, ta
 from ftdrive.recording.recording import ROW, Recording, rows_of
 from ftdrive.recording.replay import is_run_folder
 from ftdrive.recording.solve import solve_recording
-from ftdrive.runs.calibration import difference, read_calibration, sensor_files, sensor_identity
+from ftdrive.runs.calibration import identity_mismatch, read_calibration, sensor_files, sensor_identity
 from ftdrive.runs.load import Load, mass_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedData, SolveOptions, as_source, read_dataset, read_source
@@ -511,7 +511,7 @@ def _prior(
     """Return what is known of the sensor before these runs: by earlier loads, its data sheet, or as usual."""
     for path in reversed(sensor_files()):
         known = SensorMatrix.load(path)
-        if not difference(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:
+        if not identity_mismatch(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:
             say(f"Begins with {path.name} of {str(known.provenance.get('created_utc'))[:10]}.")
             return known
     return SensorMatrix.declared(data.setup)

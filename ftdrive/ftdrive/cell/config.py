@@ -398,7 +398,9 @@ def _from_file(path: Path) -> dict[str, Setting]:
             )
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
-                raise ConfigError(f"{path}: [{section}] has no key '{key}': {_suggestion(key, 'keys', _key_names(section))}")
+                raise ConfigError(
+                    f"{path}: [{section}] has no key '{key}': {_suggestion(key, 'keys', _key_names(section))}"
+                )
             values[f"{section}.{key}"] = Setting(check_value(str(path), f"{section}.{key}", value), str(path))
     return values
 
@@ -418,7 +420,9 @@ def _from_environment() -> dict[str, Setting]:
     names = {variable(key): key for key in _KEYS}
     for name, text in os.environ.items():
         if name in names:
-            values[names[name]] = Setting(check_value(name, names[name], _parse_variable(name, names[name], text)), name)
+            values[names[name]] = Setting(
+                check_value(name, names[name], _parse_variable(name, names[name], text)), name
+            )
             continue
         for section in SECTIONS:
             if name.startswith(start := variable(section) + "_"):
@@ -456,7 +460,7 @@ def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
     """
     return {
         section: {
-            item.name: rules.typed(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
+            item.name: rules.require_type(f"[{section}] {item.name} = {values[item.name]!r}", item, values[item.name])
             for item in fields(SECTIONS[section])
             if item.name in values
         }

@@ -58,7 +58,7 @@ def rule_of(item: Field[Any]) -> Rule:
     return found
 
 
-def typed(where: str, item: Field[Any], value: Any) -> Any:
+def require_type(where: str, item: Field[Any], value: Any) -> Any:
     """Return a value of the field's type; raises `ConfigError` for another type."""
     wanted, fits = _TYPES[item.type]
     if not fits(value) and not (value is None and item.default is None):
@@ -70,7 +70,7 @@ def typed(where: str, item: Field[Any], value: Any) -> Any:
 
 def ruled(where: str, item: Field[Any], value: Any) -> Any:
     """Return a value of the field's type that follows its rule; raises `ConfigError`."""
-    rule, result = rule_of(item), typed(where, item, value)
+    rule, result = rule_of(item), require_type(where, item, value)
     if rule.between is not None and not rule.between[0] <= result <= rule.between[1]:
         raise ConfigError(f"{where} is out of range: give {rule.range}")
     if fix := rule.reject(value):

@@ -30,7 +30,7 @@ _BETWEEN = re.compile(r"\s*[:;]\s*|,\s+|\s+")
 _WALL = re.compile(rf"({'|'.join(map(re.escape, SIDES))})[:\s]*(\S.*)")
 
 
-def number(what: str, text: str, units: Mapping[str, str]) -> float:
+def parse_quantity(what: str, text: str, units: Mapping[str, str]) -> float:
     """Read a number with a decimal point or comma, alone or with a unit; `what` is an option, for the message.
 
     The first of `units`, which have factors, is that of the result and of a number alone. Raises `ConfigError` for what
@@ -47,7 +47,7 @@ def number(what: str, text: str, units: Mapping[str, str]) -> float:
 
 
 def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
-    """Read lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `number`."""
+    """Read lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `parse_quantity`."""
     parts = _BETWEEN.split(_BEFORE_UNIT.sub("", text.strip()))
     values = [_parse_value(what, part, MM) for part in parts]
     found = [value for value in values if value is not None]
@@ -57,7 +57,7 @@ def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
     return found
 
 
-def rows_of(*counts: int) -> Callable[[str, str], list[float]]:
+def rows_reader(*counts: int) -> Callable[[str, str], list[float]]:
     """Return a reader of rows of so many lengths, as `row`."""
     return lambda what, text: row(what, text, counts)
 
@@ -76,7 +76,7 @@ def wall(what: str, text: str) -> list[float]:
                 f"{what} is '{text}': give side and distance such as +x 800, the sides are {', '.join(SIDES)}; or "
                 "NX:NY:NZ:MM for a slanting wall"
             ) from None
-    distance_mm = number(what, found[2], MM)
+    distance_mm = parse_quantity(what, found[2], MM)
     if distance_mm < 0:
         raise ConfigError(f"{what} is '{text}': give a distance of 0 or more, and the side on which the wall is")
     return [*map(float, SIDES[found[1]]), 0.0 - distance_mm]
@@ -99,7 +99,7 @@ def _parse_value(what: str, text: str, units: Mapping[str, str]) -> float | None
     return float(Decimal(found[1].replace(",", ".")) * Decimal(units.get(found[2], "1")))
 
 
-def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
+def parse_numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
     """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
     try:
         values = [float(part) for part in text.split(separator)]
@@ -113,4 +113,4 @@ def numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> li
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
     """Read a repeatable option, numbers separated by colons; None if it was not given."""
-    return [numbers(option, text, ":", counts) for text in texts] or None
+    return [parse_numbers(option, text, ":", counts) for text in texts] or None

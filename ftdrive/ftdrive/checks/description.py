@@ -14,7 +14,7 @@ from typing import Any, Final
 from ftcalib.files import check_format, read_object
 from ftdrive.cell.config import RULES, SECTIONS, CellConfig, RobotConfig, SensorConfig, cell_file, check_value
 from ftdrive.cell.devices import build_arm, build_sensor
-from ftdrive.cell.units import DEG_S, KG, MM, number, rows_of, wall
+from ftdrive.cell.units import DEG_S, KG, MM, parse_quantity, rows_reader, wall
 from ftdrive.checks.check import who
 from ftdrive.checks.discovery import is_place, sensor_at
 from ftdrive.errors import ConfigError
@@ -41,7 +41,7 @@ _LOOK_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class CellQuestion:
     """One question about a cell."""
 
     key: str
@@ -74,26 +74,28 @@ def _stripped(_: str, text: str) -> str:
 
 
 def _in(units: Mapping[str, str]) -> Callable[[str, str], float]:
-    return lambda option, text: number(option, text, units)
+    return lambda option, text: parse_quantity(option, text, units)
 
 
 QUESTIONS: Final = (
-    Question(ROBOT, "Robot address", "name or IPv4 address of the controller", _stripped, in_force=True),
-    Question(MODEL, "Model of the arm", "such as ur5e", _stripped, in_force=True, choices=tuple(MODELS)),
-    Question(SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _stripped, in_force=True),
-    Question("sensor.height_mm", "Sensor height", "above the flange face, mm, measure it", _in(MM)),
-    Question("sensor.mass_kg", "Sensor mass", "with its adapter, kg, from scale or data sheet", _in(KG), ""),
-    Question("tool.name", "Name of the tool", "results are found by it", _stripped, in_force=True),
-    Question(
+    CellQuestion(ROBOT, "Robot address", "name or IPv4 address of the controller", _stripped, in_force=True),
+    CellQuestion(MODEL, "Model of the arm", "such as ur5e", _stripped, in_force=True, choices=tuple(MODELS)),
+    CellQuestion(
+        SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _stripped, in_force=True
+    ),
+    CellQuestion("sensor.height_mm", "Sensor height", "above the flange face, mm, measure it", _in(MM)),
+    CellQuestion("sensor.mass_kg", "Sensor mass", "with its adapter, kg, from scale or data sheet", _in(KG), ""),
+    CellQuestion("tool.name", "Name of the tool", "results are found by it", _stripped, in_force=True),
+    CellQuestion(
         TOOL,
         "Cylinder of sensor and tool",
         "from, to and diameter, mm from the flange face, such as 0:60:90; then x and y of its axis, if it is beside "
         "the flange's, such as 60:110:50:45:0 for a camera",
-        rows_of(3, 5),
+        rows_reader(3, 5),
         repeats=True,
     ),
-    Question("tool.mass_kg", "Tool mass", "of what hangs on the sensor, kg, about", _in(KG), ""),
-    Question(
+    CellQuestion("tool.mass_kg", "Tool mass", "of what hangs on the sensor, kg, about", _in(KG), ""),
+    CellQuestion(
         "workcell.mounting",
         "Mounting",
         "floor, wall, ceiling, or degrees that the base leans to its -x",
@@ -102,9 +104,9 @@ QUESTIONS: Final = (
         in_force=True,
         choices=("floor", "wall", "ceiling"),
     ),
-    Question(WALLS, "Wall or table", "side and distance from the base, such as +x 800 mm", wall, "", repeats=True),
-    Question(BOXES, "Box", "two opposite corners X:Y:Z:X:Y:Z, mm, base axes", rows_of(6), "", repeats=True),
-    Question("robot.speed_deg_s", "Speed", "of the fastest joint, deg/s", _in(DEG_S), in_force=True),
+    CellQuestion(WALLS, "Wall or table", "side and distance from the base, such as +x 800 mm", wall, "", repeats=True),
+    CellQuestion(BOXES, "Box", "two opposite corners X:Y:Z:X:Y:Z, mm, base axes", rows_reader(6), "", repeats=True),
+    CellQuestion("robot.speed_deg_s", "Speed", "of the fastest joint, deg/s", _in(DEG_S), in_force=True),
 )
 BY_KEY: Final = {question.key: question for question in QUESTIONS}
 
@@ -128,7 +130,7 @@ class Description:
         """Where a sensor was found; its number is an answer."""
 
     @property
-    def questions(self) -> list[Question]:
+    def questions(self) -> list[CellQuestion]:
         """Questions that this cell needs: none for what the robot reports."""
         known = {ROBOT, MODEL, SENSOR} if self._simulate else {MODEL} if ROBOT in self.reports else set()
         return [question for question in QUESTIONS if question.key not in known]
@@ -145,13 +147,13 @@ class Description:
             return ""
         return f"the {self.model} has no measured shape, so no motion can be planned: use calibrate --manual"
 
-    def usual(self, question: Question) -> str | None:
+    def usual(self, question: CellQuestion) -> str | None:
         """Return the answer to a question that is left open; None if it must be answered."""
         if question.in_force and (value := self._in_force[question.key]) is not None:
             return f"{value:g}" if isinstance(value, float) else str(value)
         return question.usual
 
-    def value(self, question: Question, text: str) -> Any:
+    def value(self, question: CellQuestion, text: str) -> Any:
         """Return what one answer means, or one row; None for "unknown". Raises `ConfigError` for a text of no use."""
         if question.usual == "" and text.strip().lower() in ("", "none", "unknown"):
             return None
@@ -161,17 +163,17 @@ class Description:
         checked = check_value(question.option, question.key, [value] if question.repeats else value)
         return checked[0] if question.repeats else checked
 
-    def judge(self, question: Question, text: str) -> None:
+    def judge(self, question: CellQuestion, text: str) -> None:
         """Raise `ConfigError` unless an answer, or one row, can be used; a wall or box must leave the arm its room."""
         value = self.value(question, text)
         if question.key in (WALLS, BOXES) and value is not None:
             self._require_possible(question.key, (value,))
 
-    def judge_rows(self, question: Question) -> None:
+    def judge_rows(self, question: CellQuestion) -> None:
         """Raise `ConfigError` unless all rows together can be used; the tool must not end before its sensor."""
         self._require_possible(question.key, self._rows(question))
 
-    def _rows(self, question: Question) -> tuple[Any, ...]:
+    def _rows(self, question: CellQuestion) -> tuple[Any, ...]:
         values = (self.value(question, text) for text in self.texts.get(question.key, []))
         return tuple(value for value in values if value is not None)
 
@@ -218,7 +220,7 @@ class Description:
             self.answered.discard(MODEL)
 
     @property
-    def missing(self) -> list[Question]:
+    def missing(self) -> list[CellQuestion]:
         """Questions that must be answered, and are not."""
         return [one for one in self.questions if not self.texts.get(one.key) and self.usual(one) is None]
 

@@ -23,7 +23,7 @@ def is_place(text: str) -> bool:
 
 def sensor_at(place: str, clock: Clock = REAL) -> str:
     """Probe a port or bus and return the address of its sensor; raises `UsageError` unless exactly one answers."""
-    answers = ask(place, clock)
+    answers = probe_place(place, clock)
     urls = [answer.url for answer in answers if answer.url]
     if len(urls) == 1:
         return urls[0]
@@ -34,7 +34,7 @@ def sensor_at(place: str, clock: Clock = REAL) -> str:
     raise ConfigError(f"no known sensor answers on {place}: {why or usual}")
 
 
-def ask(place: str, clock: Clock = REAL) -> list[Answer]:
+def probe_place(place: str, clock: Clock = REAL) -> list[Answer]:
     """Probe a port or bus for known sensors, which are only read.
 
     A place is a serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN

@@ -110,7 +110,7 @@ def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Chec
     return checks
 
 
-def check_load(limits: ArrayLike | None, cell: CellConfig) -> Check:
+def check_tool_weight(limits: ArrayLike | None, cell: CellConfig) -> Check:
     """Check that twice the tool's weight, also at its end, fits into the sensor's range (6,); None is unknown."""
     name, mass_kg = "sensor.load", cell.tool.mass_kg
     if limits is None or mass_kg is None:
@@ -330,7 +330,7 @@ def examine_sensor(
     limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
         *found,
-        check_load(limits, cell),
+        check_tool_weight(limits, cell),
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
         *check_stream(samples, health, address, _LOOK_S),

@@ -42,8 +42,7 @@ from ftdrive.runs.run import Mode, Run
 from ftdrive.runs.source import Outcome
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.rehearsal import put_on
-from ftdrive.session.session import calibrate as guide
-from ftdrive.session.session import method_of_poses
+from ftdrive.session.session import method_of_poses, run_calibration
 from ftdrive.store import index_run
 from ftdrive.terminal.console import beside, messages
 from ftdrive.terminal.report import print_result
@@ -185,7 +184,7 @@ def calibrate(
             open_operator(as_json=as_json) as operator,
             on_page(page, operator, options) as (shown, options),
         ):
-            outcome = guide(cell, shown, options, load)
+            outcome = run_calibration(cell, shown, options, load)
         if outcome is None:
             beside(as_json).print(words := "Dry run: nothing has moved.")
             if page is not None:

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from ftcalib.rounding import with_sigma
-from ftdrive.cell.units import numbers
+from ftdrive.cell.units import parse_numbers
 from ftdrive.commands.options import BAG_TOPICS, FILE, FORCE, FRAME, JSON, PATH, TABLE, NewFile, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.recording.compensation import compensate_recording, source_to_compensate
@@ -71,7 +71,7 @@ def compensate(
         raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
-    delay_s = delay if delay is None or delay == "auto" else numbers("--delay", delay, ",", [1])[0]
+    delay_s = delay if delay is None or delay == "auto" else parse_numbers("--delay", delay, ",", [1])[0]
     options = SolveOptions(pair=pair, topics=(wrench_topic, pose_topic), table=table)
     what = path or wrench or Path()
     with working("Reading") as show:

@@ -15,7 +15,7 @@ from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import REAL_PACE, SENSORS, Station
 from ftdrive.commands.options import ALL, CONTROL, JSON, METHOD, SETS, runs, write_json
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.planning.drawing import draw
+from ftdrive.planning.drawing import draw_plan
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import certifier_for
 from ftdrive.runs.calibration import require_accepted
@@ -137,7 +137,7 @@ def _draw(cell: CellConfig, run: Run) -> None:
     path = run.folder / "sweep.png"
     try:
         plan = Plan.load(run.plan_path)
-        draw(plan, certifier_for(cell, cell.robot.model, plan.kinematics), path)
+        draw_plan(plan, certifier_for(cell, cell.robot.model, plan.kinematics), path)
         messages.print(f"The sweep is drawn in {path}.")
     except ConfigError as error:
         messages.print(f"The sweep is not drawn: {error}.")

@@ -12,7 +12,7 @@ from ftcalib.errors import UsageError
 from ftdrive.cell.config import clock_in_force
 from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
-from ftdrive.checks.discovery import ask
+from ftdrive.checks.discovery import probe_place
 from ftdrive.commands.options import JSON, check_simulate, simulate, write_json
 from ftdrive.terminal.console import answer, hanging
 from ftdrivers.clock import Clock
@@ -77,7 +77,7 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
     """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
-        answers = [nothing | {"url": answer.url, "what": answer.what} for answer in ask(place, clock)]
+        answers = [nothing | {"url": answer.url, "what": answer.what} for answer in probe_place(place, clock)]
     except (UsageError, DeviceError, OSError) as error:
         failures.append(error)
         return [nothing | {"what": "could not be probed", "error": str(error)}]

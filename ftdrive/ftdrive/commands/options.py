@@ -19,7 +19,7 @@ from click.core import ParameterSource
 from ftcalib import files
 from ftcalib.files import parsed_json, require_new
 from ftdrive.cell.config import CellConfig, Setting, cell_of, recorded_cell, settings
-from ftdrive.cell.units import numbers, rows
+from ftdrive.cell.units import parse_numbers, rows
 from ftdrive.errors import ConfigError, Declined
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
@@ -512,7 +512,7 @@ def _frame(axes: "Axes", about: str) -> "WrenchFrame":
 
     if about in get_args(Point):
         return WrenchFrame(axes, cast("Point", about))
-    x, y, z = numbers("--about", about, ",", [3])
+    x, y, z = parse_numbers("--about", about, ",", [3])
     return WrenchFrame(axes, (x, y, z))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from ftdrive.cell.config import cell_of, settings
 from ftdrive.cell.emulated import Station
-from ftdrive.cell.units import numbers, rows
+from ftdrive.cell.units import parse_numbers, rows
 from ftdrive.commands.options import (
     CONFIG,
     JSON,
@@ -27,7 +27,7 @@ from ftdrive.commands.options import (
     write_json,
 )
 from ftdrive.errors import ConfigError
-from ftdrive.planning.drawing import draw
+from ftdrive.planning.drawing import draw_plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 from ftdrive.terminal.console import answer, messages, working
 from ftdrive.view.plan_page import PlanPage
@@ -167,14 +167,14 @@ def plan(
     certifier = certifier_for(cell, cell.robot.model)
     again = "calibrate proves it again with the arm's own kinematics"
     messages.print(f"Made for a nominal {certifier.arm.name}, with wider margins: {again}.")
-    q_rad = np.array([*np.radians(numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
+    q_rad = np.array([*np.radians(parse_numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     with working("Planning"):
         poses, unlimited = 6 if minimal else 12 if quick else 24, tip_speed_limit == inf
         chosen: dict[str, Any] = {"sets": sets, "cone_deg": cone_deg, "box_mm": box_mm, "tip_unlimited": unlimited}
         made = plan_for(cell, certifier, q_rad, poses, **chosen)
     if png is not None:
         with working("Drawing"):
-            draw(made, certifier, png)
+            draw_plan(made, certifier, png)
     if output is not None:
         made.save(output)
     saved = [f" Saved {path}" for path in (png, output) if path is not None]

@@ -14,7 +14,7 @@ WIDTH, HEIGHT, MARGIN = 220, 44, 3
 LEAST_SIGMAS = 4.0
 
 
-def page(fleet: Fleet, observed: Observed, store: str) -> str:
+def fleet_page(fleet: Fleet, observed: Observed, store: str) -> str:
     """Write the page; `store` is the name of the store. Raises `ConfigError` without the extra `fleet`."""
     environment = templates("ftdrive.fleet", "the page of a fleet", "fleet", "--json")
     from markupsafe import Markup
@@ -23,7 +23,9 @@ def page(fleet: Fleet, observed: Observed, store: str) -> str:
     rows = []
     for state in fleet.cells:
         changes = observed.changes.get(state.calibration_id or "")
-        drawn = "" if changes is None or state.calibrated is None else _bias_plot(changes, state.calibrated, observed.now)
+        drawn = (
+            "" if changes is None or state.calibrated is None else _bias_plot(changes, state.calibrated, observed.now)
+        )
         drift = "-" if state.drift is None else f"{state.drift.level_sigmas:.1f} σ"
         rows.append({"state": state, "plot": Markup(drawn), "drift": drift, **times_in_words(state, observed.now)})
     return environment.get_template("fleet.html.j2").render(

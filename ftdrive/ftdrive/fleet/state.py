@@ -114,7 +114,7 @@ class Fleet:
 MOST: Final = 4
 
 
-def list_names(names: Sequence[str]) -> str:
+def join_names(names: Sequence[str]) -> str:
     """Write names in a sentence, such as "a, b and c"; of many only the first."""
     shown = list(names) if len(names) <= MOST + 1 else [*names[:MOST], f"{len(names) - MOST} more"]
     return shown[0] if len(shown) == 1 else f"{', '.join(shown[:-1])} and {shown[-1]}"
@@ -179,7 +179,7 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
 EVERY_S: Final = 60.0
 
 
-def serve(
+def serve_status(
     fleet_at: Callable[[datetime], Fleet],
     update: Callable[[Fleet, datetime, bool], None],
     clock: Clock,

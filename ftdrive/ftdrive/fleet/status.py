@@ -18,7 +18,7 @@ from ftcalib.after.series import drift_onset, spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
 from ftcalib.rounding import to_place_of
 from ftdrive.fleet.cells import WINDOW, Changes, Observed, when
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, list_names
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store
@@ -137,7 +137,7 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
         days = (observed.now - due).days
         what = f"The verification of {worst} is late by {days} d"
         if len(cells) > 1:
-            what = f"The verifications of {list_names(cells)} are late, that of {worst} by {days} d"
+            what = f"The verifications of {join_names(cells)} are late, that of {worst} by {days} d"
         yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
@@ -290,7 +290,7 @@ def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) 
     if len(loads) > 1:
         cells, first = tuple(one.cell for one in loads), loads[0]
         fix = "set them with `ftdrive push`"
-        yield FleetFinding("payload", cells, f"{words(first, list_names(cells))} in {first.cell}: {fix}")
+        yield FleetFinding("payload", cells, f"{words(first, join_names(cells))} in {first.cell}: {fix}")
 
 
 def _either(least: float, sigma: Array) -> Array:
@@ -367,7 +367,7 @@ def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFi
         "temperature",
         cells,
         f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
-        f"{size} a kelvin (in {list_names(cells)}): let them warm up before a calibration, and tare them at "
+        f"{size} a kelvin (in {join_names(cells)}): let them warm up before a calibration, and tare them at "
         "the temperature of the work",
     )
 

@@ -32,7 +32,7 @@ _NEAR_M, _EDGE_M = 1.0, 0.06
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
-def draw(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
+def draw_plan(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
     """Write a PNG with the arm at every pose, its tool and its surroundings, seen from the front, side and above.
 
     Needs the extra `viz`.

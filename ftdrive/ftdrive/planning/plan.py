@@ -31,7 +31,7 @@ JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class PlanStep:
     """One pose, and the move from it to the next one; the last move leads back to the first pose."""
 
     number: int
@@ -59,7 +59,7 @@ class Plan(Displayed):
     """What was tried, and the loss of accuracy of this choice."""
     made_for: Mapping[str, str]
     """SHA-256 of model, kinematics, tool, scene (with the margins). Files of version 1 have no kinematics."""
-    steps: tuple[Step, ...]
+    steps: tuple[PlanStep, ...]
     acceleration_rad_s2: float
     ball_m: float
     """Radius of a ball that contains wrist and tool during the whole tour."""
@@ -245,7 +245,9 @@ class Plan(Displayed):
         if found != digest(document):
             raise PlanRefused(f"{path} was changed after it was made: make a new plan with `ftdrive plan`")
         steps = tuple(
-            Step(**{**step, "q_rad": tuple(step["q_rad"]), "R_base_flange": tuple(map(tuple, step["R_base_flange"]))})
+            PlanStep(
+                **{**step, "q_rad": tuple(step["q_rad"]), "R_base_flange": tuple(map(tuple, step["R_base_flange"]))}
+            )
             for step in document["steps"]
         )
         return cls(
@@ -316,7 +318,7 @@ class Plan(Displayed):
             steps=steps,
             ball_m=ball_m,
             ball_centre_m=tuple(centre_m.tolist()),
-            description={**self.description, "kinematics": kinematics_of(certifier)},
+            description={**self.description, "kinematics": describe_kinematics(certifier)},
         )
 
 
@@ -353,7 +355,7 @@ def make_plan(
         words += f", {prediction.force_rms_N / all_24:.2f} times that of all 24 poses"
     ball_centre_m, ball_m = ball_of(certifier, q_rad, following)
     steps = tuple(
-        Step(
+        PlanStep(
             int(numbers[i]),
             tuple(q_rad[i].tolist()),
             tuple(tuple(row) for row in R[i].tolist()),
@@ -375,15 +377,15 @@ def make_plan(
         ball_m,
         tuple(ball_centre_m.tolist()),
         _prediction_json(prediction),
-        description_of(certifier, speeds, guess),
+        describe_plan(certifier, speeds, guess),
     )
 
 
-def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[str, Any]:
+def describe_plan(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[str, Any]:
     """Return the description of a plan."""
     return {
         "model": certifier.arm.name,
-        "kinematics": kinematics_of(certifier),
+        "kinematics": describe_kinematics(certifier),
         "tool": [asdict(part) for part in certifier.arm.tool],
         **({} if certifier.arm.hung is None else {"hung": asdict(certifier.arm.hung)}),
         "scene": certifier.scene.describe(),
@@ -398,7 +400,7 @@ def description_of(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[s
     }
 
 
-def kinematics_of(certifier: Certifier) -> dict[str, Any]:
+def describe_kinematics(certifier: Certifier) -> dict[str, Any]:
     """Return the kinematics of a description: their source, theta, a, d and alpha of all joints."""
     source = "nominal" if certifier.arm.is_nominal else "controller"
     return {"source": source, **asdict(certifier.arm.kinematics)}
@@ -420,7 +422,7 @@ def fingerprints(certifier: Certifier) -> dict[str, str]:
     hung = [] if certifier.arm.hung is None else [asdict(certifier.arm.hung)]
     return {
         "model": digest(certifier.arm.describe()),
-        "kinematics": digest(kinematics_of(certifier)),
+        "kinematics": digest(describe_kinematics(certifier)),
         "tool": digest([*(asdict(part) for part in certifier.arm.tool), *hung]),
         "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
     }

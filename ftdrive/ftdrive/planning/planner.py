@@ -171,8 +171,8 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
     between = ((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)
     away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
     why = [
-        f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_format_point(hook_m)} at each of them, and within "
-        f"{away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
+        f"{HUNG_POSES} tilts with a hanging load. Its hook stays at {_format_point(hook_m)} at each of them, and "
+        f"within {away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
     ]
     plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
     return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
@@ -226,8 +226,8 @@ def _plan_box(
     found = _box(certifier, q_now, _pose_numbers(poses), centre, half_size_m, speeds)
     if found is None:
         raise PlanRefused(
-            f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} orientations are "
-            "in reach, or no tour of them is proven clear: give a larger box, or another centre"
+            f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} orientations "
+            "are in reach, or no tour of them is proven clear: give a larger box, or another centre"
         )
     return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
 
@@ -336,8 +336,8 @@ def _elsewhere_words(q_rad: Array) -> str:
 
 def _box_words(centre_m: Array, half_size_m: float) -> str:
     return (
-        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_format_point(centre_m)}: base, shoulder and elbow move too, "
-        "and the whole arm needs clear space."
+        f"The flange stays within {1e3 * half_size_m:.0f} mm of {_format_point(centre_m)}: base, shoulder and elbow "
+        "move too, and the whole arm needs clear space."
     )
 
 
@@ -495,8 +495,8 @@ class _Shoulder:
         if gap_m > -self._radius_m or not same:
             return self._too_near(f"the plane {_plane_words(row)}", gap_m)
         return (
-            f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane {_format_row(row)}: "
-            f"the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
+            f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane "
+            f"{_format_row(row)}: the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
             + (f", {opposite} if it is on the other side of the base" if opposite else "")
         )
 

@@ -24,7 +24,7 @@ from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.kinematics import checked_joints
 from ftdrive.planning.motion import Speeds, tips
-from ftdrive.planning.plan import PROOF_S, Plan, Step, ball_of, description_of, fingerprints
+from ftdrive.planning.plan import PROOF_S, Plan, PlanStep, ball_of, describe_plan, fingerprints
 from ftdrive.planning.search.nodes import constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
@@ -227,7 +227,7 @@ def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, 
     certificate = certifier.keeping(off_curve_m).certify(q, following)
     R, turn = arm.frames(q).R_base_flange, np.abs(following - q).max(axis=1)
     steps = tuple(
-        Step(
+        PlanStep(
             i + 1,
             tuple(q[i].tolist()),
             tuple(tuple(row) for row in R[i].tolist()),
@@ -256,7 +256,7 @@ def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, 
         ball_m,
         tuple(centre_m.tolist()),
         {"force_rms_N": force_N, "torque_rms_Nm": torque_Nm, "inertia_kg_m2": inertia},
-        description_of(certifier, speeds, guess),
+        describe_plan(certifier, speeds, guess),
         sweep,
         off_curve_m,
     )

@@ -22,7 +22,7 @@ from ftdrive.errors import BadPlan, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.report.subject import Subject
 from ftdrive.runs.calibration import MARKS, marks_of
-from ftdrive.runs.pose_hints import hints, names_of
+from ftdrive.runs.pose_hints import hints, pose_names
 from ftdrive.runs.run import Run
 from ftdrive.words.result import (
     contact_in_words,
@@ -239,7 +239,7 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
 def _poses(subject: Subject) -> list[dict[str, Any]]:
     """List the poses: residual (6,), its size in sigma as the other poses predict it, and whether the pose was used."""
     result, dataset = subject.result, subject.dataset
-    names = names_of(subject.records) or [str(row + 1) for row in range(result.n_poses)]
+    names = pose_names(subject.records) or [str(row + 1) for row in range(result.n_poses)]
     spread = result.quality.get("residual_sigma") or [None] * result.n_poses
     t_s = [None] * result.n_poses if dataset is None else [None if np.isnan(t) else t for t in dataset.t_s.tolist()]
     return [

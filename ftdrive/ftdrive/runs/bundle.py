@@ -44,7 +44,7 @@ from ftdrive.checks.computer import SensorAddress, can_interfaces, check_disk, c
 from ftdrive.errors import BadBundle
 from ftdrive.runs import is_run
 from ftdrive.runs.calibration import sensor_files, versions
-from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_of, read_line
+from ftdrive.runs.numbers import CRC, ZIP_DAMAGE, line_with_crc, parse_line
 from ftdrive.runs.run import LOCK, Run
 
 _HOME = re.compile(r"(?:/home|/Users|[A-Za-z]:\\Users)[/\\]([^/\\\s\"':;,<>]+)")
@@ -119,8 +119,8 @@ class Redaction:
         document = _parse_document(line)
         if document is None:
             return self.text(line)
-        if isinstance(document, dict) and CRC in document and (event := read_line(line)) is not None:
-            return line_of(self.json(event))
+        if isinstance(document, dict) and CRC in document and (event := parse_line(line)) is not None:
+            return line_with_crc(self.json(event))
         return json.dumps(self.json(document))
 
     def json(self, value: JSON, key: str = "") -> JSON:

@@ -193,7 +193,7 @@ def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
     }
 
 
-def difference(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
+def identity_mismatch(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
     """Return why a matrix is not that of a sensor with this identity, as half a sentence; empty if it is."""
     theirs = sensor.provenance.get("sensor")
     if not isinstance(theirs, Mapping):
@@ -219,7 +219,7 @@ def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "Cal
     unused = ""
     for path in reversed(sensor_files(folder)):
         sensor = ftcalib.SensorMatrix.load(path)
-        if not (why := difference(sensor, identity)):
+        if not (why := identity_mismatch(sensor, identity)):
             return replace(calibration, sensor=sensor)
         theirs = sensor.provenance.get("sensor")
         known = theirs.get("serial") if isinstance(theirs, Mapping) else sensor.provenance.get("serial")

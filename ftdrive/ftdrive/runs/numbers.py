@@ -48,7 +48,7 @@ def read_arrays(path: Path) -> dict[str, Any]:
         }
 
 
-def read_line(line: str) -> dict[str, Any] | None:
+def parse_line(line: str) -> dict[str, Any] | None:
     """Return the object in a line; None if it is damaged."""
     try:
         content = parsed_json(line)
@@ -59,14 +59,14 @@ def read_line(line: str) -> dict[str, Any] | None:
     return content if content.pop(CRC, None) == _crc32(content) else None
 
 
-def line_of(content: Mapping[str, Any]) -> str:
+def line_with_crc(content: Mapping[str, Any]) -> str:
     """Return an object as a line with its CRC-32, without the end of the line."""
     return json.dumps({**content, CRC: _crc32(content)})
 
 
 def append_lines(file: FileIO, begin: int, objects: Sequence[Mapping[str, Any]]) -> None:
     """Add lines to an unbuffered file that ends at `begin`, or nothing. Raises `OSError`."""
-    content = "".join(line_of(one) + "\n" for one in objects).encode()
+    content = "".join(line_with_crc(one) + "\n" for one in objects).encode()
     try:
         while content:
             content = content[file.write(content) :]

@@ -14,7 +14,7 @@ _SIGNIFICANT = 4.0
 _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
 
 
-def names_of(records: Sequence[PoseRecord]) -> tuple[str, ...]:
+def pose_names(records: Sequence[PoseRecord]) -> tuple[str, ...]:
     """Name the rows of a run's dataset: R and the number of the orientation."""
     return tuple(f"R{number:02d}" for number in numbers_in_dataset(records))
 
@@ -35,7 +35,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     records = _in_dataset(records)
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
-    names, found = names_of(records), find_moved(records)
+    names, found = pose_names(records), find_moved(records)
     if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
         return tuple(found)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
@@ -65,7 +65,7 @@ def _steady(record: PoseRecord) -> bool:
 def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
     """Name the poses that were not steady; each row of a dataset has one record."""
     found = []
-    for record, name in zip(records, names_of(records), strict=True):
+    for record, name in zip(records, pose_names(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
         if turn_rad >= MOVED_RAD:
             found.append(Finding.of("pose_turned", pose=name, turn_deg=np.degrees(turn_rad)))

@@ -40,7 +40,7 @@ from ftcalib.routine import PoseRecord, TourPose
 from ftdrive.cell.config import read_recorded
 from ftdrive.errors import ConfigError
 from ftdrive.runs.calibration import made_now
-from ftdrive.runs.numbers import DAMAGE, append_lines, read_arrays, read_line, write_arrays
+from ftdrive.runs.numbers import DAMAGE, append_lines, parse_line, read_arrays, write_arrays
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.interfaces import FtSamples
 
@@ -236,11 +236,11 @@ class Run(Displayed):
         text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")
         for number, line in enumerate(lines, 1):
-            if (event := read_line(line)) is None:
+            if (event := parse_line(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
             yield event
         # What follows the last line is an event if only the end of its line is damaged.
-        if (event := read_line(rest) or read_line(rest[:-1])) is not None:
+        if (event := parse_line(rest) or parse_line(rest[:-1])) is not None:
             yield event
 
     @property

@@ -22,7 +22,7 @@ from ftcalib.motion.solve import solve_motion
 from ftcalib.result import Method
 from ftcalib.routine import ArmReading, DriftCheck, PoseRecord, WrenchSamples, dataset_from, drift_check
 from ftdrive.cell.config import NOMINAL_ORIENTATION_DEG, orientation_accuracy_deg
-from ftdrive.cell.units import numbers
+from ftdrive.cell.units import parse_numbers
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.kinematics import frames
 from ftdrive.planning.geometry.scene import down_of
@@ -168,7 +168,7 @@ def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: s
         return None
     R_flange_sensor = None
     if mounting_deg is not None:
-        rotation_vector = numbers("--mounting-deg", mounting_deg, ",", (3,))
+        rotation_vector = parse_numbers("--mounting-deg", mounting_deg, ",", (3,))
         R_flange_sensor = Rotation.from_rotvec(rotation_vector, degrees=True).as_matrix()
     try:
         return Known(
@@ -185,7 +185,7 @@ def up_direction(up: str | None) -> list[float] | None:
     """Return the direction (3,) of `--up`; None without it. Raises `ConfigError`."""
     if up is None:
         return None
-    direction = numbers("--up", up, ",", (3,))
+    direction = parse_numbers("--up", up, ",", (3,))
     if not any(direction):
         raise ConfigError(f"--up is {up}, which is no direction: give 0,0,1 for a robot on a floor")
     return direction
@@ -205,7 +205,7 @@ def table_options(
     urdf: str | None,
 ) -> TableOptions:
     """Return what the options of a command say of a table. Raises `ConfigError` or `OSError`."""
-    offset = [0.0] * 6 if tcp is None else numbers("--tcp", tcp, ",", (3, 6))
+    offset = [0.0] * 6 if tcp is None else parse_numbers("--tcp", tcp, ",", (3, 6))
     turn = [*offset, 0.0, 0.0, 0.0][3:6]
     named, text = ({}, {}) if columns is None else _named_columns(columns)
     return TableOptions(

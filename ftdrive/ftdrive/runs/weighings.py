@@ -18,7 +18,7 @@ from typing import Any, Final, Self
 from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, open_file, read_lines
 from ftdrive.runs.calibration import number_at, text_at, time_at
-from ftdrive.runs.numbers import append_lines, read_line
+from ftdrive.runs.numbers import append_lines, parse_line
 
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
@@ -103,7 +103,7 @@ class WeighingDay:
             for number, line in enumerate(read_lines(file, BadDataset, first), first):
                 if not line.endswith(b"\n"):
                     break
-                if (content := read_line(line.decode(errors="replace"))) is None:
+                if (content := parse_line(line.decode(errors="replace"))) is None:
                     raise BadDataset(f"line {number} of the weighings is damaged: take the file from a copy")
                 if number == 1:
                     check_format(content, FORMAT, BadDataset)

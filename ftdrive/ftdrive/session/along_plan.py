@@ -23,8 +23,8 @@ from ftdrive.runs.run import Run
 from ftdrive.session import guards
 from ftdrive.session.drive import SLOW, GuardedCell
 from ftdrive.session.events import GuardTripped, Planned, Question
-from ftdrive.session.open_session import PoseBook, Session, SessionOptions
-from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, check
+from ftdrive.session.open_session import OpenSession, PoseBook, SessionOptions
+from ftdrive.session.preflight import AGAIN, CHECKS, IN_CONTROL, LISTEN_S, Before, run_checks
 from ftdrive.session.watchdog import Watcher
 from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
@@ -43,7 +43,9 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
     wanted = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256}
-    return any(wanted.items() <= _parse_entry(line).items() for line in read_file(path).decode(errors="replace").splitlines())
+    return any(
+        wanted.items() <= _parse_entry(line).items() for line in read_file(path).decode(errors="replace").splitlines()
+    )
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
@@ -118,7 +120,7 @@ class AlongPlan:
         A preflight check failed: nothing moves. A dry run never takes control of the arm.
     """
 
-    def __init__(self, session: Session, planned: Callable[[Certifier, Array], Plan]) -> None:
+    def __init__(self, session: OpenSession, planned: Callable[[Certifier, Array], Plan]) -> None:
         self._session, self.cell, self.task, self.options = session, session.cell, session.task, session.options
         self._onlookers: tuple[guards.Guard, ...] = ()
         cell, plan = self.cell, session.plan
@@ -139,7 +141,7 @@ class AlongPlan:
             cell.journal.show(self.judge.add(record))
         self.before = self._look(certifier, plan)
         """What is known before any motion, with the plan at its own speeds."""
-        check(self.before, CHECKS)
+        run_checks(self.before, CHECKS)
         if self.options.dry_run:
             cell.note("the controller's safety limits are not checked: only a program on the controller can query them")
             return
@@ -147,7 +149,7 @@ class AlongPlan:
         cell.arm.open(control=True)
         if path := cell.arm.identify().facts.get("control"):
             cell.note(f"control path {path.value}")
-        check(self.before, IN_CONTROL)
+        run_checks(self.before, IN_CONTROL)
 
     @property
     def serial(self) -> str:
@@ -261,7 +263,7 @@ class AlongPlan:
         # The next approach is checked when its goal is known.
         stays = plan_approach(before.certifier, q, q, SLOW)
         quiet = self.cell.listen(LISTEN_S)
-        check(replace(before, quiet=quiet, approach=stays, known=True, resumed=True), AGAIN)
+        run_checks(replace(before, quiet=quiet, approach=stays, known=True, resumed=True), AGAIN)
         if not self.options.questions:
             return
         if asks:
@@ -302,7 +304,7 @@ def _show_plan(before: Before, options: SessionOptions) -> None:
         plan.save(options.output)
         cell.note(f"plan saved as {options.output}")
     if options.png is not None:
-        from ftdrive.planning.drawing import draw
+        from ftdrive.planning.drawing import draw_plan
 
-        draw(plan, before.certifier, options.png, way)
+        draw_plan(plan, before.certifier, options.png, way)
         cell.note(f"plan drawn in {options.png}")

@@ -19,7 +19,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.planning.geometry.scene import down_of
 from ftdrive.runs.run import Run
 from ftdrive.session.events import Compared, Estimated, Key, SensorEvents, State, StateChanged
-from ftdrive.session.open_session import OpenCell, PoseBook, Session
+from ftdrive.session.open_session import OpenCell, OpenSession, PoseBook
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
@@ -84,7 +84,7 @@ class _Held:
         """Accept a stream: it is checked wherever it is read."""
 
 
-def take_by_hand(session: Session) -> Run:
+def take_by_hand(session: OpenSession) -> Run:
     """Take poses without any motion command: the operator moves the arm, or a program on the pendant does."""
     cell, task, run = session.cell, session.task, session.resumed
     if run is None:

@@ -302,7 +302,7 @@ class Task(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Session:
+class OpenSession:
     """An open cell, and what its poses are taken for."""
 
     cell: OpenCell

@@ -14,7 +14,7 @@ from ftdrive.runs.motion import MotionRecording, means_of
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of
 from ftdrive.session.events import Key, MotionRecorded
-from ftdrive.session.open_session import OpenCell, Session
+from ftdrive.session.open_session import OpenCell, OpenSession
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
@@ -31,7 +31,7 @@ _SILENT_S: Final = 10.0
 GOOD: Final = 2
 
 
-def take_passively(session: Session) -> Run:
+def take_passively(session: OpenSession) -> Run:
     """Record the free tool of a session in motion, as `record_passively`."""
     run = session.new_run()
     found = circumstances_of(run)

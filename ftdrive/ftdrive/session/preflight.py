@@ -20,7 +20,7 @@ from ftdrive.checks import arm as of_arm
 from ftdrive.checks import computer
 from ftdrive.checks.arm import RATED_KG, check_arm, check_remote, check_safety, check_speed
 from ftdrive.checks.check import Check, merge_checks
-from ftdrive.checks.sensor import check_level, check_load, check_rate, check_rest
+from ftdrive.checks.sensor import check_level, check_rate, check_rest, check_tool_weight
 from ftdrive.errors import NotAccepted, PlanRefused
 from ftdrive.planning.approach import Approach
 from ftdrive.planning.geometry.certify import Certifier
@@ -77,7 +77,7 @@ class Before:
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class SessionCheck:
     """One check of a session."""
 
     name: str
@@ -107,7 +107,7 @@ def _check_model(before: Before) -> Check:
     return replace(check, found=f"{check.found}: the flange is where the arm's own kinematics have it")
 
 
-def check_payload(before: Before) -> Check:
+def check_total_payload(before: Before) -> Check:
     """Check the payload that is set in the controller; with a load it is the total, which the arm must carry."""
     status, tool, sensor_kg = before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg
     check, load = of_arm.check_payload(status, tool, sensor_kg), before.task.load
@@ -126,7 +126,7 @@ def check_payload(before: Before) -> Check:
     return check
 
 
-def check_link(before: Before) -> Check:
+def check_session_link(before: Before) -> Check:
     """Check that states of the arm arrive soon; a controller that reports no TCP is asked for it and needs longer."""
     arm, limits = before.cell.arm, before.cell.limits
     asked_s = limits.link_asked_s if arm.status().tcp_offset is None else 0.0
@@ -146,7 +146,7 @@ def _check_load(before: Before) -> Check:
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
     rest = check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
-    return merge_checks("load", [check_load(limits, config), rest])
+    return merge_checks("load", [check_tool_weight(limits, config), rest])
 
 
 def _check_workcell(before: Before) -> Check:
@@ -229,30 +229,30 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
         clock.sleep(0.02)
 
 
-_APPROACH: Final = Row("approach", _check_approach)
+_APPROACH: Final = SessionCheck("approach", _check_approach)
 
 # In the order of their events. None of them takes control of the arm.
-CHECKS: Final[Sequence[Row]] = (
-    Row("safety", lambda before: check_safety(before.cell.arm.status())),
-    Row("remote", lambda before: check_remote(before.cell.arm)),
-    Row("model", _check_model),
-    Row("payload", check_payload),
-    Row("slider", lambda before: check_speed(before.cell.arm.status())),
-    Row("link", check_link),
-    Row("sensor", _check_sensor),
-    Row("load", _check_load),
-    Row("workcell", _check_workcell),
-    Row("plan", _check_plan),
+CHECKS: Final[Sequence[SessionCheck]] = (
+    SessionCheck("safety", lambda before: check_safety(before.cell.arm.status())),
+    SessionCheck("remote", lambda before: check_remote(before.cell.arm)),
+    SessionCheck("model", _check_model),
+    SessionCheck("payload", check_total_payload),
+    SessionCheck("slider", lambda before: check_speed(before.cell.arm.status())),
+    SessionCheck("link", check_session_link),
+    SessionCheck("sensor", _check_sensor),
+    SessionCheck("load", _check_load),
+    SessionCheck("workcell", _check_workcell),
+    SessionCheck("plan", _check_plan),
     _APPROACH,
-    Row("cable", check_cable),
-    Row("disk", lambda before: computer.check_disk(before.runs)),
+    SessionCheck("cable", check_cable),
+    SessionCheck("disk", lambda before: computer.check_disk(before.runs)),
 )
 
 # Checks that need a program on the controller, made when all others have passed.
-IN_CONTROL: Final[Sequence[Row]] = (Row("limits", _check_safety_limits),)
+IN_CONTROL: Final[Sequence[SessionCheck]] = (SessionCheck("limits", _check_safety_limits),)
 
 # Checks before a stopped session goes on: all, except that its new approach is judged by itself.
-AGAIN: Final[Sequence[Row]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
+AGAIN: Final[Sequence[SessionCheck]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
 
 
 def _points_along(q_rad: Array, step_rad: float) -> Array:
@@ -264,7 +264,7 @@ def _points_along(q_rad: Array, step_rad: float) -> Array:
     return np.vstack([*parts, q_rad[-1:]])
 
 
-def check(before: Before, rows: Sequence[Row]) -> None:
+def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
     """Show what each check finds; raises `NotAccepted` if one failed."""
     found = []
     for row in rows:

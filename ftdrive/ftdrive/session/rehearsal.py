@@ -19,7 +19,7 @@ from ftdrive.runs.load import Load
 from ftdrive.runs.source import Outcome
 from ftdrive.session.events import Event, Key, Operator, Question
 from ftdrive.session.open_session import SessionOptions
-from ftdrive.session.session import calibrate
+from ftdrive.session.session import run_calibration
 
 
 class NoOperator:
@@ -72,7 +72,7 @@ def rehearse(
     `kept` says whether the folder `runs` outlives the calibration; the other keywords are those of `SessionOptions`.
     """
     chosen = SessionOptions(runs, name, real=False, questions=False, description=station.description, **options)
-    outcome = calibrate(station.cell, operator if kept else cast("Operator", _Unkept(operator, runs)), chosen)
+    outcome = run_calibration(station.cell, operator if kept else cast("Operator", _Unkept(operator, runs)), chosen)
     if outcome is None:
         raise RuntimeError("a rehearsal is never a dry run")
     return outcome

@@ -30,7 +30,7 @@ from ftdrive.session.events import Operator, State, StateChanged, rms_sigma
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import take_by_hand
 from ftdrive.session.live_fit import RunningFit
-from ftdrive.session.open_session import Journal, Judge, OpenCell, Session, SessionOptions, Task
+from ftdrive.session.open_session import Journal, Judge, OpenCell, OpenSession, SessionOptions, Task
 from ftdrive.session.passive import take_passively
 from ftdrive.session.sweep import on_script_path, take_sweep
 from ftdrive.session.tour import take_tour
@@ -145,7 +145,7 @@ class Calibrating:
         )
 
 
-def calibrate(
+def run_calibration(
     cell: CellConfig, operator: Operator, options: SessionOptions, load: Load | None = None
 ) -> Outcome | None:
     """Guide the operator through a calibration, with a load on the tool; None after a dry run. Raises as `take_poses`.
@@ -206,10 +206,10 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
             cell.note(words, warning=True)
 
         def new_run() -> Run:
-            description = description_of(task, options, connected)
+            description = describe_run(task, options, connected)
             return locked.enter_context(Run.create(options.runs, options.name, description, config.clock))
 
-        run = _take(Session(cell, task, options, resumed, plan, new_run))
+        run = _take(OpenSession(cell, task, options, resumed, plan, new_run))
     if run is None:
         return None
     if not (run.stops() or run.in_motion):
@@ -237,9 +237,9 @@ def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
     return plan
 
 
-def _take(session: Session) -> Run | None:
+def _take(session: OpenSession) -> Run | None:
     """Take the poses or the recording of a session in its mode; None after a dry run."""
-    by_mode: Mapping[Mode, Callable[[Session], Run | None]] = {
+    by_mode: Mapping[Mode, Callable[[OpenSession], Run | None]] = {
         "auto": take_tour,
         "step": take_tour,
         "sweep": take_sweep,
@@ -250,7 +250,7 @@ def _take(session: Session) -> Run | None:
     return by_mode[session.options.mode](session)
 
 
-def description_of(task: Task, options: SessionOptions, connected: Mapping[str, DeviceInfo]) -> dict[str, Any]:
+def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, DeviceInfo]) -> dict[str, Any]:
     """Return what run.json contains."""
     return {
         "command": task.command,

@@ -17,7 +17,7 @@ from ftdrive.session.along_plan import AlongPlan
 from ftdrive.session.drive import APPROACH_RAD_S, SLOW, STOPS, Drive
 from ftdrive.session.events import MotionRecorded, State
 from ftdrive.session.guards import Guard, Seen
-from ftdrive.session.open_session import Session
+from ftdrive.session.open_session import OpenSession
 from ftdrive.session.preflight import Before
 from ftdrivers.sweep import Sweep
 
@@ -43,7 +43,7 @@ _NOISE_N: Final = 2.0
 _UNSURE_N: Final = 2.5
 
 
-def take_sweep(session: Session) -> Run | None:
+def take_sweep(session: OpenSession) -> Run | None:
     """Record the free tool along a smooth curve of the wrist, planned where the arm stands; None after a dry run."""
     task, options = session.task, session.options
     along = AlongPlan(session, lambda certifier, q_rad: sweep_for(task.cell, certifier, q_rad, options.seconds))

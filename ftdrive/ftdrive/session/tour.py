@@ -22,7 +22,7 @@ from ftdrive.runs.run import Run
 from ftdrive.session.along_plan import NO_SERIAL, AlongPlan
 from ftdrive.session.drive import APPROACH_RAD_S, AT_RAD, BACK_RAD_S, SLOW, STOPS, Drive, GuardedCell
 from ftdrive.session.events import Key, Question, State, Weighed, rms_sigma
-from ftdrive.session.open_session import PoseBook, Session, SessionOptions
+from ftdrive.session.open_session import OpenSession, PoseBook, SessionOptions
 from ftdrive.session.preflight import LISTEN_S, Before
 
 # Target sigma of one average: it gives 0.02 N of bias from 24 poses.
@@ -32,7 +32,7 @@ _TARGET_N, _TARGET_NM = 0.057, 0.0035
 _TOOL_AVERAGES: Final = 2.0
 
 
-def take_tour(session: Session) -> Run | None:
+def take_tour(session: OpenSession) -> Run | None:
     """Take the poses of a plan, or of one that is made where the arm stands; None after a dry run."""
     options = session.options
     along = AlongPlan(session, lambda certifier, q_rad: session.task.plan(certifier, q_rad, options.poses))

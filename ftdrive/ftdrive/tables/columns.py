@@ -149,7 +149,7 @@ class Signal(NamedTuple):
     """Of each column, as the header writes it; empty where it writes none."""
 
 
-class Columns:
+class SignalColumns:
     """The columns of a table by signal.
 
     Parameters

@@ -19,7 +19,7 @@ from ftcalib.files import JSON
 from ftcalib.model import Array, angle_between, nearest_rotation
 from ftcalib.rounding import counted
 from ftdrive.errors import ConfigError
-from ftdrive.tables.columns import COUNTS, UNITS, Columns, Signal, factor
+from ftdrive.tables.columns import COUNTS, UNITS, Signal, SignalColumns, factor
 from ftdrive.tables.text import TextTable, seconds_of
 
 WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
@@ -115,7 +115,7 @@ _JOINTS_ONLY = "it has joint angles and no orientation: add --model, such as UR5
 _ANGLES_ONLY = "it has three angles: add --euler, such as ZYX (axes of the tool) or xyz (axes of the base)"
 
 
-class Source(Protocol):
+class ColumnSource(Protocol):
     """Columns that are read in blocks."""
 
     names: Sequence[str]
@@ -128,7 +128,7 @@ class Source(Protocol):
         """Give some columns (n, k) of consecutive rows, and the share of the source before the next ones."""
 
 
-class Frame:
+class FrameSource:
     """A DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
 
     words, comments = "", 0
@@ -149,7 +149,7 @@ class Frame:
             raise BadDataset(f"{error}: give a number in each cell") from error
 
 
-class Rows(NamedTuple):
+class SignalRows(NamedTuple):
     """Consecutive rows of a signal."""
 
     t_s: Array
@@ -186,9 +186,11 @@ class Table:
         self._found: dict[str, Signal | None] = {}
         with self._named():
             text = self.options.separator, self.options.decimal
-            self.source: Source = TextTable(source, *text) if isinstance(source, Path) else Frame(source)
-            in_memory = isinstance(self.source, Frame)
-            self._columns = Columns(self.source.names, self.source.units, self.options.columns, in_memory=in_memory)
+            self.source: ColumnSource = TextTable(source, *text) if isinstance(source, Path) else FrameSource(source)
+            in_memory = isinstance(self.source, FrameSource)
+            self._columns = SignalColumns(
+                self.source.names, self.source.units, self.options.columns, in_memory=in_memory
+            )
             self._find()
 
     def _find(self) -> None:
@@ -262,7 +264,7 @@ class Table:
             raise BadDataset(f"{self.name}: it has {len(t_s)} rows of the {signal}: at least 2 are needed")
         return (len(t_s) - 1) / max(float(t_s[-1] - t_s[0]), 1e-9)
 
-    def wrenches(self) -> Iterator[Rows]:
+    def wrenches(self) -> Iterator[SignalRows]:
         """Give wrenches (n, 6) in N and N·m, in axes of the sensor or the flange.
 
         Raises `BadDataset` behind the last valid rows.
@@ -274,9 +276,9 @@ class Table:
         for t_s, (read, *pose), place in self._in_order(signals):
             with self._named():
                 wrench = self._in_flange(read, pose)
-            yield Rows(t_s, wrench, place)
+            yield SignalRows(t_s, wrench, place)
 
-    def poses(self) -> Iterator[Rows]:
+    def poses(self) -> Iterator[SignalRows]:
         """Give R_base_flange row by row, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
@@ -285,7 +287,7 @@ class Table:
         for t_s, values, place in self._in_order(signals):
             with self._named():
                 R, p = self._flange(values)
-            yield Rows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
+            yield SignalRows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
         """Return the rows as poses at rest: each row is one, or the rows of each dwell in a long table.
@@ -364,7 +366,7 @@ class Table:
     def _require_time(self) -> None:
         if self._found["time"] is None and not self.options.rate_Hz:
             words = self._columns.missing("time", "time")
-            rate = "rate_Hz=…" if isinstance(self.source, Frame) else "--rate HZ"
+            rate = "rate_Hz=…" if isinstance(self.source, FrameSource) else "--rate HZ"
             raise BadDataset(f"{self.name}: {words}, or add {rate} if the samples are evenly spaced")
 
     def _require(self, signal: str) -> Signal:

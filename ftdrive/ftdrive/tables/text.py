@@ -119,7 +119,7 @@ class TextTable:
         self.comments += comments
         return found
 
-    def _count_numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
+    def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
         """Return some columns of lines as numpy reads them; None if it refuses a cell, as a blank one, or a row."""
         if not (rows := list(filter(None, lines))):
             return None

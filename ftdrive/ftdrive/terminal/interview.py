@@ -15,8 +15,8 @@ from ftdrive.checks.description import (
     ROBOT,
     SENSOR,
     WALLS,
+    CellQuestion,
     Description,
-    Question,
     saved_at,
 )
 from ftdrive.checks.discovery import is_place, places
@@ -94,7 +94,7 @@ class Interview:
         if self._draft is not None:
             self._described.save(self._draft)
 
-    def _answer(self, question: Question) -> None:
+    def _answer(self, question: CellQuestion) -> None:
         described, key = self._described, question.key
         if key in (ROBOT, SENSOR):
             self._find(question)
@@ -107,11 +107,11 @@ class Interview:
         if key in (ROBOT, MODEL) and described.without_shape:
             say(described.without_shape, "  ! ")
 
-    def _former(self, question: Question) -> str | None:
+    def _former(self, question: CellQuestion) -> str | None:
         texts = self._described.texts.get(question.key)
         return texts[0] if texts else self._described.usual(question)
 
-    def _answer_rows(self, question: Question) -> None:
+    def _answer_rows(self, question: CellQuestion) -> None:
         """Ask for rows until an empty answer; "back" removes the last one."""
         described = self._described
         rows = described.texts.setdefault(question.key, [])
@@ -135,7 +135,7 @@ class Interview:
             rows.append(text)
             self._save()
 
-    def _find(self, question: Question) -> None:
+    def _find(self, question: CellQuestion) -> None:
         """Ask for the address of a device until one answers; the operator may keep one that does not."""
         described, key = self._described, question.key
         text = self._addresses.pop(key, None)
@@ -190,7 +190,7 @@ class Interview:
             described.answered.discard(questions[int(number) - 1].key)
         return not number
 
-    def _ask(self, question: Question, words: str, usual: str | None) -> str:
+    def _ask(self, question: CellQuestion, words: str, usual: str | None) -> str:
         """Return an answer that can be used, "" for no more rows; Enter and --yes take `usual`."""
 
         def accept(text: str) -> None:

@@ -11,7 +11,7 @@ from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftcalib.sensor_matrix import LEAST_COMMON_GAIN
 from ftcalib.shown import estimates_of, values_of
-from ftdrive.runs.pose_hints import find_moved, hints, names_of
+from ftdrive.runs.pose_hints import find_moved, hints, pose_names
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.words.text import TextLine
 
@@ -128,7 +128,7 @@ def conclusion(
         lines.append(TextLine(" contact: at ", words))
     if every and result.motion is None:
         lines.append(TextLine(" residuals: ", residuals_in_words(result)))
-        if (poses := _poses_in_words(result, names_of(records))) is not None:
+        if (poses := _poses_in_words(result, pose_names(records))) is not None:
             lines.append(TextLine(" worst: ", poses))
     lines += _drift_lines(result, drift, every=every)
     return lines + [TextLine(" ? ", one.words, "yellow") for one in hints(result, records) if hinted or every]

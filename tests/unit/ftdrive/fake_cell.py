@@ -430,7 +430,7 @@ class Lab:
         return SessionOptions(self.folder / "runs", poses=6, **options)
 
     def calibrate(self, load: Load | None = None, **options: Any) -> Outcome | None:
-        return session.calibrate(self.cell, self.operator, self._options(**options), load)
+        return session.run_calibration(self.cell, self.operator, self._options(**options), load)
 
     def take_poses(self, load: Load | None = None, **options: Any) -> Run | None:
         """As `calibrate`, for a test that does not ask what the poses give."""

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from ftdrive.cell.units import numbers
+from ftdrive.cell.units import parse_numbers
 from ftdrive.commands.options import EMULATED_SENSOR, FORCE, JSON, NewFile, Number, check_simulate, simulate
 from ftdrive.errors import ConfigError
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N
@@ -101,7 +101,7 @@ def calibration(
     settings = Settings(
         height_mm=recorded_height_mm if height_mm is None else height_mm,
         sensor_mass_kg=recorded_mass_kg if sensor_mass_kg is None else sensor_mass_kg,
-        sensor_com_mm=None if sensor_com is None else tuple(numbers("--sensor-com", sensor_com, ",", [3])),
+        sensor_com_mm=None if sensor_com is None else tuple(parse_numbers("--sensor-com", sensor_com, ",", [3])),
         verification=verification,
         **frames,
     )

@@ -9,7 +9,7 @@ from ftcalib.rounding import counted
 from ftdrive.commands.options import FILE, FOLDER, STORE
 from ftdrive.errors import ConfigError
 from ftdrive.fleet.cells import Owners, read_cells, refuse_ambiguous
-from ftdrive.fleet.state import list_names
+from ftdrive.fleet.state import join_names
 from ftdrive.store import open_store
 from ftdrive.store.records import record_paths
 from ftdrive.terminal.console import answer, hanging, messages
@@ -43,7 +43,7 @@ def remove(names: Sequence[str], url: str | None) -> None:
     found = open_store(url)
     known = [cell.name for cell in found.cells()]
     if unknown := [name for name in names if name not in known]:
-        instead = f"the cells are {list_names(known)}" if known else "it has no cells"
+        instead = f"the cells are {join_names(known)}" if known else "it has no cells"
         raise ConfigError(f"the store {found.name} has no cell {unknown[0]}: {instead}")
     found.remove_cells(names)
     answer.print(f" {len(set(names))} removed from {found.name}")
@@ -73,6 +73,6 @@ def index(folders: Sequence[Path], url: str | None) -> None:
         strange = {one.arm_serial or one.robot_host or "?" for one in found.results() if owners.cell_of(one) is None}
         if strange:
             arms, them = ("arm", "it") if len(strange) == 1 else ("arms", "them")
-            names = list_names(sorted(strange))
+            names = join_names(sorted(strange))
             words = f"no cell has the {arms} {names}: add {them} to cells.toml, then `ftdrive fleet add`"
             answer.print(hanging(" ! ", words, answer), style="yellow")

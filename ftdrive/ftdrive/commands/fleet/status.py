@@ -13,8 +13,7 @@ from ftcalib.files import write_new
 from ftdrive.commands.options import JSON, STORE, NewFile, require_extra, write_json
 from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.metrics import MetricsServer
-from ftdrive.fleet.state import CellState, attention, summary, times_in_words
-from ftdrive.fleet.state import serve as serve_fleet
+from ftdrive.fleet.state import CellState, attention, serve_status, summary, times_in_words
 from ftdrive.fleet.status import fleet_of, fleet_state
 from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
 from ftdrive.store import open_store
@@ -46,9 +45,9 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
     if page_path is not None:
-        from ftdrive.fleet.page import page  # needs an extra
+        from ftdrive.fleet.page import fleet_page  # needs an extra
 
-        write_new(page_path, page(fleet, observed, found.name))
+        write_new(page_path, fleet_page(fleet, observed, found.name))
         beside(as_json).print(f" Saved {page_path}")
     if as_json:
         states = {"cells": [one.to_dict(now) for one in fleet.cells], "findings": [*map(asdict, fleet.findings)]}
@@ -104,11 +103,11 @@ def serve(address: str, url: str | None) -> None:
             )
         messages.print(f"Alert rules and a dashboard are in {MONITORING}")
         messages.print("Ctrl-C ends.")
-        serve_fleet(partial(fleet_state, found), metrics.update, REAL, say=messages.print)
+        serve_status(partial(fleet_state, found), metrics.update, REAL, say=messages.print)
 
 
 def _page(store: Store) -> str:
-    from ftdrive.fleet.page import page  # needs an extra
+    from ftdrive.fleet.page import fleet_page  # needs an extra
 
     observed = Observed.read(store, datetime.now(UTC))
-    return page(fleet_of(observed, store), observed, store.name)
+    return fleet_page(fleet_of(observed, store), observed, store.name)

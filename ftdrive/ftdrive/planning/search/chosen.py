@@ -81,7 +81,9 @@ def chosen_tour(
     best = _clear_candidates(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
         for posture in _others(certifier, q_now, candidates):
-            found = _clear_candidates(certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal)
+            found = _clear_candidates(
+                certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal
+            )
             if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
                 best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
     return best

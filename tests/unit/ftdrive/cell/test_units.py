@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ftdrive.cell.units import DEG_S, KG, MM, SIDES, number, row, side_of, wall
+from ftdrive.cell.units import DEG_S, KG, MM, SIDES, parse_quantity, row, side_of, wall
 from ftdrive.errors import ConfigError
 from ftdrive.planning.planner import plane_from_mm
 
@@ -14,24 +14,24 @@ from ftdrive.planning.planner import plane_from_mm
     [("33", 33), ("33,5", 33.5), (" 33 mm", 33), ("1.1cm", 11), ("1,3 IN", 33.02), ("−5", -5), (",5", 0.5)],
 )
 def test_lengths(text: str, mm: float) -> None:
-    assert number("--height", text, MM) == mm
+    assert parse_quantity("--height", text, MM) == mm
 
 
 @pytest.mark.parametrize(("text", "kg"), [("1.2 kg", 1.2), ("450 g", 0.45), ("0,255", 0.255), ("2 lb", 0.90718474)])
 def test_masses(text: str, kg: float) -> None:
-    assert number("--tool-mass", text, KG) == kg
+    assert parse_quantity("--tool-mass", text, KG) == kg
 
 
 @pytest.mark.parametrize("text", ["", "high", "nan", "1.2 kg", "1 2", "1.200,5", "33 furlong"])
 def test_what_is_no_length(text: str) -> None:
     with pytest.raises(ConfigError, match=r"--height is .* not a number"):
-        number("--height", text, MM)
+        parse_quantity("--height", text, MM)
 
 
 @pytest.mark.parametrize(("units", "text"), [(MM, "1,200"), (KG, "-1,200 g"), (DEG_S, "12,000")])
 def test_a_comma_that_may_separate_thousands_is_not_guessed(units: dict[str, str], text: str) -> None:
     with pytest.raises(ConfigError, match="two meanings"):
-        number("--x", text, units)
+        parse_quantity("--x", text, units)
 
 
 @pytest.mark.parametrize("text", ["0:60:88,9", "0 60 88.9", "0, 60, 88.9", "0 mm 6 cm 3.5 in", "0 ; 60mm:88.9 mm"])

@@ -200,8 +200,8 @@ def test_a_payload_is_compared_with_the_described_tool(
 @pytest.mark.parametrize(("mass_kg", "state"), [(2.0, "ok"), (2.1, "failed"), (None, "skipped")])
 def test_the_tool_must_fit_the_range_of_the_sensor(mass_kg: float | None, state: str) -> None:
     cell = CellConfig(RobotConfig(""), SensorConfig(""), replace(TOOL, mass_kg=mass_kg))
-    assert of_sensor.check_load((50.0, 50.0, 50.0, 10.0, 10.0, 10.0), cell).state == state
-    assert of_sensor.check_load(None, cell).state == "skipped"
+    assert of_sensor.check_tool_weight((50.0, 50.0, 50.0, 10.0, 10.0, 10.0), cell).state == state
+    assert of_sensor.check_tool_weight(None, cell).state == "skipped"
 
 
 @pytest.mark.parametrize(

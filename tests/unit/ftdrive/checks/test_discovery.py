@@ -8,7 +8,7 @@ import pytest
 
 from ftcalib.errors import UsageError
 from ftdrive.checks import computer, discovery
-from ftdrive.checks.discovery import ask, is_place, places, sensor_at
+from ftdrive.checks.discovery import is_place, places, probe_place, sensor_at
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError
 from ftdrivers.probe import Answer
@@ -65,22 +65,22 @@ def test_an_adapter_on_a_serial_port(
 ) -> None:
     place = f"slcan://{tty}{serial_speed}?{query}"
     assert is_place(place)
-    assert ask(place) == [FOUND, REFUSED]
+    assert probe_place(place) == [FOUND, REFUSED]
     assert asked == [(tty + serial_speed, {"interface": "slcan", "bitrate": bitrate, "base": base, "clock": REAL})]
 
 
 def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], tmp_path: Path) -> None:
     port = tmp_path / "my port"
     port.symlink_to("/dev/null")
-    ask(f"slcan://{tmp_path}/my%20port?bitrate=250000")
+    probe_place(f"slcan://{tmp_path}/my%20port?bitrate=250000")
     assert [channel for channel, _ in asked] == [str(port)]
 
 
 def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path) -> None:
-    assert ask("/dev/null") == []
+    assert probe_place("/dev/null") == []
     assert asked == [("/dev/null", REAL)]
     with pytest.raises(ConnectError, match=f"{tmp_path}/ttyUSB0 does not exist; plug it in"):
-        ask(f"{tmp_path}/ttyUSB0")
+        probe_place(f"{tmp_path}/ttyUSB0")
     assert not is_place("ati-serial:///dev/ttyUSB0")
 
 
@@ -97,7 +97,7 @@ def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path
 )
 def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[Any]) -> None:
     with pytest.raises(UsageError, match=words):
-        ask(place)
+        probe_place(place)
     assert asked == []
 
 
@@ -106,7 +106,7 @@ def test_a_place_that_is_not_written_well(place: str, words: str, asked: list[An
 )
 def test_a_serial_port_is_no_can_interface(place: str, port: str, asked: list[Any]) -> None:
     with pytest.raises(ConnectError, match=rf"is not a CAN interface; .* {port}, .* slcan://{port}\?bitrate=250000$"):
-        ask(place)
+        probe_place(place)
     assert asked == []
 
 
@@ -114,12 +114,12 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
     with pytest.raises(
         ConnectError, match=r"no CAN interface can1; .*sudo ip link set can1 up type can bitrate 250000$"
     ):
-        ask("can1")
+        probe_place("can1")
     with pytest.raises(ConnectError, match=r"500000 bit/s, .*link set can0 down"):
-        ask("socketcan://can0?bitrate=250000")
+        probe_place("socketcan://can0?bitrate=250000")
     (can0 / "flags").write_text("0x40080\n")
     with pytest.raises(ConnectError, match=r"^can0 is down; .*link set can0 up .* 500000$"):
-        ask("can0")
+        probe_place("can0")
     assert asked == []
 
 

@@ -143,7 +143,7 @@ def begin(cells: list[Any], tmp_path: Path) -> Begin:
     def begun(*arguments: str) -> str:
         assert isinstance(call(*arguments), Opened)
         cell, options = cells.pop()
-        description = session.description_of(Calibrating(cell, options), options, {})
+        description = session.describe_run(Calibrating(cell, options), options, {})
         run = Run.create(tmp_path / "runs", "calibrate", json.loads(json.dumps(description)))
         run.plan_path.touch()
         return str(run.folder)

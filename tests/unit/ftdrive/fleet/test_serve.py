@@ -5,7 +5,7 @@ from datetime import datetime, timedelta
 import pytest
 
 from ftdrive.errors import BadStore
-from ftdrive.fleet.state import EVERY_S, Fleet, serve
+from ftdrive.fleet.state import EVERY_S, Fleet, serve_status
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fleet.fleets import NOW, cell, fleet
 
@@ -31,7 +31,7 @@ class Served:
         def now() -> datetime:
             return NOW + timedelta(seconds=self.t_s)
 
-        serve(self._fleet_at, self.update, self.clock, say=self.said.append, now=now)
+        serve_status(self._fleet_at, self.update, self.clock, say=self.said.append, now=now)
 
     def _fleet_at(self, _now: datetime) -> Fleet:
         answer = self._answers.pop(0)

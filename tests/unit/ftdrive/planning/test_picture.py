@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ftdrive.planning.drawing import _title_of, draw
+from ftdrive.planning.drawing import _title_of, draw_plan
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
@@ -69,7 +69,7 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
         (certifier_of(), np.array([stands, plan.steps[0].q_rad])),
     ]
     for i, (certifier, way_rad) in enumerate(cases):
-        draw(plan, certifier, tmp_path / f"{i}.png", way_rad)
+        draw_plan(plan, certifier, tmp_path / f"{i}.png", way_rad)
     areas = [[len(axes.patches) for axes in figure.axes] for figure in saved]
     lines = [[len(axes.lines) for axes in figure.axes] for figure in saved]
     assert np.subtract(areas[1], areas[0]).tolist() == [6, 6, 6]  # the lump at each pose
@@ -77,4 +77,4 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
     assert np.subtract(lines[3], lines[0]).tolist() == [1, 1, 1]
     assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False]  # the wall is seen
     with pytest.raises(FileExistsError, match="never overwritten"):
-        draw(plan, certifier_of(), tmp_path / "0.png")
+        draw_plan(plan, certifier_of(), tmp_path / "0.png")

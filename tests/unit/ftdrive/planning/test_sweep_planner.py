@@ -123,7 +123,7 @@ def test_a_curve_is_better_if_any_error_is_smaller(
 def test_the_rows_of_a_sweep_are_its_motion_and_their_rates(plan: Plan) -> None:
     assert plan.sweep is not None
     arm, sweep, h = certifier_of().arm, plan.sweep, 1e-3
-    found, rate = sweep_planner._motion(arm, sweep)
+    found, rate = sweep_planner._flange_motion(arm, sweep)
     t = np.arange(0.0, sweep.duration_s, 0.12)
 
     def columns(t: np.ndarray) -> np.ndarray:

@@ -16,8 +16,8 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import circumstances_of, solve_records
 from ftdrive.session.events import Noted, PoseTaken, Weighed
 from ftdrive.session.open_session import SessionOptions
-from ftdrive.session.preflight import check_payload
-from ftdrive.session.session import Calibrating, description_of
+from ftdrive.session.preflight import check_total_payload
+from ftdrive.session.session import Calibrating, describe_run
 from ftdrivers.clock import REAL
 from tests.edited_files import edit
 from tests.fake_clock import FakeClock
@@ -40,7 +40,7 @@ def test_the_limit_is_that_of_the_check_before_the_tour(payload_kg: float, lab: 
     )
     lab.arm.set_status(payload_kg=float(payload_kg), p_flange_payload_m=None)
     before: Any = SimpleNamespace(cell=lab.open_cell(), config=lab.cell, task=SimpleNamespace(load=None))
-    assert (check_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
+    assert (check_total_payload(before).state == "ok") == (described_cell.payload(float(payload_kg), 1.7, 0.3) == [])
 
 
 def test_a_wrong_payload_is_noted_once_when_the_fit_knows_and_is_the_first_finding(lab: Lab) -> None:
@@ -133,7 +133,7 @@ def test_a_session_saves_no_result_as_good_whose_tool_is_elsewhere_unless_it_was
 def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None, up: Any, lab: Lab) -> None:
     lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting=mounting))
     options = SessionOptions(lab.folder)
-    description = description_of(Calibrating(lab.cell, options), options, {})
+    description = describe_run(Calibrating(lab.cell, options), options, {})
     found = circumstances_of(Run.create(lab.folder, "r", description)).setup.up_in_base
     assert found == (None if up is None else pytest.approx(up, abs=1e-12))
 
@@ -141,5 +141,5 @@ def test_a_mounting_counts_as_declared_only_if_it_was_given(mounting: str | None
 def test_a_cell_with_a_clock_of_its_own_marks_its_results_as_emulated(lab: Lab) -> None:
     options = SessionOptions(lab.folder)
     for clock, station in ((FakeClock(), {}), (REAL, None)):
-        description = description_of(Calibrating(replace(lab.cell, clock=clock), options), options, {})
+        description = describe_run(Calibrating(replace(lab.cell, clock=clock), options), options, {})
         assert circumstances_of(Run.create(lab.folder, "r", description)).origin["station"] == station

@@ -21,7 +21,7 @@ from ftdrive.planning.search.nodes import NUMBERS
 from ftdrive.runs.load import Load
 from ftdrive.runs.pose_hints import _CHANGES, hints
 from ftdrive.session.events import Estimated
-from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit, _hint, _light, _motions, faces
+from ftdrive.session.live_fit import HUNG_TILT_RAD, RunningFit, _hint, _light, _simple_motions, faces
 from ftdrive.terminal.report import print_result
 from ftdrivers.interfaces import FtSamples
 from tests.known_cells import UPSIDE_DOWN
@@ -392,7 +392,7 @@ def test_tilts_with_a_hanging_load_are_enough_for_its_run() -> None:
 def test_a_hint_keeps_a_hanging_load_below_the_tool() -> None:
     R_base_flange = tilted_candidates(np.radians([60]), 1, 0.0, (0.0, 0.0, -1.0))
     last, down = R_base_flange[0], np.array([0.0, 0.0, -1.0])
-    words, candidates = _motions(last, down)
+    words, candidates = _simple_motions(last, down)
     hint = _hint(R_base_flange, Guess(3.0, 0.05, 0.003), down, HUNG_TILT_RAD)
     (chosen,) = [R for motion, R in zip(words, candidates, strict=True) if hint.endswith(motion)]
     assert -chosen[2, 2] >= np.cos(HUNG_TILT_RAD)

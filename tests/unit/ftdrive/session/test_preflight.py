@@ -281,7 +281,7 @@ def link(lab: Lab, *, old: bool, late_s: Callable[[int], float]) -> Check:
 
     right, lab.arm.answers_s = lab.arm.state, 0.0
     lab.arm.state = late  # type: ignore[method-assign]  # this arm only
-    return preflight.check_link(cast("preflight.Before", SimpleNamespace(cell=lab.open_cell())))
+    return preflight.check_session_link(cast("preflight.Before", SimpleNamespace(cell=lab.open_cell())))
 
 
 @pytest.mark.parametrize(("old", "limit_s"), [(False, 0.02), (True, 0.06)])

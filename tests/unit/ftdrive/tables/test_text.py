@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ftcalib.errors import BadDataset
-from ftdrive.tables.table import Rows, Table
+from ftdrive.tables.table import SignalRows, Table
 from ftdrive.tables.text import TextTable
 
 ROWS = st.lists(st.lists(st.floats(allow_nan=False), min_size=3, max_size=3), min_size=1, max_size=9)
@@ -55,7 +55,7 @@ def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
     content = path.read_text()
     for line, words in (("1,4,1,2,3,4,5,6.7.8", r"tz is '6\.7\.8', which is no number"), ("1,4", "has 2 values")):
         path.write_text(f"{content}{line}\n")
-        valid: list[Rows] = []
+        valid: list[SignalRows] = []
         with pytest.raises(BadDataset, match=rf"w\.csv: line 60002.*{words}.*correct or delete"):
             valid.extend(Table(path).wrenches())
         assert 0 < len(valid) < len(parts)
