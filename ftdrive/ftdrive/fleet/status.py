@@ -18,7 +18,7 @@ from ftcalib.after.series import drift_onset, spans_temperature
 from ftcalib.model import Array, angle_between_vectors, skew
 from ftcalib.rounding import to_place_of
 from ftdrive.fleet.cells import WINDOW, Changes, Observed, when
-from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
+from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding, join_names
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store

@@ -496,7 +496,8 @@ class _Shoulder:
             return self._too_near(f"the plane {_plane_words(row)}", gap_m)
         return (
             f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane "
-            f"{_format_row(row)}: the arm stays where normal times point is at least {place:g} mm: give {same} if the plane is there"
+            f"{_format_row(row)}: the arm stays where normal times point is at least {place:g} mm: "
+            f"give {same} if the plane is there"
             + (f", {opposite} if it is on the other side of the base" if opposite else "")
         )
 
