@@ -1,6 +1,6 @@
-"""The approach from the present posture to the first pose: a straight joint move if it is clear, else via-poses.
+"""The approach from the present posture to the first pose: a straight joint move if it is clear, else via poses.
 
-Via-poses come from a roadmap with lazy proofs (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000). The
+Via poses come from a roadmap with lazy proofs (Bohlin and Kavraki, Path planning using lazy PRM, ICRA 2000). The
 shortest path through free poses is searched first, then its moves are certified, and moves that are not clear are
 removed from the roadmap. The result is deterministic.
 """
@@ -19,40 +19,40 @@ from ftdrive.planning.motion import Speeds, move_duration_s, speed_of_leading_jo
 from ftdrive.planning.search.nodes import ELBOW_RAD
 from ftdrivers.ur.kinematics import Array
 
-# If no approach is proven, the operator jogs every joint to within this angle of the first pose.
+# If no approach is proven clear, the operator must jog every joint to within this angle of the first pose.
 NEAR_RAD = float(np.radians(30))
-# Via-poses may lie this far beyond the range between start and end. Joint 6 needs no detour.
+# Largest distance of via poses from the range between start and end. Joint 6 needs no detour.
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 # An arm within this angle of the first pose needs no approach.
 AT_RAD = 1e-3
 NODES = 240
 NEIGHBOURS = 16
-# Maximum number of proof rounds, about a second; then the search gives up.
+# Largest number of rounds of proofs, about 1 s in all.
 ROUNDS = 80
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """k consecutive moves that end at the first pose; k is 0 if the arm is there already."""
+    """Consecutive moves, k in number, that end at the first pose; k is 0 if the arm is there already."""
 
     way_rad: Array
-    """(k + 1, 6) from the present posture to the first pose; (0, 6) without a move."""
+    """Joint vectors (k + 1, 6) from the present posture to the first pose; (0, 6) without a move."""
     speed_rad_s: Array
-    """(k,) of the leading joint of each move."""
+    """Speed (k,) of the leading joint in each move."""
     certified: bool
-    """Every move is proven clear. Always so when made by `plan_approach`."""
+    """Whether every move is proven clear; always true for the result of `plan_approach`."""
     clearance_m: float
-    """Lower bound of the distance to anything, over all moves."""
+    """Lower bound of the clearance over all moves."""
     limited_by: str
-    """The two bodies that come closest to their margin."""
+    """The two bodies whose distance comes closest to the margin."""
 
     @property
     def q_rad(self) -> Array:
-        """(k, 6) where each move ends."""
+        """Joint vectors (k, 6) at which each move ends."""
         return self.way_rad[1:]
 
     def duration_s(self, most_rad_s: float, acceleration_rad_s2: float) -> float:
-        """Return how long its moves take where none is faster than `most_rad_s`."""
+        """Return the duration of the moves with speeds of at most `most_rad_s`, s."""
         turns = np.abs(np.diff(self.way_rad, axis=0)).max(axis=1)
         speeds = np.minimum(self.speed_rad_s, most_rad_s)
         return float(move_duration_s(turns, speeds, acceleration_rad_s2).sum())
@@ -71,7 +71,7 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
     Raises
     ------
     PlanRefused
-        No approach was proven clear; the message says where to jog the arm.
+        No approach is proven clear; the message says where to jog the arm.
     """
     if np.abs(np.subtract(q_now, q_first)).max() < AT_RAD:
         return Approach(np.zeros((0, 6)), np.zeros(0), certified=True, clearance_m=np.inf, limited_by="")
@@ -92,7 +92,7 @@ def plan_approach(certifier: Certifier, q_now: ArrayLike, q_first: ArrayLike, sp
 
 
 def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array:
-    """Via-poses and the first pose (k, 6). Raises `PlanRefused` if there is no proven path."""
+    """Return via poses and the first pose (k, 6). Raises `PlanRefused` if no path is proven clear."""
     here = certifier.certify(now, now)
     if not here.clear[0]:
         raise PlanRefused(_too_near(certifier, here) + _where_to_jog(first))
@@ -107,21 +107,21 @@ def _around(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> A
 
 
 def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Speeds) -> Array | None:
-    """Via-poses and the first pose (k, 6); None if no path was proven."""
+    """Return via poses and the first pose (k, 6); None if no path is proven clear."""
     nodes = _nodes(certifier, now, first)
     turn = np.abs(nodes[:, None] - nodes)
     cost = move_duration_s(turn.max(axis=2), speeds.joint_rad_s, speeds.joint_rad_s2) + 0.05 * turn.sum(axis=2)
     near = np.argsort(cost, axis=1, kind="stable")[:, 1 : NEIGHBOURS + 1]
     possible = np.zeros(cost.shape, dtype=np.bool_)
     possible[np.arange(len(nodes))[:, None], near] = True
-    # Both ends see every node.
+    # Start and goal are connected to every node.
     possible[:2] = True
     possible |= possible.T
     possible[0, 1] = possible[1, 0] = False
     np.fill_diagonal(possible, val=False)
     proven = np.zeros_like(possible)
     for _ in range(ROUNDS):
-        # Two shortest-path trees give the best path through every node, so that a whole batch is certified at once.
+        # The shortest-path trees of start and goal give the best path through every node, so that a batch is certified.
         distance, before = dijkstra(
             np.where(possible, cost, 0.0), directed=False, indices=[0, 1], return_predecessors=True
         )
@@ -147,7 +147,7 @@ def _through_roadmap(certifier: Certifier, now: Array, first: Array, speeds: Spe
 
 
 def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
-    """Both ends, the corners of the box between them, and random poses in a larger box; all free."""
+    """Return start, goal, and free via poses: corners of the box between the two, and random poses in a larger box."""
     corner = (np.arange(1, 63)[:, None] >> np.arange(6)) % 2 == 1
     limit = np.full(6, 2 * np.pi)
     limit[2] = max(ELBOW_RAD, abs(now[2]), abs(first[2]))
@@ -155,7 +155,7 @@ def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
     high = np.minimum(np.maximum(now, first) + ROOM_RAD, limit)
     spread = np.random.default_rng(0).uniform(low, high, (3 * NODES, 6))
     via = np.unique(np.vstack([np.where(corner, now, first), spread]), axis=0)
-    # Where some joints of both ends are equal, corners coincide with each other or with an end.
+    # If start and goal have equal joint angles, corners coincide with each other, with start or with goal.
     via = via[(via != now).any(axis=1) & (via != first).any(axis=1)]
     away = np.maximum(np.abs(via - now), np.abs(via - first)).max(axis=1)
     via = via[np.argsort(away, kind="stable")]
@@ -163,7 +163,7 @@ def _nodes(certifier: Certifier, now: Array, first: Array) -> Array:
 
 
 def _walk(before: NDArray[np.int32], node: int) -> list[int]:
-    """Nodes from one back to the root of its tree; only the node itself if it is not reached."""
+    """Return the nodes from one back to the root of its tree; the node alone if the tree does not reach it."""
     way = [node]
     while before[way[-1]] >= 0:
         way.append(int(before[way[-1]]))
@@ -171,13 +171,13 @@ def _walk(before: NDArray[np.int32], node: int) -> list[int]:
 
 
 def _too_near(certifier: Certifier, here: Certificate) -> str:
-    found, margins = here.limited_by[0], certifier.margins
+    bodies, margins = here.limited_by[0], certifier.margins
     within = here.self_clearance_m[0] - margins.self_m < here.scene_clearance_m[0] - margins.scene_m
     distance, margin = (
         (here.self_clearance_m[0], margins.self_m) if within else (here.scene_clearance_m[0], margins.scene_m)
     )
     return (
-        f"at its present posture the arm is {1e3 * max(distance, 0.0):.0f} mm from contact ({found}), "
+        f"at the present posture the clearance is {1e3 * max(distance, 0.0):.0f} mm ({bodies}), "
         f"less than the margin of {1e3 * margin:.0f} mm: "
     )
 

@@ -1,4 +1,4 @@
-"""A plan as stick figures."""
+"""Drawing of a plan with the arm as stick figures."""
 
 from collections.abc import Iterator
 from io import BytesIO
@@ -20,36 +20,36 @@ from ftdrivers.installation import missing_extra
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
-# Axis to the right, axis up, title.
+# Views: base axis to the right, base axis up, title.
 VIEWS = ((1, 2, "along base x"), (0, 2, "along base y"), (0, 1, "from above"))
-# A plane is drawn where it is seen from its edge: of its unit normal, the share along the view is below this.
+# A plane is drawn in views along it: the component of its unit normal along the view is below this.
 _ALONG = 0.1
-# One in so many steps of a sweep is drawn.
+# Every fifth step of a sweep is drawn.
 _OF_SWEEP = 5
 _FAR_M = 20.0
-# How far from arm and ball surroundings are shown, and some room at the edge.
+# Largest distance of shown surroundings from arm and ball, and width of the border.
 _NEAR_M, _EDGE_M = 1.0, 0.06
 _TURN = np.linspace(0, 2 * np.pi, 100)
 
 
 def draw_plan(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike = ()) -> None:
-    """Write a PNG with the arm at every pose, its tool and its surroundings, seen from the front, side and above.
+    """Write a PNG of arm, tool and surroundings at every pose, seen from the front, the side and above.
 
     Needs the extra `viz`.
 
     Parameters
     ----------
     certifier : Certifier
-        For the same arm, tool and scene.
+        The certifier of the same arm, tool and scene.
     path : Path
         A new file.
     way_rad : array_like, shape (k + 1, 6), optional
-        From the present posture to the first pose; drawn in green.
+        The approach from the present posture to the first pose, drawn in green.
 
     Raises
     ------
     ConfigError
-        There is no matplotlib.
+        Matplotlib is not installed.
     OSError
         As `write_new`.
     """
@@ -71,10 +71,10 @@ def draw_plan(plan: Plan, certifier: Certifier, path: Path, way_rad: ArrayLike =
     for column, (across, up, title) in enumerate(VIEWS):
         axes = figure.add_subplot(grid[0, column])
         view = [across, up]
-        for one in _skeletons(poses):
-            axes.plot(*one[:, view].T, "-o", color="tab:gray", markersize=3, linewidth=1)
-        for one in there:
-            axes.plot(*one[:, view].T, "--o", color="tab:green", markersize=3, linewidth=1)
+        for joints in _skeletons(poses):
+            axes.plot(*joints[:, view].T, "-o", color="tab:gray", markersize=3, linewidth=1)
+        for joints in there:
+            axes.plot(*joints[:, view].T, "--o", color="tab:green", markersize=3, linewidth=1)
         for outline in _tools(arm, poses, view):
             axes.fill(*outline.T, facecolor="tab:orange", edgecolor="tab:orange", alpha=0.12, linewidth=1)
         centre = np.array(plan.ball_centre_m)[view, None]
@@ -103,15 +103,15 @@ def _plot_joints(axes: Any, sweep: Sweep) -> None:
 
 
 def _title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
-    """Say what is seen, and what is not."""
+    """Return the title: what the drawing shows, and what it does not."""
     ball = f"sphere of {plan.ball_m:.2f} m"
-    moves = f"all that moves stays in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
+    moves = f"all moving parts stay in this {ball}" if plan.arm_rests else f"wrist and tool stay in this {ball}"
     name = f"EMULATED {certifier.arm.name}" if plan.emulated else certifier.arm.name
     motion = f"{len(plan.steps)} poses" if plan.sweep is None else f"sweep of {plan.sweep.duration_s:.0f} s"
     lines = [f"{name}: {motion}; blue, dotted: {moves}"]
     if not plan.arm_rests:
         lines[0] += ", the WHOLE ARM moves"
-    lines.append("grey: arm, orange: tool, at every pose; black: base; red: planes and boxes")
+    lines.append("grey: arm at every pose; orange: tool; black: base; red: planes and boxes")
     if on_its_way:
         lines.append("green: the present posture, and the approach to the first pose")
     if slanting := sum(not _is_in_view(plane) for plane in certifier.scene.planes):
@@ -120,14 +120,14 @@ def _title_of(plan: Plan, certifier: Certifier, *, on_its_way: bool) -> str:
 
 
 def _skeletons(at: Frames) -> Array:
-    """Joints (n, 7, 3) of the arm, from base to flange."""
+    """Return the positions (n, 7, 3) of the joints from base to flange, m."""
     base = np.zeros_like(at.shoulder_m)
     joints = (base, at.shoulder_m, at.elbow_m, at.forearm_end_m, at.wrist_m, at.wrist_2_m, at.flange_m)
     return np.stack(joints, axis=1)
 
 
 def _tools(arm: ArmModel, at: Frames, view: list[int]) -> Iterator[Array]:
-    """Outline (k, 2) of every cylinder of the tool at every pose."""
+    """Yield the outline (k, 2) of every cylinder of the tool at every pose, m."""
     for flange_m, R in zip(at.flange_m, at.R_base_flange, strict=True):
         for part in arm.tool:
             points = (flange_m + _rims(part) @ R.T)[:, view]
@@ -135,14 +135,14 @@ def _tools(arm: ArmModel, at: Frames, view: list[int]) -> Iterator[Array]:
 
 
 def _rims(part: Cylinder) -> Array:
-    """Points (n, 3) of both ends, flange axes."""
+    """Return points (n, 3) on the rims of both ends of a cylinder, flange axes, m."""
     radius = part.diameter_m / 2
     x, y = part.x_m + radius * np.cos(_TURN[::4]), part.y_m + radius * np.sin(_TURN[::4])
     return np.concatenate([np.stack([x, y, np.full_like(x, z)], axis=1) for z in (part.from_m, part.to_m)])
 
 
 def _view_corners(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Array:
-    """Low and high corner (2, 3) of what is looked at: the arm, the ball, and of the surroundings what is near."""
+    """Return the low and high corner (2, 3) of the drawing: arm, ball, and near surroundings, base axes, m."""
     centre = np.array(plan.ball_centre_m)
     points = np.concatenate([_skeletons(poses).reshape(-1, 3), before, [centre - plan.ball_m, centre + plan.ball_m]])
     low, high = points.min(axis=0) - _NEAR_M, points.max(axis=0) + _NEAR_M
@@ -153,7 +153,7 @@ def _view_corners(plan: Plan, poses: Frames, before: Array, scene: Scene) -> Arr
 
 
 def _surroundings(axes: Any, scene: Scene, view: list[int]) -> None:
-    """Draw boxes, and planes that are seen from their edge."""
+    """Draw boxes, and the planes that lie along the view."""
     for box in scene.boxes:
         (left, bottom), (right, top) = np.array([box.low_m, box.high_m])[:, view]
         axes.fill([left, right, right, left], [bottom, bottom, top, top], color="tab:red", alpha=0.3)

@@ -1,4 +1,4 @@
-"""How fast a joint move may be, and how long it takes."""
+"""Speed limits and durations of joint moves."""
 
 from dataclasses import dataclass
 
@@ -9,31 +9,31 @@ from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrivers.ur.kinematics import Array
 
 SAMPLE_RAD = np.radians(0.5)
-# A joint that turns less does not count as moving: no part of any arm moves by 20 mm.
+# A joint that turns by less is considered to rest: no part of any arm then moves by 20 mm.
 STILL_RAD = float(np.radians(0.5))
 
 
 @dataclass(frozen=True, slots=True)
 class Speeds:
-    """Limits of every move: for the joint that turns farthest, and for the tips of the tool."""
+    """Limits of every move: speed and acceleration of the leading joint, and speed of the tool tips."""
 
     joint_rad_s: float = float(np.radians(60))
     joint_rad_s2: float = float(np.radians(80))
     tip_m_s: float | None = 0.25
-    """None for no limit."""
+    """Largest speed of a tip; None for no limit."""
 
     @classmethod
     def first_run(cls) -> "Speeds":
-        """Return the slow limits for a plan that has not run in its workcell yet."""
+        """Return the slow limits for a plan that was not completed in its workcell yet."""
         return cls(float(np.radians(30)), float(np.radians(40)))
 
     @classmethod
     def with_hung_load(cls) -> "Speeds":
-        """Return the limits with a weight on a string: slow against its period of a second, so it hardly swings."""
+        """Return the limits with a load on a string: slow compared with its period of 1 s, so that it hardly swings."""
         return cls(float(np.radians(15)), float(np.radians(20)), 0.1)
 
     def limited(self, other: "Speeds") -> "Speeds":
-        """Return the smaller of each limit."""
+        """Return the smaller value of each limit."""
         return Speeds(
             min(self.joint_rad_s, other.joint_rad_s),
             min(self.joint_rad_s2, other.joint_rad_s2),
@@ -42,14 +42,14 @@ class Speeds:
 
 
 def move_duration_s(turn_rad: Array, speed_rad_s: Array | float, acceleration_rad_s2: float) -> Array:
-    """Duration of moves by the angle of their leading joint, with speed ramped up and down."""
+    """Return the duration of moves by the angle of the leading joint, with a trapezoidal speed profile, s."""
     ramp = np.square(speed_rad_s) / acceleration_rad_s2
     whole = turn_rad / speed_rad_s + np.asarray(speed_rad_s) / acceleration_rad_s2
     return np.asarray(np.where(turn_rad > ramp, whole, 2 * np.sqrt(turn_rad / acceleration_rad_s2)))
 
 
 def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, speeds: Speeds) -> Array:
-    """Speed (m,) for straight joint moves (m, 6) at which no tip of the tool exceeds the limit."""
+    """Return the largest speed (m,) of the leading joint in straight moves (m, 6) within all limits, rad/s."""
     turn = end_rad - start_rad
     leading = np.abs(turn).max(axis=1)
     speed = np.full(len(turn), speeds.joint_rad_s)
@@ -64,9 +64,9 @@ def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, spee
 
 
 def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
-    """Duration (n, n) of straight moves between joint vectors (n, 6), to compare tours.
+    """Return the durations (n, n) of straight moves between joint vectors (n, 6), for the comparison of tours, s.
 
-    Tips are evaluated only at both ends and the middle of a move: their true speed may be a little higher.
+    The tips are evaluated only at both ends and the middle of a move, so that their true speed may be slightly higher.
     """
     turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
     speed = np.full(turn.shape, speeds.joint_rad_s)
@@ -81,8 +81,7 @@ def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
 
 
 def tips(arm: ArmModel, q_rad: Array) -> Array:
-    """Centres (n, k, 3) in base of the far ends of the tool's cylinders, then the hook of a load."""
-    # Centres of the far ends; a point on the rim may be somewhat faster.
+    """Return the centres (n, k, 3) of the far ends of the tool's cylinders, and the hook of a load, in base, m."""
     at = arm.frames(q_rad)
     hook = [] if arm.hung is None else [arm.hung.p_flange_m]
     local = np.array([*((part.x_m, part.y_m, part.to_m) for part in arm.tool), *hook])
@@ -90,6 +89,6 @@ def tips(arm: ArmModel, q_rad: Array) -> Array:
 
 
 def arm_moves(way_rad: ArrayLike) -> bool:
-    """Return whether base, shoulder or elbow turn along a path (n, 6)."""
+    """Return whether base, shoulder or elbow move along a path (n, 6)."""
     path = np.asarray(way_rad)
     return len(path) > 0 and bool(np.ptp(path[:, :3], axis=0).max() >= STILL_RAD)

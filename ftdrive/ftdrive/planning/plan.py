@@ -1,4 +1,4 @@
-"""A plan: joint targets, speeds, clearances, predicted accuracy, the cell that it was made for; all this in words."""
+"""A plan: joint targets, speeds, clearances, predicted accuracy and the cell for which it was made; its description."""
 
 import hashlib
 import json
@@ -24,8 +24,8 @@ from ftdrivers.ur.kinematics import Array, Kinematics
 
 PLAN_FORMAT, OLD_FORMAT = "ftdrive.plan/2", "ftdrive.plan/1"
 BALL_SAMPLES = 181
-# Between two points of a sweep whose straight move is proven clear.
-# The proof adds a distance for what lies between two points of the curve.
+# Time between two points of a sweep that are joined by a straight move for the proof, s. The proof keeps additional
+# distance for the deviation of the curve from these moves.
 PROOF_S = 0.1
 JOINTS = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
 
@@ -35,72 +35,72 @@ class PlanStep:
     """One pose, and the move from it to the next one; the last move leads back to the first pose."""
 
     number: int
-    """Number of the orientation in the paper, 1 to 24; from 101 on for chosen poses, from 1001 on for sets."""
+    """Number of the orientation: 1 to 24 as in the paper, from 101 for chosen poses, from 1001 for sets."""
     q_rad: tuple[float, ...]
     R_base_flange: tuple[tuple[float, ...], ...]
     turn_rad: float
-    """Turn of the leading joint in the move."""
+    """Angle by which the leading joint turns in the move."""
     speed_rad_s: float
     """Speed of the leading joint."""
     duration_s: float
     certified: bool
     clearance_m: float
     limited_by: str
-    """The two bodies that come closest to their margin."""
+    """The two bodies whose distance comes closest to the margin."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Plan(Displayed):
-    """A closed tour of poses; `to_dict` defines the file."""
+    """A closed tour of poses, or a sweep; `to_dict` defines the file."""
 
     kind: str
-    """constant, wrist, posture, box, cone, reachable, tool, sets, hung, verification or sweep."""
+    """Kind of plan: constant, wrist, posture, box, cone, reachable, tool, sets, hung, verification or sweep."""
     why: tuple[str, ...]
-    """What was tried, and the loss of accuracy of this choice."""
+    """Sentences about the reason for this plan and its loss of accuracy."""
     made_for: Mapping[str, str]
-    """SHA-256 of model, kinematics, tool, scene (with the margins). Files of version 1 have no kinematics."""
+    """SHA-256 of model, kinematics, tool and scene with margins. Files of version 1 lack the kinematics."""
     steps: tuple[PlanStep, ...]
     acceleration_rad_s2: float
     ball_m: float
     """Radius of a ball that contains wrist and tool during the whole tour."""
     ball_centre_m: tuple[float, ...]
-    """(3,) in base; where the axes of joints 4 and 5 cross, if base, shoulder and elbow rest."""
+    """(3,) centre of the ball in base; the crossing of joint axes 4 and 5 if base, shoulder and elbow rest."""
     predicted: Mapping[str, Any]
     description: Mapping[str, Any]
-    """Model, kinematics, tool, scene and speeds; `measured` and `emulated` see `marked`."""
+    """Model, kinematics, tool, scene and speeds; see `marked` for `measured` and `emulated`."""
     sweep: Sweep | None = None
-    """The curve that the arm follows through the steps, which are points of it."""
+    """Curve of a sweep, whose points are the steps; None for a tour."""
     off_curve_m: float = 0.0
-    """How much nearer to anything the arm can be on the curve than on the moves between the steps."""
+    """Bound of the loss of clearance on the curve relative to the straight moves between the steps."""
 
     def _summary(self) -> Summary:
         return Summary(f"Plan {self.kind}, {counted(len(self.steps), 'pose')}", notes=_summary(self))
 
     @property
     def certified(self) -> bool:
-        """Whether every move, the last one back included, is proven clear."""
+        """Whether every move, including the return to the first pose, is proven clear."""
         return all(step.certified for step in self.steps)
 
     @property
     def arm_rests(self) -> bool:
         """Whether base, shoulder and elbow stay at rest during the whole tour."""
-        # If base or elbow move, the ball around the wrist is not enough: the whole arm needs clear space.
+        # If these joints move, the whole arm needs clear space, not only the ball around the wrist.
         return len({step.q_rad[:3] for step in self.steps}) == 1
 
     @property
     def measured(self) -> bool:
-        """Whether the operator has configured tool and scene as measured; else they may be placeholders."""
+        """Whether the operator has configured that tool and scene were measured; otherwise they may be placeholders."""
         return self.description.get("measured") is True
 
     @property
     def emulated(self) -> bool:
-        """Whether it was made for an emulated cell."""
+        """Whether the plan was made for an emulated cell."""
         return self.description.get("emulated") is True
 
     def marked(self, *, measured: bool, emulated: bool = False) -> "Plan":
-        """Record in the description, and so in the file and its hash, whether tool and scene were measured.
+        """Return the plan with a description that says whether tool and scene were measured.
 
-        For an emulated cell the first sentence says so.
+        For an emulated cell the first sentence says that too. The description is part of the file and its hash.
         """
         if not emulated:
             return replace(self, description={**self.description, "measured": measured})
@@ -111,39 +111,39 @@ class Plan(Displayed):
 
     @property
     def kinematics(self) -> Kinematics | None:
-        """Those of the arm that it was made on; None if it was made with nominal ones."""
-        found = self.description.get("kinematics", {"source": "nominal"})
-        if found["source"] == "nominal":
+        """Kinematics of the arm for which the plan was made; None if they are nominal."""
+        stored = self.description.get("kinematics", {"source": "nominal"})
+        if stored["source"] == "nominal":
             return None
-        return Kinematics.of([*found["theta_rad"], *found["a_m"], *found["d_m"], *found["alpha_rad"]])
+        return Kinematics.of([*stored["theta_rad"], *stored["a_m"], *stored["d_m"], *stored["alpha_rad"]])
 
     @property
     def R_base_flange(self) -> Array:
-        """(n, 3, 3) orientations of the poses; maps flange coordinates to base coordinates."""
+        """Orientations (n, 3, 3) of the poses; they map flange coordinates to base coordinates."""
         return np.array([step.R_base_flange for step in self.steps])
 
     @property
     def nodes_rad(self) -> Array:
-        """(n, 6) joint vectors at which the arm stands: the poses, or the centre of a sweep."""
+        """Joint vectors (n, 6) at which the arm stands: the poses, or the centre of a sweep."""
         if self.sweep is not None:
             return np.array([self.sweep.centre_rad])
         return np.array([step.q_rad for step in self.steps])
 
     @property
     def stops(self) -> range:
-        """Numbers of the stops, from 1: every pose and the return to the first; a sweep is one."""
+        """Numbers of the stops, from 1: every pose and the return to the first one; a sweep has one stop."""
         return range(1, 2 if self.sweep else len(self.steps) + 2)
 
     @property
     def top_speed_rad_s(self) -> float:
-        """Largest speed of a joint."""
+        """Largest joint speed of the plan."""
         if self.sweep is not None:
             return float(self.sweep.largest(1).max())
         return max(step.speed_rad_s for step in self.steps)
 
     @property
     def motion_time_s(self) -> float:
-        """Sum of the moves at the plan's speeds, the last one back included."""
+        """Duration of all moves at the speeds of the plan, including the return to the first pose."""
         return float(sum(step.duration_s for step in self.steps))
 
     def limited(self, certifier: Certifier, speeds: Speeds) -> "Plan":
@@ -158,13 +158,13 @@ class Plan(Displayed):
         return replace(self, steps=tuple(steps), acceleration_rad_s2=acceleration_rad_s2)
 
     def at_share(self, share: float) -> "Plan":
-        """Return the plan of a sweep with the same path at a share of the speed."""
+        """Return the plan of a sweep along the same curve at this share of the speed."""
         if self.sweep is None or share == 1.0:
             return self
         return replace(self, sweep=self.sweep.slower(share), acceleration_rad_s2=self.acceleration_rad_s2 * share**2)
 
     def in_words(self, *, table: bool = True) -> str:
-        """Return the reason for the plan, its moves, joint ranges, clearances, time, space and predicted accuracy.
+        """Describe the plan: reason, moves, joint ranges, clearances, duration, space and predicted accuracy.
 
         The table is at most 72 columns wide; each sentence is one line.
         """
@@ -174,17 +174,17 @@ class Plan(Displayed):
         return "\n".join([*self.why, *rest, *([*rows, ""] if table else []), *_summary(self)])
 
     def stop_in_words(self, robot: RobotConfig) -> str:
-        """Return time and angle of a stop until rest, at the plan's highest speed; empty for other drivers."""
+        """Describe time and angle of a stop from the highest speed of the plan; empty for other drivers than "ur"."""
         if robot.driver != "ur":
             return ""
         speed_deg_s, stop_deg_s2 = np.degrees(self.top_speed_rad_s), robot.stop_deceleration_deg_s2
         return (
-            f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: at rest after "
+            f"A stop from {speed_deg_s:.0f} °/s brakes with {stop_deg_s2:.0f} °/s²: the arm rests after "
             f"{speed_deg_s / stop_deg_s2:.2f} s and {speed_deg_s**2 / (2 * stop_deg_s2):.1f}°."
         )
 
     def room_in_words(self) -> str:
-        """Return which space must be clear."""
+        """Describe the space that must be clear."""
         ball = self.ball_in_words()
         if self.arm_rests:
             crossing = "where the axes of wrist 1 and 2 cross"
@@ -192,17 +192,17 @@ class Plan(Displayed):
         return f"Wrist and tool stay {ball}, and the whole arm moves: keep the space of both clear, cables slack."
 
     def ball_in_words(self) -> str:
-        """Return radius and centre of the ball as text."""
+        """Describe radius and centre of the ball."""
         x, y, z = (f"{value:.2f}" for value in self.ball_centre_m)
         return f"within {self.ball_m:.2f} m of x {x}, y {y}, z {z} m in base"
 
     @property
     def sha256(self) -> str:
-        """Hash of the file."""
+        """SHA-256 of the contents of the file."""
         return str(self.to_dict()["sha256"])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the contents of the file; its hash over everything else reveals later changes."""
+        """Return the contents of the file, with a hash of the other entries that reveals later changes."""
         document: dict[str, Any] = {
             "format": PLAN_FORMAT,
             "kind": self.kind,
@@ -223,26 +223,26 @@ class Plan(Displayed):
         }
         if self.sweep is not None:
             document |= {"sweep": self.sweep.to_dict(), "off_curve_m": self.off_curve_m}
-        # Tuples become lists, as they come back from a file.
+        # Tuples become lists, as after reading the file.
         document = json.loads(json.dumps(document))
         return document | {"sha256": digest(document)}
 
     def save(self, path: str | Path) -> None:
-        """Write a new file."""
+        """Write the plan to a new file."""
         write_new(path, json.dumps(self.to_dict(), indent=1) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> "Plan":
-        """Read a file; raises `BadPlan` if it is not a plan, `PlanRefused` if it was changed."""
+        """Read a plan; raises `BadPlan` if the file is not a plan, and `PlanRefused` if it was changed."""
         try:
             document = read_object(path, BadPlan)
             if document.get("format") != OLD_FORMAT:
                 check_format(document, PLAN_FORMAT, BadPlan)
         except BadPlan as error:
             raise BadPlan(f"{path}: {error}") from error
-        document.pop("schema_version", None)  # that of `ftdrive plan --json`, which is a plan too
-        found = document.pop("sha256", None)
-        if found != digest(document):
+        document.pop("schema_version", None)  # the output of `ftdrive plan --json` is a plan with this entry
+        stored = document.pop("sha256", None)
+        if stored != digest(document):
             raise PlanRefused(f"{path} was changed after it was made: make a new plan with `ftdrive plan`")
         steps = tuple(
             PlanStep(
@@ -269,7 +269,7 @@ class Plan(Displayed):
         now = fingerprints(certifier)
         changed = [name for name in now if name != "kinematics" and self.made_for.get(name) != now[name]]
         if changed:
-            raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new one")
+            raise PlanRefused(f"the plan was made for another {' and another '.join(changed)}: make a new plan")
         q = np.array([step.q_rad for step in self.steps])
         if self.sweep is not None:
             q = self.sweep.at(np.arange(0.0, self.sweep.duration_s, PROOF_S))
@@ -277,12 +277,11 @@ class Plan(Displayed):
             raise PlanRefused("a move of the plan cannot be proven clear: make a new plan")
 
     def of_arm(self, certifier: Certifier) -> "Plan":
-        """Return the plan for the kinematics of this arm: its wrist has the orientations, and the distances are its.
+        """Return the plan with wrist angles and clearances for the kinematics of this arm.
 
-        A plan for another model, tool or scene is returned as it is: `require` refuses it. Raises `PlanRefused` if a
+        A plan for another model, tool or scene is returned unchanged; `require` refuses it. Raises `PlanRefused` if a
         move cannot be proven clear with these kinematics.
         """
-        # A plan from a file is proven again, in about 5 ms.
         now = fingerprints(certifier)
         if {**self.made_for, "kinematics": now["kinematics"]} != now or self.made_for == now:
             return self
@@ -331,16 +330,16 @@ def make_plan(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Certify a closed tour and predict its accuracy for the guessed tool and noise.
+    """Certify a closed tour, and predict its accuracy for the assumed tool and noise.
 
     Parameters
     ----------
     why : sequence of str
-        Sentences; the predicted error is appended.
+        Sentences about the reason; the predicted error is appended.
     numbers : sequence of int
         Numbers of the orientations.
     q_rad : array, shape (n, 6)
-        In the order of travel.
+        Joint vectors in the order of travel.
     """
     arm, following = certifier.arm, np.roll(q_rad, -1, axis=0)
     certificate = certifier.certify(q_rad, following)
@@ -382,7 +381,7 @@ def make_plan(
 
 
 def describe_plan(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[str, Any]:
-    """Return the description of a plan."""
+    """Return the `description` of a plan."""
     return {
         "model": certifier.arm.name,
         "kinematics": describe_kinematics(certifier),
@@ -401,24 +400,24 @@ def describe_plan(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[st
 
 
 def describe_kinematics(certifier: Certifier) -> dict[str, Any]:
-    """Return the kinematics of a description: their source, theta, a, d and alpha of all joints."""
+    """Return the entry `kinematics` of a description: source, theta, a, d and alpha of all joints."""
     source = "nominal" if certifier.arm.is_nominal else "controller"
     return {"source": source, **asdict(certifier.arm.kinematics)}
 
 
 def ball_of(certifier: Certifier, start_rad: Array, end_rad: Array) -> tuple[Array, float]:
-    """Centre (3,) and radius of a ball that contains wrist and tool during all moves."""
+    """Return centre (3,) in base and radius of a ball that contains wrist and tool during all moves, m."""
     share = np.linspace(0, 1, BALL_SAMPLES)[:, None, None]
     wrist_m = certifier.arm.frames(((1 - share) * start_rad + share * end_rad).reshape(-1, 6)).wrist_m
     centre_m = (wrist_m.min(axis=0) + wrist_m.max(axis=0)) / 2
-    # Between two samples the wrist centre can be farther out by no more than half a step of its path.
+    # Between two samples the wrist centre leaves the ball of the samples by at most half a step.
     step_m = np.linalg.norm(np.diff(wrist_m.reshape(BALL_SAMPLES, -1, 3), axis=0), axis=2).max()
     away_m = np.linalg.norm(wrist_m - centre_m, axis=1).max() + step_m / 2
     return centre_m, certifier.arm.ball_m + float(away_m)
 
 
 def fingerprints(certifier: Certifier) -> dict[str, str]:
-    """SHA-256 of everything that a proof of clearance depends on."""
+    """Return the SHA-256 of model, kinematics, tool and scene, on which the proof of clearance depends."""
     hung = [] if certifier.arm.hung is None else [asdict(certifier.arm.hung)]
     return {
         "model": digest(certifier.arm.describe()),
@@ -429,26 +428,26 @@ def fingerprints(certifier: Certifier) -> dict[str, str]:
 
 
 def digest(value: Any) -> str:
-    """SHA-256 of a value's JSON with sorted keys."""
+    """Return the SHA-256 of a value as JSON with sorted keys."""
     return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()
 
 
 def _prediction_json(prediction: Prediction) -> dict[str, Any]:
-    """Sigma of each estimate; null if the poses do not determine it."""
+    """Return the sigma of each estimate; None if the poses do not determine it."""
     values: dict[str, Any] = {name: np.asarray(sigma).tolist() for name, sigma in prediction.sigma.items()}
     for name in ("force_rms_N", "torque_rms_Nm", "cond9", "cond_u1", "second_basin_gap"):
         values[name] = getattr(prediction, name)
 
     def finite(value: Any) -> Any:
         if isinstance(value, list):
-            return [finite(one) for one in value]
+            return [finite(item) for item in value]
         return value if np.isfinite(value) else None
 
     return {name: finite(value) for name, value in values.items()}
 
 
 def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
-    """Return the number of moves of an approach, the range of each joint, and whether the whole arm moves."""
+    """Describe an approach: number of moves, range of each joint, clearance, and whether the whole arm moves."""
     count = len(np.asarray(way_rad)) - 1
     words = f"{counted(count, 'move')} ({turns_in_words(way_rad)}), "
     words += f"proven clear by {1e3 * clearance_m:.0f} mm"
@@ -456,12 +455,12 @@ def way_in_words(way_rad: ArrayLike, clearance_m: float) -> str:
 
 
 def turns_in_words(way_rad: ArrayLike) -> str:
-    """Return the joints that move along a path, each with its range."""
+    """Describe the joints that move along a path, each with its range."""
     ranges_deg = np.degrees(np.ptp(np.asarray(way_rad), axis=0))
     turns = [
         f"{name} {turn:.0f}°" for name, turn in zip(JOINTS, ranges_deg, strict=True) if turn >= np.degrees(STILL_RAD)
     ]
-    return ", ".join(turns) or "no joint by half a degree"
+    return ", ".join(turns) or "no joint moves by 0.5° or more"
 
 
 def _table_lines(plan: Plan) -> list[str]:
@@ -473,7 +472,8 @@ def _table_lines(plan: Plan) -> list[str]:
         return "".join(f"{row[j]:{width}.0f}" for j, width in zip(shown, widths, strict=True))
 
     names = "".join(f"{JOINTS[j]:>{width}}" for j, width in zip(shown, widths, strict=True))
-    lines = ["Poses in degrees, and the move to the next pose:", f"{'':4}{'R':>4}{names} turn  °/s    s clear mm"]
+    title = "Joint angles of the poses in degrees, and the move to the next pose:"
+    lines = [title, f"{'':4}{'R':>4}{names} turn  °/s    s clear mm"]
     for i, (step, q) in enumerate(zip(plan.steps, q_deg, strict=True), start=1):
         turn, speed = np.degrees([step.turn_rad, step.speed_rad_s])
         move = f"{turn:5.0f}{speed:5.0f}{step.duration_s:5.1f}{1e3 * step.clearance_m:9.0f}"
@@ -484,7 +484,7 @@ def _table_lines(plan: Plan) -> list[str]:
 def _sweep_table(sweep: Sweep) -> list[str]:
     t = np.arange(0.0, sweep.duration_s, 0.05)
     q_deg, speed, acceleration = np.degrees(sweep.at(t)), np.degrees(sweep.largest(1)), np.degrees(sweep.largest(2))
-    lines = [f"Joints in degrees, within {sweep.duration_s:.0f} s:", f"{'':10}begin  from    to  °/s  °/s²"]
+    lines = [f"Joint angles in degrees during {sweep.duration_s:.0f} s:", f"{'':10}begin  from    to  °/s  °/s²"]
     for j in WRISTS:
         low, high = q_deg[:, j].min(), q_deg[:, j].max()
         lines.append(f"  {JOINTS[j]:8}{q_deg[0, j]:5.0f}{low:6.0f}{high:6.0f}{speed[j]:5.0f}{acceleration[j]:6.0f}")
@@ -497,15 +497,15 @@ def _summary(plan: Plan) -> list[str]:
         count, most = len(plan.steps), np.degrees(max(step.turn_rad for step in plan.steps))
         proven = "all proven clear" if plan.certified else "NOT ALL PROVEN CLEAR"
         motion = (
-            f"{count} poses, {count} moves {proven}, none above {most:.0f}°: "
+            f"{count} poses, {count} moves {proven}, none larger than {most:.0f}°: "
             f"{plan.motion_time_s:.0f} s of motion at the plan's speeds."
         )
     else:
         proven = "proven clear along its whole length" if plan.certified else "NOT PROVEN CLEAR"
-        motion = f"A smooth curve from rest to rest, {proven}, {1e3 * plan.off_curve_m:.0f} mm off the curve included."
+        motion = f"A smooth curve from rest to rest, {proven}, with up to {1e3 * plan.off_curve_m:.0f} mm of deviation."
     return [
         motion,
-        f"Least clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
+        f"Smallest clearance: {1e3 * nearest.clearance_m:.0f} mm, {nearest.limited_by}.",
         plan.room_in_words(),
         *([] if plan.kind in ("verification", "tool", "hung", "sweep") else [_accuracy(plan)]),
     ]
@@ -513,12 +513,12 @@ def _summary(plan: Plan) -> list[str]:
 
 def _accuracy(plan: Plan) -> str:
     sigma, guess = plan.predicted, plan.description["guess"]
-    # Plans of version 0.1.0 have no gain.
-    gain = f", a sensor whose gain is {100 * guess['gain_sigma']:.2g} % off" if "gain_sigma" in guess else ""
+    # Plans of version 0.1.0 have no gain error.
+    gain = f", a sensor gain error of {100 * guess['gain_sigma']:.2g} %" if "gain_sigma" in guess else ""
     tilt_deg = np.degrees(_largest_sigma([sigma["tilt_alpha_rad"], sigma["tilt_beta_rad"]]))
     return (
-        f"Predicted for {guess['mass_kg']:g} kg{gain}, and averages good to {guess['sigma_force_N']} N, "
-        f"{guess['sigma_torque_Nm']} N·m (one sigma): mass {1e3 * _largest_sigma(sigma['mass_kg']):.2g} g, "
+        f"Predicted for {guess['mass_kg']:g} kg{gain}, and averages with a sigma of {guess['sigma_force_N']} N, "
+        f"{guess['sigma_torque_Nm']} N·m; sigma of the results: mass {1e3 * _largest_sigma(sigma['mass_kg']):.2g} g, "
         f"centre of mass {1e3 * _largest_sigma(sigma['p_sensor_com_m']):.2g} mm, "
         f"force bias {_largest_sigma(sigma['force_bias_N']):.3f} N, tilt {tilt_deg:.2f}°; "
         f"compensation {_largest_sigma(sigma['force_rms_N']):.3f} N, {_largest_sigma(sigma['torque_rms_Nm']):.4f} N·m."
@@ -526,5 +526,5 @@ def _accuracy(plan: Plan) -> str:
 
 
 def _largest_sigma(sigma: object) -> float:
-    """Largest value; NaN if the poses do not determine one, which is null in the file."""
+    """Return the largest value; NaN if one is null, because the poses do not determine it."""
     return float(np.max(np.array(sigma, dtype=np.float64)))

@@ -1,6 +1,6 @@
-"""From a cell, in millimetres and degrees, to a plan and the reason for it: the constant tour, else the next best kind.
+"""Planner: makes a plan for a cell, of the best kind that is proven clear, with the reason for the choice.
 
-All 24 orientations are preferred because they are the most informative. Tours that keep base, shoulder and elbow at
+All 24 special orientations are preferred because they are the most informative. Tours with base, shoulder and elbow at
 rest come first. If some orientations are out of reach, the most informative reachable poses replace them.
 """
 
@@ -31,37 +31,37 @@ from ftdrive.planning.search.tours import clear_tour
 from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
-# All models have room for the constant tour here with usual tools; the wrist is at its first pose.
+# Posture at which all models with usual tools have room for the constant tour; the wrist is at its first pose.
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
-# Poses of a new tool on a calibrated cell.
+# Number of poses for a new tool on a calibrated cell.
 TOOL_POSES = 4
-# Tilts with a load on a string.
+# Number of tilts with a load on a string.
 HUNG_POSES = 12
 BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
-# Orientations of a random set beyond those wanted: most of them are reachable.
+# Number of spare orientations of a random set, in case some are out of reach.
 SPARE = 100
-# No move is faster, whatever a plan or an old configuration contains.
+# Upper limit of the speeds, whatever a plan or an old configuration contains.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 
-# Of one axis in the mean of one pose, N and N·m.
+# Assumed standard deviation of one axis of the mean of a pose, N and N·m.
 _NOISE = 0.05, 0.003
-# Numbers of the orientations and joint vectors (n, 6), in the order of travel.
+# A tour: numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
-# Kind of a tour, the reason for it, and the tour where there is one.
+# Kind of a tour, the reason for it, and the tour; None if there is none of this kind.
 Attempt = tuple[str, Sequence[str], Found | None]
 
 
 def guess_of(certifier: Certifier, cell: CellConfig | None = None) -> Guess:
-    """Return a prior: `guess_of_devices`, with the centre of mass at half the tool length, and the lean of the base."""
+    """Return the prior `guess_of_devices` with the centre of mass at half the tool length and the lean of the base."""
     length_m = max(part.to_m for part in certifier.arm.tool)
     guess = Guess(USUAL_KG, *_NOISE, sensor=SensorMatrix.usual()) if cell is None else guess_of_devices(cell)
     return replace(guess, p_sensor_com_m=(0.0, 0.0, length_m / 2), tilt_beta_rad=certifier.scene.lean_rad)
 
 
 def guess_of_devices(cell: CellConfig) -> Guess:
-    """Return a prior: mass of tool, and accuracy of sensor and arm, as described; the noise as usual."""
+    """Return a prior from the described mass of the tool and accuracy of sensor and arm, with typical noise."""
     sensor = cell.sensor
     setup = Setup(
         sensor_accuracy_percent=sensor.accuracy_percent,
@@ -83,12 +83,12 @@ def plan_tour(
         Present joint angles.
     poses : {24, 12, 6}
     guess : Guess
-        Of the tool and the noise.
+        Assumed tool and noise.
 
     Returns
     -------
     Plan
-        Of kind "constant", "wrist", "posture", "box" or "reachable", in this order of preference.
+        The kind is "constant", "wrist", "posture", "box" or "reachable", in this order of preference.
 
     Raises
     ------
@@ -101,8 +101,8 @@ def plan_tour(
         if found is not None:
             return make_plan(kind, why, certifier, *found, speeds, guess)
     raise PlanRefused(
-        f"{_reason(poses)}. Another posture, a box for the flange, and other poses were tried: no tour of them is "
-        "proven clear and informative enough to estimate everything. Describe the tool more closely, or clear the "
+        f"{_reason(poses)}. Nor is a tour at another posture, with the flange in a box, or of other poses proven clear "
+        "and informative enough to estimate all parameters. Describe the tool more closely, or clear the "
         "surroundings"
     )
 
@@ -114,15 +114,15 @@ def _attempts(certifier: Certifier, q_now: Array, poses: int, speeds: Speeds, gu
         q = nodes.constant_tour(q_now, certifier.arm.kinematics)
         fits = _winds_little(q, q_now) and certifier.clear_around(q)
         yield "constant", [why], (nodes.NUMBERS, q) if fits else None
-    why = f"{reason}: the wrist visits them in the fastest order that is clear, base, shoulder and elbow at rest."
+    why = f"{reason}: the wrist alone visits them in the fastest clear order."
     yield "wrist", [why], _wrist(certifier, q_now, numbers, speeds)
     for tour in filter(certifier.clear_around, with_room(certifier, q_now)):
         elsewhere: Found | None = nodes.NUMBERS, tour
         if poses != 24 or not _winds_little(tour, q_now):
             elsewhere = _wrist(certifier, np.append(tour[0, :5], q_now[5]), numbers, speeds)
-        why = f"{reason}, and the wrist alone has no clear tour there."
+        why = f"{reason}, and there is no clear tour of the wrist alone."
         yield "posture", [why, _elsewhere_words(tour[0])], elsewhere
-    nowhere = f"{reason}, and the wrist alone has no clear tour at any posture of joints 1 to 3 that was tried."
+    nowhere = f"{reason}, and no tried posture of joints 1 to 3 has a clear tour of the wrist alone."
     usual = np.array([q_now[0], *USUAL_POSTURE_RAD[1:]])  # the usual posture at this pan angle
     for centre_m in certifier.arm.frames([q_now, usual]).flange_m:
         found = _box(certifier, q_now, numbers, centre_m, BOX_HALF_SIZE_M, speeds)
@@ -141,8 +141,8 @@ def _reason(poses: int) -> str:
 def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
     """Plan a tour of the four most informative reachable poses, for a new tool on a calibrated cell.
 
-    They determine everything, so they determine weight, centre of mass and bias of the tool too: its error is 3 %
-    above that of a tetrahedron of gravity directions.
+    The poses determine all parameters, not only weight, centre of mass and bias of the tool. Their error is 3 % above
+    that of a tetrahedron of gravity directions.
     """
     found = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
     if found is None:
@@ -152,18 +152,18 @@ def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
         )
     why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(found)]
     plan = make_plan("tool", why, certifier, found.numbers, found.q_rad, speeds, guess)
-    return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
+    return replace(plan, why=tuple(why))  # without the predicted error, which ignores the earlier calibration
 
 
 def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess: Guess) -> Plan:
-    """Plan a tour of tilts with a load on a string: its hook stays at one point, and the arm turns about it."""
+    """Plan a tour of tilts with a load on a string; the arm turns about the hook, which stays at one point."""
     speeds = speeds.limited(Speeds.with_hung_load())
     q_now = checked_joints(q_rad)
     found = hung_tour(certifier, q_now, HUNG_POSES, speeds)
     if found is None:
         raise PlanRefused(
             f"no tour of {HUNG_POSES} tilts of 45 to 75 degrees is reachable and proven clear with the hanging load: "
-            "jog the arm to where the load has room below and around it, or hang it from another point of the tool"
+            "jog the arm to where there is room around and below the load, or hang it from another point of the tool"
         )
     hook_m = found[2]
     numbers, q = _start_nearest(q_now, found[:2])
@@ -175,7 +175,7 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
         f"within {away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
     ]
     plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
-    return replace(plan, why=tuple(why))  # without the accuracy of these poses alone
+    return replace(plan, why=tuple(why))  # without the predicted error, which ignores the run of the tool alone
 
 
 def _plan_cone(
@@ -187,19 +187,20 @@ def _plan_cone(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Plan a tour of 6 chosen poses or more that keeps the tool axis (flange z) within an angle of straight down."""
+    """Plan a tour of at least 6 chosen poses with the tool axis (flange z) within an angle of straight down."""
     q_now = checked_joints(q_rad)
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
-            f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 to "
-            f"180 degrees, and {FEWEST_CHOSEN} poses or more"
+            f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 and "
+            "up "
+            f"to 180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
     cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
     found = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
     if found is None:
         raise PlanRefused(
             f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to "
-            "estimate everything: widen the cone, or jog the arm to another posture"
+            "estimate all parameters: widen the cone, or jog the arm to another posture"
         )
     why = [f"The tool axis stays {cone}.", *_chosen_words(found)]
     return make_plan("cone", why, certifier, found.numbers, found.q_rad, speeds, guess)
@@ -215,27 +216,29 @@ def _plan_box(
     speeds: Speeds,
     guess: Guess,
 ) -> Plan:
-    """Plan a tour of the special orientations with the flange free in a box. Base, shoulder and elbow move too.
+    """Plan a tour of the special orientations with the flange inside a box. Base, shoulder and elbow move too.
 
-    Its edges, twice `half_size_m` long, are along the base axes; its centre in base is by default the present flange.
+    The edges of the box, twice `half_size_m` long, are along the base axes. Its centre in base is by default the
+    present position of the flange.
     """
     q_now = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
-        raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000")
+        raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000 mm")
     centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
     found = _box(certifier, q_now, _pose_numbers(poses), centre, half_size_m, speeds)
     if found is None:
         raise PlanRefused(
-            f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} orientations "
-            "are in reach, or no tour of them is proven clear: give a larger box, or another centre"
+            f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} "
+            "orientations "
+            "are reachable, or no tour of them is proven clear: give a larger box, or another centre"
         )
     return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
 
 
 def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
-    """Plan one tour through sets of orientations of Yu's Fig. 6, one of `COUNTS` or several, as A+E.
+    """Plan one tour through one or more sets of orientations of Yu's Fig. 6, such as A+E; `COUNTS` has their names.
 
-    Random orientations that are out of reach are replaced by others of the same kind.
+    Random orientations that are out of reach are replaced by others of the same set.
     """
     q_now = checked_joints(q_rad)
     try:
@@ -262,25 +265,28 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
 def plan_verification(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour of two poses or more, far from those of a calibration, `R_fitted` (k, 3, 3); else as `plan_tour`."""
+    """Plan a tour of at least two poses far from `R_fitted` (k, 3, 3), the orientations of a calibration.
+
+    The other parameters and the errors are those of `plan_tour`.
+    """
     q_now = checked_joints(q_rad)
     if poses < FEWEST_TO_VERIFY:
         raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
     found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
     if found is None:
         raise PlanRefused(
-            f"no tour of {poses} fresh poses is reachable and proven clear: jog the arm to another posture, or clear "
+            f"no tour of {poses} new poses is reachable and proven clear: jog the arm to another posture, or clear "
             "the surroundings"
         )
     numbers, q = _start_nearest(q_now, found)
     why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
     why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
     plan = make_plan("verification", why, certifier, numbers, q, speeds, guess)
-    return replace(plan, why=tuple(why))  # without the accuracy of a calibration from these poses
+    return replace(plan, why=tuple(why))  # without the predicted error, because these poses calibrate nothing
 
 
 def _start_nearest(q_now: Array, tour: Found) -> Found:
-    """Return a closed tour from the pose nearest to the present joint angles: there the cable is wound least."""
+    """Return a closed tour that starts nearest to the present joint angles, where the cable is least wound."""
     numbers, q = tour
     nearest = -int(np.abs(q - q_now).max(axis=1).argmin())
     return np.roll(numbers, nearest).tolist(), np.roll(q, nearest, axis=0)
@@ -288,12 +294,12 @@ def _start_nearest(q_now: Array, tour: Found) -> Found:
 
 def _pose_numbers(poses: int) -> tuple[int, ...]:
     if poses not in NUMBERS:
-        raise ConfigError(f"a plan of {poses} poses does not exist: choose {', '.join(map(str, NUMBERS))}")
+        raise ConfigError(f"there is no plan of {poses} poses: choose one of {', '.join(map(str, NUMBERS))}")
     return NUMBERS[poses]
 
 
 def _winds_little(q_rad: Array, q_now: Array) -> bool:
-    """Return whether joint 6 stays in its window around its present angle."""
+    """Return whether joint 6 stays within its window about the present angle."""
     return bool(np.abs(q_rad[:, 5] - q_now[5]).max() <= WRIST_6_RAD + 1e-9)
 
 
@@ -311,7 +317,7 @@ def _box(
     q, group = box_nodes(certifier, q_rad, _at_pan(q_rad, numbers), centre_m, half_size_m)
     if len(np.unique(group)) < len(numbers):
         return None
-    # Preferred: what moves base, shoulder and elbow least.
+    # Prefer nodes that move base, shoulder and elbow least.
     away = np.abs(q - q_rad)
     calm = np.argsort(away[:, :3].max(axis=1) + 0.01 * away.sum(axis=1), kind="stable")
     order = clear_tour(certifier, q[calm], group[calm], speeds)
@@ -319,7 +325,7 @@ def _box(
 
 
 def _at_pan(q_rad: Array, numbers: Sequence[int]) -> Array:
-    """Orientations (n, 3, 3) as the constant tour would visit them: turned about base z with joint 1."""
+    """Return orientations (n, 3, 3) of the constant tour, which turn about base z with joint 1."""
     return np.asarray(Rotation.from_euler("z", q_rad[0] - np.pi / 4).as_matrix() @ special(numbers))
 
 
@@ -346,7 +352,7 @@ def _format_point(centre_m: Array) -> str:
 
 
 def speeds_of(cell: CellConfig) -> Speeds:
-    """Return the speed limits of a cell."""
+    """Return the speed limits configured for a cell."""
     robot = cell.robot
     joint_rad_s, joint_rad_s2 = np.radians([robot.speed_deg_s, robot.acceleration_deg_s2])
     return Speeds(float(joint_rad_s), float(joint_rad_s2), robot.tip_speed_mm_s / 1e3).limited(FASTEST)
@@ -363,9 +369,10 @@ def plan_for(
     sets: str | None = None,
     tip_unlimited: bool = False,
 ) -> Plan:
-    """Plan a tour for a cell, with its certifier, from joint angles `q_rad` (6,).
+    """Plan a tour for a cell and its certifier, starting near joint angles `q_rad` (6,).
 
-    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, `ConfigError` for wrong values.
+    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, and `ConfigError` for wrong
+    values.
     """
     speeds, guess = speeds_of(cell), guess_of(certifier, cell)
     if tip_unlimited:
@@ -384,12 +391,12 @@ def plan_for(
     else:
         made = plan_tour(certifier, q_rad, poses, speeds=speeds, guess=guess)
     if not made.certified:
-        raise PlanRefused("a move of the plan could not be proven clear")
+        raise PlanRefused("a move of the plan could not be proven clear: jog the arm to another posture")
     return made.marked(measured=cell.workcell.measured, emulated=cell.is_emulated)
 
 
 def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds: float) -> Plan:
-    """Plan a sweep for a cell, with its certifier, from joint angles `q_rad` (6,); raises as `plan_sweep`."""
+    """Plan a sweep for a cell and its certifier, near joint angles `q_rad` (6,); raises as `plan_sweep`."""
     made = plan_sweep(
         certifier,
         q_rad,
@@ -409,7 +416,7 @@ def certifier_for(
     *,
     must_be_possible: bool = True,
 ) -> Certifier:
-    """Describe arm, tool and surroundings of a cell to the certifier.
+    """Return the certifier for arm, tool and surroundings of a cell.
 
     Parameters
     ----------
@@ -417,21 +424,23 @@ def certifier_for(
     model : str or None
         Model of the arm, as reported by the controller or configured.
     kinematics : Kinematics, optional
-        The arm's own; without them nominal ones, and more distance is kept.
+        Kinematics of this arm. Without them nominal ones are used, and more distance is kept.
     p_flange_hook_m : (float, float, float), optional
-        Where a load hangs from the tool on a string.
+        Point of the tool from which a load hangs on a string.
     must_be_possible : bool
-        Refuse what `require_possible` does; a drawing shows it.
+        Whether to refuse impossible cells, see `require_possible`; a drawing shows them.
 
     Raises
     ------
     ConfigError
-        The arm or tool is missing, a shape is impossible, the arm has no measured shape, or see `require_possible`.
+        Arm or tool are missing, a shape is impossible, the arm has no measured shape, or as `require_possible`.
     """
     if model is None:
-        raise ConfigError("which arm? Give --model, or [robot] model in ftdrive.toml")
+        raise ConfigError("the model of the arm is unknown: give --model, or set [robot] model in ftdrive.toml")
     if not cell.tool.cylinders_mm:
-        raise ConfigError("what is mounted? Give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml")
+        raise ConfigError(
+            "the tool is not described: give --tool FROM:TO:DIAMETER, or set [tool] cylinders_mm in ftdrive.toml"
+        )
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))
     x, y, z = scene.down_base.tolist()
@@ -443,22 +452,22 @@ def certifier_for(
 
 
 def require_possible(cell: CellConfig, model: str | None) -> None:
-    """Reject impossible cells: a tool shorter than its sensor, a plane or box that contains the arm itself.
+    """Reject impossible cells: a tool that ends inside the sensor, or a plane or box that contains the arm itself.
 
-    The test uses the shoulder, because it is in the same place in every posture. Objects at the base, such as a table
-    around its plate, are allowed.
+    The test uses the shoulder, whose position is the same in every posture. Objects at the base, such as a table around
+    its mounting plate, are allowed.
 
     Parameters
     ----------
     cell : CellConfig
-        Without cylinders the tool is not checked.
+        The cell. A tool without cylinders is not checked.
     model : str or None
-        Model of the arm; without a measured shape, planes and boxes are not checked.
+        Model of the arm. If its shape is not measured, planes and boxes are not checked.
 
     Raises
     ------
     ConfigError
-        The message names the cylinders, plane or box, and the fix after the last colon.
+        The message names the cylinders, plane or box, and the remedy after the last colon.
     """
     end_mm, height_mm = max((row[1] for row in cell.tool.cylinders_mm), default=np.inf), cell.sensor.height_mm
     if height_mm is not None and end_mm < height_mm:
@@ -479,30 +488,30 @@ def require_possible(cell: CellConfig, model: str | None) -> None:
 
 
 class _Shoulder:
-    """The ball that the shoulder of an arm fills in every posture."""
+    """The ball that the shoulder of an arm occupies in every posture."""
 
     def __init__(self, name: str) -> None:
         self._centre_m = np.array([0.0, 0.0, MODELS[name].d_m[0]])
         self._radius_m, self._margin_m = SHAPES[name].shoulder_radius_m, Margins().scene_m
 
     def against_plane(self, row: Sequence[float]) -> str:
-        """Return what is wrong with a plane and which plane was probably meant; empty if nothing is wrong."""
+        """Describe the error of a plane and the plane that was probably meant; empty if there is no error."""
         gap_m, (x, y, z, place) = self._above_m(row), row
         if gap_m >= self._margin_m:
             return ""
         meant = (-x, -y, -z, -place), (x, y, z, -place)
-        same, opposite = (_plane_words(one) if self._above_m(one) >= self._margin_m else "" for one in meant)
+        same, opposite = (_plane_words(plane) if self._above_m(plane) >= self._margin_m else "" for plane in meant)
         if gap_m > -self._radius_m or not same:
             return self._too_near(f"the plane {_plane_words(row)}", gap_m)
         return (
             f"the arm's own {'base' if place > 0 else 'shoulder'} is on the wrong side of the plane "
-            f"{_format_row(row)}: the arm stays where normal times point is at least {place:g} mm: "
-            f"give {same} if the plane is there"
+            f"{_format_row(row)}: the arm must stay where normal · point is at least {place:g} mm. "
+            f"Give {same} if the plane is there"
             + (f", {opposite} if it is on the other side of the base" if opposite else "")
         )
 
     def against_box(self, row: Sequence[float]) -> str:
-        """Return what is wrong with a box; empty if nothing is."""
+        """Describe the error of a box; empty if there is no error."""
         box = box_from_mm(row)
         away_m = float(np.linalg.norm(self._centre_m - np.clip(self._centre_m, box.low_m, box.high_m)))
         gap_m = away_m - self._radius_m
@@ -528,22 +537,22 @@ def _plane_words(row: Sequence[float]) -> str:
 
 
 def _cylinder_from_mm(values: Sequence[float]) -> Cylinder:
-    """Read from, to, diameter, and x, y of an axis beside the flange's."""
+    """Return a cylinder from its values in mm: from, to, diameter, and optionally x and y of its axis."""
     return Cylinder(*_metres("a cylinder of the tool", "from, to, diameter, or these and x, y", values, (3, 5)))
 
 
 def plane_from_mm(values: Sequence[float]) -> Plane:
-    """Read a normal of any length, and the smallest allowed offset along it."""
+    """Return a plane from a normal of any length and the smallest allowed offset along it, mm."""
     *normal, offset_m = _metres("a plane", "its normal and an offset", values, (4,))
     length = float(np.linalg.norm(normal))
     if not length:
-        raise ConfigError(f"a plane is {list(values)}: its normal has no direction, give for example -1, 0, 0, -800")
+        raise ConfigError(f"a plane is {list(values)}: its normal is zero, give for example -1, 0, 0, -800")
     x, y, z = (value / length for value in normal)
     return Plane((x, y, z), offset_m)
 
 
 def box_from_mm(values: Sequence[float]) -> Box:
-    """Read any two opposite corners."""
+    """Return a box from any two opposite corners, mm."""
     corners = np.array(_metres("a box", "two opposite corners", values, (6,))).reshape(2, 3)
     (x1, y1, z1), (x2, y2, z2) = np.sort(corners, axis=0).tolist()
     return Box((x1, y1, z1), (x2, y2, z2))

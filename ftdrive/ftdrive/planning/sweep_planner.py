@@ -1,12 +1,12 @@
-"""Plans a sweep: the most informative curves of the wrist within the limits, the first of them that is proven clear.
+"""Planner of sweeps: the most informative wrist curve within the limits that is proven clear.
 
-Candidates have random frequencies, shares and phases, and as much amplitude as the limits of speed, acceleration and
-tips leave. Their information about the load comes from the same model as the estimate. Planning is deterministic.
+Candidates have random frequencies and phases, and the largest amplitudes that the limits of speed, acceleration and tip
+speed allow. Their information about the load comes from the model of the estimate. Planning is deterministic.
 
-The proof is that of a tour through points of the curve, with more distance. Between two points the curve leaves the
-straight move by at most ``acceleration step²/8``. A controller that follows with a lag T leaves the curve by about
-``acceleration T²/2``, as a first-order lag does. A stop that brakes for a time S follows the tangent, at most
-``acceleration S²/8`` off the curve.
+The proof is that of a tour through points of the curve, with additional distance. Between two points the curve leaves
+the straight move by at most ``acceleration step²/8``. A controller that follows with a lag T deviates by about
+``acceleration T²/2``, as a first-order lag does. A stop that brakes for a time S follows the tangent and deviates by at
+most ``acceleration S²/8``.
 """
 
 from collections.abc import Iterator
@@ -29,32 +29,32 @@ from ftdrive.planning.search.nodes import constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
-# White noise alone leaves as much as a sweep of 20 s: no estimator does better with less time.
+# Range of the duration, s. After 20 s white noise limits the accuracy, and no estimator needs less data.
 SECONDS = (10.0, 120.0)
 RAMP_S = 3.0
-# Between two steps of the plan.
+# Time between two steps of the plan, s.
 STEP_S = 0.2
-# The `lookahead_time` of the controller.
+# Lag of the controller, s: its `lookahead_time`.
 SMOOTHED_S = 0.1
-# Curves that are tried.
+# Numbers of random and of changed curves that are tried.
 RANDOM, CHANGED = 40, 200
-# Sizes of a change.
+# Sizes of a change, as shares of a new random curve.
 STEPS = (0.03, 0.1, 0.3)
-# So many of them, the best ones, are tried at one posture, in each of the sizes.
+# Number of the best curves whose proof is tried at each posture, in each of the sizes.
 PROVEN = 6
 SIZES = (1.0, 0.9, 0.8, 0.6)
 POSTURES = 6
-# Frequencies of the two sines of each joint: the slow one turns far, the quick one shows the inertia.
-# Inertia shows in acceleration, which costs little speed at 0.3 to 0.9 Hz; ISO 10218-1 allows 250 mm/s beside people.
+# Frequencies of the two sines of each joint: the slow one covers a large angle, the quick one determines the inertia.
+# At 0.3 to 0.9 Hz acceleration needs little speed; ISO 10218-1 allows 250 mm/s near people.
 SLOW_HZ, QUICK_HZ = (0.06, 0.16), (0.3, 0.9)
 MOST_RAD = 1.5
 _MODEL_STEP_S = 0.01
-# Among the points of the proof, one in so many is looked at first.
+# Only every fifth point of the proof is checked first.
 _COARSE = 5
-# Score of a curve that touches something, beyond its own: it is the last to be made smaller.
+# Penalty on the score of a curve that collides, so that it is tried last, with smaller amplitudes.
 _TOUCHING = 10.0
 _ROW_S = 0.12
-# Weight of the logarithm of its sigma, beside that of the compensation error.
+# Weight of log(sigma of the inertia) relative to log(compensation error) in the score.
 _INERTIA_WORTH = 0.5
 
 
@@ -67,13 +67,13 @@ def plan_sweep(
     stop_rad_s2: float,
     guess: Guess,
 ) -> Plan:
-    """Plan a sweep around the present posture, or around one that has more room.
+    """Plan a sweep around the present posture, or around one with more room.
 
-    It lasts `seconds` at the planned speed. Raises `ConfigError` if that is out of range, and `PlanRefused` if no
-    sweep was proven clear.
+    The sweep takes `seconds` at the planned speed. Raises `ConfigError` if `seconds` is out of range, and `PlanRefused`
+    if no sweep is proven clear.
     """
     if not SECONDS[0] <= seconds <= SECONDS[1]:
-        raise ConfigError(f"a sweep of {seconds:g} s does not exist: give {SECONDS[0]:g} to {SECONDS[1]:g} s")
+        raise ConfigError(f"a sweep of {seconds:g} s is not possible: give {SECONDS[0]:g} to {SECONDS[1]:g} s")
     q_now = checked_joints(q_rad)
     tried = 0
     for centre in _centres(certifier, q_now):
@@ -81,7 +81,7 @@ def plan_sweep(
             continue
         tried += 1
         best = _scored_sweeps(certifier, centre, seconds, speeds=speeds, stop_rad_s2=stop_rad_s2, guess=guess)[:PROVEN]
-        for sweep in (one.smaller(size) for size in SIZES for _, one in best):
+        for sweep in (curve.smaller(size) for size in SIZES for _, curve in best):
             off_m = certifier.reach_m(_off_curve(sweep, stop_rad_s2))
             path = sweep.at(_times(sweep, PROOF_S))
             if _seems_free(certifier, sweep, stop_rad_s2) and certifier.keeping(off_m).clear_around(path):
@@ -95,7 +95,7 @@ def plan_sweep(
 
 
 def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
-    """Postures to sweep around: the present one, others of the wrist, others of the arm."""
+    """Yield centres of the sweep: the present posture, then others of the wrist, then others of the arm."""
     yield q_now
     for turn in (np.pi / 2, -np.pi / 2):
         yield np.concatenate([q_now[:4], [turn], q_now[5:]])
@@ -108,7 +108,7 @@ def _centres(certifier: Certifier, q_now: Array) -> Iterator[Array]:
 def _scored_sweeps(
     certifier: Certifier, centre: Array, seconds: float, *, speeds: Speeds, stop_rad_s2: float, guess: Guess
 ) -> list[tuple[float, Sweep]]:
-    """Curves with their scores, the best first: random ones, then changes of the best one that seems clear."""
+    """Return random curves, and changes of the best one that seems clear, with their scores; the best first."""
     arm = certifier.arm
     rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
     best, least = _random_shape(rng), np.inf
@@ -130,19 +130,19 @@ def _scored_sweeps(
 
 
 def _seems_free(certifier: Certifier, sweep: Sweep, stop_rad_s2: float) -> bool:
-    """Look at few points of the curve."""
+    """Return whether a few points of the curve keep the margins."""
     keeping = certifier.keeping(certifier.reach_m(_off_curve(sweep, stop_rad_s2)))
     return bool(keeping.free(sweep.at(_times(sweep, _COARSE * PROOF_S))).all())
 
 
 def _random_shape(rng: np.random.Generator) -> Array:
-    """Return numbers (3, 6) from 0 to 1: of each wrist, its size, the share of its quick sine, frequencies, phases."""
+    """Return random numbers (3, 6) in 0 to 1 per wrist joint: two frequencies, quick share, amplitude, two phases."""
     return rng.uniform(size=(len(WRISTS), 6))
 
 
 def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
     hertz = np.stack([low + (high - low) * drawn[:, k] for k, (low, high) in enumerate((SLOW_HZ, QUICK_HZ))], axis=1)
-    quick = 0.1 + 0.8 * drawn[:, 2]  # of the acceleration
+    quick = 0.1 + 0.8 * drawn[:, 2]  # share of the acceleration
     strength = np.stack([1 - quick, quick], axis=1) / (2 * np.pi * hertz) ** 2
     size = (0.2 + 0.8 * drawn[:, 3]) * MOST_RAD
     amplitude = size[:, None] * strength / strength.sum(axis=1, keepdims=True)
@@ -150,7 +150,7 @@ def _curve(drawn: Array, centre: Array, seconds: float) -> Sweep:
 
 
 def _within(arm: ArmModel, sweep: Sweep, speeds: Speeds) -> Sweep | None:
-    """Reduce amplitudes until every limit is kept."""
+    """Return the sweep with amplitudes reduced to all limits; None if that is not possible."""
     limits = MOST_RAD, speeds.joint_rad_s, speeds.joint_rad_s2
     most = np.stack([sweep.largest(k) for k in range(3)])[:, list(WRISTS)]
     most[0] = np.abs(sweep.at(_times(sweep, 0.05)) - sweep.centre_rad)[:, list(WRISTS)].max(axis=0)
@@ -179,7 +179,7 @@ def _times(sweep: Sweep, step_s: float) -> Array:
 
 
 def _off_curve(sweep: Sweep, stop_rad_s2: float) -> Array:
-    """Bound (6,) of how far a joint is from the moves between the points."""
+    """Return a bound (6,) of the deviation of each joint from the straight moves between the points, rad."""
     stop_s = float(sweep.largest(1).max()) / stop_rad_s2
     return np.asarray(sweep.largest(2) * (PROOF_S**2 / 8 + SMOOTHED_S**2 / 2 + stop_s**2 / 8))
 
@@ -192,7 +192,7 @@ def _score(arm: ArmModel, sweep: Sweep, guess: Guess) -> float:
 def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, float]:
     """Return the predicted compensation error, N and N·m, and the largest sigma of a moment of inertia, kg·m².
 
-    The noise of 0.12 s of motion counts as that of a pose in the guess.
+    The mean over 0.12 s of motion is assumed to have the noise that the guess gives for a pose.
     """
     load = Load(guess.parameters, guess.g_m_s2, inertia=np.r_[np.full(3, 1e-3), np.zeros(3)])
     motion, rate = _flange_motion(arm, sweep)
@@ -200,7 +200,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
     prior = np.zeros(23)
     prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
     weight = np.divide(1.0, prior**2, out=np.zeros(23), where=prior > 0)
-    # What the motion does not show stays finite.
+    # A weak prior keeps directions finite that the motion does not determine.
     weight[:15] = 1e-6 / guess.scale**2
     covariance = np.linalg.inv(J.T @ J + np.diag(weight))
     force_N, torque_Nm = Calibrated(guess.parameters, covariance[:15, :15]).predicted_error()
@@ -208,7 +208,7 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
 
 
 def _flange_motion(arm: ArmModel, sweep: Sweep) -> tuple[Motion, Motion]:
-    """Motion of the flange in rows of 0.12 s, and its rate of change, by differences."""
+    """Return the motion of the flange every 0.12 s, and its rate of change, by finite differences."""
     t, h = _times(sweep, _ROW_S), _MODEL_STEP_S
     places = [arm.frames(sweep.at(t + k * h)) for k in range(-2, 3)]
     columns = []
@@ -242,10 +242,10 @@ def _plan(certifier: Certifier, sweep: Sweep, off_curve_m: float, q_now: Array, 
     )
     force_N, torque_Nm, inertia = predicted(arm, sweep, guess)
     centre_m, ball_m = ball_of(certifier, q, following)
-    why = ["A sweep of the wrist: the most informative of the curves within the limits that is proven clear."]
+    why = ["A sweep of the wrist: the most informative curve within the limits that is proven clear."]
     if not np.allclose(q_now, sweep.centre_rad):
         first = np.degrees(sweep.centre_rad).round().astype(int).tolist()
-        why.append(f"It has room around joints {first} degrees; the approach to them is not part of the plan.")
+        why.append(f"Its centre at joints {first} degrees has more room; the plan does not include the approach.")
     why.append(f"Predicted error of force compensation: {force_N:.3f} N.")
     return Plan(
         "sweep",

@@ -1,4 +1,4 @@
-"""A session along a plan: shown, checked, confirmed and guarded; and the register of plans driven to their end."""
+"""A session along a plan: planning, checks, questions and guards; and the register of completed plans."""
 
 import json
 from collections.abc import Callable, Iterator
@@ -30,14 +30,14 @@ from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
 
 FORMAT = "ftdrive.completed/1"
-# In the state folder of the user.
+# File in the state folder of the user.
 _COMPLETED = "completed.ndjson"
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
-    """Whether this arm has driven this plan to its end before; unreadable lines are ignored.
+    """Return whether this arm has completed this plan before; unreadable lines are ignored.
 
-    False for an arm that reports no serial number, because it may be another one.
+    False without a serial number, because the arm may be another one.
     """
     path = user_folder("state") / _COMPLETED
     if arm_serial == NOT_REPORTED or not path.is_file():
@@ -49,7 +49,7 @@ def has_completed(arm_serial: str, plan_sha256: str) -> bool:
 
 
 def remember_completed(arm_serial: str, plan_sha256: str) -> None:
-    """Record that one session drove every move of the plan, slowly, and took every pose."""
+    """Record that one session made every move of the plan, slowly, and took every pose."""
     path = user_folder("state") / _COMPLETED
     path.parent.mkdir(parents=True, exist_ok=True)
     line = {"format": FORMAT, "arm": arm_serial, "plan": plan_sha256, "utc": datetime.now(UTC).isoformat()}
@@ -66,15 +66,15 @@ def _parse_entry(line: str) -> dict[str, object]:
 
 
 class _SafetyQuestions:
-    """Asks for a free tool, free room, the emergency stop, and reduced mode; raises `Declined` unless all are yes."""
+    """Asks about free tool, free space, emergency stop and reduced mode; raises `Declined` if an answer is no."""
 
     def __init__(self, before: Before) -> None:
         self._arm, self._journal = before.cell.arm, before.cell.journal
         self._plan, self._load = before.plan, before.task.load
-        self._reduced = False  # whether the operator has confirmed the reduced mode that is active
+        self._reduced = False  # whether the operator has confirmed that reduced mode is active
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:
-        """Ask everything before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
+        """Ask all questions before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
         room = "" if self._plan.arm_rests else ", and the space of the whole arm, which moves too,"
         if arm_moves(way_rad):
             room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
@@ -88,7 +88,7 @@ class _SafetyQuestions:
         self.ask_reduced(assumed=assumed)
 
     def ask_reduced(self, *, assumed: bool) -> None:
-        """Ask whether reduced mode is intended, once as long as it lasts."""
+        """Ask whether reduced mode is intended, once per change to reduced mode."""
         reduced = self._arm.status().safety_mode == "reduced"
         if reduced and not self._reduced:
             self._journal.require("The controller is in reduced mode. Is that intended?", assumed=assumed)
@@ -100,19 +100,19 @@ _GRID_RAD: Final = float(np.radians(0.1))
 _HEAVIEST_KG: Final = {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5, "UR16e": 16.0, "UR20": 20.0}
 _HEAVIEST_OF_ALL_KG: Final = 30.0
 NO_SERIAL: Final = (
-    "the controller reports no serial number, so a completed plan cannot be assigned to an arm: newer PolyScope "
-    "versions report it"
+    "the controller reports no serial number, so a completed plan cannot be assigned to this arm; newer PolyScope "
+    "versions report one"
 )
 
 
 class AlongPlan:
-    """A session along a plan: planned, checked and shown; then guarded while the arm is driven.
+    """A session along a plan: makes, checks and shows the plan; then guards the arm while it moves.
 
     Parameters
     ----------
-    session : Session
+    session : OpenSession
     planned : callable
-        Makes the plan from joint angles (6,) where none is on disk.
+        Makes the plan from joint angles (6,) if none is on disk.
 
     Raises
     ------
@@ -128,24 +128,30 @@ class AlongPlan:
         if plan is None:
             plan = planned(certifier, np.round(cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD)
         elif plan is not (own := plan.of_arm(certifier)):
-            cell.note("the plan was made with other kinematics: its moves are proven again with those of this arm")
+            cell.note(
+                "the plan was made with other kinematics: its moves are now proven clear with the kinematics of this "
+                "arm"
+            )
             plan = own
         records = [] if session.resumed is None else session.resumed.records()
         kept = {record.stop: record for record in records if record.stop not in self.options.redo}
         self.taken = len(kept)
-        """Number of poses that a resumed run keeps."""
+        """Number of poses that the resumed run already has."""
         self.todo = [stop for stop in plan.stops if stop not in kept]
-        """Stops that are left, in order."""
+        """Remaining stops, in order."""
         self.judge = self.task.judge(by_hand=False)
         for record in kept.values():
             cell.journal.show(self.judge.add(record))
         self.before = self._look(certifier, plan)
-        """What is known before any motion, with the plan at its own speeds."""
+        """Everything known before the first motion, with the plan at its own speeds."""
         run_checks(self.before, CHECKS)
         if self.options.dry_run:
-            cell.note("the controller's safety limits are not checked: only a program on the controller can query them")
+            cell.note(
+                "the safety limits of the controller are not checked in a dry run: only a program on the controller "
+                "can do that"
+            )
             return
-        # Control of the arm is taken last, when all other checks have passed.
+        # Take control of the arm only when all other checks have passed.
         cell.arm.open(control=True)
         if path := cell.arm.identify().facts.get("control"):
             cell.note(f"control path {path.value}")
@@ -160,13 +166,13 @@ class AlongPlan:
     def _certifier(self) -> Certifier:
         arm, load = self.cell.arm, self.task.load
         if not self.options.dry_run and arm.status().tcp_offset is None:
-            # An old controller reports no poses before.
+            # An old controller reports the flange pose only to a program.
             arm.open(control=True)
         info, hook_m = arm.identify(), None if load is None else load.p_flange_m
         return certifier_for(self.task.cell, info.model, kinematics_of(info), hook_m)
 
     def _look(self, certifier: Certifier, plan: Plan) -> Before:
-        """Plan the approach to the first pose that is left, listen to the resting sensor, and show every motion."""
+        """Plan the approach to the first remaining pose, read the resting sensor, and show all motion."""
         cell, options, todo, nodes_rad = self.cell, self.options, self.todo, plan.nodes_rad
         goal = nodes_rad[(todo[0] - 1) % len(nodes_rad) if todo else 0]
         before = Before(
@@ -187,7 +193,7 @@ class AlongPlan:
         return before
 
     def end_dry_run(self) -> None:
-        """Leave the plan on a page that shows it until the operator has seen it."""
+        """Keep the page of the plan open until the operator presses Enter."""
         if self._onlookers:
             self.cell.journal.ask(Question("The page shows the plan until you press Enter", ("",)))
 
@@ -199,11 +205,10 @@ class AlongPlan:
         predict: Callable[[Array], Array | None],
         *onlookers: guards.Guard,
     ) -> Iterator[tuple[GuardedCell, PoseBook]]:
-        """Guard the cell during the block, after the safety questions; yields it and the book of the run.
+        """Ask the safety questions, then guard the cell during the block; yields the guarded cell and the pose book.
 
-        `driven` has the speeds and the sampling of this session; later checks repeat those of `before`. `quiet_std`
-        (6,) is the standard deviation of the samples of the resting sensor, `predict` as in `Judge`. The `onlookers`
-        see what the guards let pass.
+        `driven` has the speeds and the sampling of this session. `quiet_std` (6,) is the standard deviation of the
+        samples of the resting sensor, and `predict` is as in `Judge`. The `onlookers` are called after the guards.
         """
         cell, options, before, way = self.cell, self.options, self.before, self.before.approach.way_rad
         load = _range_guard(before)
@@ -224,18 +229,20 @@ class AlongPlan:
         )
 
         def on_trip(trip: guards.Tripped) -> None:
-            with suppress(SupervisorGone):  # it is recorded all the same, and the tour asks the operator next
+            with suppress(SupervisorGone):  # the event is recorded, and the tour asks the operator next
                 cell.journal.show(GuardTripped(hazard=trip.hazard, words=str(trip)))
 
         watcher = Watcher(cell, rows, on_trip)
         questions = _SafetyQuestions(before)
         recheck = partial(self._recheck, questions)
-        with watcher:  # sees an emergency stop at a question too
+        with watcher:  # it also sees an emergency stop during a question
             if options.questions and self.todo:
                 if before.certifier.arm.hung is not None:
-                    words = "Is the weight off the tool? It is hung when the arm stands at its first pose."
+                    words = "Is the weight off the tool? You hang it when the arm stands at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # one with base or elbow is new
+                questions.ask(
+                    way, assumed=before.known and not arm_moves(way)
+                )  # an approach that moves base or elbow is new
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
@@ -258,9 +265,9 @@ class AlongPlan:
         return run
 
     def _recheck(self, questions: _SafetyQuestions, asks: bool) -> None:
-        """Repeat the checks after a stop; with `asks`, all the safety questions too."""
+        """Repeat the checks after a stop, and with `asks` also all safety questions."""
         before, q = self.before, self.cell.arm.state().q_rad
-        # The next approach is checked when its goal is known.
+        # The next approach is checked later, when its goal is known.
         stays = plan_approach(before.certifier, q, q, SLOW)
         quiet = self.cell.listen(LISTEN_S)
         run_checks(replace(before, quiet=quiet, approach=stays, known=True, resumed=True), AGAIN)
@@ -272,20 +279,20 @@ class AlongPlan:
             questions.ask_reduced(assumed=False)
 
     def judge_completed(self, missing: str = "") -> None:
-        """Record that this session drove every move of the plan, slowly, or show why it does not count.
+        """Record that this session completed the plan, or show why it did not.
 
-        `missing` says which poses or moves the session lacks; empty if it has all of them.
+        `missing` describes the missing poses or moves; empty if there are none.
         """
         if not self.todo or self.before.known:
             return
         if missing:
-            why = f"a plan counts as completed when one session takes every pose and drives every move of it; {missing}"
+            why = f"a plan is completed when one session takes every pose and makes every planned move; {missing}"
         elif not self.serial:
             why = NO_SERIAL
         else:
             remember_completed(self.serial, self.before.plan.sha256)
             return
-        self.cell.note(f"the next run of this plan is slow again and needs the typed word: {why}")
+        self.cell.note(f"plan not completed, so its next run is slow again and needs the typed word: {why}")
 
 
 def _range_guard(before: Before) -> guards.RangeGuard:

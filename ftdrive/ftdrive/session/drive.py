@@ -1,8 +1,7 @@
-"""An arm on its way between the poses of a plan: certified moves only; after an error STOP, then HOLD.
+"""Motion of the arm between the poses of a plan: certified moves only; after an error STOP, then HOLD.
 
-The arm moves along the plan from one pose to the next or back, or along an approach that is planned from where the arm
-stands, shown and confirmed. `GuardedCell` leads from a stop back to motion: it finds what stopped the arm, and whether
-the cause is gone.
+The arm moves along the plan from one pose to the next or back, or along an approach that is planned from its present
+posture, shown and confirmed. `GuardedCell` recovers from a stop: it finds the cause, and whether the cause is gone.
 """
 
 import logging
@@ -31,95 +30,96 @@ from ftdrivers.errors import DeviceError, DeviceFault
 log = logging.getLogger(__name__)
 
 APPROACH_RAD_S: Final = float(np.radians(15))
-# Speed back to the previous pose, after a stop between two poses.
+# Speed of the return to the previous pose, after a stop between two poses.
 BACK_RAD_S: Final = float(np.radians(10))
 SLOW: Final = Speeds.first_run()
 AT_RAD: Final = float(np.radians(0.5))
-# An approach that comes closer than this to a skipped posture passes it.
+# An approach that comes closer than this to a skipped posture is reported as passing it.
 _NEAR_RAD: Final = float(np.radians(10))
-# How long the guards look at a resting arm before it moves on after a stop.
+# How long the guards watch the resting arm before it moves on after a stop.
 _LOOK_AGAIN_S: Final = 0.4
 _FIRST_WORD: Final = "MOVE"
 
 
 @dataclass(slots=True)
 class Progress:
-    """State of a tour between two steps.
+    """Progress of a tour.
 
-    A stop counts from 1 to `poses + 1`, the return to the first pose. An index counts the poses of the plan from 0.
+    Stops are numbered from 1 to `poses + 1`; the last one is the return to the first pose. An index counts the poses of
+    the plan from 0.
     """
 
     poses: int
     todo: list[int] = field(default_factory=list)
-    """Stops left, in order."""
+    """Remaining stops, in order."""
     stood_at: int | None = None
-    """Index of the pose where the arm stood last; None where it was moved from there by something else."""
+    """Index of the last pose at which the arm stood; None if something else has moved the arm since."""
     standing: bool = False
-    """Whether the arm still stands there."""
+    """Whether the arm still stands at the pose `stood_at`."""
     under_way: int | None = None
-    """Stop that the arm moves to or measures."""
+    """Stop to which the arm moves, or at which it measures."""
     back: tuple[int, str] | None = None
-    """Index of the pose to return to, and what stopped the arm."""
+    """Index of the pose to which the arm should return, and the cause of the stop."""
     confirmed: bool = False
-    """Whether the operator has typed the word for the first motion."""
+    """Whether the operator has typed the word that starts the first motion."""
     taken_last: int | None = None
-    """Stop of the newest pose."""
+    """Stop of the pose taken last."""
     skipped: set[int] = field(default_factory=set)
-    """Indices of postures that the arm should avoid."""
+    """Indices of the skipped poses, whose postures the arm should avoid."""
     reopened: set[int] = field(default_factory=set)
     """Stops at which the sensor was reopened."""
     driven: set[int] = field(default_factory=set)
-    """Indices of poses whose move to the next pose was completed."""
+    """Indices of poses from which the arm has completed the planned move to the next pose."""
     payload_kg: float | None = None
-    """Payload reported by the controller when it was last compared."""
+    """Payload of the controller at the last comparison with the identified mass, kg."""
 
     @property
     def stops(self) -> int:
-        """Number of stops, the return included."""
+        """Number of stops, including the return to the first pose."""
         return self.poses + 1
 
     @property
     def at(self) -> int | None:
-        """Index of the pose where the arm stands; None between poses."""
+        """Index of the pose at which the arm stands; None between poses."""
         return self.stood_at if self.standing else None
 
     @property
     def moving(self) -> bool:
-        """Whether the arm is on its way to a stop."""
+        """Whether the arm is moving to a stop."""
         return self.under_way is not None and not self.standing
 
     @property
     def came_from(self) -> int | None:
-        """Index of the pose to which the arm can return, where it was stopped on its way to another."""
+        """Index of the pose to which the arm can return after a stop between two poses; None if there is none."""
         gone = {self.index(self.todo[0]), *self.skipped}
         return None if self.standing or self.stood_at in gone else self.stood_at
 
     @property
     def undriven(self) -> list[int]:
-        """Poses, from 1, whose planned move to the next pose was replaced by an approach or left out."""
+        """Numbers of the poses, from 1, from which the planned move was left out or replaced by an approach."""
         return [index + 1 for index in range(self.poses) if index not in self.driven]
 
     def index(self, stop: int) -> int:
-        """Index of the pose of a stop."""
+        """Return the index of the pose of a stop."""
         return (stop - 1) % self.poses
 
     def lose_place(self) -> None:
-        """Forget where the arm stood: something else has moved it."""
+        """Forget where the arm stood, because something else has moved it."""
         self.standing, self.stood_at = False, None
 
     def arrive(self, index: int, *, driven_from: int | None = None) -> None:
-        """Stand at a pose; `driven_from` is the index where its planned move began."""
+        """Note that the arm stands at a pose; `driven_from` is the index of the pose where its planned move began."""
         self.stood_at, self.standing = index, True
         if driven_from is not None:
             self.driven.add(driven_from)
 
     def redo(self, stop: int) -> None:
-        """Put a stop that was taken in front of the others."""
+        """Put a stop that was taken before at the front of the remaining ones."""
         self.todo.insert(0, stop)
         self.skipped.discard(self.index(stop))
 
     def skip(self) -> list[int]:
-        """Leave out the next pose, and the return to it; return the dropped stops."""
+        """Leave out the next pose and a return to it; return the skipped stops."""
         index = self.index(self.todo[0])
         dropped = [stop for stop in self.todo if self.index(stop) == index]
         self.todo = [stop for stop in self.todo if stop not in dropped]
@@ -128,7 +128,7 @@ class Progress:
 
 
 class _OperatorStop(Exception):
-    """The operator paused, stopped, sent the arm back or answered no; the arm holds until the operator decides."""
+    """Raised when the operator paused, stopped, sent the arm back or answered no; the arm then holds."""
 
     def __init__(self, words: str, *, for_good: bool = False) -> None:
         super().__init__(words)
@@ -136,14 +136,14 @@ class _OperatorStop(Exception):
 
 
 STOPS: Final = (Tripped, DeviceError, OSError, _OperatorStop, TooFewSamples, NotAccepted, SupervisorGone)
-"""What stops the arm, and holds it until the operator decides."""
+"""Errors after which the arm stops and holds until the operator decides."""
 
 
 class GuardedCell:
-    """A cell under control with its guards, and what leads from a stop back to motion.
+    """A cell under control with its guards, and the recovery from a stop.
 
-    Of the guards, `contact` accepts the zero of a reopened sensor, and `load` judges every sample of a pose. `recheck`
-    repeats the checks, with True the safety questions too; it raises if the arm may not go on.
+    The guard `contact` must accept the new zero of a reopened sensor; the guard `load` judges every sample of a pose.
+    `recheck` repeats the checks, and with True also the safety questions; it raises if the arm may not go on.
     """
 
     def __init__(
@@ -158,15 +158,15 @@ class GuardedCell:
         self.cell, self.watcher, self.load = cell, watcher, load
         self._contact, self._recheck = contact, recheck
         self._sensor_events = SensorEvents(cell.sensor, cell.journal.show)
-        self._cause: Tripped | None = None  # why the arm is held
-        self._answered: Tripped | None = None  # last stop of row 11 whose questions were answered
+        self._cause: Tripped | None = None  # why the arm holds
+        self._answered: Tripped | None = None  # last stop of row 11 after which the safety questions were answered
 
     def show_new(self) -> None:
         """Show new events of the sensor."""
         self._sensor_events.show_new()
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
-        """Return the trip behind an error: that of a guard, or the row of the table that the error belongs to."""
+        """Return the trip behind an error: that of a guard, or one with the matching hazard; None if there is none."""
         self.watcher.unseen = False
         self._cause = self._row_of(error, moving=moving)
         if self._cause is not None:
@@ -174,21 +174,21 @@ class GuardedCell:
         return self._cause
 
     def require_answers(self) -> None:
-        """Raise a stop of row 11, however short, until its questions are answered."""
+        """Raise the last stop of row 11, however short, unless the safety questions were answered after it."""
         self.watcher.look_aside()
         stop = self.watcher.safety_stop
         if stop is not None and stop is not self._answered:
             raise stop
 
     def reopen(self) -> None:
-        """Raise unless the cause is gone. Only the operator clears a stop of the safety system."""
+        """Reopen arm and sensor; raise if the cause persists. Only the operator clears a stop of the safety system."""
         self.watcher.look_aside()
         unseen = self.watcher.unseen
         try:
             self.cell.arm.open(control=True)
         except DeviceError:
             with suppress(DeviceError):
-                self.cell.arm.open()  # to see an emergency stop that is pressed meanwhile
+                self.cell.arm.open()  # so that an emergency stop pressed meanwhile is seen
             raise
         try:
             self.cell.sensor.check()
@@ -203,13 +203,13 @@ class GuardedCell:
             self._cause = stop
             self.cell.journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
         elif unseen:
-            words = "the arm was out of sight: its emergency stop may have been pressed meanwhile"
+            words = "no status of the arm for a while: its emergency stop may have been pressed meanwhile"
             self.cell.note(words, warning=True)
         self._recheck(unseen or stop is not self._answered)
         self._answered = stop
         self.watcher.begin()
         q = self.cell.arm.state().q_rad
-        with self.watcher.watching(q, q, moving=False):  # raises if the cause is still there
+        with self.watcher.watching(q, q, moving=False):  # raises if the cause persists
             self.watcher.clock.sleep(_LOOK_AGAIN_S)
         self.require_answers()
 
@@ -225,7 +225,7 @@ class GuardedCell:
         if (trip := self.watcher.tripped(wait_s=0.3)) is not None:
             reported = error.__cause__
             if trip.hazard is Hazard.OTHER_CLIENT and isinstance(reported, DeviceFault):
-                # A guard sees only that the program has ended; the arm may know why.
+                # A guard sees only that the program has ended; the driver of the arm may know why.
                 return Tripped(trip.hazard, type(reported)(reported.found, reported.fix))
             return trip
         try:
@@ -242,18 +242,18 @@ class GuardedCell:
 
 
 class Drive:
-    """An arm under guard between the poses of a plan, each move certified and each approach confirmed.
+    """Moves the arm between the poses of a plan while the guards watch; certified moves and confirmed approaches only.
 
     Parameters
     ----------
     guarded : GuardedCell
     driven : Before
-        With the speeds of this session.
+        The plan, with the speeds of this session.
     options : SessionOptions
     numbers : sequence of int or None
-        Orientation of each pose, as events show it.
+        Number of the orientation of each pose, for events.
     obey : callable
-        What a key means that neither pauses nor stops: returns a note, or raises. Called before another pose is shown.
+        Handles a key that neither pauses nor stops: returns a note for the operator, or raises.
     """
 
     def __init__(
@@ -268,18 +268,18 @@ class Drive:
         self.arm, self.sensor, self.journal = guarded.cell.arm, guarded.cell.sensor, guarded.cell.journal
         self.note = guarded.cell.note
         self.certifier = driven.certifier
-        """For the tool as it is now: an approach is planned with it."""
-        # Whether `--yes` may answer: the plan has run to its end on this arm, or the cell is emulated.
+        """Certifier for the present tool, with or without its hanging load; it plans the approaches."""
+        # Whether `--yes` may answer: this arm has completed the plan before, or the cell is emulated.
         self.trusted = driven.known
         self.nodes_rad = driven.plan.nodes_rad
         self.now = Progress(len(self.nodes_rad))
         self._options, self._numbers, self._obey = options, numbers, obey
 
     def obey_keys(self) -> None:
-        """Obey the keys pressed: r refers to the last pose taken, s to the one under way, as on the screen.
+        """Obey the pressed keys: r refers to the pose taken last, s to the pose in progress, as on the screen.
 
-        Every key stops an arm in motion; what it means is done after the stop. Called between two looks, so before
-        another pose is shown.
+        Every key stops a moving arm; its effect follows after the stop. Keys are read before the screen shows another
+        pose.
         """
         while (key := self.journal.pressed()) is not None:
             if key is Key.STOP:
@@ -291,9 +291,9 @@ class Drive:
                 self.note(note)
 
     def approach(self, index: int, stop: int, *, back: bool = False) -> bool:
-        """Move the arm to a pose from where it stands, along moves that are not in the plan; False if it is there.
+        """Move the arm from its posture to a pose along moves outside the plan; return False if it is there already.
 
-        They are proven, shown and confirmed by themselves.
+        These moves are proven clear, shown and confirmed separately.
         """
         q = self.arm.state().q_rad
         approach = plan_approach(self.certifier, q, self.nodes_rad[index], SLOW)
@@ -309,7 +309,7 @@ class Drive:
             f"{way_in_words(way, approach.clearance_m)}"
         )
         if passed:
-            words += f"; it passes close to the skipped pose {' and '.join(passed)} and does not stop there"
+            words += f"; it passes close to the skipped pose {' and '.join(passed)} without stopping there"
         self.show_state(State.APPROACH, stop, words)
         self.confirm(f"Approach {words}.", by_operator=back or bool(passed) or arm_moves(way))
         for goal, speed in zip(approach.q_rad, approach.speed_rad_s, strict=True):
@@ -318,14 +318,14 @@ class Drive:
         return True
 
     def go_back(self, index: int, why: str) -> None:
-        """Return to the previous pose, then hold: the operator decides again."""
+        """Return to the previous pose, then hold until the operator decides again."""
         self.now.back, self.now.under_way = None, self.now.todo[0]
         self.approach(index, index + 1, back=True)
         self.now.arrive(index)
-        raise _OperatorStop(f"back at pose {index + 1}; what stopped the arm: {why}")
+        raise _OperatorStop(f"back at pose {index + 1}; cause of the stop: {why}")
 
     def _passed(self, way: Array, goal: int) -> list[str]:
-        """Return the skipped poses that an approach (k, 6) to another pose comes close to."""
+        """Return the numbers of the skipped poses that an approach (k, 6) passes closely."""
         share = np.linspace(0.0, 1.0, 181)[:, None]
         points = np.concatenate([start + share * (end - start) for start, end in pairwise(way)])
         return [
@@ -335,7 +335,7 @@ class Drive:
         ]
 
     def confirm(self, text: str, *, by_operator: bool = False) -> None:
-        """Ask before a motion; the first motion needs a typed word."""
+        """Ask before a motion; the first motion needs a typed word. `by_operator` excludes an answer by `--yes`."""
         if not self._options.questions:
             return
         trusted = self.trusted and not by_operator
@@ -350,7 +350,7 @@ class Drive:
         self.now.confirmed = True
 
     def move(self, start: Array, goal: Array, speed_rad_s: float, acceleration_rad_s2: float) -> None:
-        """Make one certified move, only from where it was certified to begin."""
+        """Make one certified move; raises unless the arm stands at its start."""
         self.require_at(start)
         turn = np.abs(goal - start).max()
         duration_s = float(move_duration_s(turn, speed_rad_s, acceleration_rad_s2))
@@ -358,7 +358,7 @@ class Drive:
         with self.watcher.watching(start, goal, moving=True):
             self.arm.move_to(
                 goal.tolist(),
-                # `StallGuard` sees an arm that stands still.
+                # `StallGuard` detects a stalled arm much earlier.
                 timeout_s=(duration_s + 1.5) / SLOWEST_SLIDER,
                 guard=self.between_looks,
                 speed_rad_s=speed_rad_s,
@@ -366,31 +366,31 @@ class Drive:
             )
 
     def require_at(self, start: Array) -> None:
-        """Raise unless the first motion is confirmed, every question is answered, and the arm stands at `start`."""
+        """Raise unless the first motion is confirmed, the safety questions are answered, and the arm is at `start`."""
         if not self.now.confirmed:
-            self.confirm("The arm begins the tour.")
+            self.confirm("The arm starts the tour.")
         self.guarded.require_answers()
         off_rad = np.abs(self.arm.state().q_rad - start)
         if off_rad.max() > AT_RAD:
             self.now.lose_place()
             raise fault(
                 Hazard.OTHER_CLIENT,
-                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° from where its move begins: "
-                "something else has moved the arm; stop that, then resume",
+                f"joint {off_rad.argmax() + 1} is {np.degrees(off_rad.max()):.1f}° off the start of the next move: "
+                "stop what else has moved the arm, then resume",
             )
 
     def between_looks(self) -> None:
-        """Raise what a guard or a key stops the arm for."""
+        """Raise the trip of a guard, or the effect of a pressed key."""
         self.watcher.check()
         self.obey_keys()
 
     def hold(self, error: Exception, choices: Callable[[int | None, str], tuple[str, Mapping[str, str]]]) -> str:
-        """Show why the arm has stopped, and wait for the operator; returns the answer when the arm may go on.
+        """Stop the arm, show the cause, and ask the operator; return the answer when the arm may go on.
 
-        Of the pose to which the arm can return and the words for the cause, `choices` says what is kept, and the
-        answers with their effects.
+        `choices` is called with the index of the pose to which the arm can return, and with words about the cause. It
+        returns a sentence about the saved data, and the effect of each possible answer.
         """
-        # The arm stops first, whatever the cause is.
+        # First of all, stop the arm.
         self.arm.stop()
         if isinstance(error, _OperatorStop) and error.for_good:
             self.show_state(State.STOP, words=str(error))
@@ -408,14 +408,16 @@ class Drive:
         if trip is not None and (trip is not reported or report_error is not None):
             self.journal.show(GuardTripped(hazard=trip.hazard, words=words))
         if report_error is not None:
-            self.note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
+            self.note(
+                f"{reported} (reported late because of {report_error!r}: check screen, pipe and disk)", warning=True
+            )
         self.show_state(State.STOP, words=words)
         self.guarded.show_new()
         self.show_state(State.HOLD, words=words)
         by_operator = isinstance(error, _OperatorStop)
         end = Declined(words) if by_operator else error if trip is None else trip.error
         if trip is not None and trip.error is not error and trip is not error and trip.error.__cause__ is None:
-            end.__cause__ = error  # which a guard may have overtaken: an arm that fails ends its own program
+            end.__cause__ = error  # a guard may have tripped first, because a failing arm ends its own program
         kept, ways = choices(back, "" if by_operator else " after fixing the cause")
         effects = ". ".join(f"{answer}: {effect}" for answer, effect in ways.items())
         question = Question(f"{kept} {effects}", tuple(ways))
@@ -431,7 +433,7 @@ class Drive:
             return answer
 
     def _choose(self, question: Question, end: Exception) -> str:
-        """Ask how to go on; raise `end`, the first cause, if the operator quits or does not answer."""
+        """Ask how to go on; raise `end`, the original cause, if the operator quits or does not answer."""
         try:
             answer = self.journal.ask(question)
         except SupervisorGone as gone:
@@ -443,7 +445,7 @@ class Drive:
         return answer
 
     def _reopened_sensor(self, trip: Tripped) -> bool:
-        """Reopen a sensor that failed while the arm stood at a pose, once for each pose; the pose is restarted."""
+        """Reopen a sensor that failed while the arm stood at a pose, once per pose; return whether that succeeded."""
         stop = self.now.todo[0]
         if trip.hazard != Hazard.SENSOR_LOST or not self.now.standing or stop in self.now.reopened:
             return False
@@ -453,10 +455,10 @@ class Drive:
         except (Tripped, DeviceError, NotAccepted, Declined) as error:
             log.info("the sensor cannot be reopened: %s", error)
             return False
-        self.note(f"{trip}; the sensor was reopened, pose {stop} restarts", warning=True)
+        self.note(f"{trip}; the sensor was reopened, and pose {stop} restarts", warning=True)
         return True
 
     def show_state(self, state: State, stop: int | None = None, words: str = "") -> None:
-        """Show what the arm does, and at which stop."""
+        """Show the state of the session, and the stop to which it refers."""
         number = None if stop is None else self._numbers[self.now.index(stop)]
         self.journal.show(StateChanged(state=state, stop=stop, stops=self.now.stops, number=number, words=words))

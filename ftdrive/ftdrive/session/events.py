@@ -1,4 +1,4 @@
-"""Events of a session: what the terminal shows and the journal keeps; and the rows of the hazard table."""
+"""Events of a session, which the terminal shows and the journal records, and the rows of the hazard table."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -14,7 +14,7 @@ from ftdrivers.interfaces import ForceTorqueSensor
 
 
 class Hazard(IntEnum):
-    """What can go wrong while the arm moves."""
+    """Row of the hazard table: what can go wrong while the arm moves."""
 
     CABLE_PULL = 1
     SELF_COLLISION = 2
@@ -27,7 +27,7 @@ class Hazard(IntEnum):
     WRONG_MODEL = 9
     PROTECTIVE_STOP = 10
     EMERGENCY_STOP = 11
-    """A safeguard stop too."""
+    """Emergency stop or safeguard stop."""
     SAFETY_MODE = 12
     OVERLOAD = 13
     CONTACT = 14
@@ -46,14 +46,14 @@ class Hazard(IntEnum):
     WRONG_PLAN = 25
     DISK_FULL = 26
     SUPERVISOR_GONE = 27
-    """The operator, or the program in their place, does not follow the session any more."""
+    """The operator, or the program that supervises the session instead, is gone."""
 
 
 SCHEMA_VERSION = 1
 
 
 class State(StrEnum):
-    """State of a session. A trip leads from any state to STOP, then HOLD, where the operator decides."""
+    """State of a session. Every trip leads to STOP and then to HOLD, where the operator decides."""
 
     IDLE = "idle"
     PREFLIGHT = "preflight"
@@ -75,7 +75,7 @@ class Event:
     t_utc: str = field(default_factory=lambda: datetime.now(UTC).isoformat())
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `--json` writes, one object a line; arrays become lists, NaN and infinity null."""
+        """Return the object that `--json` writes as one line; arrays become lists, NaN and infinity null."""
         name = "".join(f"-{c.lower()}" if c.isupper() else c for c in type(self).__name__).lstrip("-")
         return {"schema_version": SCHEMA_VERSION, "event": name} | {
             each.name: _to_json(getattr(self, each.name)) for each in fields(self)
@@ -84,11 +84,11 @@ class Event:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class RunOpened(Event):
-    """A run folder is open; it keeps every pose from now on."""
+    """The run folder is open and receives every pose from now on."""
 
     folder: str
     resume: str
-    """The command that continues it; empty for a sweep, which starts again."""
+    """The command that resumes the run; empty for a run in motion, which cannot be resumed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -97,12 +97,13 @@ class StateChanged(Event):
 
     state: State
     stop: int | None = None
-    """Place in the tour, from 1; the return to the first pose comes last."""
+    """Number of the stop in the tour, from 1; the last stop is the return to the first pose."""
     stops: int | None = None
+    """Number of stops in the tour."""
     number: int | None = None
     """Number of the orientation."""
     words: str = ""
-    """The cause, for STOP and HOLD; else what happens or what to do."""
+    """Cause of a STOP or HOLD; otherwise what happens or what to do."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,29 +113,29 @@ class Checked(Event):
     name: str
     passed: bool
     words: str
-    """What was found; for a failed check, what to do."""
+    """The finding, and for a failed check the remedy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Planned(Event):
-    """Every motion to come; shown before any question."""
+    """All motion to come; shown before the first question."""
 
     plan: Plan
-    """Its file's contents in `to_dict`."""
+    """The plan; `to_dict` gives the contents of its file."""
     way_rad: Array
-    """(k + 1, 6) joint vectors from where the arm stands to the first pose; (0, 6) if it stands there."""
+    """Joint vectors (k + 1, 6) of the approach to the first pose; (0, 6) if the arm stands there."""
     way_words: str
     stop_words: str = ""
-    """How far the arm goes on in a stop; empty for an arm of another package."""
+    """Stopping distance of the arm, in words; empty for an arm of another package."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what `--json` writes, with the plan as in its file."""
+        """Return the object that `--json` writes, with the plan as in its file."""
         return Event.to_dict(self) | {"plan": self.plan.to_dict()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noted(Event):
-    """A note for the operator without a type of its own."""
+    """A note for the operator that has no other event type."""
 
     words: str
     warning: bool = False
@@ -148,22 +149,22 @@ class PoseTaken(Event):
     stops: int
     number: int
     gravity_flange: Array
-    """(3,) unit vector down, in the flange frame, as the base is mounted."""
+    """(3,) unit vector down, flange axes, from the configured mounting."""
     mean: Array
-    """(6,) N and N·m, as measured."""
+    """(6,) mean of the samples as measured, N and N·m."""
     sigma: Array
-    """(6,) of the mean, N and N·m."""
+    """(6,) standard deviation of the mean, N and N·m."""
     samples: int
     settle_s: float
     average_s: float
     attempts: int
     steady: bool
     temperature_C: float | None = None
-    """Temperature of the sensor, where it reports it."""
+    """Temperature that the sensor reports; None if it does not."""
 
 
 def rms_sigma(sigma: Array) -> tuple[float, float]:
-    """Return one standard deviation of one axis, force in N and torque in N·m, from those of all six axes."""
+    """Return the RMS of six standard deviations: over the force axes, N, and over the torque axes, N·m."""
     force_N, torque_Nm = (float(np.sqrt(np.mean(part**2))) for part in (sigma[:3], sigma[3:]))
     return force_N, torque_Nm
 
@@ -179,61 +180,63 @@ class MotionRecorded(Event):
     states: int
     """States of the arm."""
     temperature_C: float | None = None
-    """Temperature of the sensor, where it reports it."""
+    """Temperature that the sensor reports; None if it does not."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Estimated(Event):
-    """The running fit over the poses so far; only the coverage before a fit is possible."""
+    """The running fit of the poses so far, and their coverage; the coverage alone before a fit is possible."""
 
     poses: int
     values: Mapping[str, Any]
-    """By the names of `Parameters` and its derived quantities, SI units; empty before four distinct poses."""
+    """Estimates by the names of `Parameters` and its derived quantities, SI units; empty without a fit."""
     sigma: Mapping[str, Any]
-    """One standard deviation each, same names."""
+    """Standard deviation of each estimate, by the same names."""
     residual_sigma: float | None
-    """Largest of the six residuals of the newest pose, each over its standard deviation."""
+    """Largest residual of the newest pose over the six channels, each divided by its standard deviation."""
     residual_force_N: float | None
     """Norm of the residual force of the newest pose."""
     faces: tuple[int, int, int, int, int, int]
-    """Poses by the flange axis that gravity is nearest to: +x -x +y -y +z -z."""
+    """Numbers of poses whose gravity is nearest to each flange axis: +x -x +y -y +z -z."""
     cond9: float
     cond_u1: float
+    """Condition numbers of the poses, see `ftcalib.poses.information.Prediction`."""
     empty_cap_deg: float
-    """Largest angle from any direction of gravity to the nearest one seen."""
+    """Largest angle from any direction to the nearest direction of gravity among the poses."""
     light: str
-    """green, amber or red: whether the poses suffice."""
+    """Whether the poses suffice: "green", "amber" or "red"."""
     hint: str
-    """The most useful next pose, in words; empty if the light is green or the arm is not moved by hand."""
+    """Most useful next pose, in words; empty if the light is green or the arm is not moved by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Compared(Event):
-    """A pose of a verification, beside the prediction of the calibration."""
+    """Comparison of a pose of a verification with the prediction of the calibration."""
 
     stop: int
     number: int
     residual: Array
     """(6,) measured minus predicted, N and N·m."""
     sigma: Array
-    """(6,) one standard deviation of that, of noise and calibration together."""
+    """(6,) standard deviation of the residual, from noise and calibration, N and N·m."""
     poses: int
     """Number of poses so far."""
     light: str
-    """green if the poses suffice, else amber."""
+    """Whether the poses suffice: "green" or "amber"."""
     hint: str = ""
-    """What to do, if the pose does not count."""
+    """What to do if the pose is too near to one of the calibration; else empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Weighed(Event):
-    """The running fit is reliable: the identified mass, beside the payload set on the controller."""
+    """The identified mass, when the running fit is reliable, and the payload set in the controller."""
 
     mass_kg: float
-    """Mass that the sensor carries, so without sensor and adapter."""
+    """Mass that the sensor carries, without sensor and adapter."""
     payload_kg: float
+    """Payload set in the controller, including sensor and adapter."""
     p_flange_payload_m: tuple[float, ...] | None
-    """(3,) centre of mass of that payload, flange axes; None for a controller that does not report it."""
+    """(3,) centre of mass of the payload, flange axes; None if the controller does not report it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -243,7 +246,7 @@ class GuardTripped(Event):
     hazard: int
     """Row of the hazard table."""
     words: str
-    """What was found, with the value, and what to do."""
+    """The finding, with the value, and the remedy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -253,7 +256,7 @@ class Asked(Event):
     question: str
     answer: str
     by: Literal["person", "--yes"]
-    """Who answered: the operator, or the option, which gives the assumed answer."""
+    """Who answered: the operator, or the option `--yes` with the assumed answer."""
 
 
 class SensorEvents:
@@ -286,7 +289,7 @@ def _to_json(value: Any) -> Any:
 
 
 class Key(Enum):
-    """Requests of the operator at any time; the values are the keys of the live screen."""
+    """Requests that the operator may make at any time; the values are the keys of the session screen."""
 
     KEEP = "k"
     REDO = "r"
@@ -294,43 +297,43 @@ class Key(Enum):
     PAUSE = "p"
     STOP = "q"
     OTHER = ""
-    """Any other key: Space, Enter, an arrow, Ctrl-D, Ctrl-Z. It stops an arm in motion."""
+    """Any other key, such as Space, Enter, an arrow, Ctrl-D or Ctrl-Z, which stops a moving arm."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """A question that the session waits for."""
+    """A question whose answer the session waits for."""
 
     text: str
     """The question, with the meaning of each answer."""
     answers: tuple[str, ...] = ("yes", "no")
-    """Accepted answers; a single one must be typed in full."""
+    """Accepted answers; if there is only one, it must be typed in full."""
     assumed: str | None = None
-    """Answer of `--yes`; None if the operator must answer."""
+    """Answer that `--yes` gives; None if the operator must answer."""
 
 
 class Operator(Protocol):
-    """The operator as the session sees them."""
+    """Interface between a session and its operator."""
 
     def show(self, event: Event) -> None:
-        """Show an event; returns at once. Raises `SupervisorGone` if it cannot be seen any more."""
+        """Show an event; return at once. Raises `SupervisorGone` if the operator cannot see the event."""
 
     def ask(self, question: Question) -> str:
-        """Wait for one of the question's answers; raises `Declined` or `SupervisorGone` if no operator can answer."""
+        """Return one of the answers of a question; raises `Declined` or `SupervisorGone` if no operator can answer."""
 
     def absence(self) -> str | None:
-        """Return what shows that no operator follows the session any more, such as a closed terminal; else None.
+        """Return why no operator follows the session, such as a closed terminal; None if one does.
 
-        Any thread may call it; returns at once.
+        Any thread may call this method; it returns at once.
         """
 
     @property
     def has_keys(self) -> bool:
-        """Whether keys are read; key hints are shown only then."""
+        """Whether keys are read; hints about keys are shown only then."""
 
     def pressed(self) -> Key | None:
-        """Return the oldest key not yet returned, or None; returns at once."""
+        """Return the oldest key that was not returned yet, or None, at once."""
 
     @property
     def pressed_by(self) -> str:
-        """Who pressed the key that `pressed` returned last: "the operator", or a viewer of the page."""
+        """Who pressed the last key that `pressed` returned: "the operator", or a viewer of the page."""

@@ -1,8 +1,8 @@
-"""Guards that watch the arm under control, by rows of the hazard table; `watchdog.py` runs them in a thread.
+"""Guards that watch the arm while the program controls it; `watchdog.py` runs them in a thread.
 
-A guard judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety
-system and the user's risk assessment. docs/reference/hazards.md lists every row, its guard
-and the test that injects it.
+Each guard covers rows of the hazard table in docs/reference/hazards.md, which also names the test of each row. It
+judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety system
+and of the user's risk assessment.
 """
 
 from abc import ABC, abstractmethod
@@ -24,7 +24,7 @@ from ftdrivers.interfaces import ArmState, ArmStatus
 
 G_M_S2: Final = 9.81
 _SLIDER: Final = 0.02
-# On a curve, an arm that has moved so far makes progress.
+# On a curve, a joint that has turned by this angle makes progress.
 _PROGRESS_RAD: Final = 1e-3
 
 
@@ -38,72 +38,75 @@ class Tripped(Exception):
 
 
 def fault(hazard: Hazard, *words: str) -> Tripped:
-    """Return a trip for a `DeviceFault` with these words."""
+    """Return a trip whose error is a `DeviceFault` with this text."""
     return Tripped(hazard, DeviceFault(*words))
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits at which the guards trip; the numbers of the hazard table."""
+    """Limits of the guards and of the preflight checks; the hazard table quotes them."""
 
     frozen_rad: float = float(np.radians(0.5))
-    """Allowed motion of joints that should rest."""
+    """Largest allowed motion of a joint that should rest."""
     tracking_rad: float = float(np.radians(2.0))
-    """Allowed distance of a moving joint from the straight line in joint space."""
+    """Largest allowed distance of a moving joint from the planned path in joint space."""
     flange_m: float = 0.002
     flange_rad: float = float(np.radians(0.2))
-    """From the arm's own kinematics: twice what the driver allows at rest, which has looked before."""
+    """Largest allowed deviation of the flange from the arm's own kinematics; twice the limit of the driver at rest."""
     nominal_m: float = 0.020
     nominal_rad: float = float(np.radians(3.0))
-    """From nominal kinematics; real arms are up to 7.5 mm and 1.3 degrees from them."""
+    """Largest allowed deviation from nominal kinematics. Real arms deviate by up to 7.5 mm and 1.3 degrees."""
     lag_s: float = 0.008
-    """Between joint angles and pose of one state."""
+    """Time between the joint angles and the flange pose of one state."""
     sensor_age_moving_s: float = 0.1
     sensor_age_holding_s: float = 0.5
+    """Largest time without a new sample while the arm moves and while it stands."""
     frozen_samples_s: float = 0.2
+    """Largest time during which all samples may be equal."""
     saturation: float = SATURATION
-    """Share of the sensor's range."""
+    """Largest allowed share of the sensor's range."""
     contact_N: float = 8.0
     contact_Nm: float = 0.8
     contact_sigmas: float = 5.0
+    """The contact limit is the larger of these values and of this number of standard deviations of the noise."""
     unknown_N: float = 15.0
-    """Added to twice the heaviest tool's weight while the tool is unknown."""
     unknown_Nm: float = 1.5
+    """Added to twice the weight of the heaviest tool while the running fit is not reliable yet."""
     low_pass_Hz: float = 20.0
     skew_s: float = 0.03
-    """Largest time between a pose and the wrench compared with it."""
+    """Largest time between a wrench and the pose of the arm with which it is compared."""
     stalled_s: float = 10.0
     look_s: float = 0.01
-    """Period of the guards."""
+    """Period of the guards, s."""
     counted_s: float = 0.02
-    """Longest time between two looks that counts: if this process gets no CPU time, nothing else is late."""
+    """Upper bound of the time counted between two looks, so that a pause of this process trips no other guard."""
     aside_s: float = 0.05
-    """Period of the look for a stop of the safety system while the guards rest."""
+    """Period at which the safety status is read while no motion is watched."""
     blind_s: float = 1.0
-    """The operator needs longer to press a stop, release it and make the arm ready again."""
+    """Time without a status after which an emergency stop may have been pressed and released unnoticed."""
     hung_s: float = 1.0
-    """Guards that have not looked for this time count as hung."""
+    """Time without a look after which the guards are considered to hang."""
     slow_stop_s: float = 0.2
-    """A stop that takes longer is reported before it ends. An arm that answers brakes from 60 deg/s in 0.2 s."""
+    """A stop that takes longer is reported before it has ended. A responsive arm brakes from 60 deg/s in 0.2 s."""
     link_usual_s: float = 0.02
-    """Usual time until the arm answers. The wait for the next sample takes 8 ms of it."""
+    """Largest median response time of the arm. Waiting for the next state takes up to 8 ms."""
     link_asked_s: float = 0.04
-    """Added for a controller that reports its TCP only to a program, which is asked twice: usually 24 ms."""
+    """Added for a controller that reports its TCP only to a program: two requests, usually 24 ms."""
     link_gap_s: float = 0.1
-    """Time within which nine answers in ten arrive."""
+    """Response time that nine of ten answers must not exceed."""
     program_ends_s: float = 1.5
-    """The program of a killed session ends by itself within 0.5 s."""
+    """Time-out for the program of an earlier session: after a killed session it ends by itself within 0.5 s."""
 
     @classmethod
     def of(cls, clock: Clock) -> Self:
-        """Limits of a cell: the clock of an emulated one may lead its arm, whose control process may starve."""
+        """Return the limits for a cell with this clock. The clock of an emulated cell may run ahead of its slow arm."""
         usual = cls()
         return cls(link_usual_s=usual.link_usual_s + clock.lead_s, stalled_s=clock.patience_s(usual.stalled_s))
 
 
 @dataclass(frozen=True, eq=False)
 class ExpectedMotion:
-    """The expected motion: a straight move in joint space, along a curve, or standing."""
+    """The expected motion: a straight move in joint space, a curve, or standstill."""
 
     start_rad: Array
     goal_rad: Array
@@ -113,7 +116,7 @@ class ExpectedMotion:
 
     @cached_property
     def turns_rad(self) -> Array:
-        """How far each joint turns (6,)."""
+        """Range (6,) that each joint covers, rad."""
         if self.curve_rad is None:
             return np.abs(self.goal_rad - self.start_rad)
         return np.asarray(np.ptp(self.curve_rad, axis=0))
@@ -133,16 +136,16 @@ class Seen:
     """One look at arm and sensor."""
 
     t_s: float
-    """Of the guards' own clock."""
+    """Time of the look on the clock of the cell."""
     dt_s: float
-    """Since the previous look; at most `Limits.counted_s`."""
+    """Time since the previous look, at most `Limits.counted_s`."""
     motion: ExpectedMotion
     state: ArmState
     status: ArmStatus
     wrench: Array
-    """(6,) the newest sample."""
+    """(6,) newest sample of the sensor, N and N·m."""
     sample: int
-    """Its running number."""
+    """Sequence number of that sample."""
     turn_rad_s: float
     """Angular speed of the flange between the previous look and this one."""
 
@@ -151,12 +154,12 @@ class Guard(ABC):
     """Watches one row of the hazard table, or several rows with the same signal."""
 
     def begin(self, seen: Seen) -> None:
-        """Take this look as normal: the first of a session, or the first after the operator resumes."""
-        del seen  # most compare with the plan alone
+        """Take this look as the reference; it is the first of a session, or the first after the operator resumes."""
+        del seen  # most guards need no reference
 
     @abstractmethod
     def look(self, seen: Seen) -> None:
-        """Raise `Tripped`."""
+        """Raise `Tripped` if this look shows the hazard."""
 
 
 @dataclass
@@ -167,20 +170,20 @@ class SupervisorGuard(Guard):
     """As `Operator.absence`."""
 
     def look(self, seen: Seen) -> None:
-        """Look at the far ends of the streams."""
-        del seen  # the arm does not show it
+        """Trip if the operator is absent."""
+        del seen  # the operator is not part of it
         if why := self.absence():
             raise Tripped(Hazard.SUPERVISOR_GONE, SupervisorGone(why))
 
 
 @dataclass
 class PathGuard(Guard):
-    """Rows 2 and 21: moving joints stay on the straight line or curve to the goal, the others rest."""
+    """Rows 2 and 21: moving joints stay on the straight line or curve to the goal, other joints rest."""
 
     limits: Limits
 
     def look(self, seen: Seen) -> None:
-        """Compare with the nearest point of the motion."""
+        """Compare the joint angles with the nearest point of the motion."""
         motion, q = seen.motion, seen.state.q_rad
         off = np.abs(q - motion.nearest_rad(q))
         resting = (motion.turns_rad < 1e-3) & ((np.arange(6) < 3) | (not motion.moving))
@@ -188,21 +191,21 @@ class PathGuard(Guard):
         if not (off > allowed).any():
             return
         joint = int(np.argmax(off / allowed))
-        words = f"joint {joint + 1} is {np.degrees(off[joint]):.1f}° from where it should be"
+        words = f"joint {joint + 1} is {np.degrees(off[joint]):.1f}° off its planned position"
         if motion.moving:
             raise fault(
                 Hazard.SELF_COLLISION,
-                f"{words} on the way (allowed: {np.degrees(allowed[joint]):.1f}°): find what holds the arm",
+                f"{words} during the move (allowed: {np.degrees(allowed[joint]):.1f}°): find what holds the arm",
             )
         raise fault(
             Hazard.OTHER_CLIENT,
-            f"{words} while the arm should stand, so something else moves it: stop that, then resume",
+            f"{words} while the arm should stand still: stop what else moves the arm, then resume",
         )
 
 
 @dataclass
 class StallGuard(Guard):
-    """Row 22: a slow arm is allowed, an arm that stands still during a move is not."""
+    """Row 22: the arm makes progress during a move, however slowly."""
 
     limits: Limits
     _nearest_rad: float = field(default=np.inf, init=False)
@@ -211,7 +214,7 @@ class StallGuard(Guard):
     _goal_rad: Array | None = field(default=None, init=False)
 
     def look(self, seen: Seen) -> None:
-        """Count the time without progress: towards the goal, or on a curve in any direction."""
+        """Time how long the arm makes no progress: towards the goal, or on a curve in any direction."""
         goal = seen.motion.goal_rad
         if seen.motion.curve_rad is not None:
             if self._on_curve is None or np.abs(seen.state.q_rad - self._on_curve).max() > _PROGRESS_RAD:
@@ -237,23 +240,23 @@ class StallGuard(Guard):
 
 @dataclass
 class SliderGuard(Guard):
-    """Row 22 in a sweep, on which the speed slider does not act: the operator who moves it wants another speed."""
+    """Row 22 in a sweep: trips if the operator moves the speed slider, which does not act on a sweep."""
 
     _before: float | None = field(default=None, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Remember the slider."""
+        """Store the position of the slider."""
         self._before = seen.status.speed_slider
 
     def look(self, seen: Seen) -> None:
-        """Compare while the arm sweeps."""
+        """Compare the slider with its stored position during a sweep."""
         if self._before is None or seen.motion.curve_rad is None:
             return
         if abs(seen.status.speed_slider - self._before) > _SLIDER:
             raise fault(
                 Hazard.STALL,
                 f"the speed slider was moved from {100 * self._before:.0f} to {100 * seen.status.speed_slider:.0f} %, "
-                "which a sweep does not follow: start again, it takes the new speed",
+                "which does not act on a running sweep: start the sweep again at the new speed",
             )
 
 
@@ -265,11 +268,11 @@ class ModelGuard(Guard):
     certifier: Certifier
 
     def look(self, seen: Seen) -> None:
-        """Compare the newest state."""
+        """Check the flange pose of this look."""
         self.judge(seen.state)
 
     def judge(self, state: ArmState) -> None:
-        """Compare the flange with the forward kinematics of the model the plan was certified for."""
+        """Compare the reported flange pose with the forward kinematics for which the plan was certified."""
         arm, limits = self.certifier.arm, self.limits
         at = arm.frames(state.q_rad)
         away_m = float(np.linalg.norm(at.flange_m[0] - state.p_base_flange_m))
@@ -283,23 +286,24 @@ class ModelGuard(Guard):
         if away_m > allowed_m + lag_rad * reach_m or away_rad > allowed_rad + lag_rad:
             raise fault(
                 Hazard.WRONG_TCP,
-                f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° from where a "
-                f"{arm.name} should have it: check the model and the active TCP",
+                f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° off the pose that the "
+                "kinematics of a "
+                f"{arm.name} give: check the model and the active TCP",
             )
 
 
 @dataclass
 class SettingsGuard(Guard):
-    """Rows 7 and 8: payload and TCP stay as they were at the start."""
+    """Rows 7 and 8: payload and TCP do not change."""
 
     _before: ArmStatus | None = field(default=None, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Remember both."""
+        """Store payload and TCP."""
         self._before = seen.status
 
     def look(self, seen: Seen) -> None:
-        """Compare."""
+        """Compare payload and TCP with the stored values."""
         before, now = self._before, seen.status
         if before is None:
             return
@@ -322,16 +326,16 @@ class SettingsGuard(Guard):
 
 @dataclass
 class SafetyGuard(Guard):
-    """Rows 7, 10, 11, 12 and 21: the safety system and the program on the controller."""
+    """Rows 7, 10, 11, 12 and 21: no stop of the safety system, and the control program keeps running."""
 
     _mode: str | None = field(default=None, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Remember the safety mode: normal, or reduced if the operator accepted it."""
+        """Store the safety mode: normal, or reduced if the operator has accepted that."""
         self._mode = seen.status.safety_mode
 
     def look(self, seen: Seen) -> None:
-        """Trip on every stop and every change."""
+        """Trip on every stop, every change of the safety mode, and every pause or end of the program."""
         status = seen.status
         if status.fault is not None:
             raise by_safety(status, f"the arm stopped: {status.fault}")
@@ -344,19 +348,19 @@ class SafetyGuard(Guard):
             raise fault(
                 Hazard.OTHER_CLIENT,
                 f"the control program is {status.program}: it ended by itself, or a second Ctrl-C, the pendant or "
-                "another client stopped it; read the pendant's log, then resume",
+                "another client ended it; read the log of the pendant, then resume",
             )
         if status.program != "playing":
             raise fault(
                 Hazard.OTHER_CLIENT,
-                f"the control program is {status.program}: the pendant or another client paused it; leave the arm to "
-                "this program, then resume",
+                f"the control program is {status.program}: the pendant or another client paused it; leave the "
+                "arm to this program, then resume",
             )
 
 
 @dataclass
 class SensorGuard(Guard):
-    """Row 15: samples keep arriving, and differ."""
+    """Row 15: the sensor sends new samples, and their values change."""
 
     limits: Limits
     _sample: int = field(default=-1, init=False)
@@ -366,12 +370,12 @@ class SensorGuard(Guard):
     _same: int = field(default=0, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Forget what was seen before."""
+        """Forget earlier samples."""
         self._sample, self._silent_s = seen.sample - 1, 0.0
         self._wrench, self._same_s, self._same = None, 0.0, 0
 
     def look(self, seen: Seen) -> None:
-        """Time how long no sample arrives, or all are the same."""
+        """Time how long no sample arrives, or all samples are equal."""
         if not np.isfinite(seen.wrench).all():
             raise fault(Hazard.SENSOR_LOST, f"the sensor sent {seen.wrench.tolist()}: check its cable and supply")
         if seen.sample == self._sample:
@@ -397,20 +401,20 @@ class SensorGuard(Guard):
 
 @dataclass
 class RangeGuard(Guard):
-    """Row 13: no axis comes near the end of its range. If the range is unknown, only the device's status shows it."""
+    """Row 13: no axis comes near the end of its range; without a known range, only the sensor's status shows that."""
 
     limits: Limits
     range: Array | None
-    """(6,) N and N·m."""
+    """Largest wrench (6,) of the sensor, N and N·m; None if it is unknown."""
     zero: Array = field(default_factory=lambda: np.zeros(6))
-    """(6,) N and N·m: the reading from which the range counts, where the sensor's own zero is arbitrary."""
+    """Reading (6,), N and N·m, from which the range is measured if the zero of the sensor is arbitrary."""
 
     def look(self, seen: Seen) -> None:
-        """Compare the newest sample."""
+        """Check the newest sample."""
         self.judge(seen.wrench)
 
     def judge(self, wrench: Array) -> None:
-        """Compare any number of samples (..., 6)."""
+        """Trip if a sample (..., 6) exceeds the allowed share of the range."""
         if self.range is None:
             return
         share = (np.abs(wrench - self.zero) / self.range).reshape(-1, 6).max(axis=0)
@@ -432,29 +436,29 @@ class ContactGuard(Guard):
     heaviest_kg: float
     """Mass of the heaviest possible tool."""
     lever_m: float
-    """Largest reach of a tool."""
+    """Largest distance of the tool from the flange."""
     acceleration_rad_s2: float
     quiet_std: Array
-    """(6,) of the samples of a resting sensor."""
+    """Standard deviation (6,) of the samples of the resting sensor."""
     predict: Callable[[Array], Array | None] = lambda _: None
-    """Return the wrench of a free tool at an orientation; None while it is unknown."""
+    """Returns the wrench (6,) of the free tool at an orientation (3, 3); None while it is unknown."""
     _start: Array | None = field(default=None, init=False)
     _sample: int = field(default=-1, init=False)
     _residual: Array | None = field(default=None, init=False)
     _turns_rad_s: list[float] = field(default_factory=list, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Take the first wrench as that of the free tool; after a stop the contact may still be there."""
+        """Take the first wrench of the session as that of the free tool; after a stop the contact may still exist."""
         if self._start is None:
             self._start = seen.wrench
         self._residual = None
 
     def forget(self) -> None:
-        """Take the next wrench as that of the free tool: a reopened sensor may have another zero."""
+        """Take the next wrench as that of the free tool, because the zero of a reopened sensor may differ."""
         self._start = None
 
     def look(self, seen: Seen) -> None:
-        """Compare with the running fit; before there is one, with the weight of the heaviest tool."""
+        """Compare the wrench with the running fit, or before the first fit with the weight of the heaviest tool."""
         self._turns_rad_s = [*self._turns_rad_s[-3:], seen.turn_rad_s]
         if seen.sample == self._sample:
             return
@@ -499,18 +503,18 @@ class ContactGuard(Guard):
 
 
 def arm_lost(error: DeviceError, *, moving: bool) -> Tripped:
-    """Row 16: the arm reports no state. An arm in a move may not receive the stop either."""
+    """Return the trip of row 16: the arm reports no state. A moving arm may not receive the stop either."""
     if not moving:
         return Tripped(Hazard.CONTROLLER_LOST, error)
     found = (
-        f"{error.found}; a stop was sent, but the arm may not have heard it: then it ends the one move it was given, "
-        "which is proven clear, and goes no further"
+        f"{error.found}; a stop was sent, but the arm may not have received it; then it completes the current move, "
+        "which is proven clear, and stops there"
     )
     return Tripped(Hazard.CONTROLLER_LOST, type(error)(found, error.fix))
 
 
 def by_safety(status: ArmStatus, words: str) -> Tripped:
-    """Rows 7, 10, 11 and 12: the safety system has stopped the arm, as `words` report."""
+    """Return the trip of row 7, 10, 11 or 12: the safety system has stopped the arm; `words` describe the stop."""
     mode = status.safety_mode
     if mode == "protective stop":
         payload = "" if status.payload_kg is None else f" (payload set: {status.payload_kg:.2f} kg)"

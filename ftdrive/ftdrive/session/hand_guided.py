@@ -1,7 +1,7 @@
-"""Poses to which the operator moves the arm, by hand or pendant, or a program on the pendant.
+"""Poses to which the operator moves the arm by hand or pendant, or to which a program on the pendant moves it.
 
-Nothing here commands the arm, which may be open for reading only. Each time the arm has stood still for 1 s at a new
-orientation, the sensor is averaged and the pose is written to disk.
+This module never commands the arm, which may be open for reading only. Each time the arm has stood still for 1 s at a
+new orientation, the sensor is averaged and the pose is written to disk.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,32 +23,32 @@ from ftdrive.session.open_session import OpenCell, OpenSession, PoseBook
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmState, FtSamples
 
-# On the controller's clock, because the controller's `is_steady` is always false in freedrive.
+# Judged by joint speeds, because the controller's `is_steady` is always false in freedrive; s, controller clock.
 STILL_S: Final = 1.0
 STILL_RAD_S: Final = 0.002
-# A smaller turn counts as a nudge, not as a move.
+# A smaller rotation of the flange is a nudge, not a move.
 LEFT_RAD: Final = radians(1)
 REPEAT_RAD: Final = radians(10)
-# A program returns to its first pose within this angle.
+# Largest angle between the first pose of a program and its return there.
 RETURN_RAD: Final = radians(0.1)
 LOOK_S: Final = 0.1
-# A driver that may recover gives up after 10 s.
+# Time-out for an arm or sensor that is lost, s; a driver that reconnects gives up after 10 s.
 BACK_S: Final = 12.0
+# A pose that differs from the fit of the others by more than both limits was probably disturbed by contact.
 SURPRISE_SIGMA: Final = 5.0
-# A pose that differs from the fit of the others by both was probably touched.
 SURPRISE_N: Final = 0.5
-# Number of poses, the new one included.
+# Least number of poses for this comparison, including the new one.
 LEAST_TO_COMPARE: Final = 6
 
 T = TypeVar("T")
 
 
 class _Interrupted(Exception):
-    """The stream of the sensor was interrupted, and is back."""
+    """Raised when the stream of the sensor was interrupted and has recovered."""
 
 
 class _Moved(Exception):
-    """The arm moved while a pose was measured; it was seen in this state."""
+    """Raised when the arm moved while a pose was measured; `state` is its new state."""
 
     def __init__(self, state: ArmState) -> None:
         super().__init__()
@@ -56,19 +56,19 @@ class _Moved(Exception):
 
 
 class _Held:
-    """An arm that an operator holds at a pose, and its sensor, as `take_pose` uses them: nothing is waited for."""
+    """Arm and sensor as `take_pose` uses them, for an arm that already stands still."""
 
     def __init__(self, state: Callable[[], ArmState], collect: Callable[[float], FtSamples]) -> None:
         self._state, self._collect = state, collect
         self._before: ArmState | None = None
         self.samples: FtSamples | None = None
-        """Samples of the last dwell."""
+        """Samples of the last dwell; None before the first."""
 
     def wait_until_still(self, **_: object) -> None:
         self._before = None
 
     def state(self) -> ArmState:
-        """Return the state; raises `Moved` after the samples if the arm does not stand where it stood before them."""
+        """Return the state; raises `_Moved` if the arm has moved since the first call."""
         state = self._state()
         if self._before is None:
             self._before = state
@@ -81,17 +81,19 @@ class _Held:
         return self.samples
 
     def check(self) -> None:
-        """Accept a stream: it is checked wherever it is read."""
+        """Do nothing: the stream is checked on each reading."""
 
 
 def take_by_hand(session: OpenSession) -> Run:
-    """Take poses without any motion command: the operator moves the arm, or a program on the pendant does."""
+    """Take poses without commanding the arm, which the operator or a program moves; return the run."""
     cell, task, run = session.cell, session.task, session.resumed
     if run is None:
         run = session.new_run()
         cell.journal.keep_in(run)
     if (load := task.load) is not None:
-        cell.note(f"{load} is on the tool in every pose. Keep clear of it, with nothing below it.", warning=True)
+        cell.note(
+            f"{load} is on the tool in every pose. Keep clear of the load and of the space below it.", warning=True
+        )
     book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
     with cell.journal.reporting_early_end(run):
         sampling, swing_N = task.cell.sampling, None
@@ -103,29 +105,29 @@ def take_by_hand(session: OpenSession) -> Run:
 
 
 class HandGuided:
-    """Takes poses until there are enough, in place of a tour.
+    """Takes poses at each standstill of the arm until they suffice.
 
-    Keys: keep ends it once the light is green; stop ends it at once; redo takes the newest pose again, where the arm
-    stands or is moved to next; skip leaves out the pose where it stands; pause pauses and resumes. A key takes effect
-    within the time of an average. Without keys, it ends with the first good pose that finds the light green.
+    Keys: keep ends the session when the light is green, stop ends it at once. Redo replaces the newest pose by the next
+    one, skip leaves out the present pose, pause pauses and resumes. A key takes effect within the time of an average.
+    Without keys, the session ends with the first good pose that makes the light green.
 
     Parameters
     ----------
     cell : OpenCell
-        The arm may be open for reading only. An interrupted sensor with `recover` may reconnect.
+        The arm may be open for reading only. A sensor with `recover` may reconnect after an interruption.
     book : PoseBook
     sampling : Sampling
     listen : bool
-        A program moves the arm, so no pose is suggested. Poses are taken from its start to its end, or until it
-        returns to its first pose when there are enough. That return is committed too and serves
-        `ftcalib.routine.drift_check`. A program that passes its first pose earlier is followed to its end.
+        A program moves the arm, so no pose is suggested. Poses are taken until the program ends, or returns to its
+        first pose when the poses suffice. This return is saved too and serves `ftcalib.routine.drift_check`. If the
+        program passes its first pose before the poses suffice, poses are taken until it ends.
     most_swing_N : float, optional
-        As of `ftcalib.routine.take_pose`.
+        As in `ftcalib.routine.take_pose`.
 
     Notes
     -----
-    Poses are numbered in the order of taking, and so are their orientations: they belong to no planned set. The
-    return to the first pose has its orientation number, 1. `pose.q_rad` is where the arm stood.
+    Poses and their orientations are numbered in the order of measurement. The return to the first pose has
+    the orientation number 1. `pose.q_rad` are the joint angles at which the arm stood.
     """
 
     def __init__(
@@ -146,15 +148,15 @@ class HandGuided:
         self._redo: int | None = None
         self._light = "red"
         self._paused = False
-        # Where the arm stopped; None while it moves.
+        # State in which the arm stopped; None while it moves.
         self._rests_at: ArmState | None = None
         self._still_since_s = 0.0
-        # Whether the pose where the arm rests was taken or left out.
+        # Whether the pose at which the arm stands was taken or left out.
         self._dealt_with = False
         self._program_ran = False
-        # State of the program, as the controller reports it; empty before its start.
+        # State of the program as the controller reports it; empty before the program starts.
         self._program = ""
-        # Whether the program passes its first pose before its end, as a restarted one does.
+        # Whether the program passed its first pose before the poses sufficed, as a restarted program does.
         self._passes_first = False
         self._fault: str | None = None
         self._over = False
@@ -163,24 +165,24 @@ class HandGuided:
         self._enough = False
 
     def run(self, earlier: Sequence[PoseRecord], goal: str) -> None:
-        """Take poses until they suffice, which `goal` says in words, after the `earlier` ones of a resumed run.
+        """Take poses until they suffice; `goal` describes when, and `earlier` are the poses of a resumed run.
 
-        Raises `TooFewSamples` if the sensor is too slow for the time given to a pose, and whatever arm and sensor
-        raise; the poses committed so far stand.
+        Raises `TooFewSamples` if the sensor is too slow for the averaging time, and the errors of arm and sensor; the
+        poses saved before remain.
         """
         self._passes_first = bool(earlier)
-        # An emulated clock waits for this thread, which must see each standstill.
+        # An emulated clock waits for this thread, so that it sees each standstill.
         with self._clock.keeping_up():
             self._greet(goal)
             for record in earlier:
                 self._learn(record, self._book.judge.add(record))
             if self._ends_by_itself and self._enough:
-                self._note("The poses of the run suffice: it ends with the next one.")
+                self._note("The poses of the run suffice: the session ends with the next one.")
             self._show_state(State.MOVE)
             while not self._over:
                 state = self._ask(self._arm.state)
                 with suppress(_Interrupted):
-                    self._collect(LOOK_S)  # paces the loop, and raises as soon as the sensor fails
+                    self._collect(LOOK_S)  # sets the pace of the loop, and raises as soon as the sensor fails
                 self._obey_keys()
                 if self._over or not self._may_measure():
                     continue
@@ -190,15 +192,15 @@ class HandGuided:
                     self._end("The program has ended")
 
     def _ask(self, arm: Callable[[], T]) -> T:
-        """Read the arm; wait if it does not answer, because ftdrive does not move it."""
+        """Read the arm; wait up to `BACK_S` for its answer, which is safe because ftdrive does not move it."""
         try:
             return arm()
         except DeviceTimeout as silence:
-            self._note(f"Nothing is measured until the arm answers again: {silence.found}.", warning=True)
+            self._note(f"The measurement waits until the arm answers again: {silence.found}.", warning=True)
         return self._wait_out(arm, DeviceTimeout)
 
     def _collect(self, duration_s: float) -> FtSamples:
-        """Collect samples. Raises `Interrupted` if the stream was interrupted and the driver has reconnected."""
+        """Collect samples. Raises `_Interrupted` if the stream was interrupted and the driver has reconnected."""
         try:
             return self._sensor.collect(duration_s)
         except (StreamBroken, DeviceTimeout) as error:
@@ -210,7 +212,7 @@ class HandGuided:
             self._sensor_events.show_new()
 
     def _wait_out(self, ask: Callable[[], T], *losses: type[DeviceError]) -> T:
-        """Repeat until an answer arrives, for `BACK_S` at most."""
+        """Repeat `ask` until it succeeds, for `BACK_S` at most."""
         deadline_s = self._clock.now_s() + BACK_S
         while True:
             try:
@@ -225,7 +227,7 @@ class HandGuided:
         status = self._ask(self._arm.status)
         fault = str(status.fault or "")
         if fault and fault != self._fault:
-            self._note(f"Nothing is measured: {fault}.", warning=True)
+            self._note(f"No measurement now: {fault}.", warning=True)
         self._fault = fault
         if self._listen:
             self._program_ran |= status.program == "playing"
@@ -233,7 +235,7 @@ class HandGuided:
         return not (self._paused or self._fault) and (not self._listen or self._program in {"playing", "stopped"})
 
     def _at_rest(self, state: ArmState) -> bool:
-        """Whether the arm has stood still long enough at a pose that was neither taken nor left out."""
+        """Return whether the arm has stood still long enough at a pose that was neither taken nor left out."""
         still = float(np.abs(state.qd_rad_s).max()) < STILL_RAD_S
         if self._rests_at is not None and turned_rad(self._rests_at, state) > LEFT_RAD:
             self._rests_at = None
@@ -262,7 +264,7 @@ class HandGuided:
             self._passes_first |= back
             further = " Press k to finish, or turn the tool further." if self._may_finish else " Turn the tool further."
             self._note(
-                f"This is pose {nearest} again, {degrees(others[nearest]):.0f}° from it: it is left out."
+                f"This orientation is {degrees(others[nearest]):.0f}° from pose {nearest} and is left out."
                 + ("" if self._listen else further)
             )
             self._deal_with()
@@ -277,7 +279,7 @@ class HandGuided:
             self._end("These poses are enough")
 
     def _measure(self, stop: int, number: int, state: ArmState) -> bool:
-        """Average until the samples are quiet, and keep the pose; False if the arm moved or the operator intervened."""
+        """Average until the samples are quiet, and save the pose; False if the arm moved or the operator intervened."""
         settle_s = state.t_device_s - self._still_since_s
         held = _Held(lambda: self._ask(self._arm.state), self._collect)
 
@@ -286,7 +288,7 @@ class HandGuided:
                 self._show_state(State.SAMPLE)
             elif held.samples is not None:
                 swings = self._most_swing_N is not None
-                advice = "Let the weight hang still." if swings else "Let go of tool and cable."
+                advice = "Wait until the weight hangs still." if swings else "Let go of tool and cable."
                 self._note_unrest(stop, held.samples, advice)
 
         pose = TourPose(number, state.q_rad)
@@ -310,8 +312,8 @@ class HandGuided:
             return False
         if not record.steady and held.samples is not None:
             again = "; press r to take it again" if self._operator.has_keys else ""
-            self._note_unrest(stop, held.samples, f"It is kept and marked{again}.")
-        self._obey_keys()  # r pressed before this pose is shown means the previous one
+            self._note_unrest(stop, held.samples, f"The pose is saved and marked as not quiet{again}.")
+        self._obey_keys()  # r pressed before the screen shows this pose refers to the previous one
         if self._over or self._paused or self._dealt_with:
             return False
         if self._redo is not None:
@@ -324,7 +326,7 @@ class HandGuided:
         return True
 
     def _deal_with(self) -> None:
-        """Finish the pose where the arm stands, and show it: nothing is measured there any more."""
+        """Finish the present pose; the next measurement needs another one."""
         self._dealt_with = True
         words = "the program goes on" if self._listen else "move on to another orientation"
         if self._may_finish:
@@ -337,7 +339,7 @@ class HandGuided:
 
     def _learn(self, record: PoseRecord, judged: Estimated | Compared) -> None:
         self._taken[record.stop] = record
-        # The quietest pose gives the scatter of the untouched sensor.
+        # The quietest pose gives the noise of the undisturbed sensor.
         if record.steady:
             std = record.samples.wrench.std(axis=0, ddof=1)
             self._level = std if self._level is None else np.minimum(self._level, std)
@@ -354,8 +356,9 @@ class HandGuided:
         if touched:
             again = " and press r to take the pose again" if self._operator.has_keys else ""
             self._note(
-                f"Pose {record.stop} is {force_N:.1f} N from the fit of the others: if something touched the tool, "
-                f"free it{again}.",
+                f"Pose {record.stop} differs by {force_N:.1f} N from the fit of the others: if something touched the "
+                "tool, "
+                f"remove the contact{again}.",
                 warning=True,
             )
         return touched
@@ -365,7 +368,9 @@ class HandGuided:
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(wrench, self._level))[:1]:
                 found, unit = wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
-                unrest = f"{CHANNELS[c]} scatters by {found:.2g} {unit}, at its quietest by {self._level[c]:.2g}"
+                unrest = (
+                    f"the sigma of {CHANNELS[c]} is {found:.2g} {unit}, and {self._level[c]:.2g} in the quietest pose"
+                )
         self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
 
     def _obey_keys(self) -> None:
@@ -379,46 +384,50 @@ class HandGuided:
         elif key is Key.KEEP and self._light == "green":
             self._end("Finished")
         elif key is Key.KEEP:
-            self._note(f"The light is {self._light}: these poses are not enough yet; press q to stop all the same.")
+            self._note(f"The light is {self._light}: take more poses, or press q to stop anyway.")
         elif key is Key.REDO and self._taken:
             self._redo = max(self._taken)
             self._dealt_with = False
-            self._note(f"The next pose takes the place of pose {self._redo}.")
+            self._note(f"The next pose replaces pose {self._redo}.")
         elif key is Key.SKIP and self._rests_at is not None:
-            self._note("This pose is left out: move on.")
+            self._note("This pose is left out: move the arm on.")
             self._deal_with()
         elif key is Key.PAUSE:
             self._paused = not self._paused
             self._rests_at = None
-            self._note("Paused: nothing is measured until p is pressed again." if self._paused else "Going on.")
+            self._note("Paused: press p again to resume." if self._paused else "Resumed.")
 
     def _greet(self, goal: str) -> None:
         if self._listen:
-            self._note(f"Start the program at the pendant. Each standstill counts: {self._hold_still()}.")
+            self._note(f"Start the program at the pendant. Each standstill is a pose: {self._hold_still()}.")
         elif self._most_swing_N is not None:
             self._note(
-                "Move the arm slowly, by hand or with the pendant, to tilts of the tool of 45 to 75° from straight "
-                f"down, to all sides. At each of them {self._hold_still()}, with the weight hanging still."
+                "Move the arm slowly, by hand or with the pendant: tilt the tool by 45 to 75° from straight down, to "
+                f"all sides. At each tilt {self._hold_still()}, and wait until the weight hangs still."
             )
         else:
             self._note(
-                "Move the arm by hand or with the pendant to orientations of the tool as different as you can. At each "
-                f"of them let go of the tool and {self._hold_still()}."
+                "Move the arm by hand or with the pendant to orientations of the tool that differ as much as possible. "
+                f"At each one let go of the tool and {self._hold_still()}."
             )
         if self._ends_by_itself:
-            self._note(f"It ends once {goal}. Press Ctrl-C to end it earlier.")
+            self._note(f"The session ends when {goal}. Press Ctrl-C to end it earlier.")
 
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
         return (
-            f"let it dwell {seconds:.1f} s at each pose" if self._listen else f"leave the arm still for {seconds:.1f} s"
+            f"let it dwell for {seconds:.1f} s at each pose"
+            if self._listen
+            else f"leave the arm still for {seconds:.1f} s"
         )
 
     def _end(self, why: str) -> None:
         self._over = True
-        kept = f"{len(self._taken)} {'pose is' if len(self._taken) == 1 else 'poses are'} kept"
-        enough = "" if self._light == "green" else f"; the light is {self._light}: they may be too few or too similar"
-        self._note(f"{why}: {kept}{enough}.", warning=bool(enough))
+        saved = f"{len(self._taken)} {'pose is' if len(self._taken) == 1 else 'poses are'} saved"
+        enough = (
+            "" if self._light == "green" else f"; the light is {self._light}: the poses may be too few or too similar"
+        )
+        self._note(f"{why}: {saved}{enough}.", warning=bool(enough))
 
     def _show_state(self, state: State, words: str = "") -> None:
         self._operator.show(StateChanged(state=state, stop=self._next_stop(), words=words))

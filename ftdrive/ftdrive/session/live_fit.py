@@ -1,4 +1,4 @@
-"""The fit over the poses so far, their coverage, and the most useful next pose."""
+"""Running fit of the poses taken so far, their coverage, and the most useful next pose."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -27,30 +27,30 @@ from ftdrive.cell.config import USUAL_KG
 from ftdrive.runs.load import Load
 from ftdrive.session.events import Estimated
 
-# As good as gravity directions within 50 to 60 degrees of one another; see `ftcalib.poses.information.Prediction`.
+# Limits that correspond to gravity directions 50 to 60 degrees apart; see `ftcalib.poses.information.Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
-# As within 30 to 45 degrees.
+# Limits that correspond to gravity directions 30 to 45 degrees apart.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
-# With a known load, the run of the tool alone has what cond9 judges: a hanging load leaves the tool tilted downwards.
+# A run with a load is judged by cond_u1 alone: a hanging load limits the tilt, and the run of the tool covers cond9.
 OF_A_LOAD = ("cond_u1",)
-# A hint tilts a tool from which a load hangs no farther, with room for rounding.
+# Largest tilt in a hint while a load hangs from the tool, with a margin for rounding.
 HUNG_TILT_RAD = float(np.radians(76))
-# `RunningFit.predict` returns None if its sigma of the force is more than this share of the weight.
+# A running fit is reliable if the sigma of its force is at most this share of the weight.
 TRUSTED_SHARE = 0.05
 
 
 def free_wrench(result: CalibrationResult, R_base_flange: Array) -> Array:
-    """Return the wrench (6,), N and N·m, that the sensor reads of a free tool at an orientation (3, 3)."""
-    # As read: the decoder of contacts is left out, which would scale a large bias too.
+    """Return the reading (6,), N and N·m, of the sensor with a free tool at an orientation R_base_flange (3, 3)."""
+    # The matrix that decodes contacts is left out, because the guards compare readings.
     compensator = Compensator(result.parameters, response=result.response)
     return np.asarray(-compensator(np.zeros(6), R_base_flange), dtype=np.float64)
 
 
 class RunningFit:
-    """The calibration so far, and its coverage.
+    """Calibration from the poses so far, and their coverage.
 
-    `down_base` (3,), the unit vector down in base, serves the coverage until the fit gives it. With `advise` it
-    suggests the most useful next pose. A known `load` is part of what the sensor carries.
+    `down_base` (3,) is the unit vector down in base until the fit estimates it. With `advise` the estimates suggest the
+    most useful next pose. A known `load` is part of what the sensor carries.
     """
 
     def __init__(
@@ -66,18 +66,18 @@ class RunningFit:
         self._down_base = np.asarray(down_base, dtype=np.float64)
         self._records: dict[int, PoseRecord] = {}
         self.result: CalibrationResult | None = None
-        """Result of `ftcalib.solve` for the poses so far; None while they do not determine it."""
+        """Result of `ftcalib.solve` for the poses so far; None while the poses do not determine it."""
 
     @property
     def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None while it is uncertain, as in `predict`."""
+        """Mass that the sensor carries, kg; None while the fit is not reliable."""
         result = self._trusted()
         if result is None or result.sigma["weight_N"] > TRUSTED_SHARE * result.weight_N:
             return None
         return result.mass_kg
 
     def add(self, record: PoseRecord) -> Estimated:
-        """Add a pose, in place of one with the same `stop`; return the estimate."""
+        """Add a pose, which replaces one with the same `stop`; return the new estimate."""
         self._records.pop(record.stop, None)
         residual = _surprise(self.result, record)
         self._records[record.stop] = record
@@ -102,7 +102,7 @@ class RunningFit:
         )
 
     def remove(self, stop: int) -> None:
-        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+        """Remove the pose of a stop before it is taken again; ignore a stop without a pose."""
         if self._records.pop(stop, None) is None:
             return
         if self._records:
@@ -111,10 +111,10 @@ class RunningFit:
             self.result = None
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain.
+        """Return the wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain.
 
-        It is uncertain before six poses, while another mounting of the sensor fits almost as well, and at orientations
-        far from those taken. Any thread may call it.
+        The wrench is uncertain before six poses, while another mounting of the sensor fits almost as well, and at
+        orientations far from those taken. Any thread may call this method.
         """
         result = self._trusted()
         if result is None:
@@ -142,7 +142,7 @@ class RunningFit:
         R_base_flange = self._orientations()
         coverage = predicted_sigma(R_base_flange, self._guess())
         different = different_orientations(R_base_flange)
-        # The poses alone show that the solver would fail; its advice would take time.
+        # The orientations alone show that the solver would fail; do not spend time on it.
         hopeless = different < LEAST_POSES or np.isinf(coverage.cond9) or coverage.second_basin_gap < AMBIGUOUS_GAP
         self.result = None if hopeless else self._solved()
         return coverage
@@ -160,7 +160,7 @@ class RunningFit:
         return result.gravity_force_base_N / result.weight_N
 
     def _guess(self) -> Guess:
-        """Return the tool as estimated, or a usual one, with the measured noise of the poses."""
+        """Return the estimated tool, or a typical one before the first fit, with the measured noise of the poses."""
         variance = np.mean([np.diag(record.mean.covariance) for record in self._records.values()], axis=0)
         _, alpha, beta = weight_and_tilt(self._down())
         noise: dict[str, Any] = {
@@ -179,7 +179,7 @@ class RunningFit:
 
 
 def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
-    """Count directions (n, 3) by the axis they are nearest to: +x -x +y -y +z -z."""
+    """Return how many of the directions (n, 3) are nearest to each axis: +x -x +y -y +z -z."""
     nearest = np.abs(gravity_flange).argmax(axis=1)
     negative = gravity_flange[np.arange(len(gravity_flange)), nearest] < 0
     a, b, c, d, e, f = np.bincount(2 * nearest + negative, minlength=6).tolist()
@@ -187,9 +187,9 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
 
 
 def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: float) -> str:
-    """Describe the simple motion from the last of the poses taken (n, 3, 3) to the most useful next one.
+    """Describe the simple motion from the last of the orientations (n, 3, 3) to the most useful next one.
 
-    It keeps the tool axis within an angle of straight down, if one does.
+    If possible, the tool axis stays within `most_tilt_rad` of straight down.
     """
     last = R_base_flange[-1]
     words, candidates = _simple_motions(last, down_base)
@@ -202,7 +202,7 @@ def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: f
 
 
 def _simple_motions(last: Array, down_base: Array) -> tuple[list[str], Array]:
-    """Return simple motions at the pendant: in words, and the orientations (m, 3, 3) they lead to."""
+    """Return descriptions of simple motions at the pendant, and the orientations (m, 3, 3) that they lead to."""
     words, candidates = list[str](), list[Array]()
     for axis in "zxy":
         for angle_deg in (90, -90) if axis == "z" else (90, -90, 45, -45):
@@ -219,24 +219,24 @@ def _pointing_down(gravity_flange: Array) -> str:
     axes = axes_along(gravity_flange)
     if len(axes) == 1:
         return f"the tool's {axes[0]} axis"
-    return f"the middle of the tool's {', '.join(axes[:-1])} and {axes[-1]} axes"
+    return f"the middle between the tool's {', '.join(axes[:-1])} and {axes[-1]} axes"
 
 
 def _light(coverage: Prediction, *, loaded: bool = False) -> str:
-    """Judge by conditioning; poses that another solution explains, or that are too few to be checked, are not green."""
-    found = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
+    """Return the light: by conditioning, and never green for few poses or if another solution explains them."""
+    values = {"cond9": coverage.cond9, "cond_u1": coverage.cond_u1}
     if loaded:
-        found = {name: found[name] for name in OF_A_LOAD}
-    if coverage.second_basin_gap < AMBIGUOUS_GAP or any(found[name] > AMBER[name] for name in found):
+        values = {name: values[name] for name in OF_A_LOAD}
+    if coverage.second_basin_gap < AMBIGUOUS_GAP or any(values[name] > AMBER[name] for name in values):
         return "red"
     few = coverage.n_poses < RECOMMENDED_POSES or coverage.second_basin_gap < WEAK_GAP
-    return "amber" if few or any(found[name] > GREEN[name] for name in found) else "green"
+    return "amber" if few or any(values[name] > GREEN[name] for name in values) else "green"
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """Distance of a new pose from the fit of the earlier ones: in sigmas (the worst channel), and in N.
+    """Return the residual of a new pose in the fit of the earlier ones: sigmas of the worst channel, and norm in N.
 
-    The noise of the pose counts as larger by as much as the others scatter more than theirs.
+    The noise of the pose is scaled by the noise factor of the fit.
     """
     if result is None:
         return None
@@ -248,7 +248,7 @@ def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[flo
 
 
 def _values_and_sigmas(result: CalibrationResult) -> tuple[Mapping[str, Any], Mapping[str, Any]]:
-    """Estimates and sigmas by name; with `drift` where one was found: last pose minus first, (6,) N and N·m."""
+    """Return estimates and sigmas by name; `drift`, if there is one, is last pose minus first, (6,) N and N·m."""
     sigma = dict(result.sigma)
     values = {name: getattr(result, name) for name in sigma}
     if result.drift is not None:

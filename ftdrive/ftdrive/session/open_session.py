@@ -1,4 +1,4 @@
-"""What every mode of a session works with: the open cell, its journal, what the poses are taken for, and their book."""
+"""Objects that every mode of a session uses: open cell, journal, task, judge, and the record of the poses."""
 
 import logging
 import threading
@@ -52,32 +52,32 @@ class SessionOptions:
     name: str = "calibrate"
     poses: int = 24
     sets: str | None = None
-    """Sets of Yu's Fig. 6 instead of that many poses, such as A+E."""
+    """Sets of orientations of Yu's Fig. 6, such as A+E; they replace `poses`."""
     method: Method = "ml"
     """Method that solves the poses of a calibration."""
     mode: Mode = "auto"
-    """With `resume`, "auto" means the mode of that run."""
+    """Mode of the session; with `resume`, "auto" means the mode of the resumed run."""
     dry_run: bool = False
     fast: bool = False
-    """Move at the plan's speeds if it has run to its end slowly before."""
+    """Move at the speeds of the plan if this arm has completed the plan slowly before."""
     plan: Path | None = None
     output: Path | None = None
-    """Save the plan as a new file."""
+    """New file for the plan."""
     png: Path | None = None
-    """Draw it."""
+    """New PNG file for a drawing of the plan."""
     watch: Callable[[Certifier, RangeGuard], Guard] | None = None
-    """Called before any question; the guard that it returns looks on beside the others, and never trips."""
+    """Called before the first question; returns a guard that only observes and never trips."""
     resume: Path | None = None
     redo: tuple[int, ...] = ()
     real: bool = True
     """Whether a real arm moves. An emulated cell needs no typed word and no slow first run."""
     questions: bool = True
     yes: bool = False
-    """Answer the safety questions automatically, never the first motion."""
+    """Answer the safety questions automatically, but never confirm the first motion of a new plan."""
     seconds: float = 20.0
-    """Duration of a sweep at the planned speed; the longest of a passive calibration."""
+    """Duration of a sweep at the planned speed, or longest duration of a passive calibration."""
     description: Mapping[str, Any] = field(default_factory=dict)
-    """Goes into run.json."""
+    """Further entries of run.json."""
 
     @property
     def by_hand(self) -> bool:
@@ -89,10 +89,12 @@ class SessionOptions:
         begun = self.mode if self.resume is None else Run(self.resume).mode
         if self.resume is not None and begun in IN_MOTION:
             what = "a sweep" if begun == "sweep" else "a passive calibration"
-            raise ConfigError(f"{self.resume} is {what}, which is not continued: start again with --{begun}")
+            raise ConfigError(f"{self.resume} is {what}, which cannot be resumed: start again with --{begun}")
         if self.mode != "auto" and (begun in _BY_HAND) != self.by_hand:
             way = f"with --{begun}" if begun in _BY_HAND else "along a plan"
-            raise ConfigError(f"{self.resume} was started {way} and only continues so: leave out --{self.mode}")
+            raise ConfigError(
+                f"{self.resume} was started {way} and can only be resumed in this mode: leave out --{self.mode}"
+            )
         options = replace(self, mode=begun if self.mode == "auto" else self.mode)
         if options.redo and options.resume is None:
             raise ConfigError("--redo needs a run: name the run with --resume RUN")
@@ -112,9 +114,9 @@ class SessionOptions:
 
 
 class Journal:
-    """Shows and records every event, one at a time, from any thread.
+    """Shows and records every event, one at a time, from any thread; asks the operator.
 
-    With `yes` it gives the assumed answer of questions that have one; the operator answers the others.
+    With `yes` it answers a question by its assumed answer; the operator answers questions without one.
     """
 
     def __init__(self, operator: Operator, *, yes: bool = False) -> None:
@@ -126,7 +128,7 @@ class Journal:
         self._absence_recorded = False
 
     def keep_in(self, run: Run) -> None:
-        """Record in the run, starting with the events so far."""
+        """Record events in this run from now on, beginning with those shown before."""
         with self._lock:
             self._run = run
             for event in self._early:
@@ -136,7 +138,7 @@ class Journal:
         self.show(RunOpened(folder=str(run.folder), resume=resume), sync=True)
 
     def show(self, event: Event, *, sync: bool = False) -> None:
-        """Show and record an event. Raises `SupervisorGone` at the first one that cannot be seen any more."""
+        """Show and record an event. Raises `SupervisorGone` at the first event that the operator cannot see."""
         with self._lock:
             try:
                 self._operator.show(event)
@@ -155,7 +157,7 @@ class Journal:
             return
         try:
             self._run.append_event(event.to_dict(), sync=sync)
-        # A pose that cannot be written raises.
+        # An event may be lost; a pose that cannot be written raises elsewhere.
         except OSError as error:
             log.warning("events.ndjson cannot be written: %s", error)
 
@@ -164,13 +166,13 @@ class Journal:
         return self._operator.absence()
 
     def require_operator(self) -> None:
-        """Raise `SupervisorGone` if no operator follows the session any more."""
+        """Raise `SupervisorGone` if no operator follows the session."""
         if why := self.absence():
             raise SupervisorGone(why)
 
     @contextmanager
     def recording_absence(self) -> Iterator[None]:
-        """Record a `SupervisorGone` of the block, unless its event is recorded already."""
+        """Record a `SupervisorGone` that the block raises, unless it is recorded already."""
         try:
             yield
         except SupervisorGone as gone:
@@ -181,7 +183,7 @@ class Journal:
 
     @contextmanager
     def reporting_early_end(self, run: Run) -> Iterator[None]:
-        """Show where the data of a run are if the block ends early."""
+        """Show where the data of a run are if the block raises."""
         try:
             yield
         except BaseException:
@@ -189,9 +191,9 @@ class Journal:
             raise
 
     def ask(self, question: Question) -> str:
-        """Ask; record the answer and who gave it. Raises `SupervisorGone`, also where `--yes` would answer."""
+        """Ask, and record the answer and its author. Raises `SupervisorGone`, even if `--yes` would answer."""
         assumed = question.assumed if self._yes else None
-        with self.recording_absence():  # the arm stands
+        with self.recording_absence():  # no guard does so, because the arm stands
             self.require_operator()
             try:
                 answer = self._operator.ask(question) if assumed is None else assumed
@@ -213,7 +215,7 @@ class Journal:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return the next key pressed."""
+        """As `Operator.pressed`."""
         return self._operator.pressed()
 
     @property
@@ -224,7 +226,7 @@ class Journal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenCell:
-    """Arm and sensor, open; the clock that times them, the journal, and the limits of the session."""
+    """The open arm and sensor, the clock of the cell, the journal, and the limits of the guards."""
 
     arm: RobotArm
     sensor: ForceTorqueSensor
@@ -237,7 +239,7 @@ class OpenCell:
         self.journal.show(Noted(words=words, warning=warning))
 
     def listen(self, duration_s: float) -> FtSamples:
-        """Collect samples of the resting sensor; reopen it once if it fails, as after a killed session."""
+        """Collect samples of the resting sensor; reopen a failed sensor once, as after a killed session."""
         try:
             return self.sensor.collect(duration_s)
         except DeviceError as error:
@@ -248,28 +250,28 @@ class OpenCell:
 
 
 class Judge(Protocol):
-    """Judges the poses so far."""
+    """Judges the poses taken so far."""
 
     @property
     def weighed_kg(self) -> float | None:
-        """Mass that the sensor carries; None while it is uncertain."""
+        """Mass that the sensor carries, kg; None while it is uncertain."""
 
     def add(self, record: PoseRecord) -> Estimated | Compared:
-        """Add a pose, in place of one with the same `stop`; return what the poses show now."""
+        """Add a pose, which replaces one with the same `stop`; return the new estimate or comparison."""
 
     def remove(self, stop: int) -> None:
-        """Remove a pose, so that it can be taken again; a stop that was not taken is ignored."""
+        """Remove the pose of a stop before it is taken again; ignore a stop without a pose."""
 
     def predict(self, R_base_flange: Array) -> Array | None:
         """Wrench (6,), N and N·m, of a free tool at this orientation (3, 3); None while it is uncertain."""
 
 
 class Task(Protocol):
-    """Which poses are taken, and how they are judged."""
+    """The purpose of a session: which poses it takes, and how they are judged."""
 
     @property
     def command(self) -> str:
-        """The command line of the task; the run folder names it."""
+        """Name of the command, as run.json records it."""
 
     @property
     def cell(self) -> CellConfig:
@@ -277,33 +279,33 @@ class Task(Protocol):
 
     @property
     def calibration(self) -> CalibrationResult | None:
-        """The calibration that the poses are compared with: arm, sensor and mounting must be its own."""
+        """Calibration with which the poses are compared; arm, sensor and mounting must be the same."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the operator should know before a pose is taken."""
+        """Warnings that are shown before the first pose."""
 
     @property
     def load(self) -> Load | None:
-        """A weighed load on the tool; `cell` counts it as part of the tool."""
+        """Weighed load on the tool, if any; the tool mass in `cell` includes it."""
 
     @property
     def goal(self) -> str:
-        """When the poses suffice that the operator moves the arm to."""
+        """Condition under which hand-guided poses suffice, as half a sentence."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Plan the poses from joint angles (6,). Raises `PlanRefused`."""
+        """Return a plan that starts near joint angles (6,). Raises `PlanRefused`."""
 
     def judge(self, *, by_hand: bool) -> Judge:
-        """Return who judges the poses; `by_hand` says that no plan chooses them."""
+        """Return the judge of the poses; `by_hand` means that no plan chooses them."""
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
-        """Describe what averages with one standard deviation `sigma` (6,) can show; empty if that is not known."""
+        """Describe the accuracy to expect if each average has standard deviations `sigma` (6,); empty if unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OpenSession:
-    """An open cell, and what its poses are taken for."""
+    """An open cell with the task and the options of the session."""
 
     cell: OpenCell
     task: Task
@@ -311,23 +313,23 @@ class OpenSession:
     resumed: Run | None
     """The run that is continued."""
     plan: Plan | None
-    """The plan on disk that is followed; None where it is made when the posture of the arm is known."""
+    """The plan to follow; None if it is made later from the posture of the arm."""
     new_run: Callable[[], Run]
     """Creates the folder of a new run."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseBook:
-    """Keeps the poses of a session, and judges them."""
+    """Writes the poses of a session to its run, shows and judges them."""
 
     cell: OpenCell
     run: Run
     judge: Judge
     down_base: Array
-    """(3,) unit vector down in base, as mounted."""
+    """(3,) unit vector down, base axes, from the configured mounting."""
 
     def keep(self, record: PoseRecord, *, stops: int, settle_s: float, average_s: float) -> Estimated | Compared:
-        """Commit and show a pose; return what the poses show now."""
+        """Commit and show a pose; return the new estimate or comparison."""
         # Each pose is on disk before the arm moves on: a crash costs only the pose in progress.
         record = self.run.commit(record)
         self.cell.journal.show(
@@ -352,9 +354,9 @@ class PoseBook:
 
 def _describe_kept(run: Run) -> str:
     if run.mode == "sweep":
-        return f"the sweep was not completed: {run.folder} has its events, and no recording"
+        return f"sweep not completed: {run.folder} has its events but no recording"
     if run.mode == "passive":
-        kept = f"the recording so far is kept; solve it with\n{run.solve_command}"
-        return kept if run.in_motion else f"nothing was recorded in {run.folder}"
+        words = f"the recording so far is saved; solve it with\n{run.solve_command}"
+        return words if run.in_motion else f"nothing was recorded in {run.folder}"
     words = f"{len(run.stops())} poses saved in {run.folder}; continue with\n{run.resume_command}"
     return words + (f"\nor solve them with\n{run.solve_command}" if run.stops() and run.command == "calibrate" else "")

@@ -1,4 +1,4 @@
-"""A calibration beside a program or a hand that moves the arm: both devices are only read, until the result is good."""
+"""Passive calibration: another program or the operator moves the arm, and ftdrive only reads arm and sensor."""
 
 from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
@@ -18,38 +18,42 @@ from ftdrive.session.open_session import OpenCell, OpenSession
 from ftdrivers.errors import ConnectError, DeviceTimeout, StreamBroken
 from ftdrivers.interfaces import ArmStates, FtSamples
 
-# Until the first fit; each later one has a quarter more.
+# Duration of the first fit's data, s; each later fit has 25 % more.
 FIRST_S: Final = 10.0
 LONGER: Final = 1.25
+# Shortest useful recording, s.
 LEAST_S: Final = 5.0
-# Between two files: what a power failure can lose, and all that is in memory.
+# Time between two files, s: the most that a power failure can lose.
 PART_S: Final = 1.0
 _READ_S: Final = 0.2
-# A shorter silence of a device is a gap in the recording, not its end.
+# Silence of a device that ends the recording, s; a shorter one is only a gap.
 _SILENT_S: Final = 10.0
-# So many good fits in a row end it.
+# Number of consecutive good fits that end the recording.
 GOOD: Final = 2
 
 
 def take_passively(session: OpenSession) -> Run:
-    """Record the free tool of a session in motion, as `record_passively`."""
+    """Record the free tool in motion, see `record_passively`; return the run."""
     run = session.new_run()
-    found = circumstances_of(run)
-    record_passively(session.cell, run, session.options.seconds, found.setup, found.g_m_s2)
+    known = circumstances_of(run)
+    record_passively(session.cell, run, session.options.seconds, known.setup, known.g_m_s2)
     return run
 
 
 def record_passively(
     cell: OpenCell, run: Run, seconds: float, setup: Setup, g_m_s2: float, fits: Executor | None = None
 ) -> None:
-    """Record the free tool in motion until two fits in a row are good, the operator presses q, or the time is over.
+    """Record the free tool in motion until two consecutive fits are good, the operator presses q, or time is up.
 
-    Each second is on disk before the next. Each fit is shown with its sigmas and with the motion that is missing. It
-    runs in a thread of `fits`, so that a lost device is reported at once: a `DeviceError`, and what was recorded is in
-    the run. Raises `Declined` if the operator ended it in the first seconds.
+    Each second of data is on disk before the next. Each fit is shown with its sigmas and with the missing motion. The
+    fits run in a thread of `fits`, so that a lost device is noticed at once. It raises a `DeviceError`; the recording
+    so far is in the run. Raises `Declined` if the operator ends the recording in the first seconds.
     """
-    # Every sample is kept: sums could not judge contact again, and the run could not be solved from its folder.
-    cell.note(f"Recording for {seconds:.0f} s at most; nothing is commanded. Keep the tool free for part of the time.")
+    # Every sample is kept, not sums alone, so that the run can be solved again and contact judged anew.
+    cell.note(
+        f"Recording for at most {seconds:.0f} s; ftdrive does not move the arm. Keep the tool free for part of the "
+        "time."
+    )
     cell.journal.keep_in(run)
     executor = fits or ThreadPoolExecutor(1)
     recorder = _Recorder(cell, run)
@@ -91,11 +95,11 @@ class _Recorder:
                         samples.append(wrench.read(_READ_S))
                         states.append(poses.read(0.0))
                         heard_s, is_silent = clock.now_s(), False
-                    except (DeviceTimeout, StreamBroken, ConnectError) as error:  # one with `recover` reconnects
+                    except (DeviceTimeout, StreamBroken, ConnectError) as error:  # a sensor with `recover` reconnects
                         if clock.now_s() - heard_s > _SILENT_S:
                             raise
                         if not is_silent:
-                            cell.note(f"{error}. Waiting {_SILENT_S:.0f} s for it.", warning=True)
+                            cell.note(f"{error}. Waiting up to {_SILENT_S:.0f} s for new data.", warning=True)
                         is_silent = True
                         clock.sleep(_READ_S)
                     self.duration_s = clock.now_s() - begin_s
@@ -129,7 +133,7 @@ class _Recorder:
 
 
 def _fitted(run: Run, at_s: float, setup: Setup, g_m_s2: float) -> tuple[str, bool]:
-    """Fit what is on disk; return how good it is in words, and whether it is good."""
+    """Fit the recording on disk; return a description of the fit, and whether the fit is good."""
     try:
         wrench, poses = means_of(run.motion_path)
         result = solve_motion(wrench, poses, setup=setup, height_m=setup.sensor_height_m, g_m_s2=g_m_s2)

@@ -1,4 +1,4 @@
-"""The preflight checks: which, in which order, and those that only a session needs. A failed one forbids motion."""
+"""Preflight checks of a session, in their order. A failed check forbids motion."""
 
 import shutil
 import subprocess
@@ -33,66 +33,67 @@ from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 
 LISTEN_S: Final = 2.0
-# Each question takes the controller some 10 ms. Between two points no part is more than 1 mm off their chord.
+# Step between points checked against the safety limits: about 10 ms each; between two points the arm deviates from
+# their chord by at most 1 mm.
 _EDGE_RAD: Final = float(np.radians(5))
-# A plan is made for rounded joint angles, and an arm at rest is off its pose by joint noise, about 2e-5 rad.
+# A plan is made for rounded joint angles, and the joint angles of a resting arm have noise of about 2e-5 rad.
 _ROUNDED_RAD: Final = float(np.radians(1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Before:
-    """What is known before any motion: everything the checks need."""
+    """Everything that is known before the first motion: the input of the checks."""
 
     cell: OpenCell
     config: CellConfig
     certifier: Certifier
     plan: Plan
     approach: Approach
-    """To the first pose that is left."""
+    """Approach to the first remaining pose."""
     runs: Path
     known: bool
-    """Whether this plan has run to its end on this arm before: the controller has accepted its edges then."""
+    """Whether this arm has completed the plan before, so that its controller has accepted every move."""
     quiet: FtSamples
-    """`LISTEN_S` of the sensor at rest."""
+    """Samples of the resting sensor over `LISTEN_S`."""
     resumed: bool
-    """Whether a part of the plan has run before."""
+    """Whether a part of the plan was driven before."""
     task: Task
 
     def quiet_std(self, average_s: float) -> Array:
-        """Return the standard deviation (6,) of the samples of the resting sensor, as in an average of this length."""
+        """Return the standard deviation (6,) of the resting sensor's samples within averages of this length."""
         share = min(1.0, average_s / LISTEN_S)
         return noise_level(self.quiet.wrench, max(LEAST_SAMPLES, int(len(self.quiet) * share)))
 
     @property
     def sensor_range(self) -> Array | None:
-        """Largest wrench (6,) of the sensor, as far as its driver knows."""
+        """Measuring range (6,) of the sensor, N and N·m; None if its driver does not know the range."""
         fact = self.cell.sensor.identify().facts.get("range")
         return None if fact is None else np.asarray(fact.value, dtype=np.float64)
 
     @property
     def sensor_zero(self) -> Array:
-        """Reading (6,) from which its range counts: at rest, where its own zero is arbitrary."""
+        """Reading (6,) from which the range is measured: that at rest if the sensor's zero is arbitrary, else 0."""
         is_arbitrary = self.cell.sensor.identify().has_arbitrary_zero
         return np.asarray(self.quiet.wrench.mean(axis=0) if is_arbitrary else np.zeros(6))
 
 
 @dataclass(frozen=True, slots=True)
 class SessionCheck:
-    """One check of a session."""
+    """A preflight check."""
 
     name: str
-    """In the event."""
+    """Name of the check in its event."""
     judge: Callable[[Before], Check]
 
     def __call__(self, before: Before) -> Checked:
-        """Return the event; a warning does not forbid motion."""
+        """Run the check and return its event; a warning does not forbid motion."""
         check = self.judge(before)
         words = f"{check.found}: {check.fix}" if check.fix else check.found
         return Checked(name=self.name, passed=check.state != "failed", words=words)
 
 
 def _check_model(before: Before) -> Check:
-    """Check that this is the configured arm, and that its flange is where the forward kinematics have it."""
+    """Check that this is the configured arm, and that its flange pose agrees with the forward kinematics."""
     check = check_arm(before.cell.arm.identify(), before.config.robot)
     if check.state == "failed":
         return check
@@ -102,13 +103,13 @@ def _check_model(before: Before) -> Check:
         return Check("robot.model", "failed", str(trip))
     arm = before.certifier.arm
     if arm.is_nominal:
-        found = f"{check.found}: the flange is near that of a nominal {arm.name}, its own kinematics are not known"
+        found = f"{check.found}: the flange agrees with a nominal {arm.name}; the kinematics of this arm are not known"
         return Check("robot.model", "warning", found, "the margins of the plan are wider")
-    return replace(check, found=f"{check.found}: the flange is where the arm's own kinematics have it")
+    return replace(check, found=f"{check.found}: the flange pose agrees with the arm's own kinematics")
 
 
 def check_total_payload(before: Before) -> Check:
-    """Check the payload that is set in the controller; with a load it is the total, which the arm must carry."""
+    """Check the payload set in the controller; with a load it must be the total mass, which the arm can carry."""
     status, tool, sensor_kg = before.cell.arm.status(), before.config.tool, before.config.sensor.mass_kg
     check, load = of_arm.check_payload(status, tool, sensor_kg), before.task.load
     if load is None:
@@ -116,18 +117,18 @@ def check_total_payload(before: Before) -> Check:
     least_kg = (tool.mass_kg or load.mass_kg) + (sensor_kg or 0.0)
     rated_kg = RATED_KG.get(before.certifier.arm.name)
     if rated_kg is not None and least_kg > rated_kg:
-        found = f"sensor, tool and load are {least_kg:.2f} kg or more, the arm carries {rated_kg:g} kg"
+        found = f"sensor, tool and load weigh at least {least_kg:.2f} kg, but the arm carries {rated_kg:g} kg"
         return Check(check.name, "failed", found, "take a lighter load")
     too_little = status.payload_kg is not None and status.payload_kg < least_kg - described_cell.PAYLOAD_KG
     if check.state == "failed" or too_little:
         total = f"{least_kg:.2f} kg" if tool.mass_kg else f"the mass of sensor, tool and load, above {least_kg:.2f} kg"
-        fix = f"set the payload to {total} and its centre at the pendant before the load hangs"
+        fix = f"set the payload to {total}, and its centre of mass, at the pendant before the load is hung"
         return Check(check.name, "failed", f"{check.found}, for {load}", fix)
     return check
 
 
 def check_session_link(before: Before) -> Check:
-    """Check that states of the arm arrive soon; a controller that reports no TCP is asked for it and needs longer."""
+    """Check the response time of the arm; longer is allowed if a program must request the TCP."""
     arm, limits = before.cell.arm, before.cell.limits
     asked_s = limits.link_asked_s if arm.status().tcp_offset is None else 0.0
     usual_s = limits.link_usual_s + asked_s
@@ -135,14 +136,14 @@ def check_session_link(before: Before) -> Check:
 
 
 def _check_sensor(before: Before) -> Check:
-    """Check that all six axes are alive, at the nominal rate."""
+    """Check the rate of the samples, and that all six axes show noise."""
     wrench = before.quiet.wrench
     rate = check_rate(len(wrench) / LISTEN_S, before.cell.sensor.health().nominal_rate_Hz)
     return merge_checks("sensor", [rate, check_level(wrench)])
 
 
 def _check_load(before: Before) -> Check:
-    """Check that the sensor's range is enough for the tool and for what the sensor reads at rest."""
+    """Check that tool weight and reading at rest fit into the range of the sensor."""
     limits, config = before.sensor_range, before.config
     is_arbitrary = before.cell.sensor.identify().has_arbitrary_zero
     rest = check_rest(before.quiet.wrench, limits, config, zero_is_arbitrary=is_arbitrary)
@@ -150,20 +151,20 @@ def _check_load(before: Before) -> Check:
 
 
 def _check_workcell(before: Before) -> Check:
-    """Check that tool and surroundings are described and measured; `doctor` only warns of a missing tool."""
+    """Check that tool and surroundings are described and measured; a warning of `doctor` is a failure here."""
     check = computer.check_workcell(before.config, before.certifier.arm.name)
     return check if check.state == "ok" else replace(check, state="failed")
 
 
 def _check_plan(before: Before) -> Check:
-    """Check that every move of the plan is proven clear, for this arm, tool and scene."""
+    """Check that every move of the plan is proven clear for this arm, tool and scene."""
     try:
         before.plan.require(before.certifier)
     except PlanRefused as error:
         return Check("plan", "failed", str(error))
     clear = 1e3 * min(step.clearance_m for step in before.plan.steps)
     motion = "sweep" if before.plan.sweep else f"{len(before.plan.steps)} moves"
-    found = f"{motion} proven clear, nearest {clear:.0f} mm; joint motion only"
+    found = f"{motion} proven clear, smallest clearance {clear:.0f} mm; joint motion only"
     return Check("plan", "ok", found)
 
 
@@ -174,16 +175,18 @@ def _check_approach(before: Before) -> Check:
     if not len(approach.q_rad):
         return Check("approach", "ok", "the arm stands at the first pose")
     nearest_mm = 1e3 * approach.clearance_m
-    return Check("approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, nearest {nearest_mm:.0f} mm")
+    return Check(
+        "approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, smallest clearance {nearest_mm:.0f} mm"
+    )
 
 
 def check_cable(before: Before) -> Check:
-    """Check that wrist 3 stays in its window about the present angle, at which the cable lies well."""
+    """Check that wrist 3 stays within its window about the present angle, at which the cable is not wound up."""
     stands = before.cell.arm.state().q_rad[5]
-    turns = [step.q_rad[5] for step in before.plan.steps]  # an approach turns it no farther
+    turns = [step.q_rad[5] for step in before.plan.steps]  # an approach stays between these angles
     low, high = min(turns), max(turns)
-    where, least, most = np.degrees([stands, low, high])
-    found = f"wrist 3 stands at {where:.0f}° and turns between {least:.0f}° and {most:.0f}°"
+    now, least, most = np.degrees([stands, low, high])
+    found = f"wrist 3 stands at {now:.0f}° and turns between {least:.0f}° and {most:.0f}°"
     inside = low - _ROUNDED_RAD <= stands <= high + _ROUNDED_RAD
     has_been_there = (before.known or before.resumed) and inside
     if has_been_there or max(high - stands, stands - low) <= WRIST_6_RAD + _ROUNDED_RAD:
@@ -194,7 +197,7 @@ def check_cable(before: Before) -> Check:
 
 
 def _check_safety_limits(before: Before) -> Check:
-    """Check that the controller accepts every pose, and before the first run of a plan points between them."""
+    """Check that the controller accepts every pose, and before the first run of a plan also points between them."""
     nodes = np.array([step.q_rad for step in before.plan.steps])
     path = np.vstack([nodes, nodes[:1]])
     step_rad = np.inf if before.known else _EDGE_RAD
@@ -207,7 +210,7 @@ def _check_safety_limits(before: Before) -> Check:
 
 
 def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
-    """Return where the controller's safety limits forbid straight moves through joint vectors (n, 6); empty if none."""
+    """Return why the controller's safety limits forbid moves through joint vectors (n, 6); empty if they do not."""
     for q in _points_along(q_rad, step_rad):
         if not arm.within_safety_limits(q.tolist()):
             return (
@@ -218,20 +221,21 @@ def forbidden(arm: RobotArm, q_rad: Array, step_rad: float = _EDGE_RAD) -> str:
 
 
 def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
-    """Raise `NotAccepted` while a program stays on the controller (row 21): a session never stops it."""
+    """Raise `NotAccepted` if a program keeps running on the controller (row 21); a session never stops it."""
     deadline_s = clock.now_s() + limits.program_ends_s
     while (program := arm.status().program) != "stopped":
         if clock.now_s() > deadline_s:
             raise NotAccepted(
-                f"another program is on the controller ({arm.reported_program() or program}): stop it at the pendant, "
-                "then start again; nothing was touched"
+                f"another program is active on the controller ({arm.reported_program() or program}): stop it at the "
+                "pendant, "
+                "then start again; ftdrive has changed nothing"
             )
         clock.sleep(0.02)
 
 
 _APPROACH: Final = SessionCheck("approach", _check_approach)
 
-# In the order of their events. None of them takes control of the arm.
+# These checks do not need control of the arm.
 CHECKS: Final[Sequence[SessionCheck]] = (
     SessionCheck("safety", lambda before: check_safety(before.cell.arm.status())),
     SessionCheck("remote", lambda before: check_remote(before.cell.arm)),
@@ -248,10 +252,10 @@ CHECKS: Final[Sequence[SessionCheck]] = (
     SessionCheck("disk", lambda before: computer.check_disk(before.runs)),
 )
 
-# Checks that need a program on the controller, made when all others have passed.
+# Checks that need a program on the controller; they follow when all others have passed.
 IN_CONTROL: Final[Sequence[SessionCheck]] = (SessionCheck("limits", _check_safety_limits),)
 
-# Checks before a stopped session goes on: all, except that its new approach is judged by itself.
+# Checks before a stopped session goes on. The new approach is checked later, when its goal is known.
 AGAIN: Final[Sequence[SessionCheck]] = (*(row for row in CHECKS if row is not _APPROACH), *IN_CONTROL)
 
 
@@ -265,7 +269,7 @@ def _points_along(q_rad: Array, step_rad: float) -> Array:
 
 
 def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
-    """Show what each check finds; raises `NotAccepted` if one failed."""
+    """Run checks and show their results; raises `NotAccepted` if one failed."""
     found = []
     for row in rows:
         found.append(row(before))
@@ -276,14 +280,14 @@ def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
 
 @contextmanager
 def awake() -> Iterator[str]:
-    """Keep the computer from going to sleep where systemd can (row 18); yields what was done, in words."""
-    asleep = "this computer is not kept awake: make sure that it does not go to sleep"
+    """Keep the computer from going to sleep if systemd can (row 18); yields a note for the operator."""
+    asleep = "this computer may go to sleep: disable sleep during the session"
     tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
     if tool is None:
         yield asleep
         return
-    command = [tool, "--what=sleep:idle", "--who=ftdrive", "--why=an arm is under way", "--mode=block", "cat"]
-    # `cat` ends with our end of its stdin, so the inhibition cannot outlive us.
+    command = [tool, "--what=sleep:idle", "--who=ftdrive", "--why=an arm moves", "--mode=block", "cat"]
+    # `cat` ends when this process closes its stdin, so the inhibition cannot outlive this process.
     process = subprocess.Popen(
         command,
         stdin=subprocess.PIPE,
@@ -292,7 +296,7 @@ def awake() -> Iterator[str]:
         start_new_session=True,
     )
     try:
-        # It only ends by itself when systemd denies the request.
+        # The process ends early only if systemd denies the request.
         with suppress(subprocess.TimeoutExpired):
             process.wait(timeout=0.3)
         yield "this computer is kept awake" if process.returncode is None else asleep

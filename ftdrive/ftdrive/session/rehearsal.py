@@ -1,4 +1,4 @@
-"""A calibration of an emulated cell, without questions, and what a session needs of such a cell."""
+"""Calibration of an emulated cell without questions, and changes of its load."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
@@ -23,7 +23,7 @@ from ftdrive.session.session import run_calibration
 
 
 class NoOperator:
-    """Nothing is shown and no key is pressed; a question raises `Declined`."""
+    """An operator who sees nothing and presses no key; a question raises `Declined`."""
 
     has_keys = False
     pressed_by = "the operator"
@@ -36,7 +36,7 @@ class NoOperator:
         raise Declined(f"no operator can answer: {question.text}")
 
     def absence(self) -> str | None:
-        """Return None: a session without an operator misses none."""
+        """Return None, because this session needs no operator."""
         return None
 
     def pressed(self) -> Key | None:
@@ -45,7 +45,7 @@ class NoOperator:
 
 
 class _Unkept:
-    """An operator without the events that name a temporary folder."""
+    """Passes events to an operator, except those that name a temporary folder."""
 
     def __init__(self, operator: Operator, folder: Path) -> None:
         self._operator, self._folder = operator, str(folder)
@@ -67,9 +67,9 @@ def rehearse(
     kept: bool = True,
     **options: Any,
 ) -> Outcome:
-    """Calibrate an emulated cell.
+    """Calibrate an emulated cell and return the outcome.
 
-    `kept` says whether the folder `runs` outlives the calibration; the other keywords are those of `SessionOptions`.
+    `kept` means that the folder `runs` is not temporary; the other keywords are those of `SessionOptions`.
     """
     chosen = SessionOptions(runs, name, real=False, questions=False, description=station.description, **options)
     outcome = run_calibration(station.cell, operator if kept else cast("Operator", _Unkept(operator, runs)), chosen)
@@ -82,9 +82,9 @@ def rehearse(
 def rehearsed_run(
     operator: AbstractContextManager[Operator], sensor: str | None = None, **options: Any
 ) -> Iterator[Path]:
-    """Make a short run of an emulated cell, with options of `SessionOptions`; yields its folder, deleted afterwards.
+    """Calibrate an emulated cell with options of `SessionOptions`; yields the run folder, which is deleted afterwards.
 
-    The operator is entered for the calibration alone; `sensor` is as `sensor_name` takes it.
+    The context `operator` is active only during the calibration; `sensor` is as in `sensor_name`.
     """
     with TemporaryDirectory(prefix="ftdrive-") as runs:
         with Station.of(None, sensor) as station, operator as shown:
@@ -93,7 +93,7 @@ def rehearsed_run(
 
 
 def short_calibration(operator: AbstractContextManager[Operator], sensor: str | None = None) -> CalibrationResult:
-    """Calibrate an emulated cell with six poses, which takes about 10 s; parameters as of `rehearsed_run`.
+    """Return a calibration of an emulated cell from six poses, in about 10 s; parameters as in `rehearsed_run`.
 
     Raises `NotAccepted` if the result is rejected.
     """
@@ -105,13 +105,13 @@ def short_calibration(operator: AbstractContextManager[Operator], sensor: str | 
 
 
 def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Station:
-    """Return the emulated cell of a calibration for a stream, not started; `sensor` replaces its sensor."""
-    # A stream pairs by the controller's clock.
+    """Return the emulated cell of a calibration, not started; `sensor` replaces its sensor."""
+    # A stream pairs samples and poses by the controller's clock, so the cell runs at real pace.
     return Station.of(calibration.provenance.get("station"), sensor, REAL_PACE)
 
 
 def put_on(station: Station, load: Load) -> None:
-    """Give the emulated cell the load, and its controller the total as payload."""
+    """Attach the load to the tool of the emulated cell, and set the payload of its controller to the total mass."""
     truth = station.truth
     mass_kg = truth["mass_kg"] + load.mass_kg
     station.control(do="set-payload", payload_kg=mass_kg + truth["sensor_mass_kg"])
@@ -119,7 +119,7 @@ def put_on(station: Station, load: Load) -> None:
         place = list(load.p_flange_mm)
         station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M)
     else:
-        # In the middle between the fingers, about: its place is unknown to the solution.
+        # About the middle between the fingers; the solver does not know this position.
         p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])
         com_m = (truth["mass_kg"] * np.array(truth["p_sensor_com_m"]) + load.mass_kg * p_load_m) / mass_kg
         station.control(do="payload-shift", mass_kg=mass_kg, p_sensor_com_m=com_m.tolist())
@@ -137,13 +137,14 @@ def rehearse_loads(
     operator: Callable[[], AbstractContextManager[Operator]],
     say: Callable[[str], object],
 ) -> LoadSolution:
-    """Hang a load at two places, take poses with each, and solve the sensor's matrix with those of the tool."""
+    """Take poses with a load at each of two hooks; return the sensor matrix solved from these and the tool's poses."""
     truth = station.truth
     taken: list[tuple[Outcome, KnownLoad | None]] = [(tool, None)]
     for name, hook_mm in _HOOKS_MM.items():
         say(
-            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. It swings because "
-            "this quick tour moves its hook; `calibrate --load` turns the tool about it."
+            f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. The load swings, "
+            "because "
+            "this quick tour moves its hook; `calibrate --load` turns the tool about the hook instead."
         )
         station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm, swing_deg=0)
         whole_kg = truth["payload_kg"] + _LOAD_KG
@@ -160,10 +161,9 @@ def rehearse_loads(
 
 
 def contact_errors(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
-    """Return the error of a contact of 100 N at the tip: as the sensor reads it, decoded, and the sigma of that.
+    """Return the RMS force error of a contact of 100 N at the tip, N: as read, decoded, and the predicted sigma.
 
-    Root mean square of the length of the force over all directions, N. The reading is computed from the truth, not with
-    the solver's model.
+    The mean is over random directions. The reading is computed from the truth, not with the model of the solver.
     """
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     force = CONTACT_N * directions / np.linalg.norm(directions, axis=1, keepdims=True)

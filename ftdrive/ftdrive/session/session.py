@@ -1,4 +1,4 @@
-"""A session from its cell to its result: what a calibration takes poses for, and the table of the modes."""
+"""The course of a session from the cell to the result, the task of a calibration, and the table of modes."""
 
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack, closing
@@ -37,18 +37,18 @@ from ftdrive.session.tour import take_tour
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from ftdrivers.registry import Options, split_url
 
-# Options of a sensor's address that choose one of its calibrations, with their defaults.
+# Options in the address of a sensor that select its factory calibration, with their defaults.
 _CHOOSES_CALIBRATION: Final = {"slot": 0, "calibration": 1}
-# Facts that differ for another scale or calibration.
+# Facts of a sensor that depend on its scale or factory calibration.
 _OF_NUMBERS: Final = ("counts_per_N", "counts_per_Nm", "range", "software_bias")
 
 
 def _require_devices(
     connected: Mapping[str, DeviceInfo], config: SensorConfig, *, calibration: CalibrationResult | None, run: Run | None
 ) -> tuple[str, ...]:
-    """Return what is uncertain about the connected devices, where a calibration or a resumed run must have the same.
+    """Require the devices of a calibration or of a resumed run; return warnings about what could not be compared.
 
-    Raises `ConfigError` if arm, sensor or mounting is not that of the calibration, and as `_require_same_devices`.
+    Raises `ConfigError` if arm, sensor or mounting differ from the calibration, and as `_require_same_devices`.
     """
     belongs = None if calibration is None else compare_devices(calibration, connected, config.mount)
     if belongs is not None and belongs.others:
@@ -59,9 +59,9 @@ def _require_devices(
 
 
 def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str, DeviceInfo]) -> None:
-    """Raise `PlanRefused` for other devices than those of the run, or a sensor that is scaled otherwise now.
+    """Raise `PlanRefused` if the devices, or the scaling of the sensor, differ from those of the run.
 
-    Without a serial number a device counts as the same if its model is, and the run has no serial number either.
+    Devices without a serial number are compared by their model, if the run has no serial number either.
     """
     header = run.header()
     devices = header["devices"]
@@ -69,24 +69,24 @@ def _require_same_devices(run: Run, config: SensorConfig, connected: Mapping[str
         model, serial = devices[name]["model"], devices[name]["serial"]
         if (model, serial) == (info.model, info.serial):
             continue
-        fix = "connect that of the run"
+        fix = f"connect the {name} of the run"
         if name == "sensor" and NOT_REPORTED in {serial, info.serial}:
             fix += ", or set serial=… in its address as in the run"
         raise PlanRefused(
-            f"the run was made with the {name} {model}, serial {serial}, connected is {info.model}, serial "
-            f"{info.serial}: {fix}, or start a new run"
+            f"the run was made with the {name} {model}, serial {serial}, but {info.model}, serial {info.serial} is "
+            f"connected: {fix}, or start a new run"
         )
     then = _meaning(header["config"]["sensor"], devices["sensor"].get("facts", {}))
     now = _meaning(asdict(config), asdict(connected["sensor"])["facts"])
     if other := [name for name in then if name in now and not np.array_equal(then[name], now[name])]:
         changes = " and ".join(f"{name} was {then[name]} and is {now[name]}" for name in other)
         raise PlanRefused(
-            f"the sensor is configured otherwise than in the run, {changes}: set it back, or start a new run"
+            f"the sensor is configured differently from the run, {changes}: restore that setting, or start a new run"
         )
 
 
 def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return what defines a sensor's values: sign, calibration, scale and range."""
+    """Return the settings and facts that define the scaling of a sensor: sign, factory calibration, scale and range."""
     options = Options(config["url"], split_url(config["url"]).query)
     chosen = {f"option {name}": options.integer(name, usual, 0, 255) for name, usual in _CHOOSES_CALIBRATION.items()}
     scale = {name: fact["value"] for name, fact in facts.items() if name in _OF_NUMBERS}
@@ -95,7 +95,7 @@ def _meaning(config: Mapping[str, Any], facts: Mapping[str, Mapping[str, Any]]) 
 
 @dataclass(frozen=True, eq=False)
 class Calibrating:
-    """A calibration."""
+    """The task of a calibration."""
 
     command: ClassVar[str] = "calibrate"
     goal: ClassVar[str] = "the coverage is green"
@@ -106,9 +106,9 @@ class Calibrating:
     load: Load | None = None
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return a tour. Raises `PlanRefused` if it lacks orientations that the method needs."""
+        """Return a tour. Raises `PlanRefused` if the tour lacks orientations that the method needs."""
         options = self.options
-        # From a tour of one hook, the wrist has no approach to another turn of itself.
+        # With a hanging load, no approach leads to another full turn of the wrist.
         q_rad = q_rad if certifier.arm.hung else from_usual_wrist(certifier, q_rad)
         plan = plan_for(self.cell, certifier, q_rad, poses, sets=options.sets)
         special = sum(step.number in NUMBERS[24] for step in plan.steps)
@@ -130,7 +130,7 @@ class Calibrating:
         return RunningFit(g_m_s2=self.cell.site.g_m_s2, down_base=down_base, advise=by_hand, load=self.load)
 
     def forecast(self, plan: Plan, certifier: Certifier, sigma: Array, /) -> str:
-        """Describe the sigmas of the result; those of a new tool depend on the earlier result too."""
+        """Describe the predicted sigmas of the result; empty for a new tool or with a load."""
         if plan.kind == "tool" or self.load is not None:
             return ""
         force_N, torque_Nm = rms_sigma(sigma)
@@ -138,7 +138,7 @@ class Calibrating:
         found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
         assumed = " (assumed: [tool] mass_kg is not set)" if self.options.real and not self.cell.tool.mass_kg else ""
         return (
-            f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor whose gain is {100 * guess.gain_sigma:.2g} % off, "
+            f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor gain error of {100 * guess.gain_sigma:.2g} %; "
             f"one sigma: mass {1e3 * found.sigma['mass_kg']:.2g} g, "
             f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
             f"{to_place_of(found.torque_rms_Nm, found.torque_rms_Nm)} N·m"
@@ -148,14 +148,14 @@ class Calibrating:
 def run_calibration(
     cell: CellConfig, operator: Operator, options: SessionOptions, load: Load | None = None
 ) -> Outcome | None:
-    """Guide the operator through a calibration, with a load on the tool; None after a dry run. Raises as `take_poses`.
+    """Guide the operator through a calibration; return its outcome, or None after a dry run. Raises as `take_poses`.
 
-    A resumed run has the load that it was begun with.
+    `load` is a known load on the tool. A resumed run has the load with which it began.
     """
     if options.resume is not None:
         load = Load.of_header(Run(options.resume).header())
     if load is not None:
-        # The run keeps the cell as it is configured; checks and guards count the load as part of the tool.
+        # The run records the cell as configured; checks and guards treat the load as part of the tool.
         options = replace(
             options, description={**options.description, "config": cell.to_dict(), "load": load.to_dict()}
         )
@@ -167,11 +167,11 @@ def run_calibration(
 
 
 def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run | None:
-    """Guide the operator through the poses of a task; None after a dry run.
+    """Guide the operator through the poses of a task; return the run, or None after a dry run.
 
-    Raises `Declined` if the operator ended it, and `NotAccepted`, `PlanRefused` or `ConfigError` if the session
-    refuses to start. After `DeviceError`, `OSError` or `SupervisorGone` the poses taken are in the run, which can be
-    resumed.
+    Raises `Declined` if the operator ended the session, and `NotAccepted`, `PlanRefused` or `ConfigError` if the
+    session refuses to start. After `DeviceError`, `OSError` or `SupervisorGone` the run has all poses taken so far and
+    can be resumed.
     """
     config = task.cell
     journal = Journal(operator, yes=options.yes)
@@ -196,7 +196,7 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
         arm.open()
         journal.show(StateChanged(state=State.PREFLIGHT))
         if not options.by_hand:
-            # A program of another client is never ended to begin.
+            # A session never stops the program of another client.
             preflight.require_no_program(arm, cell.clock, cell.limits)
             if options.real and not options.dry_run:
                 cell.note(kept_awake)
@@ -213,21 +213,21 @@ def take_poses(task: Task, operator: Operator, options: SessionOptions) -> Run |
     if run is None:
         return None
     if not (run.stops() or run.in_motion):
-        raise Declined(f"ended before the first pose: {run.folder} has no pose to solve")
+        raise Declined(f"the session ended before the first pose: {run.folder} has no pose to solve")
     journal.show(StateChanged(state=State.REPORT))
     return run
 
 
 def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
-    """Load the plan of the resumed run, or the given one.
+    """Load the plan of the resumed run, or the plan of `--plan`; None if there is none.
 
-    Raises `ConfigError` if it lacks a pose of `redo`, or is a sweep, whose guards only the mode of a sweep has.
+    Raises `ConfigError` if the plan lacks a pose of `redo`, or is a sweep, which needs the guards of the mode "sweep".
     """
     if run is None:
         given = None if options.plan is None else Plan.load(options.plan)
         if given is not None and given.sweep is not None:
             raise ConfigError(
-                f"{options.plan} is the plan of a sweep: leave out --plan and give --sweep, which plans one"
+                f"{options.plan} is the plan of a sweep: leave out --plan and give --sweep, which plans a new one"
             )
         return given
     plan = Plan.load(run.plan_path)
@@ -238,7 +238,7 @@ def _plan_on_disk(options: SessionOptions, run: Run | None) -> Plan | None:
 
 
 def _take(session: OpenSession) -> Run | None:
-    """Take the poses or the recording of a session in its mode; None after a dry run."""
+    """Take the poses or the recording in the mode of the session; return the run, or None after a dry run."""
     by_mode: Mapping[Mode, Callable[[OpenSession], Run | None]] = {
         "auto": take_tour,
         "step": take_tour,
@@ -251,20 +251,22 @@ def _take(session: OpenSession) -> Run | None:
 
 
 def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, DeviceInfo]) -> dict[str, Any]:
-    """Return what run.json contains."""
+    """Return the contents of run.json."""
     return {
         "command": task.command,
         "config": task.cell.to_dict(),
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
         **({} if options.method == "ml" else {"method": options.method}),
-        **({"station": {}} if task.cell.is_emulated else {}),  # of another process: nothing more is known
+        **(
+            {"station": {}} if task.cell.is_emulated else {}
+        ),  # an emulated cell in another process, whose truth is unknown
         **options.description,
     }
 
 
 def method_of_poses(name: str) -> Method:
-    """Return a method by its name, if poses suffice for it. Raises `ConfigError`."""
+    """Return the method of this name. Raises `ConfigError` if it is unknown or needs more than poses."""
     if name not in get_args(Method):
         raise ConfigError(f"there is no method '{name}': choose one of {', '.join(get_args(Method))}")
     if name == "carlson-cayley":

@@ -1,9 +1,10 @@
-"""Settings of the controller from a calibration: payload and gravity, sent after a typed word and read back.
+"""Push payload and gravity from a calibration to the controller: sent after a typed word, then read back.
 
-A push changes what the controller assumes, so it is refused unless the arm is that of the calibration, rests, and no
-program runs. Every attempt that has sent something leaves a receipt with the old values, from which they are restored.
+A push changes the robot's model of its load. It is refused unless the arm is that of the calibration, stands still, and
+no program runs. Every attempt that may have sent something writes a receipt with the old values, which can be restored.
 
-push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; push-2.json and so on
+push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; then push-2.json and so
+on
 """
 
 import re
@@ -33,49 +34,49 @@ from ftdrive.session.preflight import require_no_program
 from ftdrivers.interfaces import ControllerSettings, DeviceInfo, ForceTorqueSensor, Guard, RobotArm
 
 FORMAT: Final = "ftdrive.push/1"
-# Of a receipt, before its number and its ending.
+# Start of the file name of a receipt.
 _RECEIPT: Final = "push"
-# What is typed to send each setting.
+# The word that the operator types to send each setting.
 WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 
 _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
-# A steady reading fails the test once in some hundred times.
+# Number of attempts at a steady reading: a steady one fails the test about once in a hundred times.
 _LISTENS: Final = 3
-# Largest difference of a value that is read back; it travels as the same 64 bits.
+# Largest allowed difference between a value and its reading back, which has the same 64 bits.
 _TOLERANCE: Final = 1e-6
 
-# Asks for the word of a setting, such as "payload"; raises `Declined`.
+# Asks for the word of a setting, such as "payload"; raises `Declined` if it is not typed.
 Ask = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """A receipt on disk."""
+    """Receipt of a push, read from disk."""
 
     path: Path
     old: ControllerSettings
     new: ControllerSettings
     devices: Mapping[str, Mapping[str, Any]]
     restores: str | None
-    """The receipt whose old values were sent back; None for a push."""
+    """Path of the receipt whose old values were restored; None for a push."""
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a receipt; of a run folder the newest of a push. Raises `BadDataset`."""
+        """Read a receipt, or the newest receipt of a push in a run folder. Raises `BadDataset`."""
         if path.is_dir():
             return cls._newest(path)
         try:
             document = read_object(path, BadDataset)
             check_format(document, FORMAT, BadDataset)
             old, new = (_settings(document[name]) for name in ("old", "new"))
-            found = cls(path, old, new, document["devices"], document.get("restores"))
-            found.devices["arm"]["serial"], found.devices["arm"]["model"]
+            receipt = cls(path, old, new, document["devices"], document.get("restores"))
+            receipt.devices["arm"]["serial"], receipt.devices["arm"]["model"]
         except BadDataset as error:
             raise BadDataset(f"{path}: {error}") from error
         except (KeyError, TypeError, ValueError) as error:
-            raise BadDataset(f"{path} is damaged ({error!r}): take it from a copy") from error
-        return found
+            raise BadDataset(f"{path} is damaged ({error!r}): restore it from a copy") from error
+        return receipt
 
     @classmethod
     def _newest(cls, run: Path) -> Self:
@@ -84,7 +85,9 @@ class Receipt:
         for _, path in reversed(paths):
             if (receipt := cls.load(path)).restores is None:
                 return receipt
-        raise BadDataset(f"{run} has no receipt of a push: give the run, or the {_RECEIPT}.json, of an earlier push")
+        raise BadDataset(
+            f"{run} has no receipt of a push: give the run folder or the {_RECEIPT}.json of an earlier push"
+        )
 
 
 def _settings(values: Mapping[str, Any]) -> ControllerSettings:
@@ -101,23 +104,23 @@ def _settings(values: Mapping[str, Any]) -> ControllerSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Push:
-    """What is to be set, beside what is set."""
+    """Settings to send, with the present ones and the comparison that led to them."""
 
     old: ControllerSettings
     new: ControllerSettings
-    """None where nothing is to be set."""
+    """New values; None for each setting that does not change."""
     devices: Mapping[str, DeviceInfo]
     reason: Mapping[str, Any]
-    """What the values come from, for the receipt."""
+    """Origin of the values, for the receipt."""
     load: FlangeLoad | None = None
     lean: Lean | None = None
-    """Tilt of the base from the gravity of the controller, or from the configured mounting if it is unknown."""
+    """Tilt of the base relative to the controller's gravity, or to the configured mounting if that is unknown."""
     contact: Array | None = None
-    """(6,) what the sensor reads beyond a free tool: contact, or drift since the calibration."""
+    """(6,) reading minus that of a free tool, N and N·m: contact, or drift since the calibration."""
 
     @property
     def settings(self) -> list[str]:
-        """Return the names of the settings to be sent, as in `WORDS`."""
+        """Names of the settings to send, as in `WORDS`."""
         asked = {"payload": self.new.mass_kg, "gravity": self.new.up_base_m_s2}
         return [name for name, value in asked.items() if value is not None]
 
@@ -132,16 +135,16 @@ def propose(
     gravity: bool,
     name: str,
 ) -> Push:
-    """Compare a calibration, from the path `name`, with what the controller assumes; nothing is changed.
+    """Compare a calibration, from the path `name`, with the settings of the controller; return the push to make.
 
     Raises
     ------
     ConfigError
         Mass or height of the sensor is not configured.
     NotAccepted
-        The calibration is rejected or of other devices, or the arm is not ready.
+        The calibration is rejected or belongs to other devices, or the arm is not ready.
     """
-    # Sensor and adapter are one mass halfway up the sensor's height; the plate that carries the tool counts twice.
+    # Sensor and adapter are modelled as one mass at half the height; the plate that carries the tool is counted twice.
     if result.verdict == "rejected":
         raise NotAccepted(f"{name} is rejected ({'; '.join(result.reasons)}): calibrate again")
     mass_kg, height_m = _sensor_of(cell)
@@ -180,19 +183,19 @@ def _sensor_of(cell: CellConfig) -> tuple[float, float]:
     mass_kg, height_mm = cell.sensor.mass_kg, cell.sensor.height_mm
     if mass_kg is None:
         raise ConfigError(
-            "[sensor] mass_kg is not set, and the sensor cannot weigh itself: set it to the mass of sensor and "
+            "[sensor] mass_kg is not set, and the sensor cannot measure its own mass: set it to the mass of sensor and "
             "adapter, or to 0 for the sensor inside the wrist"
         )
     if height_mm is None:
         raise ConfigError(
-            "[sensor] height_mm is not set, and gravity does not reveal it: set it to the height of the sensor's "
+            "[sensor] height_mm is not set, and gravity does not determine it: set it to the height of the sensor's "
             "origin above the flange face"
         )
     return mass_kg, height_mm / 1e3
 
 
 def _require_ready(cell: CellConfig, arm: RobotArm) -> None:
-    """Raise `NotAccepted` unless this is the configured arm, free of programs, in remote control, and at rest."""
+    """Raise `NotAccepted` unless this is the configured arm, without a program, in remote control, and at rest."""
     require_no_program(arm, cell.clock, Limits())
     for check in (
         check_arm(arm.identify(), cell.robot),
@@ -209,7 +212,7 @@ def _wait_until_still(arm: RobotArm) -> None:
 
 
 def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: CalibrationResult) -> Array | None:
-    """Return the reading beyond a free tool, None where the arm's pose is unknown; raises if it is not steady."""
+    """Return the reading (6,) minus that of a free tool; None if the flange pose is unknown. Raises `NotAccepted`."""
     for _ in range(_LISTENS):
         wrench = sensor.collect(_LISTEN_S).wrench
         check = check_level(wrench)
@@ -223,8 +226,8 @@ def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: Calibratio
 
 
 def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
-    """Return the gravity to be set, as large as the controller has it; None if it agrees."""
-    # A tilt is pushed only where the controller reports its gravity: elsewhere it could not be read back or restored.
+    """Return the gravity to set, with the magnitude that the controller uses; None if its direction agrees."""
+    # Without a report of the controller's gravity, a change could be neither read back nor restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
             f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
@@ -233,7 +236,7 @@ def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettin
     if lean.is_other_mounting:
         raise NotAccepted(
             f"gravity is {lean.deg:.0f}° off the direction in the controller: correct the mounting at the pendant; "
-            "near 180°, check the sensor's sign first"
+            "if it is near 180°, check the sensor's sign first"
         )
     if not lean.is_significant:
         return None
@@ -251,59 +254,65 @@ def _unit_vector(vector: Any) -> Array:
 def send(
     arm: RobotArm, push: Push, folder: Path, ask: Ask, guard: Guard = lambda: None
 ) -> tuple[Path, ControllerSettings]:
-    """Ask for a word for each setting, send them, and read them back.
+    """Ask for the word of each setting, send the settings, and read them back.
 
     `guard` is called before each setting is sent, and may raise.
 
-    Returns the path of the receipt, a new file in `folder`, and what the controller keeps.
+    Returns the path of the receipt, a new file in `folder`, and the settings that the controller then reports.
 
     Raises
     ------
     NotAccepted
-        The controller's values have changed since they were shown, or it reports others than were sent.
+        The settings have changed since they were shown, or the controller reports values that differ from those sent.
     Declined
-        The word was not typed; nothing was sent.
+        A word was not typed; nothing was sent.
     DeviceError
-        The arm failed. If something may have been sent, there is a receipt.
+        The arm failed. If a setting may have been sent, there is a receipt.
     """
-    # Read back after the pushing program has ended, because only that shows what remains; so the arm is opened twice.
+    # The settings are read back after the program has ended, because only then they are known to remain.
     disk = computer.check_disk(folder)
     if disk.state == "failed":
-        raise NotAccepted(f"no receipt can be written, {disk.found}: copy the run to another folder; nothing was sent")
+        raise NotAccepted(f"no receipt can be written: {disk.found}. Copy the run to another folder; nothing was sent")
     for name in push.settings:
         ask(name)
     arm.open(control=True)
     _wait_until_still(arm)
     if arm.controller_settings() != push.old:
-        raise NotAccepted("the settings of the controller have changed meanwhile: start again; nothing was sent")
+        raise NotAccepted(
+            "the settings of the controller have changed since they were shown: start again; nothing was sent"
+        )
     guard()
     read_back, failure = None, ""
     try:
         _set(arm, push.new, guard)
-        arm.close()  # what the controller keeps without our program
+        arm.close()  # then only the settings that remain without the program are read
         arm.open()
         read_back = arm.controller_settings()
-    except BaseException as error:  # also Ctrl-C
+    except BaseException as error:  # including Ctrl-C
         failure = str(error) or "interrupted"
         raise
     finally:
         values = {"old": push.old, "new": push.new, "read_back": read_back}
         path = _write_receipt(folder, push.devices, push.reason, values, failure)
     if different := _differences(push.new, read_back):
-        raise NotAccepted(f"the controller reports another {' and '.join(different)} than was sent; receipt: {path}")
+        raise NotAccepted(
+            f"the controller does not report the {' and '.join(different)} that was sent: check the settings at the "
+            f"pendant; receipt: {path}"
+        )
     return path, read_back
 
 
-# What each setting does, with the question.
+# Effect of each setting, with the question for its word.
 EFFECTS: Final = {
     "payload": (
-        "The controller uses the payload to detect collisions and to limit speed. With a wrong one the arm may stop or "
-        "move by itself. Setting it zeroes the arm's own force sensor, and the arm may make a small jump. "
+        "The controller uses the payload to detect collisions and to limit speed. With a wrong payload the arm may "
+        "stop or move by itself. Setting it zeroes the arm's own force sensor, and the arm may make a small jump. "
         "Keep the arm free and still, and hands off. Type PUSH to send the payload"
     ),
     "gravity": (
-        "The controller uses gravity as it uses the payload, for the whole arm. With a wrong one the arm may stop, or "
-        "sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send gravity"
+        "The controller uses the gravity direction to compensate the weight of the whole arm. With a wrong direction "
+        "the "
+        "arm may stop, or sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send gravity"
     ),
 }
 
@@ -317,7 +326,7 @@ def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
 
 
 def _differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
-    """Return which settings were read back with another value; what is not reported does not count."""
+    """Return the names of the settings that the controller reports with another value than was sent."""
     back = read_back or ControllerSettings()
     pairs = {
         "mass": (sent.mass_kg, back.mass_kg),
@@ -333,19 +342,21 @@ def _differences(sent: ControllerSettings, read_back: ControllerSettings | None)
 
 
 def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
-    """Return the push that sends the old values of a receipt back; raises as `propose`."""
+    """Return the push that restores the old values of a receipt; raises as `propose`."""
     info = arm.identify()
     made = receipt.devices["arm"]["model"], receipt.devices["arm"]["serial"]
     if made != (info.model, info.serial):
         raise NotAccepted(
-            f"{receipt.path} is of the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial} is "
+            f"{receipt.path} belongs to the arm {made[0]}, serial {made[1]}, but {info.model}, serial {info.serial} is "
             "connected: connect the arm of the receipt"
         )
     _require_ready(cell, arm)
     old, changed = receipt.old, receipt.new
     payload = changed.mass_kg is not None
     if payload and (old.mass_kg is None or old.p_flange_com_m is None):
-        raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it at the pendant")
+        raise NotAccepted(
+            f"{receipt.path} has no old payload, because the controller did not report one: set it at the pendant"
+        )
     back = ControllerSettings(
         old.mass_kg if payload else None,
         old.p_flange_com_m if payload else None,
@@ -364,8 +375,8 @@ def _write_receipt(
 ) -> Path:
     """Write a new receipt into a run folder; return its path.
 
-    `reason` says where the new values come from. `values` holds `old`, `new` (None for a setting that was not to
-    change) and `read_back` (None if it failed), and `error` says why the push failed, or is empty.
+    `reason` is the origin of the new values. `values` has the entries `old`, `new` (None for a setting that does not
+    change) and `read_back` (None if reading failed). `error` says why the push failed, or is empty.
     """
     receipt = {
         "format": FORMAT,

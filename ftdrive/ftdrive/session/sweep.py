@@ -1,4 +1,4 @@
-"""A sweep: the free tool recorded along a smooth curve, at the speed of the slider; and what it teaches the guards."""
+"""A sweep: recording of the free tool along a smooth curve, and the prediction of its wrench for the contact guard."""
 
 from collections import deque
 from dataclasses import dataclass, field, replace
@@ -21,37 +21,38 @@ from ftdrive.session.open_session import OpenSession
 from ftdrive.session.preflight import Before
 from ftdrivers.sweep import Sweep
 
-# Recorded before the sweep and after it.
+# Rest that is recorded before the sweep and after it, s.
 REST_S: Final = 2.0
-# Between two points of the curve that the guards compare with.
+# Time between two points of the curve that the guards use, s.
 CURVE_S: Final = 0.01
 _READ_S: Final = 1.0
-# Share of the planned speed in the first run of a plan.
+# Share of the planned speed during the first run of a plan.
 FIRST_SHARE: Final = 0.5
+# Lowest speed slider at which a sweep is useful.
 LEAST_SLIDER: Final = 0.5
-# Length of the averages of the resting sensor that the guards compare with.
+# Averaging time for the noise level that the contact guard uses, s.
 _QUIET_S: Final = 1.0
-# The mass of the tool where [tool] mass_kg is not set.
+# Assumed mass of the tool if [tool] mass_kg is not set.
 _HEAVIEST_KG: Final = 5.0
-# The motion teaches so long before anything is predicted.
+# Duration of motion before the first prediction, s.
 KNOWN_S: Final = 3.0
-# The newest looks do not teach: a contact that grows must not pass for weight.
+# The fit excludes the newest readings over this time, s, so that a growing contact is not taken for weight.
 BEHIND_S: Final = 1.0
-# Noise of one look, vibration and acceleration included.
+# Standard deviation of one reading, including vibration and acceleration.
 _NOISE_N: Final = 2.0
-# A prediction with a larger sigma is none.
+# A prediction with a larger sigma is not used.
 _UNSURE_N: Final = 2.5
 
 
 def take_sweep(session: OpenSession) -> Run | None:
-    """Record the free tool along a smooth curve of the wrist, planned where the arm stands; None after a dry run."""
+    """Record the free tool along a wrist curve about the present posture; return the run, None after a dry run."""
     task, options = session.task, session.options
     along = AlongPlan(session, lambda certifier, q_rad: sweep_for(task.cell, certifier, q_rad, options.seconds))
     driven, sweep = _choose_speed(along.before, slow=options.real and not along.before.known)
     if options.dry_run:
         along.end_dry_run()
         return None
-    # No pose shows what the tool weighs while it moves.
+    # There are no poses, so the motion itself must show the weight of the tool.
     tool = FreeToolPrediction(driven.certifier.scene.down_base, task.cell.tool.mass_kg or _HEAVIEST_KG)
     with along.guarding(driven, driven.quiet_std(_QUIET_S), tool.predict, tool) as (guarded, book):
         drive = Drive(guarded, driven, options, [None], lambda _: "")
@@ -61,7 +62,7 @@ def take_sweep(session: OpenSession) -> Run | None:
 
 
 def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
-    """Take the arm to the centre of a sweep, along it, and back; start again after a stop. Raises as `Tour.run`."""
+    """Move the arm to the centre of the sweep and along the curve; repeat after a stop. Raises as `Tour.run`."""
     now = drive.now
     now.todo = [1]
     drive.watcher.begin()
@@ -84,7 +85,7 @@ def _repeat_until_recorded(drive: Drive, sweep: Sweep, sampling: Sampling, run: 
 
 
 def _record_sweep(drive: Drive, sweep: Sweep, sampling: Sampling, run: Run) -> None:
-    """Follow the curve from its centre, where the arm stands, and keep the recording."""
+    """Follow the curve from the centre, where the arm stands, and save the recording."""
     (centre,), clock = drive.nodes_rad, drive.watcher.clock
     curve = sweep.at(np.arange(0.0, sweep.duration_s + CURVE_S, CURVE_S))
     with drive.sensor.follow() as wrench, drive.arm.follow() as poses:
@@ -128,27 +129,27 @@ def _rest(drive: Drive, still_timeout_s: float) -> None:
 
 
 def _begin_words(sweep: Sweep) -> str:
-    return f"The arm stands where the sweep of {sweep.duration_s:.0f} s begins. Begin?"
+    return f"The arm stands at the start of the sweep, which takes {sweep.duration_s:.0f} s. Begin?"
 
 
 def _choices(_: int | None, fixed: str) -> tuple[str, dict[str, str]]:
-    """Return what is kept, and the answers in a hold with their effects; see `Drive.hold`."""
+    """Return a sentence about the data, and the answers in a hold with their effects; see `Drive.hold`."""
     ways = {"resume": f"sweep again from the start{fixed}", "quit": "stop; the next session starts again"}
-    return "A sweep that was stopped is not kept.", ways
+    return "The stopped sweep is not saved.", ways
 
 
 @dataclass
 class FreeToolPrediction(Guard):
-    """Recursive least squares of the wrench as a linear function of the direction of gravity in the flange.
+    """Recursive least-squares fit of the wrench as a linear function of the gravity direction in flange axes.
 
-    Force and torque are linear in it, whatever mounting, weight, centre of mass and bias are. It looks as a guard, but
-    never trips: the contact guard asks it what a free tool weighs.
+    Force and torque of a free tool are linear in this direction for every mounting, weight, centre of mass and bias.
+    The class is a guard that never trips: it learns from each look and predicts the wrench for the contact guard.
     """
 
     down_base: Array
-    """(3,) unit vector."""
+    """(3,) unit vector down, base axes."""
     heaviest_kg: float
-    """Mass of the heaviest possible tool: the size of what is unknown."""
+    """Mass of the heaviest possible tool, which sets the prior standard deviation."""
     _moving_s: float = field(default=0.0, init=False)
     _sample: int = field(default=-1, init=False)
     _waiting: deque[tuple[float, Array, Array]] = field(default_factory=deque, init=False)
@@ -156,8 +157,7 @@ class FreeToolPrediction(Guard):
     _coefficients: Array = field(default_factory=lambda: np.zeros((4, 6)), init=False)
 
     def begin(self, _: Seen) -> None:
-        """Forget everything."""
-        # After a stop the tool may be another, and the sensor may have another zero.
+        """Discard the fit, because tool and sensor zero may differ after a stop."""
         unknown = (self.heaviest_kg * STANDARD_GRAVITY_M_S2 / _NOISE_N) ** 2
         self._covariance = np.diag([unknown, unknown, unknown, 1e6])
         self._coefficients = np.zeros((4, 6))
@@ -165,8 +165,8 @@ class FreeToolPrediction(Guard):
         self._moving_s = 0.0
 
     def look(self, seen: Seen) -> None:
-        """Learn from what was seen a second ago."""
-        # Learns from a second ago and before; a push that grows over several seconds is partly learned.
+        """Add the readings older than `BEHIND_S` to the fit."""
+        # A push that grows over several seconds still enters the fit in part.
         if seen.motion.curve_rad is not None:
             self._moving_s += seen.dt_s
         if seen.sample == self._sample:
@@ -181,9 +181,8 @@ class FreeToolPrediction(Guard):
             self._covariance = self._covariance - np.outer(gain, Px)
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
-        # The full fit takes longer than a guard may wait, and knows no contact, so a linear function of gravity
-        # predicts.
+        """Return the wrench (6,) of a free tool at this orientation (3, 3); None while it is uncertain."""
+        # The full fit takes longer than a guard may wait.
         if self._moving_s < KNOWN_S:
             return None
         x = self._features(R_base_flange)
@@ -196,31 +195,31 @@ class FreeToolPrediction(Guard):
 
 
 def on_script_path(cell: CellConfig) -> CellConfig:
-    """Return the cell with the control path that follows a curve; raises `ConfigError` if another one is set."""
-    # Only our own program evaluates the curve and stops with its heartbeat.
+    """Return the cell with control path "script", which a sweep needs; raises `ConfigError` if "ur-rtde" is set."""
+    # Only the program of ftdrive evaluates the curve and stops when its heartbeat is lost.
     if cell.robot.control == "ur-rtde":
         raise ConfigError(
-            "a sweep needs the control path script, whose program evaluates the curve on the controller and stops "
-            "with it: give --control script, or set [robot] control"
+            "a sweep needs the control path script, whose program evaluates the curve on the controller: give "
+            "--control script, or set [robot] control"
         )
     return replace(cell, robot=replace(cell.robot, control="script"))
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return the plan at the speed of the slider, which does not act on a sweep while it runs, and its curve.
+    """Return the plan and its curve, slowed down by the speed slider, which does not act on a running sweep.
 
     Raises `NotAccepted` if the slider is too low.
     """
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(
-            f"the speed slider is at {100 * slider:.0f} %, at which a sweep shows too little: set it to "
+            f"the speed slider is at {100 * slider:.0f} %, too slow for a useful sweep: set it to "
             f"{100 * LEAST_SLIDER:.0f} % or more"
         )
     share = min(slider, 1.0) * (FIRST_SHARE if slow else 1.0)
     plan = before.plan.at_share(share)
     if plan.sweep is None:
-        raise NotAccepted("the plan holds no sweep: make it with --sweep")
+        raise NotAccepted("the plan has no sweep: make a plan with --sweep")
     why = "the first run of a plan is slow" if slow else f"speed slider {100 * slider:.0f} %"
     total_s = plan.sweep.duration_s + 2 * REST_S + before.approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
     cell.note(

@@ -1,4 +1,4 @@
-"""A tour: (MOVE, SETTLE, SAMPLE) for each pose of a plan, then CLOSE; each pose is on disk before the next move."""
+"""A tour: MOVE, SETTLE and SAMPLE for each pose of a plan, then CLOSE; each pose is on disk before the next move."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -25,15 +25,15 @@ from ftdrive.session.events import Key, Question, State, Weighed, rms_sigma
 from ftdrive.session.open_session import OpenSession, PoseBook, SessionOptions
 from ftdrive.session.preflight import LISTEN_S, Before
 
-# Target sigma of one average: it gives 0.02 N of bias from 24 poses.
+# Target sigma of one average; 24 poses then give a sigma of the force bias of 0.02 N.
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
-# Length of an average of a new tool in that of other tours: its four poses then show as much as eight.
-# Drift within a pose counts twice as long, but four long poses are as good as six with two moves less.
+# Factor on the averaging time for a new tool: its four poses then have the information of eight.
+# Drift acts for twice the time, but four long poses are as accurate as six, with two moves less.
 _TOOL_AVERAGES: Final = 2.0
 
 
 def take_tour(session: OpenSession) -> Run | None:
-    """Take the poses of a plan, or of one that is made where the arm stands; None after a dry run."""
+    """Take the poses of a plan, or of one planned from the present posture; return the run, or None after a dry run."""
     options = session.options
     along = AlongPlan(session, lambda certifier, q_rad: session.task.plan(certifier, q_rad, options.poses))
     driven = _choose_pace(along)
@@ -50,7 +50,7 @@ def take_tour(session: OpenSession) -> Run | None:
 
 
 class _Turned(Exception):
-    """The operator wants another pose than the one under way: the next, or the last one again."""
+    """Raised when the operator skips the pose in progress, or takes the last pose again."""
 
     def __init__(self, key: Key) -> None:
         super().__init__(key.name)
@@ -58,10 +58,10 @@ class _Turned(Exception):
 
 
 class Tour:
-    """Takes the arm along a plan; the book keeps every pose.
+    """Moves the arm along a plan and takes its poses, which `book` saves.
 
-    `driven` has the speeds and the sampling of this session, `quiet_std` (6,) the standard deviation of the samples of
-    the resting sensor.
+    `driven` has the speeds and the sampling of this session; `quiet_std` (6,) is the standard deviation of the samples
+    of the resting sensor.
     """
 
     def __init__(
@@ -73,19 +73,19 @@ class Tour:
         self._nodes, self._now = self._drive.nodes_rad, self._drive.now
         self._quiet_std, self._book, self._options = quiet_std, book, options
         self._certifier = driven.certifier
-        # A load is hung on its string when the arm stands at the first pose.
+        # A load is hung on its string only when the arm stands at the first pose.
         self._to_hang = self._certifier.arm.hung is not None
         self._drive.certifier = self._certifier.without_load
 
     def run(self, todo: Sequence[int]) -> None:
-        """Take the poses of these stops, counted from 1; the return to the first pose is the last.
+        """Take the poses of these stops, numbered from 1; the last stop is the return to the first pose.
 
         Raises
         ------
         Declined
-            The operator ended it, or no operator answered.
+            The operator ended the tour, or did not answer.
         Tripped, DeviceError, OSError, SupervisorGone
-            What stopped the arm, if the operator then ended the tour.
+            The cause of a stop, if the operator then ended the tour.
         """
         self._now.todo = list(todo)
         self._drive.watcher.begin()
@@ -118,14 +118,14 @@ class Tour:
         self._go(index, stop)
         self._drive.obey_keys()
         if self._to_hang:
-            words = f"Pose {stop}: hang {self._load} now, and let it hang still. Its string must be free. Go on?"
+            words = f"Pose {stop}: hang {self._load} now, and wait until it hangs still on its free string. Go on?"
             self._drive.confirm(words, by_operator=self._options.real)
             self._to_hang, self._drive.certifier = False, self._certifier
         self._take(stop, index)
         del self._now.todo[0]
 
     def _compare_payload(self) -> None:
-        """Row 7: show the mass on the sensor, and whether the configured payload differs; once for each payload."""
+        """Row 7: show the mass on the sensor, and warn if the controller's payload disagrees; once per payload."""
         mass_kg = self._book.judge.weighed_kg
         if mass_kg is None:
             return
@@ -139,7 +139,7 @@ class Tour:
             self._note(finding.words, warning=True)
 
     def _step(self, stop: int, index: int) -> bool:
-        """Ask for Enter; return whether to move."""
+        """Ask the operator in step mode; return whether to move."""
         answer = self._journal.ask(
             Question(
                 f"Pose {stop} of {self._now.stops}, orientation {self._plan.steps[index].number:02d}: "
@@ -156,16 +156,16 @@ class Tour:
         return answer == ""
 
     def _way(self, index: int) -> str:
-        """Describe what Enter does in step mode."""
+        """Describe the motion that Enter starts in step mode."""
         turn_rad = np.abs(self._nodes[index] - self._arm.state().q_rad)
         moving = [str(joint + 1) for joint in np.flatnonzero(turn_rad > AT_RAD)]
         if not moving:
-            return "the arm stands there, Enter measures"
+            return "the arm stands there, Enter starts the measurement"
         joints = f"joint{'s' if len(moving) > 1 else ''} {', '.join(moving)}"
         largest = f"largest turn {np.degrees(turn_rad.max()):.0f}°"
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
-            drives = ", and drives it where --yes may confirm it" if self._drive.trusted and self._options.yes else ""
+            drives = ", and moves along it if --yes may confirm it" if self._drive.trusted and self._options.yes else ""
             return f"Enter plans the approach and shows it{drives}, {joints}, {largest}"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f} °/s"
 
@@ -178,12 +178,12 @@ class Tour:
             self._skip()
 
     def _redoable(self) -> bool:
-        """Whether r can take the last pose again; a note says why it cannot."""
+        """Return whether r can take the last pose again; if not, a note says why."""
         last = self._now.taken_last
         if last is None:
-            self._note("r takes the last pose again: there is no pose yet")
+            self._note("no pose yet: nothing to take again with r")
         elif self._now.todo[0] == last:
-            self._note(f"pose {last} is being taken again already")
+            self._note(f"pose {last} is already being taken again")
         return last is not None and self._now.todo[0] != last
 
     def _redo(self) -> None:
@@ -195,17 +195,19 @@ class Tour:
         self._note(f"pose {stop} is taken again")
 
     def _skip(self) -> None:
-        """Drop the pose, and the return to it. A pose that was to be taken again keeps its earlier samples."""
+        """Leave out the next pose and a return to it. A pose that was to be taken again keeps its earlier samples."""
         dropped = self._now.skip()
         names = {stop: "the return to pose 1" if stop == self._now.stops else f"pose {stop}" for stop in dropped}
         stay = set(dropped).intersection(self._book.run.stops())
         for record in self._book.run.records() if stay else ():
             if record.stop in stay:
                 self._journal.show(self._book.judge.add(record))
-                self._note(f"{names[record.stop]} stays as it was measured", warning=True)
+                self._note(f"{names[record.stop]} keeps its earlier measurement", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
-            way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "it was the last"
-            self._note(f"skipped: {' and '.join(left)}, {way}; --resume takes skipped poses", warning=True)
+            way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "no pose is left"
+            self._note(
+                f"skipped: {' and '.join(left)}; {way}; a session with --resume takes skipped poses", warning=True
+            )
 
     def _take(self, stop: int, index: int) -> None:
         step, sampling, clock = self._plan.steps[index], self._config.sampling, self._drive.watcher.clock
@@ -237,7 +239,7 @@ class Tour:
         self._compare_payload()
 
     def _go(self, index: int, stop: int) -> None:
-        """Move the arm to a pose of the plan, along certified moves only."""
+        """Move the arm to a pose, along a move of the plan or an approach."""
         at, speed_rad_s, driven_from = self._now.at, self._own_speed(index), None
         if index == at:
             return
@@ -252,32 +254,32 @@ class Tour:
         self._now.arrive(index, driven_from=driven_from)
 
     def _own_speed(self, index: int) -> float | None:
-        """Speed of the plan's move from where the arm stands to a pose, rad/s; None if the plan has no such move."""
+        """Return the planned speed of the move from the present pose to another, rad/s; None if the plan has none."""
         at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None
         return self._plan.steps[at if (index - at) % n == 1 else index].speed_rad_s
 
     def _choices(self, back: int | None, fixed: str) -> tuple[str, dict[str, str]]:
-        """Return what is kept, and the answers in a hold with their effects; see `Drive.hold`."""
+        """Return a sentence about the saved poses, and the answers in a hold with their effects; see `Drive.hold`."""
         stop = self._now.todo[0]
-        ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"leave pose {stop} out"}
+        ways = {"resume": f"go on with pose {stop}{fixed}", "skip": f"skip pose {stop}"}
         if back is not None:
             ways["back"] = f"return to pose {back + 1} at {np.degrees(BACK_RAD_S):.0f} °/s"
         ways["quit"] = "stop; continue later with --resume"
         return f"{len(self._book.run.stops())} poses are saved.", ways
 
     def _obey(self, key: Key) -> str:
-        """Turn to another pose for s and r, or return what to say of a key at rest."""
+        """Raise `_Turned` for s and r, or return a note about a key without effect."""
         if (key is Key.SKIP and self._now.under_way is not None) or (key is Key.REDO and self._redoable()):
             raise _Turned(key)
         if key is Key.KEEP:
-            return "every pose is saved without a key; press r to take it again"
+            return "every pose is saved automatically; press r to take the last one again"
         return "no pose in progress: nothing to skip" if key is Key.SKIP else ""
 
 
 def _choose_pace(along: AlongPlan) -> Before:
-    """Choose speeds and sampling; show the accuracy to expect with this sensor's noise, and the duration."""
+    """Choose speeds and sampling; show the expected accuracy and duration."""
     before, todo, cell, task, options = along.before, along.todo, along.cell, along.task, along.options
     sampling, sigma = _chosen_sampling(before, todo)
     force_N, torque_Nm = rms_sigma(sigma)
@@ -286,7 +288,7 @@ def _choose_pace(along: AlongPlan) -> Before:
     slow = options.real and not (options.fast and before.known)
     if options.fast and slow:
         why = "" if along.serial else f": {NO_SERIAL}"
-        cell.note(f"{'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
+        cell.note(f"--fast has no effect: {'every' if why else 'the first'} run of a plan is slow{why}", warning=True)
     speeds = speeds_of(task.cell)
     plan = before.plan.limited(before.certifier, speeds.limited(SLOW) if slow else speeds)
     total_s = moves_s(plan, todo, before.approach) + len(todo) * (sampling.average_s + 0.6)
@@ -299,9 +301,10 @@ def _choose_pace(along: AlongPlan) -> Before:
 
 
 def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
-    """Return the time of all moves at the plan's speeds: the approach to the first of these stops, then to the rest.
+    """Return the duration of the approach and of all moves between these stops at the speeds of the plan, s.
 
-    Stops count from 1. Where some are left out between two, there is an approach too, counted as a straight move.
+    Stops are numbered from 1. Between two stops that do not follow each other, an approach is counted as a straight
+    move.
     """
     total_s = approach.duration_s(APPROACH_RAD_S, SLOW.joint_rad_s2)
     for stop, following in pairwise(todo):
@@ -316,19 +319,24 @@ def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
 
 
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
-    """Return how each pose is averaged, and (6,) one sigma of such an average.
+    """Return the sampling of each pose, and the standard deviation (6,) of its average.
 
-    The duration is configured, or chosen from a record of the sensor's noise. The few poses of a new tool take longer.
+    The duration is configured, or chosen from a record of the sensor's noise. It is longer for a new tool or a hanging
+    load.
     """
     sampling, sigma = _usual_sampling(before, todo)
     load = before.task.load
     if load is not None and not load.gripped:
         longer = load.sampling(sampling)
-        before.cell.note(f"a hanging load: {longer.average_s:g} s at each tilt, repeated while it swings by 5° or more")
+        before.cell.note(
+            f"hanging load: {longer.average_s:g} s at each tilt, repeated while the load swings by 5° or more"
+        )
         return longer, sigma / np.sqrt(longer.average_s / sampling.average_s)
     if before.plan.kind != "tool":
         return sampling, sigma
-    before.cell.note(f"a new tool: {_TOOL_AVERAGES:g} times that average at each of its {len(before.plan.steps)} poses")
+    before.cell.note(
+        f"new tool: {_TOOL_AVERAGES:g} times this averaging time at each of the {len(before.plan.steps)} poses"
+    )
     return replace(sampling, average_s=_TOOL_AVERAGES * sampling.average_s), sigma / np.sqrt(_TOOL_AVERAGES)
 
 

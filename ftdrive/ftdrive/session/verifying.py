@@ -1,4 +1,4 @@
-"""A verification: a session with fresh poses, each compared with the prediction of a calibration."""
+"""A verification: a session with new poses, each of which is compared with the prediction of a calibration."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -32,16 +32,16 @@ Answer = Literal["ask", "no", "yes"]
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
-# A pose nearer to one of the calibration does not count.
+# A pose nearer to an orientation of the calibration is not a new one.
 FRESH_RAD: Final = float(np.radians(10))
+# The contact guard uses the calibration after this number of poses, if all their residuals are within the two limits.
 HOLDS_N, HOLDS_NM = 2.0, 0.2
-# The contact guard uses the calibration from this many poses on, if all of them are this near their prediction.
 HOLDS_POSES: Final = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Verifying:
-    """A verification."""
+    """The task of a verification."""
 
     command: ClassVar[str] = "verify"
     load: ClassVar[None] = None
@@ -50,18 +50,18 @@ class Verifying:
     path: Path
     """The file of the calibration."""
     poses: int
-    """Number of fresh poses."""
+    """Number of new poses to take."""
     runs: Path
-    """Folder of runs: the plan of an earlier verification is driven again if it still fits the cell."""
+    """Folder of runs; the plan of an earlier verification is used again if it still fits the cell."""
 
     @staticmethod
     def chosen(
         options: SessionOptions, path: Path | None, poses: int | None, limits: Limits
     ) -> tuple[Path | None, Limits, SessionOptions]:
-        """Return what is verified and how: as given, or as the run that is resumed was begun. Raises `ConfigError`."""
+        """Return calibration, limits and options: the given ones, or those of the resumed run. Raises `ConfigError`."""
         quick, resume = options.fast, options.resume
         if quick and poses is not None:
-            raise ConfigError("--quick and --poses exclude one another: leave one of them out")
+            raise ConfigError("--quick and --poses exclude each other: leave one of them out")
         if resume is None:
             return path, limits, replace(options, poses=poses or (QUICK_POSES if quick else POSES))
         limited = limits != NO_LIMITS
@@ -77,17 +77,17 @@ class Verifying:
 
     @classmethod
     def of(cls, cell: CellConfig, path: Path, options: SessionOptions) -> Self:
-        """Verify a calibration file, or that of a run folder; quickly if `options` are fast. Raises as it is read."""
+        """Return the task for a calibration file or a run folder. Raises as `read_calibration`."""
         calibration = read_calibration(path)
         path = Run(path).calibration_path if path.is_dir() else path
-        # 12 s of noise would take longer than the poses.
+        # A noise record of 12 s would take longer than the poses.
         if options.fast:
             cell = replace(cell, sampling=replace(cell.sampling, noise_record_s=0.0))
         return cls(cell, calibration, path, options.poses, options.runs)
 
     def take(self, operator: Operator, limits: Limits, options: SessionOptions) -> Verified:
-        """Guide the operator through the poses, and compare them with the calibration. Raises as `take_poses`."""
-        # The run keeps what is verified and how, so that --resume continues alike.
+        """Guide the operator through the poses; return the result of the verification. Raises as `take_poses`."""
+        # The run records calibration and options, so that --resume continues with them.
         kept = {"path": str(self.path.absolute()), "poses": options.poses, "quick": options.fast}
         about = {**kept, "limits": dict(zip(("force_N", "torque_Nm"), limits, strict=True)), "id": self.calibration.id}
         run = take_poses(self, operator, replace(options, description={"verification": about, **options.description}))
@@ -97,25 +97,25 @@ class Verifying:
 
     @property
     def goal(self) -> str:
-        """When the poses suffice that the operator moves the arm to."""
+        """As `Task.goal`."""
         return f"{self.poses} poses differ by {np.degrees(FRESH_RAD):.0f}° or more from those of the calibration"
 
     @cached_property
     def R_fitted(self) -> Array:
-        """(k, 3, 3) orientations R_base_flange of the calibration; (0, 3, 3) if they are unknown."""
+        """Orientations R_base_flange (k, 3, 3) of the calibration; (0, 3, 3) if they are unknown."""
         dataset = fitted_dataset(self.calibration, self.path)
         return np.zeros((0, 3, 3)) if dataset is None else dataset.R_base_flange
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Whether the poses may be those of the calibration."""
+        """Warning if the poses of the calibration are unknown."""
         if len(self.R_fitted):
             return ()
-        lost = f"the poses of the calibration are unknown, because its dataset.json is not beside {self.path}"
-        return (f"{lost}: the poses of the verification may be the same",)
+        lost = f"the poses of the calibration are unknown, because its dataset.json is not next to {self.path}"
+        return (f"{lost}; the verification may repeat them",)
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
-        """Return the plan of the newest verification with as many poses, or a new one from joint angles (6,)."""
+        """Return the plan of the newest suitable verification, or a new plan from joint angles (6,)."""
         q_rad = from_usual_wrist(certifier, q_rad)
         earlier = self._earlier(certifier, q_rad, poses)
         if earlier is not None:
@@ -125,21 +125,23 @@ class Verifying:
         return plan.marked(measured=self.cell.workcell.measured, emulated=self.cell.is_emulated)
 
     def judge(self, *, by_hand: bool) -> Judge:
-        """Return who compares each pose with the calibration."""
+        """Return the comparison of each pose with the calibration."""
         return RunningComparison(self.calibration, self.R_fitted if by_hand else np.zeros((0, 3, 3)), self.poses)
 
     def forecast(self, _plan: Plan, _certifier: Certifier, _sigma: Array, /) -> str:
-        """Describe how far poses of an unchanged cell may be from the prediction."""
+        """Describe the error to expect in an unchanged cell."""
         error_N, error_Nm = self.calibration.likely_error()
         return f"error of the calibration: {error_N:.2g} N, {to_place_of(error_Nm, error_Nm)} N·m"
 
     def _earlier(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan | None:
-        """Find a plan that was driven before: it may have been completed, so that it may run fast."""
+        """Return a plan that was driven before and may therefore run fast; None if no plan fits."""
         for path in sorted(self.runs.glob("*/plan.json"), reverse=True):
             with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
                 plan = Plan.load(path)
                 turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
-                near = turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD  # else the cable winds up
+                near = (
+                    turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD
+                )  # otherwise the cable would wind up
                 if plan.kind == "verification" and len(plan.steps) == poses and near and self._is_mine(path.parent):
                     plan.require(certifier)
                     return plan
@@ -153,11 +155,11 @@ class Verifying:
 class RunningComparison:
     """Compares each pose with the prediction of a calibration.
 
-    Of the poses far from `R_fitted` (k, 3, 3), the orientations of the calibration, as many are needed as `wanted`.
+    The poses suffice when `wanted` of them are far from `R_fitted` (k, 3, 3), the orientations of the calibration.
     """
 
     weighed_kg: float | None = None
-    """Never: the payload was compared when the cell was calibrated."""
+    """Always None, because the payload was compared when the cell was calibrated."""
 
     def __init__(self, calibration: CalibrationResult, R_fitted: Array, wanted: int) -> None:
         self._calibration, self._R_fitted, self._wanted = calibration, R_fitted, wanted
@@ -165,13 +167,17 @@ class RunningComparison:
         self._fresh: set[int] = set()
 
     def add(self, record: PoseRecord) -> Compared:
-        """Add a pose, in place of one with the same `stop`."""
+        """Add a pose, which replaces one with the same `stop`; return its comparison."""
         self.remove(record.stop)
         R_base_flange = record.before.R_base_flange
         if angle_between(self._R_fitted, R_base_flange).min(initial=np.inf) >= FRESH_RAD:
             self._fresh.add(record.stop)
         enough = len(self._fresh) >= self._wanted
-        hint = "" if record.stop in self._fresh else "this pose is one of the calibration: turn the tool further"
+        hint = (
+            ""
+            if record.stop in self._fresh
+            else "this pose is too near to one of the calibration: turn the tool further"
+        )
         compared = Compared(
             stop=record.stop,
             number=record.pose.number,
@@ -185,14 +191,14 @@ class RunningComparison:
         return compared
 
     def remove(self, stop: int) -> None:
-        """Remove a pose, so that it can be taken again."""
+        """Remove the pose of a stop before it is taken again."""
         self._compared.pop(stop, None)
         self._fresh.discard(stop)
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Wrench (6,) of a free tool at this orientation; None until poses have shown that the calibration holds.
+        """Return the wrench (6,) of a free tool at this orientation (3, 3); None until poses confirm the calibration.
 
-        Any thread may call it.
+        Any thread may call this method.
         """
         seen = [compared.residual for compared in list(self._compared.values())]
         norms = ((np.linalg.norm(one[:3]), np.linalg.norm(one[3:])) for one in seen)
@@ -202,7 +208,7 @@ class RunningComparison:
 
 
 def save_wanted_update(verified: Verified, update: Answer, ask: Callable[[Question], str]) -> Path | None:
-    """Save the update as a new calibration if there is one and it is wanted; None if not, or no operator answers."""
+    """Save an available update as a new calibration if the operator wants it; return its path, else None."""
     if verified.passed or verified.update is None or update == "no":
         return None
     question = Question(f"An update of {verified.updated} is sufficient. Save it as a new calibration?")

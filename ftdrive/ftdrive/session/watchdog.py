@@ -1,6 +1,6 @@
-"""The thread of the guards: 100 looks a second on the cell's clock. It stops the arm, then reports the trip.
+"""The thread that runs the guards, 100 times per second on the clock of the cell; after a trip it stops the arm.
 
-A stop that the controller does not answer takes 1 to 2 s: the trip is reported before that ends.
+A stop that the controller does not answer takes 1 to 2 s; the trip is then reported before the stop has ended.
 """
 
 import logging
@@ -23,26 +23,26 @@ log = logging.getLogger(__name__)
 
 
 class Watcher:
-    """Runs the guards while a `watching` block is open, from `begin` on; it looks for row 11 all the time.
+    """Runs the guards during each `watching` block; at other times it looks for stops of the safety system (row 11).
 
-    `on_trip` is called from the thread once the arm has stopped, or is slow to stop.
+    `on_trip` is called from the thread when the arm has stopped, or after 0.2 s if the stop takes longer.
     """
 
     def __init__(self, cell: OpenCell, guards: Sequence[Guard], on_trip: Callable[[Tripped], None]) -> None:
         self.clock, self._limits = cell.clock, cell.limits
         self._arm, self._sensor, self._guards, self._on_trip = cell.arm, cell.sensor, tuple(guards), on_trip
         self._motion: ExpectedMotion | None = None
-        self._seen: ExpectedMotion | None = None  # the motion that all guards have looked at
+        self._seen: ExpectedMotion | None = None  # the last motion that all guards have judged
         self._wake = threading.Event()
         self._end = threading.Event()
         self._reported = threading.Event()
         self._tripped: Tripped | None = None
         self.report_error: Exception | None = None
-        """Why the last trip could not be reported; the hold shows both."""
+        """Error of reporting the last trip; the hold shows it with the trip."""
         self.safety_stop: Tripped | None = None
-        """The last emergency or safeguard stop, also one while the arm stood; kept until the session ends."""
+        """The last emergency or safeguard stop, moving or not; it is kept until the session ends."""
         self.unseen = False
-        """Whether the arm reported nothing for so long that a stop may have come and gone; the reader resets it."""
+        """Whether the status was missing so long that a stop may have gone unnoticed; the reader resets this flag."""
         self._blind_since_s: float | None = None
         self._stopped_by_safety = False
         self._judging = threading.RLock()
@@ -61,7 +61,7 @@ class Watcher:
         self._thread.join(timeout=5.0)
 
     def begin(self) -> None:
-        """Forget a trip, and take the next look as normal."""
+        """Forget the last trip, and let the guards take the next look as their reference."""
         self._tripped = self.report_error = None
         self._reported.clear()
         self._begun = False
@@ -70,9 +70,10 @@ class Watcher:
     def watching(
         self, start_rad: Array, goal_rad: Array, *, moving: bool, curve_rad: Array | None = None
     ) -> Iterator[None]:
-        """Watch while the block runs, after a first look. A trip is raised before it, after it, and by `check`.
+        """Run the guards during the block, which begins after their first look.
 
-        With `curve_rad` (n, 6) the arm moves along this curve, else straight.
+        A trip is raised before the block, after it, and by `check`. The arm moves straight in joint space, or along
+        `curve_rad` (n, 6).
         """
         self.check()
         self._last = None
@@ -90,14 +91,14 @@ class Watcher:
         self.check()
 
     def look_aside(self) -> None:
-        """Row 11 while the arm stands: the stop may be released again before the operator answers.
+        """Look for row 11 while no motion is watched, because a stop may be released before the operator answers.
 
-        Nothing is shown from here: a question may stand on the screen.
+        Shows nothing, because the screen may show a question.
         """
         with self._judging:
             try:
                 status = self._arm.status()
-            # Another package's arm may raise anything; reopening it reports the cause.
+            # An arm of another package may raise any error; reopening the arm reports the cause.
             except Exception as error:
                 log.debug("the arm reports no status: %r", error)
                 now_s = self.clock.now_s()
@@ -112,17 +113,19 @@ class Watcher:
                 self.keep(trip)
 
     def keep(self, trip: Tripped) -> None:
-        """Remember the trip as `safety_stop` if it is one."""
+        """Store the trip as `safety_stop` if its hazard is an emergency or safeguard stop."""
         if trip.hazard == Hazard.EMERGENCY_STOP:
             with self._judging:
                 self.safety_stop, self._stopped_by_safety = trip, True
 
     def check(self) -> None:
-        """Raise a trip, or that the guards have ended or hung. Called in the loops that wait for the arm."""
+        """Raise the trip, or raise one if the guards have ended or hang. Every loop that waits for the arm calls it."""
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
-            raise fault(Hazard.UNGUARDED, "the guards' thread has ended, nothing is watched", "quit this session")
+            raise fault(
+                Hazard.UNGUARDED, "the thread of the guards has ended, the arm is not watched", "quit this session"
+            )
         if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
             raise fault(
                 Hazard.UNGUARDED,
@@ -130,7 +133,7 @@ class Watcher:
             )
 
     def tripped(self, *, wait_s: float) -> Tripped | None:
-        """Return the trip once the arm has stopped and the trip was reported; None if none occurs within `wait_s`."""
+        """Return the trip after the arm has stopped and the trip is reported; None if none occurs within `wait_s`."""
         deadline_s = self.clock.now_s() + wait_s
         while self._tripped is None and self.clock.now_s() < deadline_s:
             self.clock.sleep(0.005)
@@ -139,7 +142,7 @@ class Watcher:
         return self._tripped
 
     def turn(self) -> float:
-        """Look once; return the seconds until the next look."""
+        """Run the guards once; return the time until the next look, s."""
         motion = self._motion
         if motion is None or self._tripped is not None:
             self.look_aside()
@@ -170,7 +173,7 @@ class Watcher:
         try:
             state = self._arm.state()
         except DeviceFault as error:
-            # The stop may have come between the two readings.
+            # The safety system may have stopped the arm between the two readings.
             status = self._arm.status()
             if status.fault is not None:
                 raise by_safety(status, str(error)) from error
@@ -180,7 +183,7 @@ class Watcher:
             sample = self._sensor.latest(timeout_s=0.0)
         except DeviceError as error:
             raise Tripped(Hazard.SENSOR_LOST, error) from error
-        # The block has ended meanwhile: the readings may belong to the next one.
+        # The `watching` block has ended meanwhile: the readings may belong to the next block.
         if motion is not self._motion:
             return
         now_s = self.clock.now_s()
@@ -206,7 +209,7 @@ class Watcher:
         self.clock.wait(stopped, self._limits.slow_stop_s)
         try:
             self._on_trip(trip)
-        # A screen or a disk failed: the arm is watched all the same.
+        # The screen or the disk failed; the guards must go on.
         except Exception as error:
             log.exception("a stop could not be reported")
             self.report_error = error
@@ -215,14 +218,14 @@ class Watcher:
         self._reported.set()
 
     def _begin_to_stop(self) -> threading.Event:
-        """Stop the arm in a separate thread; the event is set when the stop has ended."""
+        """Stop the arm in a separate thread; return an event that is set when the stop has ended."""
         stopped = threading.Event()
 
         def stop() -> None:
             try:
                 self._arm.stop()
             except Exception:
-                log.exception("no stop could be sent to the arm: press the emergency stop")
+                log.exception("the stop could not be sent to the arm: press the emergency stop")
             finally:
                 stopped.set()
 

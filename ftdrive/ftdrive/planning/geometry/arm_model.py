@@ -1,13 +1,13 @@
-"""The shapes of arm and tool, where they are at given joint angles, and their distances.
+"""Shapes of arm and tool, their positions at given joint angles, and distances between them.
 
-A body is a cylinder with flat ends, grown by a rounding radius: radius 0 with a rounding is a capsule. A direction u
-from body A to body B separates them by at least `min_B(u·x) - max_A(u·x)`. The best direction is found by projecting
-back and forth between the bodies; any other one only makes the answer smaller, so the search need not be perfect.
+A body is a cylinder with flat ends, enlarged by a rounding radius; a cylinder of radius 0 then becomes a capsule. Along
+a direction u, the distance between bodies A and B is at least `min_B(u·x) - max_A(u·x)`. Alternating projections
+between the bodies find the best direction. Any other direction gives a smaller bound, so the search need not be exact.
 
 Radii and hub widths were measured from the convex hulls of the collision meshes in the ROS 2 description of the arms,
-version 2.4.5. Those of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges: none stands out
-by more than 1 mm. Those of UR20 and UR30 were widened alike, their lids scaled from the UR5e by the length of wrist 2.
-Models without measured shapes are refused.
+version 2.4.5. The shapes of UR3e, UR5e, UR10e and UR16e were then fitted to meshes with all lids and edges, which
+exceed them by at most 1 mm. Those of UR20 and UR30 were widened in the same way, with lids scaled from the UR5e by the
+length of wrist 2. Models without measured shapes are refused.
 """
 
 from collections.abc import Sequence
@@ -25,36 +25,36 @@ from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
 PROJECTIONS = 24
 TINY_M = 1e-12
-# A lower bound that is as close to the true distance is good enough.
+# Tolerance of a lower bound relative to the true distance.
 CLOSE_M = 1e-5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bodies:
-    """Any number of bodies at once; metres, base axes."""
+    """Arrays of bodies; metres, base axes."""
 
     centre_m: Array
-    """(..., 3)"""
+    """(..., 3) centre of each cylinder."""
     axis: Array
     """(..., 3) unit vector along each cylinder."""
     half_length_m: Array
-    """(...) of the cylinder, without the rounding."""
+    """(...) half the length of the cylinder, without the rounding."""
     radius_m: Array
-    """(...) of the cylinder, without the rounding."""
+    """(...) radius of the cylinder, without the rounding."""
     rounding_m: Array
-    """(...)"""
+    """(...) rounding radius."""
 
     @property
     def reach_m(self) -> Array:
-        """(...) Radius of a ball about the centre that holds the body."""
+        """(...) radius of a ball about the centre that contains the body."""
         return np.asarray(np.hypot(self.half_length_m, self.radius_m) + self.rounding_m)
 
     def centre_at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> Array:
-        """Centres (m, 3) of some of the bodies of (n, k), one a pair of indices."""
+        """Return the centres (m, 3) of some of the bodies (n, k), one per pair of indices."""
         return self.centre_m.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0)
 
     def at(self, row: NDArray[np.intp], column: NDArray[np.intp]) -> "Bodies":
-        """Take some of the bodies of (n, k), one a pair of indices."""
+        """Return some of the bodies (n, k) as a list (m,), one per pair of indices."""
         return Bodies(
             self.centre_at(row, column),
             self.axis.reshape(-1, 3).take(row * len(self.half_length_m) + column, axis=0),
@@ -64,7 +64,7 @@ class Bodies:
         )
 
     def some(self, index: NDArray[np.intp]) -> "Bodies":
-        """Take some of a flat list of bodies."""
+        """Return some of a list (n,) of bodies."""
         return Bodies(
             self.centre_m.take(index, axis=0),
             self.axis.take(index, axis=0),
@@ -74,35 +74,35 @@ class Bodies:
         )
 
     def height_above(self, normal: Array, offset_m: float) -> Array:
-        """Exact distance (...) to the half-space `normal · x < offset_m`; negative inside."""
+        """Return the exact distance (...) to the half-space `normal · x < offset_m`, m; negative inside."""
         return np.asarray(self.centre_m @ normal - offset_m - _extent(self, -normal))
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Scalar products (...) of vectors (..., 3)."""
+    """Return the scalar products (...) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
 def _extent(bodies: Bodies, direction: Array) -> Array:
-    """How far each body reaches along a unit direction, from its centre."""
+    """Return the extent (...) of each body along a unit direction, from its centre, m."""
     along = dot(bodies.axis, direction)
     across = np.sqrt(np.maximum(1 - along**2, 0.0))
     return bodies.half_length_m * np.abs(along) + bodies.radius_m * across + bodies.rounding_m
 
 
 def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
-    """Lower bound (k,) of the distance between bodies, pair by pair; negative or zero where none can be shown.
+    """Return a lower bound (k,) of the distance of each pair of bodies, m; at most zero if the pair may touch.
 
     Parameters
     ----------
     a, b : Bodies
-        k of each.
+        Bodies (k,) each.
     enough_m : array, shape (k,)
-        A pair that is shown to be this far apart is not looked at any more.
+        A pair with a bound of at least this distance is not refined further.
     """
     between, capsule_distance = _between_axes(a, b)
     bound = capsule_distance - (a.radius_m + a.rounding_m + b.radius_m + b.rounding_m)
-    # Capsules are judged exactly by their axes; flat ends are not.
+    # The distance of the axes is exact for capsules, but not for flat ends.
     open_ = np.flatnonzero((bound < enough_m) & (a.radius_m + b.radius_m > 0))
     if len(open_):
         inner_a, inner_b = (replace(body.some(open_), rounding_m=np.zeros(len(open_))) for body in (a, b))
@@ -112,13 +112,13 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
 
 
 def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
-    """Lower bound (k,) of the distance between each body and a box parallel to the base axes.
+    """Return a lower bound (k,) of the distance between each body and a box along the base axes, m.
 
-    A body that is shown to be `enough_m` (k,) away is not looked at any more.
+    A body with a bound of at least `enough_m` (k,) is not refined further.
     """
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
-    # If a body intersects the box, the depth is not computed.
+    # For a body that intersects the box the bound is -1 m, because the depth is not computed.
     best = np.full(len(point), -1.0)
     open_ = np.arange(len(point))
     for _ in range(PROJECTIONS):
@@ -155,7 +155,7 @@ def _by_projections(a: Bodies, b: Bodies, on_b: Array) -> Array:
 
 
 def _nearest(bodies: Bodies, point: Array) -> Array:
-    """Point (k, 3) of each cylinder, without rounding, that is nearest to a given one."""
+    """Return the point (k, 3) of each cylinder, without rounding, that is nearest to a given point."""
     from_centre = point - bodies.centre_m
     along = dot(from_centre, bodies.axis)
     across = from_centre - along[:, None] * bodies.axis
@@ -166,10 +166,10 @@ def _nearest(bodies: Bodies, point: Array) -> Array:
 
 
 def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
-    """Point (k, 3) of each segment b nearest to the segment a, and the distance (k,) of the two.
+    """Return the point (k, 3) of each axis segment b nearest to segment a, and the distance (k,) of the segments, m.
 
-    The distance is convex in the two positions: the unconstrained answer, clipped on one and then on the other segment,
-    is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
+    The distance is convex in the two positions, so that the unconstrained solution, clipped to one segment and then to
+    the other, is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
     """
     gap = a.centre_m - b.centre_m
     cosine, on_a, on_b = dot(a.axis, b.axis), dot(a.axis, gap), dot(b.axis, gap)
@@ -183,17 +183,17 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     return point, np.sqrt(dot(difference, difference))
 
 
-# Rounding of the edges of the housings at the joints. On the constant tour a UR3e then comes within 22 mm of itself;
-# the convex hulls of its meshes stay 27 mm apart.
+# Rounding of the edges of the housings at the joints. With it, the clearance of a UR3e to itself on the constant tour
+# is 22 mm; that of the convex hulls of its meshes is 27 mm.
 HUB_ROUNDING_M = 0.020
 
-# The same where the forearm carries the wrist.
+# Rounding of the edges of the housing at the end of the forearm.
 FOREARM_END_ROUNDING_M = 0.010
 
 
 @dataclass(frozen=True, slots=True)
 class _Shape:
-    """Sizes of one arm, metres. Ranges are along the lift axis, from the shoulder's centre."""
+    """Dimensions of one arm, metres. Ranges are along the lift axis, from the centre of the shoulder."""
 
     upper_arm_offset_m: float
     forearm_offset_m: float
@@ -208,7 +208,7 @@ class _Shape:
     elbow_hub_m: tuple[float, float]
     forearm_hub_m: tuple[float, float]
     forearm_end_hub_m: tuple[float, float]
-    # From the centres of joints 5 and 6 back to the lids of wrists 1 and 2.
+    # Distance from the centres of joints 5 and 6 back to the lids of wrists 1 and 2.
     wrist_lid_m: float
 
 
@@ -244,75 +244,79 @@ SHAPES = {
 
 @dataclass(frozen=True, slots=True)
 class Cylinder:
-    """A part of what is mounted on the flange: sensor, adapter, gripper, or a lump at its side. Metres, flange axes."""
+    """A cylinder of the equipment on the flange: sensor, adapter, gripper or a part of it. Metres, flange axes."""
 
     from_m: float
-    """Along the flange z axis, 0 at the flange face."""
+    """Start of the cylinder along the flange z axis; 0 is the flange face."""
     to_m: float
     diameter_m: float
     x_m: float = 0.0
-    """Place of its axis, which is parallel to the flange z axis."""
+    """Position x, y of the axis of the cylinder, which is parallel to the flange z axis."""
     y_m: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.from_m < self.to_m <= 2:
             raise ConfigError(
-                f"a cylinder of the tool goes from {self.from_m * 1e3:g} to {self.to_m * 1e3:g} mm from the flange: "
-                "give 0 or more first, then something larger, at most 2000"
+                f"a cylinder of the tool reaches from {self.from_m * 1e3:g} to {self.to_m * 1e3:g} mm from the "
+                "flange: give a start of 0 mm or more, and a larger end of at most 2000 mm"
             )
         if not 0 < self.diameter_m <= 1:
-            raise ConfigError(f"a cylinder of the tool is {self.diameter_m * 1e3:g} mm thick: give 1 to 1000")
+            raise ConfigError(
+                f"a cylinder of the tool has a diameter of {self.diameter_m * 1e3:g} mm: give 1 to 1000 mm"
+            )
         if not self.offset_m <= 1:
-            raise ConfigError(f"a cylinder of the tool is {self.offset_m * 1e3:g} mm off its axis: give at most 1000")
+            raise ConfigError(
+                f"a cylinder of the tool is {self.offset_m * 1e3:g} mm off the flange axis: give at most 1000 mm"
+            )
 
     @property
     def offset_m(self) -> float:
-        """Distance of its axis from that of joint 6."""
+        """Distance of the axis of the cylinder from the axis of joint 6."""
         return float(np.hypot(self.x_m, self.y_m))
 
     @property
     def reach_m(self) -> float:
-        """Largest distance of a point of it from the axis of joint 6."""
+        """Largest distance of a point of the cylinder from the axis of joint 6."""
         return self.offset_m + self.diameter_m / 2
 
 
-# The largest weight on the longest string that a plan keeps clear.
+# Length of the longest string, and height and radius of the largest weight, for which a plan is proven clear.
 STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M = 0.25, 0.1, 0.06
 
 
 @dataclass(frozen=True, slots=True)
 class HungLoad:
-    """A weight that hangs on a string from a point of the tool, straight down in base axes in every posture."""
+    """A weight that hangs straight down on a string from a point of the tool."""
 
     p_flange_m: tuple[float, float, float]
-    """The hook, in flange axes from the centre of the flange face."""
+    """Position of the hook from the centre of the flange face, flange axes."""
     down_base: tuple[float, float, float]
-    """Unit vector along gravity."""
+    """Unit vector along gravity, base axes."""
     string_m: float = STRING_M
     height_m: float = WEIGHT_HEIGHT_M
-    """Of the weight below the string."""
+    """Height of the weight below the string."""
     radius_m: float = WEIGHT_RADIUS_M
-    """Of the weight."""
+    """Radius of the weight."""
     swing_rad: float = float(np.radians(10))
-    """It may swing so far: the body of the weight is wider by as much."""
+    """Largest swing angle; the modelled body of the weight is widened accordingly."""
     free_m: float = 0.05
-    """Length of the string below the hook that may be close to the tool."""
+    """Length of the upper part of the string, which may be close to the tool."""
 
     @property
     def swing_m(self) -> float:
-        """How far the end of the string swings aside."""
+        """Largest horizontal displacement of the end of the string."""
         return float(self.string_m * np.sin(self.swing_rad))
 
     @property
     def reach_m(self) -> float:
-        """Largest distance of a point of it from the hook."""
+        """Largest distance of a point of the weight from the hook."""
         return float(np.hypot(self.string_m + self.height_m, self.radius_m + self.swing_m))
 
 
-# Bodies of a hung load, after those of the tool: ends below the hook and radius.
+# Names of the bodies of a hanging load, after those of the tool.
 _HUNG: Final = ("string", "load")
 
-# Name of each body of the arm, and how many joints move it.
+# Name of each body of the arm, and number of joints that move it.
 _ARM = (
     ("base", 0),
     ("shoulder", 1),
@@ -333,23 +337,23 @@ _ARM = (
 _UPPER_ARM, _ELBOW_SIDE, _FOREARM = [*range(2, 9)], 9, [*range(10, 14)]
 _WRIST_1, _WRIST_2_ALONG_6, _WRIST_3, _TOOL = (14, 15), 17, 18, 19
 
-# Ends (n, 3) of the axis of a body, its radius and its rounding.
+# A body: ends (n, 3) of its axis, radius and rounding.
 _Part = tuple[Array, Array, float, float]
-# The housing of a joint: its centre (n, 3), from where to where along the lift axis, its radius and its rounding.
+# The housing of a joint: centre (n, 3), range along the lift axis, radius and rounding.
 _Housing = tuple[Array, tuple[float, float], float, float]
 
 
 class ArmModel:
-    """One arm with its tool.
+    """Model of one arm with its tool.
 
     Parameters
     ----------
     model : str
     tool : sequence of Cylinder
     kinematics : Kinematics, optional
-        The arm's own; without them nominal ones, from which a real arm differs: `Certifier` then keeps more distance.
+        Kinematics of this arm. Without them nominal ones are used, and `Certifier` keeps more distance.
     hung : HungLoad, optional
-        A weight on a string.
+        A load on a string.
     """
 
     def __init__(
@@ -361,12 +365,10 @@ class ArmModel:
     ) -> None:
         name = model_named(model, controller_major=0)
         if name is None:
-            raise ConfigError(
-                f"'{model}' is not a model of Universal Robots known here: use one of {', '.join(MODELS)}"
-            )
+            raise ConfigError(f"'{model}' is not a known model of Universal Robots: use one of {', '.join(MODELS)}")
         if name not in SHAPES:
             raise ConfigError(
-                f"the shape of the {name} has not been measured, so no collision can be excluded: plans exist for "
+                f"the shape of the {name} has not been measured, so that collisions cannot be excluded: use one of "
                 f"{', '.join(SHAPES)}"
             )
         if not tool:
@@ -384,11 +386,11 @@ class ArmModel:
         self.travel_m = self._travel()
 
     def frames(self, q_rad: ArrayLike) -> Frames:
-        """Where the joints are, for joint vectors (n, 6)."""
+        """Return the positions and axes of the joints at joint vectors (n, 6)."""
         return frames(self.kinematics, q_rad)
 
     def bodies(self, q_rad: ArrayLike) -> Bodies:
-        """Bodies (n, k) at joint vectors (n, 6), in the order of `names`."""
+        """Return the bodies (n, k) at joint vectors (n, 6), in the order of `names`."""
         at, s = self.frames(q_rad), self.shape
         *_, d1_m, d5_m, d6_m = self._lengths_m
         axis_6 = at.R_base_flange[:, :, 2]
@@ -439,12 +441,12 @@ class ArmModel:
         return Bodies((start + end) / 2, axis, half_length, np.array(radius), np.array(rounding))
 
     def hook_m(self, at: Frames) -> Array:
-        """Points (n, 3) in base from which the load hangs; the centres of the flange faces without one."""
+        """Return the hook (n, 3) of the load in base, m; without a load the centre of the flange face."""
         return at.flange_m if self.hung is None else at.flange_m + at.R_base_flange @ np.array(self.hung.p_flange_m)
 
     @property
     def ball_m(self) -> float:
-        """Radius about the wrist centre of a ball that holds all that the last three joints move, and 15 mm more."""
+        """Radius of a ball about the wrist centre that contains all parts moved by the wrist joints, plus 15 mm."""
         (*_, d5_m, d6_m), r = self._lengths_m, self.shape.wrist_radius_m
         parts = [(r, d6_m), *((part.reach_m, d6_m + part.to_m) for part in self.tool)]
         ball_m = max(float(np.hypot(d5_m + reach, height)) for reach, height in parts)
@@ -454,7 +456,7 @@ class ArmModel:
         return ball_m + float(self._off_m[3:].sum()) + 0.015
 
     def describe(self) -> dict[str, Any]:
-        """Everything a plan relies on, for its hash; kinematics apart."""
+        """Return model, nominal geometry and shape, on which a plan depends, for its hash."""
         nominal = MODELS[self.name]
         lengths = nominal.d_m[0], *nominal.a_m[1:3], *nominal.d_m[3:]
         names = ("d1_m", "a2_m", "a3_m", "d4_m", "d5_m", "d6_m")
@@ -462,7 +464,7 @@ class ArmModel:
 
     @cached_property
     def _lengths_m(self) -> tuple[float, ...]:
-        """Upper arm, forearm, d4, d1, d5 and d6."""
+        """Lengths of upper arm and forearm, then d4, d1, d5 and d6."""
         links = self.kinematics.links_m
         upper, fore = np.hypot(links[1:3, 0], links[1:3, 1]).tolist()
         d1_m, _, _, d4_m, d5_m, d6_m = links[:, 2].tolist()
@@ -470,7 +472,7 @@ class ArmModel:
 
     @cached_property
     def _off_m(self) -> Array:
-        """Bound (6,): how far what follows each link is from where an arm with the same lengths, exact axes has it."""
+        """Bound (6,) of the displacement beyond each link relative to an arm with the same lengths and exact axes."""
         shift_m, tilt_rad = deviation(self.kinematics)
         length_m = np.linalg.norm(self.kinematics.links_m, axis=1)
         after_m = length_m[::-1].cumsum()[::-1] - length_m
@@ -481,15 +483,15 @@ class ArmModel:
         return np.asarray(shift_m + tilt_rad * (after_m + beyond_m + thick_m))
 
     def _travel(self) -> Array:
-        """Bound (k, 6): how far a turn of joint j by one radian can move a point of body i, metres.
+        """Return a bound (k, 6) of the displacement of a point of body i per radian of joint j, m.
 
-        Largest distance of a point of the body from the joint's axis, over all postures, as of an arm with exact axes,
-        and how far the links between can be from it. Of a body that is round about the axis of joint 6, that joint
-        moves nothing.
+        It is the largest distance of a point of the body from the axis of the joint over all postures, for an arm with
+        exact axes, plus the deviation of the links in between. Joint 6 does not move a body that is round about its
+        axis.
         """
         (upper, fore, d4_m, _, d5_m, d6_m), s = self._lengths_m, self.shape
         # Reach of each body beyond the wrist centre: from axis 4, from axis 5, from axis 6, and along the lift axis.
-        # Rounding is left out: where a body's core stays, so does all of it.
+        # Rounding is left out: if the core of a body does not move, neither does its rounding.
         r, lid = s.wrist_radius_m, s.wrist_lid_m - HUB_ROUNDING_M
         hub, back_4, back_5 = r - HUB_ROUNDING_M, max(lid, d5_m / 2), max(lid, d6_m / 2)
         wrist: list[tuple[float, float, float]] = [
@@ -504,7 +506,7 @@ class ArmModel:
             turned = reach if part.offset_m > 0 else 0.0
             wrist.append((float(np.hypot(d5_m + reach, height)), float(np.hypot(height, reach)), turned))
         if self.hung is not None:
-            # It does not turn with the flange, so every point of it moves as its hook does.
+            # The load does not turn with the flange, so every point of it moves as the hook does.
             x_m, y_m, z_m = self.hung.p_flange_m
             aside, height = float(np.hypot(x_m, y_m)), d6_m + abs(z_m)
             hook = float(np.hypot(d5_m + aside, height)), float(np.hypot(height, aside)), aside
@@ -522,7 +524,7 @@ class ArmModel:
             from_2 = upper + fore + from_4
             row[:] = np.hypot(from_2, d4_m + from_5 + radius), from_2, fore + from_4, from_4, from_5, from_6
         between = np.arange(6) < self.moved_by[:, None]
-        # What moves with a joint begins at its own link: the links from the joint to the body's, that one included.
+        # Sum over the links from the joint to the body, including the link of the body.
         off_m = np.where(between, self._off_m, 0.0)
         return np.asarray(rows + np.where(between, off_m[:, ::-1].cumsum(axis=1)[:, ::-1], 0.0))
 
@@ -533,9 +535,9 @@ def _hub(lift: Array, housing: _Housing) -> _Part:
 
 
 def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
-    """Two bars from housing to housing, along the edges of their hull at its low (0) or high (1) end of the lift axis.
+    """Return two bars along the edges of the hull of two housings, at its low (0) or high (1) end of the lift axis.
 
-    The arm is hollow there, between its tube and the housings; nothing should be planned to go in.
+    They close the gap between the tube of the arm and its housings, which nothing should enter.
     """
     (first, *_), (second, *_) = housings
     side = cross(lift, second - first)
@@ -552,10 +554,10 @@ def _edges(lift: Array, end: int, *housings: _Housing) -> list[_Part]:
 
 
 def _pairs(n_tool: int, n_hung: int = 0) -> NDArray[np.intp]:
-    """Pairs (p, 2) of bodies that can touch. Neighbours on a joint, and what the arm's build keeps apart, are left out.
+    """Return the pairs (p, 2) of bodies that can touch, without neighbours at a joint and pairs kept apart by design.
 
-    Upper arm and forearm turn past each other in parallel planes, and so do forearm and the part of wrist 2 along axis
-    5. Wrists 1 and 3 are held apart by wrist 2.
+    Upper arm and forearm move past each other in parallel planes, as do the forearm and the part of wrist 2 along
+    axis 5. Wrist 2 keeps wrists 1 and 3 apart.
     """
     tool = range(_TOOL, _TOOL + n_tool)
     hung = range(_TOOL + n_tool, _TOOL + n_tool + n_hung)

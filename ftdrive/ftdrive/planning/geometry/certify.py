@@ -1,8 +1,8 @@
 """Proof that straight joint moves are clear along their whole length, not only at samples.
 
 In a straight joint move, the distance of two bodies changes by at most the sum of |turn| times the longest lever over
-the joints between them. An interval is clear if its midpoint is farther from contact than half of that change. Other
-intervals are halved. Only pairs that are still undecided are examined again.
+the joints between the bodies. An interval is clear if the distance at its midpoint exceeds half of this change. Other
+intervals are halved. Only undecided pairs are examined again.
 """
 
 from dataclasses import dataclass
@@ -16,23 +16,24 @@ from ftdrivers.ur.kinematics import Array
 
 FIRST_STEP_RAD = np.radians(15)
 LAST_STEP_RAD = np.radians(0.4)
-# The reported clearance is at most this fraction, or 2 mm, below the true minimum of the move.
+# The reported clearance is below the true minimum of the move by at most this fraction or 2 mm.
 TIGHTNESS = 0.1
 
 
-# Times the levers of the joints between two bodies: how much more distance is kept if the arm's own kinematics are not
-# known. Of 15 real arms, none is nearer to a plane than its nominal model by more (at most 8.3 mm). Neighbours of the
-# wrist are nearer by up to 6.5 mm, which is part of the margin between parts of the arm.
+# Additional distance if the kinematics of the arm are not known: these angles times the levers of the joints between
+# two bodies. It covers the deviations of 15 real arms from their nominal models towards a plane (at most 8.3 mm).
+# Bodies of the wrist approach each other by up to 6.5 mm, which the margin between parts of the arm covers.
 NOMINAL_RAD = np.array([0.0025, 0.0025, 0.0025, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """Distances to keep, metres."""
+    """Smallest allowed distances, m."""
 
     self_m: float = 0.020
-    """Between parts of arm and tool: more than the errors of their shapes and of nominal kinematics."""
+    """Between parts of arm and tool; larger than the errors of their shapes and of nominal kinematics."""
     scene_m: float = 0.030
+    """Between the arm or its tool and the surroundings."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,22 +41,22 @@ class Certificate:
     """The result of the proof for m moves."""
 
     clear: NDArray[np.bool_]
-    """(m,) The whole move keeps the margins."""
+    """(m,) whether the whole move keeps the margins."""
     self_clearance_m: Array
-    """(m,) Lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
+    """(m,) lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
     scene_clearance_m: Array
-    """(m,) The same to planes and boxes; infinite if there are none."""
+    """(m,) such a bound of the distance to planes and boxes; infinite if there are none."""
     limited_by: tuple[str, ...]
-    """(m,) The pair that comes closest to its margin."""
+    """(m,) the pair of bodies whose distance comes closest to the margin."""
 
     @property
     def clearance_m(self) -> Array:
-        """(m,) The smaller of both clearances."""
+        """(m,) smaller one of the two clearances."""
         return np.minimum(self.self_clearance_m, self.scene_clearance_m)
 
 
 class Certifier:
-    """Proves moves of one arm with its tool in one scene."""
+    """Proves that moves of an arm with its tool are clear in a scene."""
 
     def __init__(self, arm: ArmModel, scene: Scene, margins: Margins | None = None) -> None:
         self.arm, self.scene, self.margins = arm, scene, margins or Margins()
@@ -71,13 +72,13 @@ class Certifier:
         own_m = arm.travel_m[self._pairs[:, 1]] * between
         self._margin_m = np.repeat([self.margins.self_m, self.margins.scene_m], [len(self._pairs), len(self._of_scene)])
         if (hung := arm.hung) is not None:
-            # To a body of the arm that a joint turns, the load turns about its hook as far.
+            # Seen from a body that a joint turns, the load turns about its hook by the same angle.
             own_m = own_m + hung.reach_m * ((self._pairs[:, 1:] >= len(arm.names) - 2) & ~between)
             string = np.flatnonzero(self._pairs[:, 1] == len(arm.names) - 2)
-            # It begins at the tool, and swings towards the rest.
+            # The string starts at the tool, and swings towards other bodies.
             to_tool = low[string] == 6
             self._margin_m[string] += np.where(to_tool, -Margins().self_m, hung.swing_m)
-        # (p, 6) metres of approach a radian of each joint can bring; pairs of the scene after those of the arm.
+        # (p, 6) largest approach per radian of each joint, m; the pairs with the scene follow those of the arm.
         self._lever_m = np.vstack([own_m, arm.travel_m[self._of_scene[:, 0]]])
         if arm.is_nominal:
             self._margin_m += self._lever_m @ NOMINAL_RAD
@@ -89,7 +90,7 @@ class Certifier:
 
     @property
     def without_load(self) -> "Certifier":
-        """A certifier for the tool before the load hangs from it."""
+        """Certifier for the tool without its hanging load."""
         arm = self.arm
         if arm.hung is None:
             return self
@@ -97,11 +98,11 @@ class Certifier:
         return Certifier(ArmModel(arm.name, arm.tool, own), self.scene, self.margins)
 
     def reach_m(self, off_rad: Array) -> float:
-        """Return how much nearer any two bodies can come if each joint is off by up to `off_rad` (6,)."""
+        """Return a bound of the approach of any two bodies if each joint is off by up to `off_rad` (6,), m."""
         return float((self._lever_m @ np.abs(off_rad)).max())
 
     def keeping(self, more_m: float) -> "Certifier":
-        """Return a certifier that keeps so much more distance: to what is that near a move, the margins remain."""
+        """Return a certifier with margins larger by `more_m`, for motion that deviates from its moves by that much."""
         return Certifier(self.arm, self.scene, Margins(self.margins.self_m + more_m, self.margins.scene_m + more_m))
 
     def free(self, q_rad: ArrayLike) -> NDArray[np.bool_]:
@@ -114,7 +115,7 @@ class Certifier:
         return free
 
     def too_near(self, q_rad: ArrayLike) -> list[list[str]]:
-        """Return the pairs that are nearer than the margins allow at joint angles (6,), such as forearm and plane 2."""
+        """Return the pairs of bodies within their margin at joint angles (6,), such as ["forearm", "plane 2"]."""
         q, pair = np.asarray(q_rad, dtype=np.float64).reshape(1, 6), np.arange(len(self._margin_m))
         distance = self._distance(q, np.zeros_like(pair), pair, self._margin_m)
         return [self._names[i].split(" - ") for i in np.flatnonzero(distance <= self._margin_m)]
@@ -130,15 +131,15 @@ class Certifier:
         ----------
         start_rad, end_rad : array_like, shape (m, 6)
         tight : bool
-            If true, refine the reported clearances; else stop as soon as the margins are proven.
+            Whether to refine the reported clearances; otherwise the proof ends as soon as the margins are proven.
         """
         start = np.asarray(start_rad, dtype=np.float64).reshape(-1, 6)
         turn = np.asarray(end_rad, dtype=np.float64).reshape(-1, 6) - start
         m, n_pairs, n_self = len(start), len(self._margin_m), len(self._pairs)
-        approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) over the whole move
+        approach_m = np.abs(turn) @ self._lever_m.T  # (m, p) largest approach over the whole move
         leading = np.abs(turn).max(axis=1)
-        proven = np.full((m, 2), np.inf)  # smallest lower bound of what is settled, by kind
-        nearest = np.full((m, 2), np.inf)  # smallest distance met, by kind
+        proven = np.full((m, 2), np.inf)  # smallest lower bound of the settled intervals, by kind
+        nearest = np.full((m, 2), np.inf)  # smallest distance so far, by kind
         least_excess, limited_by = np.full(m, np.inf), np.zeros(m, dtype=np.intp)
         clear = np.ones(m, dtype=np.bool_)
 
@@ -169,7 +170,7 @@ class Certifier:
             settled |= last
             np.minimum.at(proven, (own[settled], kind[settled]), bound[settled])
             open_ = ~settled & clear[own]
-            # Halve the intervals that still hold an open pair.
+            # Halve the intervals with an undecided pair.
             kept, position = np.unique(interval[open_], return_inverse=True)
             pair = np.concatenate([pair[open_]] * 2)
             interval = np.concatenate([position, position + len(kept)])
@@ -180,7 +181,7 @@ class Certifier:
         return Certificate(clear, stated[:, 0], stated[:, 1], tuple(self._names[i] for i in limited_by))
 
     def _distance(self, q_rad: Array, row: NDArray[np.intp], pair: NDArray[np.intp], enough_m: Array) -> Array:
-        """Lower bounds of distances (k,) of some pairs at some joint vectors; coarse where they are enough."""
+        """Return lower bounds (k,) of the distances of pairs at joint vectors, m; coarse if a coarse bound suffices."""
         bodies = self.arm.bodies(q_rad)
         distance = np.empty(len(pair))
         of_arm = pair < len(self._pairs)

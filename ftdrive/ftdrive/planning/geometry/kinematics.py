@@ -1,8 +1,8 @@
-"""Kinematics of Universal Robots arms for many joint vectors at once.
+"""Forward and inverse kinematics of Universal Robots arms for arrays of joint vectors.
 
 Joints 2, 3 and 4 of a nominal arm turn about parallel axes (the lift axis), so the flange orientation in the shoulder
-frame is `Rz(psi) @ Ry(-q5) @ Rz(q6)` with psi = q2 + q3 + q4. Both inverses below read the wrist off this product. The
-axes of a real arm are up to half a degree from parallel: there, the product is where Newton's method begins.
+frame is `Rz(psi) @ Ry(-q5) @ Rz(q6)` with psi = q2 + q3 + q4. Both inverses take the wrist angles from this product.
+The axes of a real arm deviate from parallel by up to half a degree; the product is then the start of Newton's method.
 """
 
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from ftcalib.model import cross
 from ftdrive.errors import ConfigError
 from ftdrivers.ur.kinematics import Array, Kinematics
 
-# Below this sine of q5, joints 4 and 6 turn about one line.
+# Below this sine of q5 the axes of joints 4 and 6 are considered parallel.
 ALIGNED = 1e-9
-# Steps of Newton's method, from an arm with exactly parallel axes: the rest is rounding.
+# Number of Newton steps from the solution for parallel axes; the remaining error is rounding.
 _STEPS = 5
 _TINY = 1e-14
-# Metres and radians.
+# Largest error of a solution, m and rad.
 _REACHED = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frames:
-    """Where the joints are, for n joint vectors; everything (n, 3) in base, metres."""
+    """Positions (n, 3) and axes (n, 3) of the joints for n joint vectors, base axes, metres."""
 
     lift: Array
     """Direction of joint axis 2."""
@@ -35,27 +35,29 @@ class Frames:
     shoulder_m: Array
     elbow_m: Array
     forearm_end_m: Array
-    """On axis 4, at no distance from the shoulder along the lift axis."""
+    """Point on axis 4 at the level of the shoulder along the lift axis."""
     wrist_m: Array
-    """Wrist centre, where axis 4 crosses axis 5, or comes nearest to it."""
+    """Wrist centre: the point of axis 4 that is on axis 5 or nearest to it."""
     axis_5: Array
     wrist_2_m: Array
-    """The same on axis 5, for axis 6."""
+    """The point of axis 5 that is on axis 6 or nearest to it."""
     R_base_flange: Array
-    """(n, 3, 3); its last column is the direction of axis 6."""
+    """(n, 3, 3) orientation of the flange; the last column is the direction of axis 6."""
     flange_m: Array
 
 
 def checked_joints(q_rad: ArrayLike) -> Array:
-    """Joint vector (6,); raises `ConfigError` unless all are within one turn of zero, which every model can reach."""
+    """Return the joint vector (6,); raises `ConfigError` unless all joints are within one turn of zero."""
     q = np.asarray(q_rad, dtype=np.float64)
     if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi + ALIGNED):
-        raise ConfigError(f"joints are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero")
+        raise ConfigError(
+            f"joint angles are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero"
+        )
     return q
 
 
 def frames(kinematics: Kinematics, q_rad: ArrayLike) -> Frames:
-    """Forward kinematics of joint vectors (n, 6)."""
+    """Return the forward kinematics of joint vectors (n, 6)."""
     axes, points, R = _axes_and_flange(kinematics, np.asarray(q_rad, dtype=np.float64).reshape(-1, 6))
     along = kinematics.links_m[:, 2]
     return Frames(
@@ -77,7 +79,7 @@ def _axes_and_flange(kinematics: Kinematics, q_rad: Array) -> tuple[list[Array],
     """Return directions (n, 3) of the six axes, a point (n, 3) on each and the flange, and R_base_flange (n, 3, 3)."""
     turn = q_rad.T + np.array(kinematics.theta_rad)[:, None]
     cosine, sine = np.cos(turn), np.sin(turn)
-    x, y, z = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(q_rad)))  # each (3, n): numpy is quicker so
+    x, y, z = np.broadcast_to(np.eye(3)[:, :, None], (3, 3, len(q_rad)))  # each (3, n), which is faster
     point = np.zeros((3, len(q_rad)))
     axes, points = [], []
     for c, s, alpha, (a, b, d) in zip(cosine, sine, kinematics.alpha_rad, kinematics.links_m.tolist(), strict=True):
@@ -93,7 +95,7 @@ def _axes_and_flange(kinematics: Kinematics, q_rad: Array) -> tuple[list[Array],
 
 
 def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: Array) -> Array:
-    """Angles of the wrist that give the flange these orientations while joints 1 to 3 stand still.
+    """Return the joint vectors with these flange orientations, for given angles of joints 1 to 3.
 
     Parameters
     ----------
@@ -104,8 +106,8 @@ def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: A
     Returns
     -------
     array, shape (n, 2, 6)
-        Joint vectors with the wrist in (-pi, pi], once with q5 >= 0 and once with q5 <= 0. Where axes 4 and 6 of a
-        nominal arm are parallel, q6 is free and taken as zero; a real arm may there be off by its own deviation.
+        Joint vectors with the wrist in (-pi, pi], first with q5 >= 0, then with q5 <= 0. If axes 4 and 6 of a nominal
+        arm are parallel, q6 is free and set to zero; a real arm may then miss the orientation by its deviation.
     """
     q_arm = np.asarray(q_arm_rad, dtype=np.float64)
     _, offset = _parallel(kinematics)
@@ -119,12 +121,12 @@ def wrist_inverse(kinematics: Kinematics, q_arm_rad: ArrayLike, R_base_flange: A
 
 
 def wrist_refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array) -> Array:
-    """Turn the wrist of joint vectors (n, 6), which nearly have these orientations (n, 3, 3), to have them exactly."""
+    """Return joint vectors (n, 6) whose wrist is corrected so that the flange has these orientations (n, 3, 3)."""
     return _refined(kinematics, np.asarray(q_rad), R_base_flange)
 
 
 def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array) -> Array:
-    """All joint vectors that bring the flange to these poses.
+    """Return all joint vectors with these flange poses.
 
     Parameters
     ----------
@@ -135,8 +137,8 @@ def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array
     Returns
     -------
     array, shape (n, 8, 6)
-        In (-pi, pi]; two shoulders, two wrists, two elbows, in this order of nesting; nan where there is no solution.
-        A real arm may have none where the nominal one is just stretched out, or the other way round: nan too.
+        Joint angles in (-pi, pi] for two shoulders, two wrists and two elbows, in this order of nesting; nan if there
+        is no solution. Near the stretched arm, nan also where only the real or only the nominal arm has a solution.
     """
     R, p = np.asarray(R_base_flange, dtype=np.float64), np.asarray(p_base_flange_m, dtype=np.float64)
     (d1, a2, a3, d4, d5, d6), offset = _parallel(kinematics)
@@ -159,18 +161,19 @@ def inverse(kinematics: Kinematics, R_base_flange: Array, p_base_flange_m: Array
     q = q.reshape(-1, 6)
     reached = np.flatnonzero(~np.isnan(q).any(axis=1))
     pose = reached // 8
-    found = q[reached] if is_exact(kinematics) else _refined(kinematics, q[reached], R[pose], p[pose])
-    at = frames(kinematics, found)
+    solution = q[reached] if is_exact(kinematics) else _refined(kinematics, q[reached], R[pose], p[pose])
+    at = frames(kinematics, solution)
     off = np.maximum(np.abs(at.flange_m - p[pose]).max(axis=1), np.abs(at.R_base_flange - R[pose]).max(axis=(1, 2)))
     q[:] = np.nan
-    q[reached] = np.where((off < _REACHED)[:, None], _wrapped(found), np.nan)
+    q[reached] = np.where((off < _REACHED)[:, None], _wrapped(solution), np.nan)
     return q.reshape(len(R), 8, 6)
 
 
 def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
-    """Return the arm with the same lengths and axes exactly parallel or at right angles: d1, a2, a3, d4, d5 and d6.
+    """Return d1, a2, a3, d4, d5, d6 of the arm with the same lengths and exact axes, and the joint offsets (6,).
 
-    Its joint angles are those of the given arm plus the offsets (6,), which are zero for a nominal one.
+    The joint angles of that arm are those of the given arm plus the offsets, which are zero for a nominal arm. Exact
+    axes are parallel or at right angles.
     """
     links, theta = kinematics.links_m, np.array(kinematics.theta_rad)
     limbs = np.hypot(links[1:3, 0], links[1:3, 1])
@@ -180,17 +183,17 @@ def _parallel(kinematics: Kinematics) -> tuple[tuple[float, ...], Array]:
 
 
 def is_exact(kinematics: Kinematics) -> bool:
-    """Return whether the axes are exactly parallel or at right angles, as those of nominal arms."""
+    """Return whether the axes are exactly parallel or at right angles, as in a nominal arm."""
     return all(bool(off.max() < ALIGNED) for off in deviation(kinematics))
 
 
 def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
-    """How far each link (6,) is from one of an arm with the same lengths and axes exactly parallel or at right angles.
+    """Return the deviation of each link from an arm with the same lengths and exactly parallel or orthogonal axes.
 
     Returns
     -------
     shift_m, tilt_rad : array, shape (6,)
-        Of the point on the next axis, and of that axis.
+        Shift of the point on the next axis, and tilt of that axis.
     """
     links = kinematics.links_m
     shift_m = np.hypot(links[:, 0], links[:, 1])
@@ -200,7 +203,7 @@ def deviation(kinematics: Kinematics) -> tuple[Array, Array]:
 
 
 def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array | None = None) -> Array:
-    """Newton's method from joint vectors (n, 6) to the nearest ones with these poses; without points, by the wrist."""
+    """Return joint vectors with these poses by Newton's method from `q_rad` (n, 6); without positions, wrist only."""
     first = 3 if p_base_flange_m is None else 0
     q = q_rad.copy()
     for _ in range(_STEPS):
@@ -212,7 +215,7 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
             J = np.concatenate([np.stack(levers, axis=2), J], axis=1)
             off = np.concatenate([p_base_flange_m - points[6], off], axis=1)
         JT = np.swapaxes(J, 1, 2)
-        # No step is above half a radian.
+        # The damping keeps every step below half a radian.
         damping = np.square(off).sum(axis=1)[:, None, None] + _TINY
         step = JT @ np.linalg.solve(J @ JT + damping * np.eye(J.shape[1]), off[:, :, None])
         q[:, first:] += step[:, :, 0]
@@ -220,7 +223,7 @@ def _refined(kinematics: Kinematics, q_rad: Array, R_base_flange: Array, p_base_
 
 
 def _wrist_angles(q1_rad: Array | float, R_base_flange: Array) -> tuple[Array, Array, Array]:
-    """psi, q5 and q6 (n, 2), with q5 first positive, then negative."""
+    """Return psi, q5 and q6 (n, 2), first with positive q5, then with negative q5."""
     c1, s1 = np.cos(q1_rad), np.sin(q1_rad)
     R = np.asarray(R_base_flange, dtype=np.float64)
     x = np.moveaxis(c1 * R[:, 0].T + s1 * R[:, 1].T, 0, 1)  # rows of the orientation in the shoulder frame
@@ -236,5 +239,5 @@ def _wrist_angles(q1_rad: Array | float, R_base_flange: Array) -> tuple[Array, A
 
 
 def _wrapped(angle_rad: Array) -> Array:
-    """Angles in (-pi, pi]."""
+    """Return the angles in (-pi, pi]."""
     return np.asarray(np.pi - np.mod(np.pi - angle_rad, 2 * np.pi))

@@ -14,7 +14,7 @@ MOUNTINGS = {"floor": 0.0, "wall": np.pi / 2, "ceiling": np.pi}
 
 @dataclass(frozen=True, slots=True)
 class Plane:
-    """A wall or a table: all of the arm must stay where `normal · x >= offset_m`, base axes."""
+    """A wall or a table: the whole arm must stay where `normal · x >= offset_m`, base axes."""
 
     normal: tuple[float, float, float]
     offset_m: float
@@ -26,46 +26,46 @@ class Plane:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A block with edges along the base axes."""
+    """A box with edges along the base axes."""
 
     low_m: tuple[float, float, float]
     high_m: tuple[float, float, float]
 
     def __post_init__(self) -> None:
         if not all(low < high for low, high in zip(self.low_m, self.high_m, strict=True)):
-            raise ConfigError(f"a box from {self.low_m} to {self.high_m} m is empty: give its low corner first")
+            raise ConfigError(f"a box from {self.low_m} to {self.high_m} m is empty: give the low corner first")
 
 
-# The surface that the base is bolted to.
+# The surface to which the base is bolted.
 BASE_PLANE = Plane((0.0, 0.0, 1.0), 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Planes and boxes in base axes. The base leans by `lean_rad` from upright towards its -x."""
+    """Planes and boxes in base axes, and the lean of the base from upright towards -x."""
 
     planes: Sequence[Plane] = field(default=(BASE_PLANE,))
     boxes: Sequence[Box] = ()
     lean_rad: float = 0.0
-    """0 on a floor, pi/2 on a wall (gravity along -x), pi under a ceiling."""
+    """Lean of the base: 0 on a floor, pi/2 on a wall (gravity along -x), pi under a ceiling."""
 
     @property
     def down_base(self) -> Array:
-        """(3,) direction of gravity in base."""
+        """(3,) unit vector along gravity, base axes."""
         return np.array([-np.sin(self.lean_rad), 0.0, -np.cos(self.lean_rad)])
 
     def describe(self) -> dict[str, Any]:
-        """Everything a plan relies on, for its hash."""
+        """Return planes, boxes and lean, on which a plan depends, for its hash."""
         return asdict(self)
 
 
 def down_of(mounting: str | None) -> Array:
-    """Return the direction of gravity in base (3,) for a mounting."""
+    """Return the unit vector (3,) along gravity in base for a mounting."""
     return Scene(lean_rad=lean_of(mounting)).down_base
 
 
 def lean_of(mounting: str | None) -> float:
-    """Read a mounting: floor, wall, ceiling, or an angle in degrees; a floor if none is declared."""
+    """Return the lean of a mounting, rad: floor, wall, ceiling, or an angle in degrees; a floor if it is None."""
     mounting = mounting or "floor"
     if mounting in MOUNTINGS:
         return MOUNTINGS[mounting]

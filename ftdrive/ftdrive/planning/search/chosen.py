@@ -1,7 +1,7 @@
-"""A tour of chosen poses that the wrist reaches: the most informative ones, or those far from a calibration's.
+"""Tours of chosen poses: the most informative ones, ones far from those of a calibration, sets, or tilts of a load.
 
-Informative poses follow the design of `ftcalib.poses.selection`, which keeps the second solution away and the gravity
-directions out of one plane.
+Informative poses are chosen by `ftcalib.poses.selection`, which excludes a second solution and gravity directions in
+one plane.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -20,12 +20,13 @@ from ftdrive.planning.search.nodes import Nodes, grid, hung_nodes, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 
+# Numbers of tool directions, and of turns about the tool axis for each of them.
 DIRECTIONS, SPINS = 150, 8
-# If joint 6 changes what can collide: each spin is a shape of its own then.
+# Fewer for a tool that is not round about the axis of joint 6, because each turn needs its own collision check.
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
-# Number of disconnected parts of free space that are tried.
+# Largest number of disconnected parts of free space that are tried.
 MOST_PARTS = 2
-# Number of joint vectors of each part, the nearest ones, to which a straight move is tried.
+# Number of the nearest joint vectors of each part to which a straight move is tried.
 FROM_HERE = 6
 # No other posture is tried if the predicted error is within this factor of the best poses of the cone.
 NEARLY = 1.05
@@ -33,30 +34,30 @@ OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
 # Number of the first chosen pose; 1 to 24 are those of the paper.
 FIRST_NUMBER = 101
-# Number of tool directions that compare postures.
+# Number of tool directions with which postures are compared.
 LOOKS = 24
-# Tilts of the tool with a load on a string, and how many azimuths each has.
+# Tilts of the tool with a load on a string, and the number of azimuths of each.
 HUNG_TILTS_DEG, HUNG_AZIMUTHS = (75, 60, 45), 24
-# Azimuths of each tilt that compare places of the hook, and how many places are tried.
+# Number of azimuths with which positions of the hook are compared, and number of positions that are tried.
 LOOKS_OF_A_TILT, MOST_HOOKS = 8, 4
-# How far the hook may be from its place between two tilts; the first that has a tour.
+# Largest distance of the hook from its position between two tilts; the first value with a tour is used.
 HOOK_M = (0.03, 0.06)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chosen:
-    """Poses in the order of travel."""
+    """A tour of chosen poses, in the order of travel."""
 
     numbers: tuple[int, ...]
-    """From 101 on, in the order of choice: not those of the paper."""
+    """Numbers from 101, in the order of choice; the paper has numbers up to 24."""
     q_rad: Array
-    """(n, 6)"""
+    """(n, 6) joint vectors."""
     force_rms_N: float
-    """Predicted error of compensation."""
+    """Predicted RMS error of force compensation."""
     ideal_force_rms_N: float
-    """Predicted error of the best poses without limits of reach."""
+    """Predicted RMS error of the best poses if every pose were reachable."""
     elsewhere: bool
-    """Joints 1 to 3 differ from the present posture."""
+    """Whether joints 1 to 3 differ from the present posture."""
 
 
 def chosen_tour(
@@ -67,11 +68,11 @@ def chosen_tour(
     speeds: Speeds,
     guess: Guess,
 ) -> Chosen | None:
-    """Choose four poses or more and find a short closed tour through them, base, shoulder and elbow at rest.
+    """Return a short closed tour through four or more chosen poses, with base, shoulder and elbow at rest.
 
-    Another posture of joints 1 to 3 than that of `q_rad` is used if it lowers the predicted error. The tool axis
-    (flange z) stays within an angle of straight down. None if too few poses are reachable, or if they are not
-    informative enough to estimate everything.
+    The posture of joints 1 to 3 differs from `q_rad` if that lowers the predicted error. The tool axis (flange z) stays
+    within `half_angle_rad` of straight down. None if too few poses are reachable, or if they are not informative enough
+    to estimate all parameters.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
     lumps = certifier.arm.travel_m[:, 5].any()
@@ -99,14 +100,14 @@ def _clear_candidates(
     guess: Guess,
     ideal: float,
 ) -> Chosen | None:
-    """Choose the most informative of the poses that are reachable at this posture."""
+    """Return a tour of the most informative poses that are reachable at this posture; None if there is none."""
 
     def choice(reached: Nodes) -> Nodes:
         return reached[choose(candidates[reached], poses, guess)]
 
     for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, choice, speeds):
         rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
-        if np.isfinite(rms):  # else these poses leave a parameter unobservable
+        if np.isfinite(rms):  # otherwise a parameter is not observable
             return Chosen(numbers, q, rms, ideal, elsewhere=False)
     return None
 
@@ -114,10 +115,10 @@ def _clear_candidates(
 def verification_tour(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, speeds: Speeds
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Choose two poses or more far from those of a calibration, `R_fitted` (k, 3, 3), and find a short closed tour.
+    """Return a short closed tour through two or more poses far from `R_fitted` (k, 3, 3), those of a calibration.
 
-    Joints 1 to 3 move only if the wrist alone has no such tour here. Returns numbers, from 101 on in the order of
-    choice, and joint angles (n, 6) in the order of travel; None if too few poses are reachable.
+    Joints 1 to 3 move only if the wrist alone has no such tour. Returns numbers from 101, in the order of choice, and
+    joint vectors (n, 6) in the order of travel; None if too few poses are reachable.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
     directions = max(DIRECTIONS_OF_A_LUMP, poses // 2)
@@ -135,11 +136,11 @@ def verification_tour(
 def tour_of_sets(
     certifier: Certifier, q_rad: ArrayLike, kinds: Sequence[tuple[Array, int]], speeds: Speeds
 ) -> tuple[Nodes, Array] | None:
-    """Find a short closed tour through a number of orientations of each of several kinds.
+    """Return a short closed tour through orientations of several kinds.
 
-    Each kind has orientations (m, 3, 3) and how many of them are wanted: the first ones that are reachable. Returns,
-    in the order of travel, the places among the wanted orientations, counted through all kinds, and joint angles
-    (n, 6); None if too few poses of a kind are reachable.
+    Each kind has orientations (m, 3, 3) and a number; the tour has this number of them, the first reachable ones.
+    Returns, in the order of travel, the indices of the selected orientations over all kinds, and joint vectors (n, 6).
+    None if too few poses of a kind are reachable.
     """
     kind = np.repeat(np.arange(len(kinds)), [len(R) for R, _ in kinds])
     wanted = [count for _, count in kinds]
@@ -156,38 +157,38 @@ def tour_of_sets(
 def hung_tour(
     certifier: Certifier, q_rad: ArrayLike, poses: int, speeds: Speeds
 ) -> tuple[tuple[int, ...], Array, Array] | None:
-    """Choose tilts with a load on a string, spread evenly about straight down, and find a short closed tour.
+    """Return a short closed tour through tilts with a load on a string, spread evenly about straight down.
 
-    The hook stays at one point at each of them: nearest to where it is, with the tool turned least. Returns numbers,
-    from 101 on in the order of choice, joint angles (n, 6) in the order of travel, and the hook (3,) in base; None if
-    too few poses are reachable.
+    The hook is at the same point in all tilts, near its present position and with the tool turned little. Returns
+    numbers from 101, in the order of choice, joint vectors (n, 6) in the order of travel, and the hook (3,) in base, m;
+    None if too few poses are reachable.
     """
     q_now, down = np.asarray(q_rad, dtype=np.float64), certifier.scene.down_base
     hooks = _hooks(certifier, q_now)
-    for kept, (hook_m, heading_rad) in product((_HookKept(certifier, most_m) for most_m in HOOK_M), hooks):
+    for steady, (hook_m, heading_rad) in product((_SteadyHook(certifier, most_m) for most_m in HOOK_M), hooks):
         candidates = tilted_candidates(np.radians(HUNG_TILTS_DEG), HUNG_AZIMUTHS, heading_rad, down)
         q, group = hung_nodes(certifier, q_now, candidates, hook_m)
-        part = connected(kept, q, np.zeros(len(q), dtype=np.intp))
+        part = connected(steady, q, np.zeros(len(q), dtype=np.intp))
         best = max(range(part.max() + 1), key=lambda p: len(np.unique(group[part == p])))
         reached = np.unique(group[part == best])
         if len(reached) < poses:
             continue
         chosen = reached[_evenly_spread(down @ candidates[reached], poses)]
         inside = part == best
-        if (tour := _tour_through(kept, q[inside], group[inside], chosen, speeds)) is not None:
+        if (tour := _tour_through(steady, q[inside], group[inside], chosen, speeds)) is not None:
             return *tour, hook_m
     return None
 
 
-class _HookKept(Certifier):
-    """Proves only moves in which the hook of the load stays within a distance of where it is."""
+class _SteadyHook(Certifier):
+    """Certifier that proves only moves in which the hook of the load stays within `most_m` of its start."""
 
     def __init__(self, certifier: Certifier, most_m: float) -> None:
         super().__init__(certifier.arm, certifier.scene, certifier.margins)
         self._most_m = most_m
 
     def certify(self, start_rad: ArrayLike, end_rad: ArrayLike, *, tight: bool = True) -> Certificate:
-        """As `Certifier.certify`; a move that takes the hook along is not clear."""
+        """As `Certifier.certify`; a move that displaces the hook is not clear."""
         start, end = (np.asarray(q, dtype=np.float64).reshape(-1, 6) for q in (start_rad, end_rad))
         hooks_m = [self.arm.hook_m(self.arm.frames(start + share * (end - start))) for share in np.linspace(0, 1, 9)]
         stays = np.linalg.norm(np.subtract(hooks_m, hooks_m[0]), axis=2).max(axis=0) <= self._most_m
@@ -196,7 +197,7 @@ class _HookKept(Certifier):
 
 
 def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
-    """Places of the hook (3,) that reach the most tilts, each with turns about the tool axis (rad), to be tried."""
+    """Return positions (3,) of the hook with the most reachable tilts, m, each with turns about the tool axis, rad."""
     down, at = certifier.scene.down_base, certifier.arm.frames(q_now)
     present_rad = _heading(at.R_base_flange[0], down)
     looks = tilted_candidates(np.radians(HUNG_TILTS_DEG), LOOKS_OF_A_TILT, present_rad, down)
@@ -207,15 +208,15 @@ def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
 
 
 def _heading(R_base_flange: Array, down_base: Array) -> float:
-    """Turn about the tool axis of `tilted_candidates` that is nearest to an orientation (3, 3)."""
+    """Return the turn about the tool axis in `tilted_candidates` that is nearest to an orientation (3, 3), rad."""
     straight = tilted_candidates([0.0], 1, 0.0, down_base)[0]
     turn = straight.T @ R_base_flange
-    # The tool is turned about -z there, seen along its axis.
+    # `tilted_candidates` turns the tool about its -z axis.
     return float(np.arctan2(turn[0, 1] - turn[1, 0], turn[0, 0] + turn[1, 1]))
 
 
 def _away(certifier: Certifier, wrist_m: Array) -> Array:
-    """Shifts (k, 3) of the hook from where it is, the nearest first: up and down, towards the base and away from it."""
+    """Return shifts (k, 3) of the hook, nearest first: up and down, towards the base and away from it, m."""
     down = certifier.scene.down_base
     outwards = wrist_m - wrist_m @ down * down
     outwards /= max(float(np.linalg.norm(outwards)), 1e-9)
@@ -226,7 +227,7 @@ def _away(certifier: Certifier, wrist_m: Array) -> Array:
 
 
 def _evenly_spread(directions: Array, count: int) -> Nodes:
-    """Indices of directions (m, 3), each as far as possible from those before it, from the first on."""
+    """Return indices of directions (m, 3), beginning with the first, each as far as possible from those before it."""
     chosen = [0]
     while len(chosen) < count:
         nearest = (directions @ directions[chosen].T).max(axis=1)
@@ -244,7 +245,7 @@ def _first_tour(
     choice: Callable[[Nodes], Nodes],
     speeds: Speeds,
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Return the first tour of `_tours_at`, with joints 1 to 3 as they stand or at a posture with more room."""
+    """Return the first tour of `_tours_at` at the present posture of joints 1 to 3, or at one with more room."""
 
     def tours(q: Array) -> Iterator[tuple[tuple[int, ...], Array]]:
         return _tours_at(certifier, q, candidates, spins, poses, choice, speeds)
@@ -266,8 +267,8 @@ def _tours_at(
 ) -> Iterator[tuple[tuple[int, ...], Array]]:
     """Yield tours of chosen candidates that are reachable at this posture and connected by clear moves.
 
-    Each is given as numbers from 101 on, in the order of choice, and joint vectors (n, 6) in the order of travel.
-    `choice` gets the indices of the reachable candidates and returns `poses` of them.
+    A tour has numbers from 101, in the order of choice, and joint vectors (n, 6) in the order of travel. `choice`
+    receives the indices of the reachable candidates and returns `poses` of them.
     """
     q, group = wrist_nodes(certifier, q_now, candidates)
     if not len(q):
@@ -275,7 +276,7 @@ def _tours_at(
     part = connected(certifier, q, group % spins)
     reached = [np.unique(group[part == p]) for p in range(part.max() + 1)]
     here = _begins_here(certifier, q_now, q, part)
-    # The same orientations a whole turn of wrist 2 away are another part, with no approach: the arm is in between.
+    # The orientations with wrist 2 turned by a full turn form another part, to which no clear approach leads.
     for p in sorted(range(len(reached)), key=lambda p: (not here[p], -len(reached[p])))[:MOST_PARTS]:
         if len(reached[p]) < poses:
             break
@@ -289,10 +290,10 @@ def _tours_at(
 def _tour_through(
     certifier: Certifier, q: Array, group: Nodes, chosen: Nodes, speeds: Speeds
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Find a short closed tour through one of the joint vectors q (n, 6) of each chosen orientation.
+    """Return a short closed tour through one of the joint vectors q (n, 6) of each chosen orientation.
 
-    `group` (n,) has the orientation of each. The tour is given as numbers from 101 on, in the order of `chosen`, and
-    joint vectors in the order of travel.
+    `group` (n,) has the orientation of each joint vector. The tour has numbers from 101, in the order of `chosen`, and
+    joint vectors in the order of travel; None if there is no tour.
     """
     nodes = np.flatnonzero(np.isin(group, chosen))
     place = np.full(group.max() + 1, -1)
@@ -304,7 +305,7 @@ def _tour_through(
 
 
 def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) -> list[bool]:
-    """Return for each part whether a straight move from the present joint angles leads into it."""
+    """Return for each part of free space whether a clear straight move leads into it from the present joint angles."""
     near = np.argsort(np.abs(q_rad - q_now).max(axis=1), kind="stable")
     ends = [near[part[near] == p][:FROM_HERE] for p in range(part.max() + 1)]
     goals = q_rad[np.concatenate(ends)]
@@ -313,7 +314,7 @@ def _begins_here(certifier: Certifier, q_now: Array, q_rad: Array, part: Nodes) 
 
 
 def _others(certifier: Certifier, q_now: Array, candidates: Array) -> Array:
-    """Postures (k, 3) of joints 1 to 3 that reach the most tool directions."""
+    """Return the postures (k, 3) of joints 1 to 3 with the most reachable tool directions."""
     postures = grid(certifier, q_now, POSTURE_STEP_DEG)
     looks = candidates[np.linspace(0, len(candidates) - 1, LOOKS).astype(int)]
     q = np.array([wrist_inverse(certifier.arm.kinematics, posture, looks) for posture in postures])  # (m, LOOKS, 2, 6)

@@ -1,11 +1,11 @@
-"""Joint vectors that bring the flange to wanted orientations: all branches and whole turns within the joints' windows.
+"""Joint vectors for given flange orientations: all branches and full turns within the windows of the joints.
 
-Nodes (n, 6) come with a group (n,), the index of the orientation that each of them serves.
+Nodes (n, 6) have a group (n,), the index of the orientation of each node.
 
 With base, shoulder and elbow at rest, the three wrist joints of every Universal Robots arm reach all 24 orientations of
-Yu et al. (eq. 14, Fig. 3). The table is the same for all models: their wrists share one geometry. No tour of the wrist
-can have fewer or shorter moves. Of those that have not more, and are clear on all models, this one is the fastest where
-the speed of the tool's tip is limited: 16 moves turn joint 6 alone. Wrist 1 turns by 90 degrees only.
+Yu et al. (eq. 14, Fig. 3). The table of the constant tour holds for all models, because their wrists have the same
+geometry. No wrist tour has fewer or shorter moves. Among the tours with as few moves that are clear on all models, it
+is the fastest with limited tip speed: 16 moves turn joint 6 alone. Wrist 1 turns by 90 degrees only.
 """
 
 from collections.abc import Iterator
@@ -23,32 +23,32 @@ from ftdrivers.ur.kinematics import MODELS, Array, Kinematics
 Nodes = NDArray[np.intp]
 
 SHOULDER_RAD = float(np.radians(110))
-# The cable follows wrist 3, so it stays within 200° of its present angle.
+# Wrist 3 winds the cable, so it stays within 200° of its present angle.
 WRIST_6_RAD = float(np.radians(200))
-# So that a real arm, which is up to 3 degrees from the table, has both ways to an angle half a turn away.
+# Half a turn plus 3 degrees, by which a real arm may differ from the table, so that both directions remain possible.
 HALF_TURN_RAD = float(np.radians(183))
-# To both sides of where the joints stand. Joint 6 is what winds the cable.
+# Largest turn of each joint to either side of its present angle.
 WINDOW_RAD = np.array([np.pi, SHOULDER_RAD, np.inf, HALF_TURN_RAD, HALF_TURN_RAD, WRIST_6_RAD])
-# From stretched. The elbow cannot fold further, and the shapes do not know it.
+# Largest elbow angle from the stretched arm: the elbow cannot fold further, which the collision shapes do not show.
 ELBOW_RAD = float(np.radians(165))
-# Places of the flange along each edge of a box, as shares of its half size.
+# Flange positions along each edge of a box, as shares of half its size.
 STEPS = (-1.0, 0.0, 1.0)
 
 
 def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) -> tuple[Array, Nodes]:
-    """All free joint vectors with joints 1 to 3 as they stand and the flange in one of these orientations.
+    """Return all free joint vectors with joints 1 to 3 at rest and the flange in one of these orientations.
 
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Present joint angles; the wrist stays in its windows around them.
+        Present joint angles; the wrist stays within its windows about them.
     R_base_flange : array, shape (m, 3, 3)
 
     Returns
     -------
     q : array, shape (n, 6)
     group : int array, shape (n,)
-        Index of the orientation.
+        Index of the orientation of each joint vector.
     """
     q_now = np.asarray(q_rad, dtype=np.float64)
     solutions = wrist_inverse(certifier.arm.kinematics, q_now[:3], R_base_flange)  # (m, 2, 6)
@@ -59,10 +59,10 @@ def wrist_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array) ->
 def box_nodes(
     certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array, centre_m: Array, half_size_m: float
 ) -> tuple[Array, Nodes]:
-    """All free joint vectors with the flange in one of these orientations, at one of 27 places in a box.
+    """Return all free joint vectors with the flange in one of these orientations, at one of 27 positions in a box.
 
-    The joints stay in their windows around `q_rad`. The edges of the box, twice `half_size_m` long, are along the base
-    axes. Returns joint vectors (n, 6), and the index (n,) of the orientation of each.
+    The joints stay within their windows about `q_rad`. The edges of the box, twice `half_size_m` long, are along the
+    base axes. Returns joint vectors (n, 6), and the index (n,) of the orientation of each.
     """
     places = centre_m + half_size_m * np.stack(np.meshgrid(STEPS, STEPS, STEPS), axis=-1).reshape(-1, 3)
     group, place = (index.ravel() for index in np.indices((len(R_base_flange), len(places))))
@@ -70,10 +70,10 @@ def box_nodes(
 
 
 def hung_nodes(certifier: Certifier, q_rad: ArrayLike, R_base_flange: Array, hook_m: Array) -> tuple[Array, Nodes]:
-    """All free joint vectors with the flange in one of these orientations and the hook of the load at one point.
+    """Return all free joint vectors with the flange in one of these orientations and the hook of the load at one point.
 
-    The joints stay in their windows around `q_rad`. Returns joint vectors (n, 6), and the index (n,) of the
-    orientation.
+    The joints stay within their windows about `q_rad`. Returns joint vectors (n, 6), and the index (n,) of the
+    orientation of each.
     """
     hung = certifier.arm.hung
     p_flange_hook_m = np.zeros(3) if hung is None else np.array(hung.p_flange_m)
@@ -93,7 +93,10 @@ def _at_places(
 
 
 def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
-    """Joint vectors that differ in what can collide: angle 6 does not matter to a tool that is round about its axis."""
+    """Return the joint vectors (k, 6) with different shapes, and the index (n,) of each given one among them.
+
+    Joint angles that move no body are set to zero, such as that of joint 6 with a tool that is round about its axis.
+    """
     moves = certifier.arm.travel_m.max(axis=0) > 0
     rounded = np.round(np.where(moves, q_rad, 0.0), 9)
     _, first, back = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
@@ -101,8 +104,8 @@ def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
 
 
 def _within_windows(q_rad: Array, group: Nodes, q_now: Array, first: int) -> tuple[Array, Nodes]:
-    """Add whole turns to the joints from index `first` on, as far as windows and limits let them."""
-    # Far from zero a joint has no room on one side: the window about zero serves there.
+    """Return the joint vectors with full turns added to the joints from index `first`, within windows and limits."""
+    # A joint far from zero has no room on one side, so its window is about zero.
     middle = np.where(np.abs(q_now) > np.pi, 0.0, q_now)
     for joint in range(first, 6):
         turned = q_rad[:, None] + 2 * np.pi * np.array([-1, 0, 1])[:, None] * np.eye(6)[joint]
@@ -127,14 +130,14 @@ _GRID_DEG = 10
 _SHOULDER_DEG, _ELBOW_DEG = (-180, 0), (-160, 160)
 _BATCH = 40
 _LEVEL = 1e-9
-# At most so many postures are tried, so that a cell without a tour is reported in time.
+# Largest number of postures that are tried, which limits the search time in a cell without a tour.
 MOST_POSTURES = 200
 
 
 def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array:
-    """Candidate postures (m, 3) of joints 1 to 3, the nearest first."""
+    """Return candidate postures (m, 3) of joints 1 to 3, the nearest first."""
     level = not certifier.scene.boxes and all(np.hypot(*plane.normal[:2]) < _LEVEL for plane in certifier.scene.planes)
-    # Nothing distinguishes one pan from another.
+    # In a scene without vertical features all pan angles are equivalent.
     pans = q_rad[0] + np.radians(_PANS_DEG[:1] if level else _PANS_DEG)
     shoulder, elbow = (np.radians(np.arange(low, high + 1, step_deg)) for low, high in (_SHOULDER_DEG, _ELBOW_DEG))
     postures = np.array(list(product(pans, shoulder, elbow)))
@@ -144,12 +147,12 @@ def grid(certifier: Certifier, q_rad: Array, step_deg: int = _GRID_DEG) -> Array
 
 
 def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
-    """Constant tours (24, 6) at other postures whose poses are free; their moves may not be clear."""
+    """Yield constant tours (24, 6) at other postures, whose poses are free; their moves may not be clear."""
     postures = grid(certifier, q_rad)
     offered = 0
     for batch in np.array_split(postures, max(1, len(postures) // _BATCH)):
         tours = np.array([constant_tour([*first, *q_rad[3:]]) for first in batch])
-        # Turning joint 6 alone brings a new pose, but hardly a new shape: the rest is for the proof.
+        # Poses that differ in joint 6 alone have nearly the same shape; the proof checks them later.
         q = tours[:, DIFFERENT_SHAPES]
         for i in np.flatnonzero(certifier.free(q.reshape(-1, 6)).reshape(q.shape[:2]).all(axis=1)):
             yield constant_tour(tours[i, 0], certifier.arm.kinematics)
@@ -159,8 +162,8 @@ def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
 
 
 # Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees.
-# Any order of 90° moves takes 54 s at 60 °/s; this one has only eight moves of the whole wrist, which the tip limit
-# makes slow.
+# Every order of 90° moves takes 54 s at 60 °/s. This one has only eight moves of the whole wrist, which the limit of
+# the tip speed slows down.
 _TOUR_DEG = (
     (1, -90, 90, 45),
     (10, -90, 90, -45),
@@ -189,39 +192,39 @@ _TOUR_DEG = (
 )
 # Numbers of the orientations, 1 to 24, in the order of travel.
 NUMBERS = tuple(row[0] for row in _TOUR_DEG)
-# Stops that differ in more than joint 6.
+# Indices of poses that differ in more than joint 6.
 DIFFERENT_SHAPES = tuple(np.unique([row[1:3] for row in _TOUR_DEG], axis=0, return_index=True)[1].tolist())
 
 
 # The wrist angles of an orientation are the same for every nominal arm.
 _NOMINAL = MODELS["UR5e"]
-# Between the table and the wrist angles of a real arm, which is at most 1.3 degrees from the nominal one.
+# Bound of the difference between table and wrist angles of a real arm, which is within 1.3 degrees of the nominal one.
 _ROOM_RAD = float(np.radians(3))
 
 
 def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
-    """Joint vectors (24, 6) of the tour at the present posture of joints 1 to 3.
+    """Return the joint vectors (24, 6) of the constant tour at the present posture of joints 1 to 3.
 
-    Joints 1 to 3 keep their angles. The flange orientation at a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
-    matrix R_i, so at other base pans than 45 degrees the whole set is turned about the base's z axis. The wrist of an
-    arm with its own kinematics turns up to a few degrees less or more to get there.
+    Joints 1 to 3 keep their angles. The flange orientation of a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
+    matrix R_i, so that at another base angle than 45 degrees the whole set is turned about the base z axis. The wrist
+    angles of a real arm differ from the table by up to a few degrees.
 
     Parameters
     ----------
     q_rad : array_like, shape (6,)
-        Present joint angles. Joint 4 stays as close to it as whole turns allow.
+        Present joint angles. Joint 4 stays as close to its angle as full turns allow.
     kinematics : Kinematics, optional
-        The arm's own.
+        Kinematics of this arm; nominal if omitted.
 
     Returns
     -------
     array
-        In the order of travel; all joints within one turn of zero.
+        Joint vectors in the order of travel; all joints within one turn of zero.
     """
-    # Wrist 3 turns between -135° and 180°: from outside of -20° to 65° another order is used.
+    # Wrist 3 turns between -135° and 180°; if it is outside of -20° to 65° now, another order is used elsewhere.
     q = checked_joints(q_rad)
     psi, q5, q6 = np.radians(_TOUR_DEG)[:, 1:].T
-    # Whole turns, chosen for the tour as one; as it turns joint 4 by 90 degrees only, some fit always.
+    # One number of full turns for the whole tour; joint 4 turns by 90 degrees only, so that one always fits.
     q4 = psi - q[1] - q[2] + 2 * np.pi * np.arange(-3, 4)[:, None]
     room = _ROOM_RAD if kinematics is not _NOMINAL else -1e-9
     inside = q4[(np.abs(q4) <= 2 * np.pi - room).all(axis=1)]
@@ -233,12 +236,12 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
 
 
 def from_usual_wrist(certifier: Certifier, q_rad: Array) -> Array:
-    """Return joint angles (6,) with joints 4 and 5 as the constant tour begins, from which most tours are found.
+    """Return joint angles (6,) with joints 4 and 5 as at the start of the constant tour, where most tours exist.
 
-    Joint 6 keeps its turn, which shows how the cable is wound.
+    Joint 6 keeps its angle, which shows how the cable is wound.
     """
     q = q_rad.copy()
-    # The planner reports it, with what to do.
+    # The planner reports this error with its remedy.
     with suppress(ConfigError):
         q[3:5] = constant_tour(q, certifier.arm.kinematics)[0, 3:5]
     return q

@@ -1,8 +1,9 @@
-"""The shortest closed tour through groups of joint vectors, one of each group, over moves that are proven clear.
+"""Short closed tours through groups of joint vectors, one of each group, over moves that are proven clear.
 
-A generalised travelling salesman: the order is improved by reversing parts of it, the choice within the groups is then
-exact (dynamic programming), and the best tour is shaken until that no longer helps. Moves are proven lazily: those to
-near neighbours first, which shows what hangs together at all, and then those that a tour would use. Deterministic.
+This is a generalised travelling salesman problem. Reversals of segments (2-opt) improve the order, dynamic programming
+finds the best choice within the groups, and random perturbations (double bridges) leave local minima. Moves are proven
+lazily: first those to near neighbours, which show the connected parts, then those that a tour would use. The result is
+deterministic.
 """
 
 import numpy as np
@@ -17,32 +18,34 @@ from ftdrive.planning.search.nodes import Nodes, distinct
 from ftdrivers.ur.kinematics import Array
 
 FORBIDDEN_S = 1e6
-# Per radian, summed over the joints: among equally fast tours the calmer one.
+# Cost per radian, summed over the joints: it prefers less motion among equally fast tours.
 COST_OF_TRAVEL_S = 0.02
+# Number of perturbations of the final search, and of each round before.
 SHAKES = 150
 SHAKES_A_ROUND = 10
-# Most rounds of proving the moves of a tour and finding another one without those that are not clear.
+# Largest number of rounds; each proves the moves of a tour and excludes those that are not clear.
 ROUNDS = 60
-# Up to this many joint vectors every move is looked at; of more, those to the nearest ones of each group.
+# Up to this number of joint vectors all moves are considered; otherwise those to the nearest ones of each group.
 FEW = 120
 NEAREST_OF_EACH = 2
-# From here on only the nearest of all groups are looked at: moves to each group are as many as their square.
+# From this number of groups on, only moves to the nearest joint vectors of all groups are considered.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
-# In all layers together, about.
+# Approximate number of neighbours in all layers together.
 NEIGHBOURS = 10
-# Number of the first nodes of each group; more where those do not hang together.
+# Number of nodes of each group that are used; the larger one if the first ones are not connected.
 MOST_NODES = (25, 60)
 
 
 def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
-    """Number (n,) the parts of free joint space, from 0, that hang together by clear moves between neighbours.
+    """Return the index (n,) of the connected part of free joint space, from 0, to which each joint vector belongs.
 
     Parameters
     ----------
     q_rad : array, shape (n, 6)
-        Free.
+        Free joint vectors.
     layer : int array, shape (n,)
-        Neighbours are looked for in each layer, from 0, by itself: for nodes that are dense in some joints only.
+        Layer of each joint vector, from 0. Neighbours are searched in each layer separately, because joint vectors may
+        be dense in some joints only.
     """
     shapes, of = distinct(certifier, q_rad)
     layer_of_shape = layer[np.unique(of, return_index=True)[1]]
@@ -52,20 +55,20 @@ def connected(certifier: Certifier, q_rad: Array, layer: Nodes) -> Nodes:
 
 
 def clear_tour(certifier: Certifier, q_rad: Array, group: Nodes, speeds: Speeds) -> Nodes | None:
-    """Order of nodes of a short closed tour of clear moves, one of each group.
+    """Return a short closed tour of clear moves through one node of each group.
 
     Parameters
     ----------
     q_rad : array, shape (n, 6)
-        Free.
+        Free joint vectors.
     group : int array, shape (n,)
-        From 0, none left out; where a group has many nodes, the preferred ones come first.
+        Group of each node, from 0 without gaps. In a group with many nodes, the preferred ones come first.
     speeds : Speeds
 
     Returns
     -------
     int array or None
-        None where none was found.
+        Indices of the nodes in the order of travel; None if no tour was found.
     """
     if not len(q_rad):
         return None
@@ -104,9 +107,9 @@ def _tour_of(
         if clear.all():
             if shakes == SHAKES:
                 return inside[order]
-            best, shakes = inside[order], SHAKES  # clear, now short as well
+            best, shakes = inside[order], SHAKES  # this tour is clear; search for a shorter one
         for i, j in zip(start[~clear], end[~clear], strict=True):
-            # Where one move is blocked others from and to its ends may be too: see them before the next round.
+            # If a move is blocked, other moves from and to its ends may be blocked too: prove them now.
             others = np.flatnonzero(group == group[j]), np.flatnonzero(group == group[i])
             proof.prove(known_as[np.repeat(i, len(others[0]))], known_as[others[0]])
             proof.prove(known_as[np.repeat(j, len(others[1]))], known_as[others[1]])
@@ -116,7 +119,7 @@ def _tour_of(
 def shortest_tour(
     cost_s: Array, group: Nodes, allowed: NDArray[np.bool_], *, start: Nodes | None = None, shakes: int = SHAKES
 ) -> Nodes | None:
-    """Order of nodes of a short closed tour over allowed moves, one of each group; None where none was found."""
+    """Return the nodes of a short closed tour over allowed moves, one of each group; None if none was found."""
     groups = [np.flatnonzero(group == g) for g in range(group.max() + 1)] if len(group) else []
     if len(groups) < 2 or not all(len(nodes) for nodes in groups):
         return None
@@ -135,7 +138,7 @@ def shortest_tour(
 
 
 class _Proof:
-    """What is known of the moves between joint vectors; every pair of shapes is judged once at most."""
+    """Proofs of moves between joint vectors; every pair of shapes is certified at most once."""
 
     def __init__(self, certifier: Certifier, q_rad: Array) -> None:
         self._certifier = certifier
@@ -145,7 +148,7 @@ class _Proof:
         self._clear = np.eye(n, dtype=np.bool_)
 
     def prove(self, start: Nodes, end: Nodes) -> NDArray[np.bool_]:
-        """Say (m,) whether moves between nodes are clear."""
+        """Return (m,) whether moves between nodes are clear."""
         i, j = self.of[start], self.of[end]
         open_ = np.unique(np.sort(np.stack([i, j], axis=1)[~self._known[i, j]], axis=1), axis=0)
         if len(open_):
@@ -156,25 +159,25 @@ class _Proof:
         return np.asarray(self._clear[i, j])
 
     def not_refuted(self, nodes: Nodes) -> NDArray[np.bool_]:
-        """Say (m, m) which moves between nodes are clear or not judged yet."""
+        """Return (m, m) whether moves between nodes are clear or not yet certified."""
         of = self.of[nodes]
         return np.asarray((self._clear | ~self._known)[np.ix_(of, of)])
 
     def parts(self, nodes: Nodes, start: Nodes, end: Nodes) -> Nodes:
-        """Part (m,) of each of some nodes, from those of these moves between them that are clear."""
+        """Return the connected part (m,) of each node, over those of the given moves that are clear."""
         clear = self.prove(nodes[start], nodes[end])
         edges = coo_array((np.ones(clear.sum()), (start[clear], end[clear])), shape=(len(nodes), len(nodes)))
         return np.asarray(connected_components(edges, directed=False)[1], dtype=np.intp)
 
 
 def _to_neighbours(q_rad: Array, count: int, among: Nodes) -> tuple[Nodes, Nodes]:
-    """Moves from every node to its nearest ones among some."""
+    """Return the moves (start, end) from every node to its nearest ones among some nodes."""
     near = cKDTree(q_rad[among]).query(q_rad, range(1, min(count, len(among)) + 1), p=np.inf)[1]
     return np.repeat(np.arange(len(q_rad)), near.shape[1]), among[near.ravel()]
 
 
 def _to_every_group(q_rad: Array, group: Nodes, count: int) -> tuple[Nodes, Nodes]:
-    """Moves from every node to its nearest ones of each group."""
+    """Return the moves (start, end) from every node to its nearest ones of each group."""
     start, end = np.hstack([_to_neighbours(q_rad, count, np.flatnonzero(group == g)) for g in range(group.max() + 1)])
     return start, end
 
@@ -194,7 +197,7 @@ def _nearest_neighbours(groups: list[Nodes], cost: Array) -> Nodes:
 
 
 def _improved(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> tuple[Nodes, float]:
-    """Return a tour that no reversed part and no other choice shortens, and its length."""
+    """Return a tour that no reversal and no other choice within the groups shortens, and its cost, s."""
     tour, length = _choice(tour, group, groups, cost), np.inf
     while (now := _tour_length(tour, cost)) < length - 1e-9:
         length = now
@@ -203,7 +206,7 @@ def _improved(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> tu
 
 
 def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
-    """Reverse the part of the tour that shortens it most, until none does."""
+    """Return the tour after reversing segments until no reversal shortens it (2-opt)."""
     n = len(tour)
     i, j = np.triu_indices(n, 2)
     while True:
@@ -217,7 +220,7 @@ def _reversed_parts(tour: Nodes, cost: Array) -> Nodes:
 
 
 def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Nodes:
-    """Choose the best node of each group for the order of the groups in a closed tour."""
+    """Return the tour with the best node of each group for the given order of the groups."""
     order = [groups[g] for g in group[tour]]
     first = min(range(len(order)), key=lambda k: len(order[k]))
     order = order[first:] + order[:first]
@@ -237,6 +240,6 @@ def _choice(tour: Nodes, group: Nodes, groups: list[Nodes], cost: Array) -> Node
 
 
 def _shaken(tour: Nodes, rng: np.random.Generator) -> Nodes:
-    """Exchange two neighbouring parts of the tour (double bridge)."""
+    """Return the tour with two neighbouring segments exchanged (double bridge)."""
     a, b, c = np.sort(rng.choice(np.arange(1, len(tour) + 1), 3, replace=False))
     return np.concatenate([tour[:a], tour[b:c], tour[a:b], tour[c:]])
