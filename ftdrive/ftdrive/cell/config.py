@@ -1,10 +1,10 @@
 # ruff: noqa: RUF009 - `entry` returns a new field for each key
-"""The configuration of one cell: its keys with their rules, the source of each value, and the file with comments.
+"""Configuration of a cell: keys with their rules, the source of each value, and the configuration file.
 
-The first of these that sets a value counts: an option of the command; the environment, where FTDRIVE_ROBOT_HOST is the
-key `host` of `[robot]`; the project's file, `ftdrive.toml` in the working directory, or `--config`; the user's file,
-`$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. Values that must be measured have no default. The averaging time
-is chosen from a record of the sensor at rest, unless `average_s` is set and `noise_record_s` is not.
+A value comes from the first of these sources that sets it: an option of the command; the environment, where
+FTDRIVE_ROBOT_HOST is the key `host` of `[robot]`; the project's file, which is `ftdrive.toml` in the working directory
+or `--config`; the user's file, `$XDG_CONFIG_HOME/ftdrive/ftdrive.toml`; the default. Values that must be measured have
+no default. The averaging time is chosen from a noise record, unless `average_s` is set and `noise_record_s` is not.
 """
 
 import json
@@ -34,59 +34,62 @@ PREFIX = "FTDRIVE_"
 CLOCK = "FTDRIVE_CLOCK"
 _HOMES = {"config": "~/.config", "data": "~/.local/share", "state": "~/.local/state"}
 
-# Expected mass of a tool whose mass is not configured.
+# Assumed mass of a tool whose mass is not configured.
 USUAL_KG = 1.0
-# One sigma, an axis, of an orientation by the nominal kinematics of a model: 20 real arms are .13 to 1.04° off in all.
+# Standard deviation per axis of a flange orientation from nominal kinematics; 20 real arms are off by 0.13° to 1.04°.
 NOMINAL_ORIENTATION_DEG = 0.3
 
 
-# The rule of a key stands on its field: separate tables of ranges and texts drifted apart.
+# The rule of a key is defined at its field, so that type, range and text stay consistent.
 @dataclass(frozen=True, slots=True)
 class RobotConfig:
     """The arm."""
 
     host: str = entry(
-        "name or IPv4 address of the controller, or topics of ROS 2 such as ros2:/pose",
+        "name or IPv4 address of the controller, or ROS 2 topics such as ros2:/pose",
         option="--robot",
         reject=rules.reject_host,
     )
     model: str | None = entry(
-        'such as "ur5e"; compared with the controller where it reports one',
+        'model of the arm, such as "ur5e"; compared with the model that the controller reports',
         None,
         option="--model",
         reject=rules.reject_model,
     )
     speed_deg_s: float = entry(
-        "of the fastest joint; the first run of a plan is slower", 60.0, "deg/s", (0.5, 60), option="--speed"
+        "speed of the fastest joint; the first run of a plan is slower", 60.0, "deg/s", (0.5, 60), option="--speed"
     )
-    acceleration_deg_s2: float = entry("of the fastest joint", 80.0, "deg/s²", (1, 300))
+    acceleration_deg_s2: float = entry("acceleration of the fastest joint", 80.0, "deg/s²", (1, 300))
     stop_deceleration_deg_s2: float = entry(
-        "of the fastest joint in a stop; lower it if the arm with a heavy tool ends a stop in a protective stop",
+        "deceleration of the fastest joint in a stop; lower it if a stop with a heavy tool causes a protective stop",
         300.0,
         "deg/s²",
         (60, 300),
     )
     tip_speed_mm_s: float = entry(
-        "of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
+        "speed of the tool's farthest point; 250 is the reduced speed of ISO 10218-1", 250.0, "mm/s", (1, 250)
     )
     orientation_accuracy_deg: float | None = entry(
-        "of the flange, one standard deviation of an axis; 0.06 is assumed if it is not set, as for an arm with its "
-        "own factory kinematics; 0 declares an exact arm with rigid mounts",
+        "standard deviation per axis of the flange orientation; if it is not set, 0.06 is assumed, which is typical of "
+        "factory-calibrated kinematics; 0 declares an exact arm with rigid mounts",
         None,
         "deg",
         (0, 5),
     )
-    driver: str = entry("ur, or the entry point of an arm of another package", "ur", reject=rules.reject_empty)
+    driver: str = entry("driver of the arm: ur, or an entry point of another package", "ur", reject=rules.reject_empty)
     control: str = entry(
-        "auto, ur-rtde or script: what moves the arm; auto takes ur-rtde where it is installed and the controller has "
-        "what it needs; script begins to brake within 0.3 s when this computer or the network fails",
+        "control path: auto, ur-rtde or script; auto takes ur-rtde if it is installed and the controller supports it; "
+        "script starts to brake within 0.3 s when this computer or the network fails",
         "auto",
         reject=rules.reject_control,
     )
-    api_port: int = entry("of the Robot API of PolyScope X", 80, between=(1, 65535))
-    serial: str | None = entry("serial number; if set, nothing moves on another arm", None, reject=rules.reject_empty)
+    api_port: int = entry("port of the Robot API of PolyScope X", 80, between=(1, 65535))
+    serial: str | None = entry(
+        "serial number of the arm; if it is set, no other arm is moved", None, reject=rules.reject_empty
+    )
     simulate: bool = entry(
-        "true for an emulated cell: commands with --simulate take its tool, masses, surroundings and speed, all others "
+        "true for an emulated cell: commands with --simulate use its tool, masses, surroundings and speed; other "
+        "commands "
         "refuse it",
         False,
     )
@@ -96,12 +99,14 @@ class RobotConfig:
 class SensorConfig:
     """The force/torque sensor."""
 
-    url: str = entry("such as ati-can://can0?bitrate=250000", option="--sensor", reject=rules.reject_empty)
+    url: str = entry("address, such as ati-can://can0?bitrate=250000", option="--sensor", reject=rules.reject_empty)
     sign: int = entry(
-        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` finds it", 1, reject=rules.reject_sign
+        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` determines it",
+        1,
+        reject=rules.reject_sign,
     )
     height_mm: float | None = entry(
-        "of the sensor's origin above the flange face; gravity cannot identify it",
+        "height of the sensor's origin above the flange face; gravity does not determine it",
         None,
         "mm",
         (0, 500),
@@ -109,26 +114,26 @@ class SensorConfig:
         reject=rules.reject_height,
     )
     mass_kg: float | None = entry(
-        "of sensor and adapter, from scale or datasheet; the sensor cannot weigh itself",
+        "mass of sensor and adapter, from a scale or data sheet; the sensor cannot measure it",
         None,
         "kg",
         (0, 20),
         option="--sensor-mass",
     )
     accuracy_percent: float | None = entry(
-        "of its readings under load, 95 % of them, from the data sheet or a check; 4 is assumed if it is not set",
+        "accuracy under load (95 % of readings), from the data sheet or a check; 4 is assumed if it is not set",
         None,
         "%",
         (0, 20),
     )
-    range_N: float | None = entry("of its forces, from the data sheet", None, "N", (0, 1e5))
-    range_Nm: float | None = entry("of its torques", None, "N·m", (0, 1e4))
+    range_N: float | None = entry("measuring range of the forces, from the data sheet", None, "N", (0, 1e5))
+    range_Nm: float | None = entry("measuring range of the torques", None, "N·m", (0, 1e4))
     delay_ms: float | None = entry(
-        "delay of the wrench after the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
+        "delay of the wrench relative to the pose; estimated from motion if it is not set", None, "ms", (-100, 100)
     )
     mount: str | None = entry(
         "label of the mounting, such as adapter-a; a calibration is valid for one label: change it when the sensor is "
-        "mounted again",
+        "remounted",
         None,
         reject=rules.reject_empty,
     )
@@ -136,33 +141,34 @@ class SensorConfig:
 
 @dataclass(frozen=True, slots=True)
 class ToolConfig:
-    """Everything mounted on the flange, the sensor included. What is not described here may collide."""
+    """Everything mounted on the flange, including the sensor. Parts that are not described here may collide."""
 
     name: str = entry(
-        "of the tool; `live --tool NAME` takes its newest calibration",
+        "name of the tool; `live --tool NAME` uses its newest calibration",
         "tool",
         option="--tool-name",
         reject=rules.reject_empty,
     )
     cylinders_mm: Rows = entry(
-        "[from, to, diameter] along the flange z axis from the flange face; [from, to, diameter, x, y] puts the axis "
-        "aside; measure cables, cameras and screws too",
+        "[from, to, diameter] along the flange z axis from the flange face; [from, to, diameter, x, y] shifts the axis "
+        "sideways; include cables, cameras and screws",
         (),
         "mm",
         option="--tool",
         reject=rules.reject_cylinders,
     )
     mass_kg: float | None = entry(
-        "of what hangs on the sensor, about; compared with the controller's payload and the sensor's range; until six "
-        "poses are taken, a larger change of the wrench counts as contact",
+        "approximate mass below the sensor; compared with the controller's payload and the sensor's range; it limits "
+        "the "
+        "change of the wrench until six poses are taken",
         None,
         "kg",
         (0.001, 100),
         option="--tool-mass",
     )
     mass_sigma_kg: float | None = entry(
-        "one standard deviation of mass_kg, if a scale gave it: the tool then shows the scale of the sensor too; 0.2 % "
-        "of the mass is usual",
+        "standard deviation of mass_kg, if the tool was weighed on a scale; it then calibrates the gain of the sensor; "
+        "0.2 % of the mass is typical",
         None,
         "kg",
         (0, 1),
@@ -174,24 +180,26 @@ class WorkcellConfig:
     """Base and surroundings, in base axes, mm from the centre of the base. PLACEHOLDERS until measured."""
 
     mounting: str | None = entry(
-        "floor, wall, ceiling, or degrees the base leans towards its -x, 90 is wall; a floor where it is not set, but "
-        "then no result is good whose gravity points elsewhere",
+        "floor, wall, ceiling, or the lean of the base towards -x in degrees, 90 is a wall; without it a floor is "
+        "assumed, "
+        "and results with another gravity direction are not accepted as good",
         None,
         option="--mounting",
         reject=rules.reject_mounting,
     )
     planes_mm: Rows = entry(
-        "[nx, ny, nz, place]: the arm stays where normal times point is place or more; [-1, 0, 0, -800] is a wall 800 "
-        "mm away towards +x; the plane under the base is always there",
+        "[nx, ny, nz, offset]: the arm stays where normal · point is at least the offset; [-1, 0, 0, -800] is a wall "
+        "at "
+        "+x 800 mm; the plane under the base is always included",
         (),
         "mm",
         option="--plane",
         reject=rules.reject_planes,
     )
     boxes_mm: Rows = entry(
-        "[x, y, z, x, y, z], two opposite corners of a block", (), "mm", option="--box", reject=rules.reject_boxes
+        "[x, y, z, x, y, z], two opposite corners of a box", (), "mm", option="--box", reject=rules.reject_boxes
     )
-    measured: bool = entry("set it to true when tool, planes and boxes are measured; nothing moves before", False)
+    measured: bool = entry("set it to true when tool, planes and boxes are measured; otherwise nothing moves", False)
 
 
 _ROUTINE = {item.name: item.default for item in fields(Sampling)}
@@ -199,17 +207,22 @@ _ROUTINE = {item.name: item.default for item in fields(Sampling)}
 
 @dataclass(frozen=True, slots=True)
 class _SamplingConfig(Sampling):
-    """How long each pose is averaged."""
+    """Averaging of each pose."""
 
     average_s: float = entry(
-        "at each pose; if set alone, no noise record is taken", _ROUTINE["average_s"], "s", (0.05, 600)
+        "averaging time of each pose; if only this key is set, no noise record is taken",
+        _ROUTINE["average_s"],
+        "s",
+        (0.05, 600),
     )
-    still_timeout_s: float = entry("until the arm rests at a pose", _ROUTINE["still_timeout_s"], "s", (1, 600))
+    still_timeout_s: float = entry("time-out until the arm rests at a pose", _ROUTINE["still_timeout_s"], "s", (1, 600))
     attempts: int = entry(
-        "averages of a pose that moves or drifts; the last is kept as noisy", _ROUTINE["attempts"], between=(1, 100)
+        "number of averages of a pose that moves or drifts; the last one is kept and marked as noisy",
+        _ROUTINE["attempts"],
+        between=(1, 100),
     )
     noise_record_s: float = entry(
-        "record of the sensor at rest before the tour, which chooses the averaging time; 0 for none",
+        "noise record of the resting sensor before the tour, which sets the averaging time; 0 for none",
         _ROUTINE["noise_record_s"],
         "s",
         (0, 600),
@@ -219,17 +232,18 @@ class _SamplingConfig(Sampling):
 
 @dataclass(frozen=True, slots=True)
 class _SiteConfig:
-    """The place of the cell."""
+    """Location of the cell."""
 
-    g_m_s2: float = entry("local gravity; it scales the mass and nothing else", 9.80665, "m/s²", (9.7, 9.9))
+    g_m_s2: float = entry("local gravity; it only scales the mass", 9.80665, "m/s²", (9.7, 9.9))
 
 
 @dataclass(frozen=True, slots=True)
 class _StoreConfig:
-    """The store of results and verifications, an index of run folders."""
+    """Store of results and verifications, an index of run folders."""
 
     url: str | None = entry(
-        "of the database, such as sqlite:////data/store.sqlite; a file in the user's data folder if it is not set",
+        "address of the database, such as sqlite:////data/store.sqlite; if it is not set, a file in the user's data "
+        "folder",
         None,
         reject=rules.reject_store,
     )
@@ -237,7 +251,7 @@ class _StoreConfig:
 
 @dataclass(frozen=True, slots=True)
 class CellConfig:
-    """Everything that is configured."""
+    """Configuration of a cell."""
 
     robot: RobotConfig
     sensor: SensorConfig
@@ -247,37 +261,37 @@ class CellConfig:
     site: _SiteConfig = field(default_factory=_SiteConfig)
     store: _StoreConfig = field(default_factory=_StoreConfig)
     clock: Clock = field(default=REAL, compare=False, repr=False)
-    """Times everything in the cell; an emulated cell has its own. It is in no file."""
+    """Clock of the cell; an emulated cell has its own clock. Files do not contain it."""
 
     @property
     def is_emulated(self) -> bool:
-        """Whether the cell has a time of its own."""
+        """Whether the cell is emulated and so has its own clock."""
         return self.clock is not REAL
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the sections as files have them; a password in the store's address is left out."""
-        found = {name: asdict(getattr(self, name)) for name in SECTIONS}
+        """Return the sections as in a file, without the password in the store's address."""
+        sections = {name: asdict(getattr(self, name)) for name in SECTIONS}
         if self.store.url is not None:
-            found["store"]["url"] = without_password(self.store.url)
-        return found
+            sections["store"]["url"] = without_password(self.store.url)
+        return sections
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One value of the configuration."""
+    """A value of the configuration and its origin."""
 
     value: Any
-    """None where it is not set and has no default."""
+    """The value; None if it is not set and has no default."""
     origin: str
     """The option, variable or file that sets it; "default" or "not set"."""
 
 
 def without_password(text: str) -> str:
-    """Return an address, or a word of a command line, without the password in it."""
+    """Return an address, or an argument of a command line, without its password."""
     return re.sub(r"(://[^:/@]*):.*@", r"\1@", text)
 
 
-# An option of a command, and its value; None where it was not given.
+# An option of a command and its value; None if the option was not given.
 Flag = tuple[str, Any]
 
 SECTIONS: Mapping[str, Any] = {
@@ -295,9 +309,9 @@ RULES: Mapping[str, Rule] = {key: rule_of(item) for key, item in _KEYS.items()}
 
 
 def clock_in_force() -> Clock:
-    """Return the clock of the emulated cell whose page FTDRIVE_CLOCK names, else the computer's.
+    """Return the clock of the emulated cell that FTDRIVE_CLOCK names, else the clock of the computer.
 
-    An emulated cell of another process looks like a real one, but only its own clock waits for a busy computer.
+    An emulated cell in another process looks like a real one, but only its own clock waits for a busy computer.
     """
     if page := os.environ.get(CLOCK):
         from ftdrive.cell.emulated_clock import EmulatedClock
@@ -307,7 +321,7 @@ def clock_in_force() -> Clock:
 
 
 def load(config: Path | None = None, flags: Mapping[str, Flag] | None = None, *, devices: bool = True) -> CellConfig:
-    """Read a cell from all sources, as `settings`; without `devices` the addresses of arm and sensor may be empty."""
+    """Return the cell from all sources, see `settings`; with `devices` false, arm and sensor may lack an address."""
     return cell_of(settings(config, flags), devices=devices)
 
 
@@ -316,9 +330,9 @@ def settings(
 ) -> dict[str, Setting]:
     """Return every key, such as "robot.host", with its value and origin.
 
-    `config` is read in place of the project's file. `flags` are options of the command by key, such as
+    `config` replaces the project's file. `flags` are options of the command by key, such as
     ``{"robot.host": ("--robot", "10.0.0.2")}``. An emulated `cell` replaces all files and variables. Raises
-    `ConfigError` with source, section, key, value and what to do.
+    `ConfigError`, whose message names source, section, key and value, and the remedy.
     """
     found: dict[str, Setting] = {}
     if cell is not None:
@@ -332,7 +346,7 @@ def settings(
     for key, (option, value) in (flags or {}).items():
         if value is not None:
             found[key] = Setting(check_value(option, key, value), option)
-    # A set averaging time is not chosen again.
+    # A configured averaging time needs no noise record.
     if "sampling.average_s" in found:
         found.setdefault("sampling.noise_record_s", Setting(0.0, found["sampling.average_s"].origin))
     defaults = {key: None if item.default is MISSING else item.default for key, item in _KEYS.items()}
@@ -341,7 +355,7 @@ def settings(
 
 
 def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfig:
-    """Turn settings into a cell; raises `ConfigError` when a device is needed, but not named or emulated."""
+    """Return the cell of these settings; raises `ConfigError` if a needed device has no address or is emulated."""
     if devices and values["robot.simulate"].value:
         origin = values["robot.simulate"].origin
         raise ConfigError(
@@ -353,7 +367,7 @@ def cell_of(values: Mapping[str, Setting], *, devices: bool = True) -> CellConfi
         section, key = missing[0].split(".")
         raise ConfigError(
             f"[{section}] {key} is not set: write it into {FILE} (`ftdrive init` asks for it), set "
-            f"{variable(missing[0])} or give {RULES[missing[0]].option}; --simulate takes an emulated cell"
+            f"{variable(missing[0])} or give {RULES[missing[0]].option}; --simulate uses an emulated cell"
         )
     found = {key: setting.value for key, setting in values.items()} | dict.fromkeys(missing, "")
     return CellConfig(
@@ -371,22 +385,22 @@ def variable(key: str) -> str:
 
 
 def as_toml(value: Any) -> str:
-    """Return a value as a file has it."""
+    """Return a value as TOML."""
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return json.dumps(value)
 
 
 def user_folder(kind: str) -> Path:
-    """Return the folder of a user for "config", "data" or "state"; it need not exist."""
+    """Return the user's folder for "config", "data" or "state", which may not exist."""
     home = os.environ.get(f"XDG_{kind.upper()}_HOME", "")
     return (Path(home) if Path(home).is_absolute() else Path(_HOMES[kind]).expanduser()) / "ftdrive"
 
 
 def _from_file(path: Path) -> dict[str, Setting]:
     document = read_toml(path)
-    if (found := document.pop("format", None)) != FORMAT:
-        instead = "" if found is None else f", found {found!r}"
+    if (version := document.pop("format", None)) != FORMAT:
+        instead = "" if version is None else f", but it is {version!r}"
         raise ConfigError(f'{path}: the first line must be format = "{FORMAT}"{instead}')
     if unknown := sorted(document.keys() - SECTIONS.keys()):
         raise ConfigError(f"{path}: unknown section [{unknown[0]}]: {_suggestion(unknown[0], 'sections', SECTIONS)}")
@@ -394,7 +408,8 @@ def _from_file(path: Path) -> dict[str, Setting]:
     for section, content in document.items():
         if not isinstance(content, dict):
             raise ConfigError(
-                f"{path}: {section} = {content!r} is not a section: write [{section}] alone on a line, its keys below"
+                f"{path}: {section} = {content!r} is not a section: write [{section}] on its own line, and the keys "
+                "below"
             )
         for key, value in content.items():
             if f"{section}.{key}" not in _KEYS:
@@ -406,7 +421,7 @@ def _from_file(path: Path) -> dict[str, Setting]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a file; raises `ConfigError` or `OSError`."""
+    """Return the contents of a TOML file; raises `ConfigError` or `OSError`."""
     try:
         return tomllib.loads(read_file(path).decode("utf-8-sig"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
@@ -427,14 +442,14 @@ def _from_environment() -> dict[str, Setting]:
         for section in SECTIONS:
             if name.startswith(start := variable(section) + "_"):
                 known = _suggestion(name.removeprefix(start).lower(), "keys", _key_names(section))
-                raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset it")
+                raise ConfigError(f"{name} is set, but [{section}] has no such key: {known}; unset the variable")
     return values
 
 
 def _parse_variable(name: str, key: str, text: str) -> Any:
-    """Read a text as it is, and everything else as a file has it."""
+    """Return the value of an environment variable: a string unchanged, other types parsed as TOML."""
     if not text:
-        raise ConfigError(f"{name} is empty: give [{key.replace('.', '] ')} a value, or unset it")
+        raise ConfigError(f"{name} is empty: give it a value for [{key.replace('.', '] ')}, or unset it")
     if _KEYS[key].type in {str, str | None}:
         return text
     try:
@@ -454,9 +469,9 @@ def _suggestion(unknown: str, kind: str, names: Iterable[str]) -> str:
 
 
 def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return the cell that a run has recorded; raises `ConfigError` for a value of a wrong type.
+    """Return the sections that a run has recorded; raises `ConfigError` for a value of a wrong type.
 
-    Keys that this version does not know are left out. Ranges are not checked: another version may have had others.
+    Unknown keys are left out. Ranges are not checked, because another version may have had other ranges.
     """
     return {
         section: {
@@ -470,40 +485,40 @@ def read_recorded(config: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str
 
 
 def recorded_cell(config: Mapping[str, Mapping[str, Any]]) -> CellConfig:
-    """Return the cell of a run from what `read_recorded` returns."""
+    """Return the cell of a run from the result of `read_recorded`."""
     return CellConfig(**{name: kind(**config.get(name, {})) for name, kind in SECTIONS.items()}, clock=clock_in_force())
 
 
 def orientation_accuracy_deg(host: str | None, declared: float | None) -> float | None:
-    """Return that of an arm as declared, else that of nominal kinematics if its joints are topics with a URDF."""
+    """Return the declared orientation accuracy, else that of nominal kinematics for an arm with a URDF, else None."""
     nominal = NOMINAL_ORIENTATION_DEG if host is not None and "urdf=" in host else None
     return nominal if declared is None else declared
 
 
 def check_value(place: str, key: str, value: Any) -> Any:
-    """Return the value of a key such as "robot.host" as its section takes it, or raise `ConfigError`."""
+    """Return the value of a key such as "robot.host" converted to its type; raises `ConfigError` if it is invalid."""
     where = f"{place}: [{key.replace('.', '] ')} = {value!r}"
     if key == "workcell.mounting" and rules.is_number(value):  # degrees
         value = str(value)
     return rules.ruled(where, _KEYS[key], value)
 
 
-# Longest line of a file.
+# Longest line of a configuration file.
 WIDTH = 120
 
 
-def cell_file(cell: CellConfig, found: Sequence[str]) -> str:
-    """Return a cell as a file, with what the devices report; `workcell.measured` is false in it, whatever the cell has.
+def cell_file(cell: CellConfig, reports: Sequence[str]) -> str:
+    """Return the configuration file of a cell, with comments about its devices; `workcell.measured` is always false.
 
-    Keys that `init` does not ask for are commented out, so that the user's file still counts.
+    Keys that `init` does not ask for are commented out, so that the user's file still sets them.
     """
     values = {f"{section}.{key}": value for section, keys in cell.to_dict().items() for key, value in keys.items()}
     values["workcell.measured"] = False
     asked = {key for key, rule in RULES.items() if rule.option} | {"workcell.measured"}
     asked |= {"robot.simulate"} if cell.robot.simulate else set()
     lines = [
-        *(f"# {''.join(c if c.isprintable() else '?' for c in words)}" for words in found),
-        "# To print the values in force and their origins: ftdrive config show --origin",
+        *(f"# {''.join(c if c.isprintable() else '?' for c in words)}" for words in reports),
+        "# To print all values and their origins: ftdrive config show --origin",
     ]
     return document(values, lambda key: RULES[key].description, head=["", *lines], active=lambda key: key in asked)
 
@@ -516,7 +531,7 @@ def document(
     active: Callable[[str], bool] = lambda _: True,
     width: int = WIDTH,
 ) -> str:
-    """Return values by key, such as "robot.host", as a file; those that are None or not active are commented out."""
+    """Return values by key, such as "robot.host", as a file; values that are None or not active are commented out."""
     lines = [f'format = "{FORMAT}"', *head]
     for section, keys in groupby(values, lambda key: key.split(".")[0]):
         about = wrap(getdoc(SECTIONS[section]) or "", width - 2)
@@ -527,7 +542,7 @@ def document(
 
 
 def _entry(name: str, value: Any, comment: str, active: bool, width: int) -> Iterator[str]:
-    """Yield the lines of one value: its comment behind it where there is room, else above it."""
+    """Yield the lines of a value, with its comment after it if there is room, else above it."""
     text = f"{name} =" if value is None else f"{name} = {as_toml(value)}"
     line = f"{text if active and value is not None else f'# {text}':<32} # {comment}".removesuffix(" # ").rstrip()
     if len(line) <= width:

@@ -1,4 +1,4 @@
-"""The only place where configuration becomes drivers."""
+"""Construction of drivers from the configuration; no other module does this."""
 
 from collections.abc import Callable
 from math import radians
@@ -16,7 +16,7 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
-    """Build the arm's driver, not yet open; it moves at the speed of the cell unless a move names its own."""
+    """Return the driver of the arm, not yet open; its default speed is that of the cell."""
     robot = cell.robot
     try:
         by_topic = robot.driver == "ur" and robot.host.startswith("ros2:")
@@ -24,7 +24,7 @@ def build_arm(cell: CellConfig) -> RobotArm:
         build = cast("Callable[..., RobotArm]", arm_class(driver))
     except BadUrl as error:
         raise ConfigError(f"[robot] driver: {error}") from error
-    # Only an emulated arm takes a clock: an arm of another package may not know it.
+    # Only an emulated arm gets a clock, because a driver of another package may not accept one.
     more: dict[str, Any] = {"clock": cell.clock} if cell.is_emulated else {}
     if driver == "ur":
         timing = UrTiming.emulated() if cell.is_emulated else STRICT
@@ -37,12 +37,12 @@ def build_arm(cell: CellConfig) -> RobotArm:
         acceleration_rad_s2=radians(robot.acceleration_deg_s2),
         **more,
     )
-    _fits: Arm = arm  # checked statically: what the routine asks for is what the driver gives
+    _fits: Arm = arm  # checked statically: the driver satisfies the interface of the routine
     return arm
 
 
 def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
-    """Build the sensor's driver, not yet open."""
+    """Return the driver of the sensor, not yet open."""
     url, clock = sensor_reached(cell.sensor.url, cell.clock)
     sensor = sensor_from_url(url, sign=cell.sensor.sign, clock=clock)
     _fits: Sensor = sensor
@@ -50,11 +50,13 @@ def build_sensor(cell: CellConfig) -> ForceTorqueSensor:
 
 
 def program_registers(cell: CellConfig, first: int, integers: int, doubles: int) -> ProgramRegisters:
-    """Claim registers for answers to the program on the controller.
+    """Return registers for answers to a program on the controller.
 
-    Raises `ConfigError` if the arm has none, and `ConnectError` if nothing answers, or another client or a fieldbus
-    owns a register.
+    Raises `ConfigError` if the arm has no registers, and `ConnectError` if the controller does not answer, or if
+    another client or a fieldbus owns a register.
     """
     if cell.robot.driver != "ur":
-        raise ConfigError(f"[robot] driver {cell.robot.driver} has no registers: serve-load needs a UR")
+        raise ConfigError(
+            f"[robot] driver {cell.robot.driver} has no registers: use serve-load with a Universal Robots arm"
+        )
     return ProgramRegisters(cell.robot.host, first, integers, doubles, clock=cell.clock)

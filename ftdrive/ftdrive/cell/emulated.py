@@ -1,4 +1,4 @@
-"""An emulated cell as a child process; the real drivers reach it over real wires."""
+"""An emulated cell as a child process, with which the real drivers communicate over real interfaces."""
 
 import atexit
 import json
@@ -17,31 +17,31 @@ from ftdrivers import sensors
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError
 
-# The emulated arm moves this many times faster; nothing else differs from a real cell.
+# Factor on the speed of the emulated arm, the only difference from a real cell.
 TIME_SCALE = 20
-# Options of a cell whose arm is recorded in motion.
+# Options of a cell that is recorded in motion.
 REAL_PACE = ("--time-scale", "1")
 _PERFECT = ("--gain", "0", "--cross-talk", "0")
 
-# Sensors an emulated cell can have: `Station(NAME)`, or the address emulated://NAME for one without an arm.
+# Sensors of an emulated cell, for `Station(NAME)`, or with the address emulated://NAME for a sensor alone.
 SENSORS = {name: text for kind in sensors.SENSORS.values() for name, text in kind.emulated.items()}
 EMULATED = "emulated://"
-# How the emulated arm moves in modes in which the session does not move it: the request to the cell, and words.
+# Motion of the emulated arm in modes in which the session does not move it: request to the cell, and description.
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
-    "manual": ({"do": "hand-guide"}, "its arm is guided by hand from orientation to orientation"),
+    "manual": ({"do": "hand-guide"}, "its arm is guided by hand to several orientations"),
     "passive": ({"do": "production"}, "a production program picks, places and touches"),
-    "listen": ({"do": "pendant-program"}, "a program is started on its pendant, which turns the wrist"),
+    "listen": ({"do": "pendant-program"}, "a program on its pendant turns the wrist"),
 }
 
 TOOL_MM = (0.0, 200.0, 100.0)
 
 
 class Station:
-    """One `mocks` process, ended by leaving its `with` block or by the end of ours.
+    """A process of `mocks`, which ends with its `with` block or with this process.
 
-    Its `with` block raises `ConfigError` on another system than Linux. `sensor` is one of `SENSORS`, "both" (can and
-    serial) or "none"; `options` are more of `python -m ftmocks station`; `control_path` is as `[robot] control`.
-    `values` of the configuration, by key such as "tool.name", replace those of the usual emulated cell.
+    Entering the block raises `ConfigError` on a system other than Linux. `sensor` is one of `SENSORS`, "both" (can and
+    serial) or "none"; `options` are further options of `python -m ftmocks station`; `control_path` is as in
+    `[robot] control`. The `values`, by key such as "tool.name", replace those of the default emulated cell.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Station:
         self.values = dict(values)
         self.endpoints: Mapping[str, Any] = {}
         self.clock: Clock = REAL
-        """The cell's own, once it has started."""
+        """The clock of the cell, after its start."""
         self._process: subprocess.Popen[str] | None = None
 
     @classmethod
@@ -70,18 +70,18 @@ class Station:
         *,
         control_path: str | None = None,
     ) -> Self:
-        """Describe the station that a run or a calibration names as its `station`; not started.
+        """Return the station that a run or a calibration records as its `station`, not started.
 
-        Without one it is that of the configuration if `[robot] simulate` is true there, else the usual one. An address
-        emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path; `options` come after its
-        own.
+        If `made_by` is None, the station is that of the configuration if `[robot] simulate` is true there, else the
+        default one. An address emulated://NAME in `sensor` replaces its sensor, and `control_path` its control path;
+        `options` are appended to its options.
         """
         made_by = made_by or _configured(sensor)
         name = sensor_name(sensor) if sensor else made_by.get("sensor", sensor_name(None))
         path = control_path or made_by.get("control_path", "auto")
         values = {key: check_value("the run", key, value) for key, value in made_by.get("values", {}).items()}
         own = tuple(made_by.get("options", ()))
-        # Emulated sensors were perfect by default before.
+        # In earlier versions emulated sensors were perfect by default.
         if "truth" in made_by and not any(map(any, made_by["truth"].get("sensor_error", ()))):
             own = (*_PERFECT, *own)
         return cls(name, (*own, *options), control_path=path, values=values)
@@ -89,13 +89,14 @@ class Station:
     def __enter__(self) -> Self:
         if sys.platform != "linux":
             raise ConfigError(
-                f"an emulated cell needs Linux, and this is {platform.system()}: use recorded data, without --simulate"
+                f"an emulated cell needs Linux, but this is {platform.system()}: leave --simulate out and use "
+                "recorded data"
             )
         from ftdrive.cell.emulated_clock import EmulatedClock
 
         command = [sys.executable, "-P", "-m", "ftmocks", "station", "--sensor", self.sensor]
         command += ["--time-scale", str(TIME_SCALE), *self.options]
-        # A session of its own: Ctrl-C in the terminal is for us, not for the emulated cell.
+        # In a new session, so that Ctrl-C in the terminal does not reach the emulated cell.
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
         )
@@ -108,26 +109,26 @@ class Station:
             return
         process, self._process = self._process, None
         try:
-            process.communicate(timeout=3)  # closes its stdin, which ends it
+            process.communicate(timeout=3)  # closes its stdin, which ends the process
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
 
     @property
     def truth(self) -> Mapping[str, Any]:
-        """The values that a perfect calibration of this cell finds."""
+        """True parameters of this cell."""
         truth: Mapping[str, Any] = self.endpoints["truth"]
         return truth
 
     @property
     def description(self) -> dict[str, Any]:
-        """What run.json contains about it; `of` describes the same station again."""
+        """Entry of run.json about the station, from which `of` returns the same station."""
         made_by = {"sensor": self.sensor, "options": self.options, "control_path": self.control_path}
         return {"station": {**made_by, "values": self.values, "truth": self.truth}}
 
     @property
     def pid(self) -> int:
-        """Process number while the station lives."""
+        """Process id of the station; 0 if it does not run."""
         return self._process.pid if self._process else 0
 
     def control(self, **request: Any) -> Mapping[str, Any]:
@@ -138,7 +139,7 @@ class Station:
         return self._answer()
 
     def start_mover(self, mode: str, say: Callable[[str], object]) -> None:
-        """Let the cell move its arm, in a mode in which the session does not move it; `say` takes a sentence."""
+        """Let the cell move its own arm in a mode without motion commands; `say` receives a sentence about it."""
         if mover := MOVED_BY.get(mode):
             request, words = mover
             self.control(**request)
@@ -147,18 +148,18 @@ class Station:
     def _answer(self) -> Mapping[str, Any]:
         line = self._process.stdout.readline() if self._process and self._process.stdout else ""
         if not line:
-            raise ConnectError("the emulated cell has ended: read its message above")
+            raise ConnectError("the emulated cell has ended: read its last message above")
         answer: Mapping[str, Any] = json.loads(line)
         return answer
 
     @property
     def mounting(self) -> str:
-        """As set by its options."""
+        """Mounting of the base, as set by the options."""
         return self.options[self.options.index("--mount") + 1] if "--mount" in self.options else "floor"
 
     @property
     def cell(self) -> CellConfig:
-        """Configuration that reaches this station as it would reach a real cell."""
+        """Configuration with which drivers reach this station like a real cell."""
         arm = self.endpoints["arm"]
         url = next(iter(self.endpoints["sensors"].values()))["url"]
         truth = self.truth
@@ -180,7 +181,7 @@ class Station:
         return _with_values(usual, self.values)
 
 
-# What an emulated cell takes from a configuration, beside the truth that `_options` sets.
+# Keys that an emulated cell takes from a configuration, besides the true values that `_options` sets.
 _OF_FILE = (
     *("robot.speed_deg_s", "tool.name", "tool.cylinders_mm", "tool.mass_kg"),
     *("workcell.mounting", "workcell.planes_mm", "workcell.boxes_mm"),
@@ -188,24 +189,24 @@ _OF_FILE = (
 
 
 def _configured(sensor: str | None) -> Mapping[str, Any]:
-    """Return the station that the configuration describes, as a run names it; nothing if its cell is not emulated."""
-    found = settings()
-    if not found["robot.simulate"].value:
+    """Return the station of the configuration, as a run records it; empty if its cell is not emulated."""
+    configured = settings()
+    if not configured["robot.simulate"].value:
         return {}
-    values = {key: one.value for key, one in found.items() if one.value is not None}
+    values = {key: setting.value for key, setting in configured.items() if setting.value is not None}
     name = sensor_name(sensor or values.get("sensor.url"))
     chosen = {key: values[key] for key in _OF_FILE if key in values}
     return {"sensor": name, "options": _options(values, name), "values": chosen}
 
 
 def _options(values: Mapping[str, Any], sensor: str) -> tuple[str, ...]:
-    """Return the options that give a station the masses, the height and the mounting of a configuration."""
+    """Return the options of a station with the masses, the sensor height and the mounting of a configuration."""
     options = list[str]()
     if "tool.mass_kg" in values:
         options += ["--mass", str(values["tool.mass_kg"])]
     if "sensor.height_mm" in values:
         options += ["--sensor-origin", f"0,0,{values['sensor.height_mm'] / 1e3}"]
-    if "sensor.mass_kg" in values and sensor != "ur-ft":  # that one is part of the arm
+    if "sensor.mass_kg" in values and sensor != "ur-ft":  # which is part of the arm
         options += ["--sensor-mass-kg", str(values["sensor.mass_kg"])]
     mounting = values.get("workcell.mounting", "floor")
     if mounting in {"floor", "wall", "ceiling"}:
@@ -221,10 +222,10 @@ def _with_values(cell: CellConfig, values: Mapping[str, Any]) -> CellConfig:
 
 
 def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
-    """Return address and clock for a driver: for emulated://NAME those of a sensor, which is started once.
+    """Return address and clock for a driver; for emulated://NAME those of an emulated sensor, which is started once.
 
-    Its orientation is constant; emulated:// alone is an ATI sensor on CAN. Any other address keeps the given clock.
-    Raises `ConfigError` for an unknown name.
+    The orientation of the sensor is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned
+    unchanged with the given clock. Raises `ConfigError` for an unknown name.
     """
     if not url.startswith(EMULATED):
         return url, clock
@@ -233,17 +234,17 @@ def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
 
 
 def emulated_cell(url: str) -> CellConfig:
-    """Return the cell of emulated://NAME, which lives as long as this process. Raises `ConfigError`."""
+    """Return the cell of emulated://NAME, which ends with this process. Raises `ConfigError` for an unknown name."""
     return _emulated_alone(sensor_name(url))
 
 
 def sensor_name(url: str | None) -> str:
-    """Return the name in emulated://NAME, by default the first one. Raises `ConfigError`."""
+    """Return the name in emulated://NAME, by default the first sensor. Raises `ConfigError` for an unknown name."""
     name = (url or EMULATED).removeprefix(EMULATED) or next(iter(SENSORS))
     if name not in SENSORS:
         known = ", ".join(EMULATED + name for name in SENSORS)
         real = (
-            "" if (url or "").startswith(EMULATED) else f"; a real one is shown by\nftdrive live --sensor {url} --raw"
+            "" if (url or "").startswith(EMULATED) else f"; to show a real sensor:\nftdrive live --sensor {url} --raw"
         )
         raise ConfigError(f"{url} is not an emulated sensor: leave --sensor out, or give one of {known}{real}")
     return name
@@ -251,7 +252,7 @@ def sensor_name(url: str | None) -> str:
 
 @cache
 def _emulated_alone(name: str) -> CellConfig:
-    """Start a cell whose arm rests, for the life of this process."""
+    """Start a cell with a resting arm, which ends with this process; return its configuration."""
     station = Station(name, ["--time-scale", "1"])
     atexit.register(station.__exit__)
     return station.__enter__().cell

@@ -1,4 +1,4 @@
-"""The clock of an emulated cell, as a client reads it. `mocks/ftmocks/clock.py` describes page and rule."""
+"""Client of the clock of an emulated cell. `mocks/ftmocks/clock.py` describes the shared page and its rules."""
 
 import fcntl
 import mmap
@@ -15,9 +15,9 @@ from ftdrivers.errors import ConnectError
 
 _VERSION: Final = 1
 _NOW, _COUNT, _SLOTS = 1, 2, 4
-# A thread that keeps up looks at the clock this often while it waits.
+# Period at which a waiting thread in `keeping_up` reads the clock, s.
 _SLICE_S: Final = 0.005
-# When the time has stood still for so long, it is checked whether the station has ended.
+# Time without progress of the clock after which the end of the station is checked, s.
 _SUSPECT_S: Final = 0.25
 _PATIENCE_S: Final = 30.0
 _LOCAL_SLOTS: Final = 8
@@ -27,17 +27,17 @@ _claiming = threading.Lock()
 
 
 class EmulatedClock(Clock):
-    """Time of one emulated cell; when its process has ended, time goes on with the computer's.
+    """Clock of an emulated cell; after the end of its process it continues with the clock of the computer.
 
     Parameters
     ----------
     path : str
-        The page of shared memory that the station has announced.
+        Page of shared memory that the station has announced.
 
     Raises
     ------
     ConnectError
-        There is no such page, or it has another version.
+        The page does not exist, or has another version.
     """
 
     poll_s = _SLICE_S
@@ -49,31 +49,33 @@ class EmulatedClock(Clock):
             self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
             self._page = memoryview(mmap.mmap(self._descriptor, 0)).cast("q")
         except (OSError, ValueError) as error:
-            raise ConnectError(f"the clock of the emulated cell cannot be read ({error})", "start it again") from error
+            raise ConnectError(
+                f"the clock of the emulated cell cannot be read ({error})", "start the emulated cell again"
+            ) from error
         if self._page[0] != _VERSION:
             raise ConnectError(
                 f"the clock of the emulated cell has version {self._page[0]}, not {_VERSION}",
-                "install ftdrive and its emulators from one version",
+                "install ftdrive and its emulators in the same version",
             )
         weakref.finalize(self, os.close, self._descriptor)
         self._own = threading.local()
         self._seen_ns, self._seen_at_s = 0, 0.0
-        # What to add to the computer's clock, once the station has ended.
+        # Offset to the clock of the computer after the end of the station.
         self._ended_ns: int | None = None
 
     def patience_s(self, limit_s: float) -> float:
-        """Return a long limit on another process, which may starve."""
+        """Return the larger of the limit and 30 s, because another process may get little CPU time."""
         return max(limit_s, _PATIENCE_S)
 
     def now_ns(self) -> int:
-        """Return the cell's time, and let it go on where it waits for this thread and is not held."""
+        """Return the time of the cell; let it advance if it waits for this thread and is not held."""
         now_ns = self._read_ns()
         if not getattr(self._own, "held", False):
             self._follow(now_ns)
         return now_ns
 
     def sleep(self, duration_s: float) -> None:
-        """Sleep; a thread that keeps up is not waited for meanwhile."""
+        """Sleep; meanwhile the clock does not wait for this thread."""
         deadline_ns = self.now_ns() + round(duration_s * 1e9)
         self._follow(deadline_ns)
         while (left_ns := deadline_ns - self._read_ns()) > 0:
@@ -81,7 +83,7 @@ class EmulatedClock(Clock):
         self.now_ns()
 
     def wait(self, waitable: Waitable, timeout_s: float) -> bool:
-        """Wait in short turns where the cell's time waits for this thread."""
+        """Wait for an event, in short slices if the clock waits for this thread; return whether it was set."""
         deadline_ns = self.now_ns() + round(timeout_s * 1e9)
         longest_s = _SUSPECT_S if self._slot is None else _SLICE_S
         while True:
@@ -93,7 +95,7 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def keeping_up(self) -> Iterator[None]:
-        """Claim a slot of the page for this thread; blocks may be nested."""
+        """Let the clock wait for this thread during the block; blocks may be nested."""
         if self._slot is not None:
             yield
             return
@@ -106,7 +108,7 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Let the time stand still for this thread."""
+        """Stop the clock during the block, as far as it waits for this thread."""
         self._own.held = True
         try:
             yield
@@ -115,7 +117,7 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def away(self) -> Iterator[None]:
-        """Let the time go on without this thread."""
+        """Let the clock advance without this thread during the block."""
         self._follow(_NEVER_NS)
         try:
             yield
@@ -146,7 +148,7 @@ class EmulatedClock(Clock):
                 self._page[slot + 1] = self._read_ns()
                 self._page[slot] = os.getpid()
                 return slot
-        raise ConnectError("too many threads follow one emulated cell", "start another cell")
+        raise ConnectError("too many threads use one emulated cell", "start another cell")
 
     def _read_ns(self) -> int:
         if self._ended_ns is not None:
@@ -161,7 +163,7 @@ class EmulatedClock(Clock):
         return now_ns
 
     def _station_has_ended(self) -> bool:
-        """Whether the lock on the page is free, which the station holds as long as it lives."""
+        """Return whether the station has released its lock on the page, which it holds while it runs."""
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except OSError:
@@ -170,9 +172,9 @@ class EmulatedClock(Clock):
 
 
 class LocalClock(EmulatedClock):
-    """Time of a device that this process plays: it follows real time and waits for the threads that keep up."""
+    """Clock of a device that this process plays back: real time, but it waits for the threads in `keeping_up`."""
 
-    lead_s = 0.0  # what was late in a recording is late in its play
+    lead_s = 0.0  # a late record of a recording is also late in its playback
 
     def __init__(self) -> None:
         self._page = memoryview(bytearray(8 * (_SLOTS + 2 * _LOCAL_SLOTS))).cast("q")

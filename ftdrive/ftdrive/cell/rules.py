@@ -1,4 +1,4 @@
-"""The rule of a configuration key, kept in the metadata of its field: description, unit, range, option, condition."""
+"""Rules of configuration keys in the metadata of their fields: description, unit, range, option and condition."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field
@@ -9,33 +9,33 @@ from ftdrive.errors import ConfigError
 from ftdrivers.ur.control import CONTROL_SETTINGS
 
 Rows = tuple[tuple[float, ...], ...]
-# Returns what to do about a value that cannot be used; None for one that can.
+# Returns the remedy for a value that cannot be used; None if the value can be used.
 Reject = Callable[[Any], str | None]
 
-# Values in metres or inches are thinner.
+# Smallest dimension; values in metres or inches are usually smaller.
 _THINNEST_MM = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """What a key means and which values it takes, beside its type."""
+    """Meaning and allowed values of a key."""
 
     help: str
     unit: str
     between: tuple[float, float] | None
     option: str
-    """Option of `ftdrive init`, which asks for it."""
+    """Option of `ftdrive init` for this key; empty if `init` does not ask for the key."""
     reject: Reject
 
     @property
     def range(self) -> str:
-        """The range with its unit, such as "0.5 to 60 deg/s"; only the unit where there is no range."""
+        """The range with its unit, such as "0.5 to 60 deg/s"; the unit alone if there is no range."""
         span = "" if self.between is None else "{:g} to {:g}".format(*self.between)
         return f"{span} {self.unit}".strip()
 
     @property
     def description(self) -> str:
-        """Range, unit and meaning, as files and documents show them."""
+        """Range, unit and meaning, as configuration files show them."""
         return f"{self.range}, {self.help}" if self.range else self.help
 
 
@@ -48,18 +48,18 @@ def entry(
     option: str = "",
     reject: Reject = lambda _: None,
 ) -> Any:
-    """Return a field with its rule; without a default it must be set."""
+    """Return a dataclass field with a rule; without a default the key must be set."""
     return field(default=default, metadata={"rule": Rule(help, unit, between, option, reject)})
 
 
 def rule_of(item: Field[Any]) -> Rule:
     """Return the rule of a field."""
-    found: Rule = item.metadata["rule"]
-    return found
+    rule: Rule = item.metadata["rule"]
+    return rule
 
 
 def require_type(where: str, item: Field[Any], value: Any) -> Any:
-    """Return a value of the field's type; raises `ConfigError` for another type."""
+    """Return the value converted to the type of the field; raises `ConfigError` if its type is wrong."""
     wanted, fits = _TYPES[item.type]
     if not fits(value) and not (value is None and item.default is None):
         raise ConfigError(f"{where} is not {wanted}")
@@ -69,7 +69,7 @@ def require_type(where: str, item: Field[Any], value: Any) -> Any:
 
 
 def ruled(where: str, item: Field[Any], value: Any) -> Any:
-    """Return a value of the field's type that follows its rule; raises `ConfigError`."""
+    """Return the value converted to the type of the field; raises `ConfigError` if it violates type or rule."""
     rule, result = rule_of(item), require_type(where, item, value)
     if rule.between is not None and not rule.between[0] <= result <= rule.between[1]:
         raise ConfigError(f"{where} is out of range: give {rule.range}")
@@ -90,10 +90,10 @@ def _is_rows(value: Any) -> bool:
 
 
 _TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
-    str: ("a text: put it in quotes", lambda value: isinstance(value, str)),
+    str: ("a string: put it in quotes", lambda value: isinstance(value, str)),
     float: ("a number: give one such as 1.5, without quotes and unit", is_number),
     int: (
-        "a whole number: give one such as 1, without quotes and point",
+        "a whole number: give one such as 1, without quotes and decimal point",
         lambda value: isinstance(value, int) and not isinstance(value, bool),
     ),
     bool: ("true or false: give one of them, without quotes", lambda value: isinstance(value, bool)),
@@ -102,77 +102,77 @@ _TYPES: Mapping[Any, tuple[str, Callable[[Any], bool]]] = {
 _TYPES = {**_TYPES, str | None: _TYPES[str], float | None: _TYPES[float]}
 
 
-# Conditions that are not a range. ----------------------------------------------------------------------------------
+# Conditions other than a range. -----------------------------------------------------------------------------------
 
 
 def _unless(fits: Callable[[Any], bool], fix: str) -> Reject:
     return lambda value: None if fits(value) else fix
 
 
-reject_empty = _unless(lambda text: bool(text.strip()), "it is empty, give one or leave it out")
+reject_empty = _unless(lambda text: bool(text.strip()), "it is empty: give a value, or leave the key out")
 reject_sign = _unless({-1, 1}.__contains__, "give 1, or -1 for a sensor that reports the reaction")
-reject_height = _unless(lambda mm: not 0 < mm < 1, "is it mm? Give the height in mm, such as 33, or 0")
-reject_store = _unless(lambda url: "://" in url, "it is no address, give one such as sqlite:////data/store.sqlite")
+reject_height = _unless(lambda mm: not 0 < mm < 1, "the unit is mm: give the height in mm, such as 33, or 0")
+reject_store = _unless(lambda url: "://" in url, "it is not an address: give one such as sqlite:////data/store.sqlite")
 reject_control = _unless(CONTROL_SETTINGS.__contains__, f"give one of {', '.join(CONTROL_SETTINGS)}")
-reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is of no use")
+reject_record = _unless(lambda s: s == 0 or s >= 3, "give 3 or more, or 0 for none: a shorter record is useless")
 
 
 def reject_host(value: str) -> str | None:
-    """Reject a URL where a host is meant."""
+    """Return the remedy for a URL in place of a host; None for a host."""
     is_url = "/" in value and not value.startswith("ros2:")
-    return "give name or IPv4 address alone, such as 192.168.0.10" if is_url else reject_empty(value)
+    return "give only a name or an IPv4 address, such as 192.168.0.10" if is_url else reject_empty(value)
 
 
 def reject_model(value: str) -> str | None:
-    """Reject an unknown model."""
+    """Return the remedy for an unknown model; None for a known one."""
     from ftdrivers.ur.kinematics import MODELS, model_named
 
     return None if model_named(value, controller_major=0) else f"the models are {', '.join(MODELS)}"
 
 
 def reject_mounting(value: str) -> str | None:
-    """Reject what is neither a mounting nor an angle."""
+    """Return the remedy for a value that is neither a mounting nor an angle; None for a valid one."""
     try:
         usable = value in {"floor", "wall", "ceiling"} or abs(float(value)) <= 180
     except ValueError:
         usable = False
-    return None if usable else "give floor, wall, ceiling, or degrees the base leans to -x, -180 to 180"
+    return None if usable else "give floor, wall, ceiling, or the lean of the base towards -x, -180 to 180 degrees"
 
 
 def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
-    """Reject impossible cylinders, and those in other units."""
+    """Return the remedy for impossible cylinders, or for ones in other units; None for valid ones."""
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
-                f"{list(row)} is not a cylinder: give [from, to, diameter] or [from, to, diameter, x, y] in mm from "
-                "the flange face, from 0 up, to at most 2000, diameter at most 1000"
+                f"{list(row)} is not a cylinder: give [from, to, diameter] or [from, to, diameter, x, y] in mm "
+                "from the flange face, with from at least 0, to at most 2000, and a diameter of at most 1000"
             )
         if min(row[1] - row[0], row[2]) < _THINNEST_MM:
             return (
-                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm, are these mm? Give from, to and diameter "
-                f"in mm, and {_THINNEST_MM:g} mm for what is thinner"
+                f"{list(row)} is shorter or thinner than {_THINNEST_MM:g} mm: give from, to and diameter in mm, and "
+                f"{_THINNEST_MM:g} mm for a thinner part"
             )
     return None
 
 
 def reject_planes(rows: Sequence[Sequence[float]]) -> str | None:
-    """Reject planes without a direction."""
+    """Return the remedy for planes without a direction; None for valid ones."""
     for row in rows:
         if len(row) != 4:
             return f"{list(row)} is not a plane: give [nx, ny, nz, mm], such as [-1, 0, 0, -800]"
         if not any(row[:3]):
-            return f"the normal of {list(row)} has no direction: give for example [-1, 0, 0, -800]"
+            return f"the normal of {list(row)} is zero: give for example [-1, 0, 0, -800]"
     return None
 
 
 def reject_boxes(rows: Sequence[Sequence[float]]) -> str | None:
-    """Reject flat boxes, and those in other units."""
+    """Return the remedy for flat boxes, or for ones in other units; None for valid ones."""
     for row in rows:
         if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
             return f"{list(row)} is not a box: give two opposite corners [x, y, z, x, y, z] in mm"
         if min(abs(row[i] - row[i + 3]) for i in range(3)) < _THINNEST_MM:
             return (
-                f"{list(row)} is thinner than {_THINNEST_MM:g} mm, are these mm? Give two opposite corners in mm, "
-                f"{_THINNEST_MM:g} mm apart for what is thinner"
+                f"{list(row)} is thinner than {_THINNEST_MM:g} mm: give two opposite corners in mm, and "
+                f"{_THINNEST_MM:g} mm for a thinner box"
             )
     return None

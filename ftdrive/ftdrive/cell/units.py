@@ -1,4 +1,4 @@
-"""Lengths, masses and rows of them as people write them: `33 mm`, `33,5`, `1.3 in`, `0:60:90`, `+x 800`."""
+"""Parsing of quantities as people write them: `33 mm`, `33,5`, `1.3 in`, `0:60:90`, `+x 800`."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -8,12 +8,12 @@ from typing import Final
 
 from ftdrive.errors import ConfigError
 
-# The factors are decimal: 1.1 cm are 11 mm, and not 11.000000000000002.
+# Decimal factors, so that 1.1 cm are 11 mm, not 11.000000000000002.
 MM: Final = {"mm": "1", "cm": "10", "m": "1000", "in": "25.4"}
 KG: Final = {"kg": "1", "g": "0.001", "lb": "0.45359237"}
 DEG_S: Final = {"deg/s": "1", "°/s": "1"}
 
-# The normals of walls, which point towards the arm.
+# Normals of walls by their side; a normal points towards the arm.
 SIDES: Final = {
     "+x": (-1, 0, 0),
     "-x": (1, 0, 0),
@@ -31,41 +31,41 @@ _WALL = re.compile(rf"({'|'.join(map(re.escape, SIDES))})[:\s]*(\S.*)")
 
 
 def parse_quantity(what: str, text: str, units: Mapping[str, str]) -> float:
-    """Read a number with a decimal point or comma, alone or with a unit; `what` is an option, for the message.
+    """Return a number with a decimal point or comma, with or without a unit; messages name it as `what`.
 
-    The first of `units`, which have factors, is that of the result and of a number alone. Raises `ConfigError` for what
-    is not a number, or has a comma that may separate thousands.
+    `units` have factors; the first one is the unit of the result, and of a number without a unit. Raises `ConfigError`
+    if the text is not a number, or if its comma may separate thousands.
     """
     value = _parse_value(what, text, units)
     if value is None:
         unit, *others = units
         raise ConfigError(
-            f"{what} is '{text}', which is not a number: give one such as 1.5 or 1,5, in {unit} or with its unit, such "
-            f"as {others[0]}"
+            f"{what} is '{text}', which is not a number: give one such as 1.5 or 1,5, in {unit} or with another unit "
+            f"such as {others[0]}"
         )
     return value
 
 
 def row(what: str, text: str, counts: Sequence[int]) -> list[float]:
-    """Read lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `parse_quantity`."""
+    """Return lengths in mm, separated by colons, semicolons or spaces; raises `ConfigError` as `parse_quantity`."""
     parts = _BETWEEN.split(_BEFORE_UNIT.sub("", text.strip()))
     values = [_parse_value(what, part, MM) for part in parts]
-    found = [value for value in values if value is not None]
-    if len(found) != len(values) or len(values) not in counts:
+    lengths = [value for value in values if value is not None]
+    if len(lengths) != len(values) or len(values) not in counts:
         wanted = " or ".join(map(str, counts))
         raise ConfigError(f"{what} is '{text}': give {wanted} numbers separated by ':' or spaces, in mm or with a unit")
-    return found
+    return lengths
 
 
 def rows_reader(*counts: int) -> Callable[[str, str], list[float]]:
-    """Return a reader of rows of so many lengths, as `row`."""
+    """Return a function like `row` for rows of these numbers of lengths."""
     return lambda what, text: row(what, text, counts)
 
 
 def wall(what: str, text: str) -> list[float]:
-    """Read a wall as the row of `[workcell] planes_mm`: side and distance from the base, or normal and offset in mm.
+    """Return a wall as a row of `[workcell] planes_mm`, from side and distance, or from normal and offset in mm.
 
-    Raises `ConfigError` if it is neither, or the distance is negative.
+    Raises `ConfigError` if the text is neither, or if the distance is negative.
     """
     found = _WALL.fullmatch(text.strip().lower())
     if found is None:
@@ -73,7 +73,7 @@ def wall(what: str, text: str) -> list[float]:
             return row(what, text, (4,))
         except ConfigError:
             raise ConfigError(
-                f"{what} is '{text}': give side and distance such as +x 800, the sides are {', '.join(SIDES)}; or "
+                f"{what} is '{text}': give a side and a distance such as +x 800 (sides: {', '.join(SIDES)}), or "
                 "NX:NY:NZ:MM for a slanting wall"
             ) from None
     distance_mm = parse_quantity(what, found[2], MM)
@@ -83,9 +83,9 @@ def wall(what: str, text: str) -> list[float]:
 
 
 def side_of(plane_mm: Sequence[float]) -> str:
-    """Return side and distance of a wall, such as "+x 800 mm"; empty for one that `SIDES` does not have."""
+    """Return side and distance of a wall, such as "+x 800 mm"; empty for a wall on none of the `SIDES`."""
     *normal, offset_mm = plane_mm
-    side = next((side for side, one in SIDES.items() if list(one) == normal), "")
+    side = next((name for name, towards_arm in SIDES.items() if list(towards_arm) == normal), "")
     return f"{side} {0.0 - offset_mm:g} mm" if side and offset_mm <= 0 else ""
 
 
@@ -95,12 +95,12 @@ def _parse_value(what: str, text: str, units: Mapping[str, str]) -> float | None
         return None
     if _THOUSANDS.fullmatch(found[1]):
         whole, point = found[1].replace(",", ""), found[1].replace(",", ".")
-        raise ConfigError(f"{what} is '{text}', where the comma has two meanings: write {whole} or {point}")
+        raise ConfigError(f"{what} is '{text}', where the comma is ambiguous: write {whole} or {point}")
     return float(Decimal(found[1].replace(",", ".")) * Decimal(units.get(found[2], "1")))
 
 
 def parse_numbers(option: str, text: str, separator: str, counts: Sequence[int]) -> list[float]:
-    """Read the numbers in the value of an option; raises `ConfigError` unless their count is one of `counts`."""
+    """Return the numbers in the value of an option; raises `ConfigError` unless their count is in `counts`."""
     try:
         values = [float(part) for part in text.split(separator)]
     except ValueError:
@@ -112,5 +112,5 @@ def parse_numbers(option: str, text: str, separator: str, counts: Sequence[int])
 
 
 def rows(option: str, texts: Sequence[str], counts: Sequence[int]) -> list[list[float]] | None:
-    """Read a repeatable option, numbers separated by colons; None if it was not given."""
+    """Return the rows of a repeatable option, numbers separated by colons; None if it was not given."""
     return [parse_numbers(option, text, ":", counts) for text in texts] or None

@@ -21,17 +21,17 @@ from ftdrivers.errors import DeviceError, ModelUnknown
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, RobotArm
 from ftdrivers.ur.kinematics import MODELS, kinematics_of
 
-# The centre of the payload may be this far outside the described tool.
+# Largest allowed distance of the payload's centre outside the described tool.
 _PAYLOAD_MM: Final = 100.0
 _LINK_S: Final = 0.5
 _CLOCK_S: Final = 1.0
 _LINK_TRIES: Final = 3
-# Random ones, in which an arm is compared with its model.
+# Number of random postures at which an arm is compared with its model.
 _POSTURES: Final = 200
 SLOWEST_SLIDER = 0.05
-"""The time-outs of moves allow for this one."""
-# Rated payloads by Universal Robots' data sheets. Later arms of one model may carry more: see the label of the arm.
-# The curve of payload against the offset of its centre is published only as a picture, in the user manual.
+"""Lowest speed slider for which the time-outs of moves are sufficient."""
+# Rated payloads from the data sheets of Universal Robots. Later arms of a model may carry more: see the label.
+# The payload curve over the offset of the centre of mass is published only as a figure in the user manual.
 RATED_KG: Final = (
     {"UR3": 3.0, "UR5": 5.0, "UR10": 10.0}
     | {"UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 10.0, "UR12e": 12.5, "UR16e": 16.0}
@@ -40,7 +40,7 @@ RATED_KG: Final = (
 
 
 def check_unreachable(error: DeviceError, host: str) -> Check:
-    """Return why an arm could not be opened, and what to do about it."""
+    """Return the failed check of an arm that could not be opened, with its remedy."""
     fix = error.fix or f"ping {host}"
     if isinstance(error, ModelUnknown):
         fix = f'write model = "ur5e" under [robot] in ftdrive.toml, or give --model: one of {", ".join(MODELS)}'
@@ -48,23 +48,23 @@ def check_unreachable(error: DeviceError, host: str) -> Check:
 
 
 def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
-    """Check that the arm is the configured one, where [robot] serial is set."""
+    """Check that the arm has the configured serial number, if [robot] serial is set."""
     name = "robot.identity"
     if robot.serial not in {None, info.serial}:
-        found = f"the arm at {robot.host} has serial {info.serial}, [robot] serial is {robot.serial}"
+        found = f"the arm at {robot.host} has serial {info.serial}, but [robot] serial is {robot.serial}"
         if info.serial == NOT_REPORTED:
-            return Check(name, "failed", f"{found}: they cannot be compared", "remove [robot] serial")
-        return Check(name, "failed", found, "correct one of the two")
+            return Check(name, "failed", f"{found}, so the two cannot be compared", "remove [robot] serial")
+        return Check(name, "failed", found, "connect the configured arm, or correct [robot] serial")
     return Check(name, "ok", who(info))
 
 
 def check_kinematics(info: DeviceInfo) -> Check:
-    """Check that an arm reports its own kinematics, and how far they are from those of its model."""
+    """Check that an arm reports its kinematics, and compare them with those of its nominal model."""
     name, own = "robot.kinematics", kinematics_of(info)
     if info.model not in MODELS:
-        return Check(name, "skipped", f"the kinematics of a {info.model} are not known here")
+        return Check(name, "skipped", f"the nominal kinematics of a {info.model} are unknown")
     if own is None:
-        found = f"no kinematics reported: plans use those of a nominal {info.model}, with wider margins"
+        found = f"no kinematics reported: plans use nominal {info.model} kinematics with wider margins"
         return Check(name, "warning", found, "enable the primary client interface under Settings, Security, Services")
     q_rad = np.random.default_rng(0).uniform(-np.pi, np.pi, (_POSTURES, 6))
     real, nominal = frames(own, q_rad), frames(MODELS[info.model], q_rad)
@@ -83,10 +83,10 @@ def check_remote(arm: RobotArm) -> Check:
     except DeviceError as error:
         return Check(name, "failed", error.found, error.fix or None)
     if remote is None:
-        return Check(name, "skipped", "this controller does not report whether it accepts programs from the network")
+        return Check(name, "skipped", "the controller does not report whether it accepts programs from the network")
     if remote:
         return Check(name, "ok", "remote control on")
-    return Check(name, "failed", "local control", "press Local, Remote Control at the top right of the pendant")
+    return Check(name, "failed", "local control", "press Local at the top right of the pendant, then Remote Control")
 
 
 def check_safety(status: ArmStatus) -> Check:
@@ -94,7 +94,7 @@ def check_safety(status: ArmStatus) -> Check:
     if status.fault is not None:
         return Check("robot.safety", "failed", status.fault.found, status.fault.fix)
     if status.safety_mode != "normal":
-        fix = "check at the pendant that this mode is intended; calibrate asks for it"
+        fix = "check at the pendant that this mode is intended; calibrate asks for confirmation"
         return Check("robot.safety", "warning", f"safety mode {status.safety_mode}", fix)
     return Check("robot.safety", "ok", "powered, brakes released, no stop")
 
@@ -102,64 +102,71 @@ def check_safety(status: ArmStatus) -> Check:
 def check_program(status: ArmStatus) -> Check:
     """Check that no program runs on the controller."""
     if status.program == "stopped":
-        return Check("robot.program", "ok", "no program runs; other clients that only read cannot be detected")
-    found = f"a program is on the controller ({status.program})"
-    return Check("robot.program", "warning", found, "stop it at the pendant: calibrate refuses to start beside it")
+        return Check("robot.program", "ok", "no program runs; clients that only read cannot be detected")
+    found = f"a program is active on the controller ({status.program})"
+    return Check(
+        "robot.program",
+        "warning",
+        found,
+        "stop it at the pendant: calibrate refuses to start while a program is active",
+    )
 
 
 def check_speed(status: ArmStatus) -> Check:
-    """Check that the speed slider lets the arm move in a reasonable time."""
+    """Check that the speed slider is high enough."""
     found = (
         f"speed slider at {100 * status.speed_slider:.0f} %, the controller allows {100 * status.speed_scaling:.0f} %"
     )
     if status.speed_slider < SLOWEST_SLIDER:
-        fix = "raise the speed slider at the pendant, to 100 % if that is safe: ftdrive never moves it"
+        fix = "raise the speed slider at the pendant, to 100 % if that is safe; ftdrive never changes it"
         return Check("robot.speed", "failed", f"{found}: the arm would hardly move", fix)
     return Check("robot.speed", "ok", found)
 
 
 def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) -> Check:
-    """Check the payload configured in the controller, and compare it with tool and sensor as far as they are described.
+    """Check the payload set in the controller, and compare it with the described tool and sensor.
 
-    The mass may differ by the larger of `described_cell.PAYLOAD_KG` and its share; the centre must be at the tool.
+    The mass may differ by the larger of `PAYLOAD_KG` and `PAYLOAD_SHARE`; the centre must be near the tool.
     """
     name, payload_kg, p_m = "robot.payload", status.payload_kg, status.p_flange_payload_m
     if payload_kg is None:
-        return Check(name, "skipped", "this controller does not report its payload: compare it at the pendant")
+        return Check(name, "skipped", "the controller does not report its payload: check it at the pendant")
     if payload_kg <= 0:
-        fix = "set mass and centre of mass of all that hangs on the flange at the pendant; else the arm may stop itself"
+        fix = "set total mass and centre of mass below the flange at the pendant; otherwise the arm may stop itself"
         return Check(name, "failed", "no payload is set in the controller", fix)
     found = f"payload {payload_kg:.2f} kg"
     if p_m is None:
-        found += ", its centre is not reported"
+        found += "; its centre of mass is not reported"
     else:
         found += " at ({:.0f}, {:.0f}, {:.0f}) mm from the flange".format(*(1e3 * value for value in p_m))
         if tool.cylinders_mm and not _at_tool(p_m, tool):
-            fix = "correct the centre of the payload at the pendant, or [tool] cylinders_mm"
+            fix = "correct the centre of mass at the pendant, or [tool] cylinders_mm"
             return Check(name, "failed", f"{found}, outside the tool", fix)
     if tool.mass_kg is not None:
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
-        found += f", sensor and tool are {expected_kg:.2f} kg"
+        found += f", sensor and tool weigh {expected_kg:.2f} kg"
         if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
-            return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
+            return Check(
+                name, "failed", found, "correct the payload at the pendant, or the masses in [tool] and [sensor]"
+            )
     if p_m is not None and not any(p_m):
         fix = "set the centre of gravity at the pendant: Installation, Payload"
-        return Check(name, "warning", f"{found}; nothing hangs in the middle of the flange face", fix)
+        return Check(name, "warning", f"{found}; no real payload has its centre in the flange face", fix)
     return Check(name, "ok", found)
 
 
 def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
-    """Compare the payload that the controller reports with the load that a calibration has weighed.
+    """Compare the payload that the controller reports with the mass identified by a calibration.
 
-    `sensor_kg` is the mass of sensor and adapter, which the sensor cannot weigh.
+    `sensor_kg` is the mass of sensor and adapter, which the sensor does not measure.
     """
     name = "robot.payload"
     if payload_kg is None:
-        return Check(name, "skipped", "this controller does not report its payload")
+        return Check(name, "skipped", "the controller does not report its payload")
     for finding in described_cell.payload(payload_kg, result.mass_kg, sensor_kg):
         return Check(name, "warning", finding.found, finding.fix)
     known = "sensor" if sensor_kg is None else f"{sensor_kg:.2f} kg sensor"
-    return Check(name, "ok", f"robot {payload_kg:.2f} kg; weighed {result.mass_kg:.2f} kg + {known}")
+    return Check(name, "ok", f"controller {payload_kg:.2f} kg; identified {result.mass_kg:.2f} kg + {known}")
 
 
 def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:
@@ -170,12 +177,12 @@ def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:
 
 
 def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> Check:
-    """Check that states of the arm arrive soon and without gaps, in one of three half seconds.
+    """Check the response time of the arm, in one of three periods of 0.5 s.
 
-    The median time for an answer must be below `usual_s`, and that of nine in ten answers below `gap_s`.
+    The median must be below `usual_s`, and the 90 % quantile below `gap_s`.
     """
     name, found = "robot.link", ""
-    # A computer that is busy for a moment is not a bad link.
+    # Try again, because a briefly busy computer is not a bad link.
     for _ in range(_LINK_TRIES):
         try:
             with clock.keeping_up():
@@ -183,10 +190,10 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
         except DeviceError as error:
             return _silent(name, error)
         median_s = float(np.median(took_s))
-        found = f"the arm answers within {1e3 * median_s:.0f} ms, at worst {1e3 * max(took_s):.0f} ms"
+        found = f"the arm answers in {1e3 * median_s:.0f} ms (median), at most {1e3 * max(took_s):.0f} ms"
         if median_s < usual_s and np.quantile(took_s, 0.9) < gap_s:
             return Check(name, "ok", found)
-    limit = f"allowed are {1e3 * usual_s:.0f} ms, {1e3 * gap_s:.0f} ms for nine in ten"
+    limit = f"allowed: median {1e3 * usual_s:.0f} ms, 90 % within {1e3 * gap_s:.0f} ms"
     return Check(name, "failed", f"{found} ({limit})", "use a cable, and reduce the load of this computer and network")
 
 
@@ -199,7 +206,7 @@ def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
 
 
 def check_clock(arm: RobotArm, clock: Clock) -> Check:
-    """Compare the pace of the controller's clock with ours; their readings are never subtracted from each other."""
+    """Compare the rate of the controller's clock with that of this computer, from differences of each clock alone."""
     t_host_ns, t_device_s = list[int](), list[float]()
     try:
         with clock.keeping_up():
@@ -212,10 +219,12 @@ def check_clock(arm: RobotArm, clock: Clock) -> Check:
         return _silent("clock.pace", error)
     host_s = (np.asarray(t_host_ns) - t_host_ns[0]) / 1e9
     pace = float(np.polyfit(host_s, np.asarray(t_device_s) - t_device_s[0], 1)[0])
-    found = f"the controller's clock runs at {pace:.4f} of ours, over {host_s[-1]:.1f} s"
+    found = f"rate of the controller's clock relative to this computer: {pace:.4f}, over {host_s[-1]:.1f} s"
     if abs(pace - 1) < 0.02:
         return Check("clock.pace", "ok", found)
-    return Check("clock.pace", "warning", found, "close other programs on this computer; look at the network's load")
+    return Check(
+        "clock.pace", "warning", found, "close other programs on this computer, and check the load of the network"
+    )
 
 
 def _silent(name: str, error: DeviceError) -> Check:
@@ -223,28 +232,28 @@ def _silent(name: str, error: DeviceError) -> Check:
 
 
 def check_flange(arm: RobotArm, status: ArmStatus) -> Check:
-    """Check that poses of the flange can be read without control."""
+    """Check that the flange pose can be read without control of the arm."""
     name = "robot.flange"
     if status.tcp_offset is None:
-        found = "the controller does not report its TCP offset: only a calibration, which takes control, can read poses"
+        found = "the controller does not report its TCP offset, so poses can only be read with control of the arm"
         return Check(name, "skipped", found)
     try:
         p_mm = 1e3 * arm.state().p_base_flange_m
     except DeviceError as error:
         return _silent(name, error)
     where = ", ".join(f"{value:.0f}" for value in p_mm)
-    return Check(name, "ok", f"TCP offset read; flange at ({where}) mm in base")
+    return Check(name, "ok", f"TCP offset reported; flange at ({where}) mm in base")
 
 
 def examine_arm(
     cell: CellConfig, stack: ExitStack, *, usual_s: float, gap_s: float
 ) -> tuple[list[Check], RobotArm | None]:
-    """Open the arm until the stack ends and make every check that needs no control; None if it does not answer.
+    """Open the arm until `stack` ends, and return all checks without control, and the arm; None if it does not answer.
 
-    The times are those of `check_link`.
+    The times are as in `check_link`.
     """
     if not cell.robot.host:
-        found = "the sensor is checked alone, because [robot] host and --robot are not set"
+        found = "only the sensor is checked, because [robot] host and --robot are not set"
         return [Check("robot.reachable", "skipped", found)], None
     arm = stack.enter_context(closing(build_arm(cell)))
     try:
@@ -271,29 +280,29 @@ def examine_arm(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlangeLoad:
-    """Mass and centre of mass of everything below the flange, which a controller calls the payload."""
+    """Mass and centre of mass of everything below the flange: the payload of the controller."""
 
     mass_kg: float
     p_flange_com_m: Array
-    """(3,) centre of mass."""
+    """(3,) centre of mass, flange axes."""
     sigma_kg: float
     sigma_m: Array
-    """(3,) of the centre."""
+    """(3,) standard deviation of the centre of mass."""
 
 
 def flange_load(
     result: CalibrationResult, sensor_kg: float, height_m: float, p_flange_sensor_com_m: Array | None = None
 ) -> FlangeLoad:
-    """Add sensor and adapter to the load that a calibration has weighed.
+    """Return the payload: sensor and adapter plus the tool identified by a calibration.
 
-    The sum is ``m = m_tool + m_sensor``, its centre ``(m_tool c_tool + m_sensor c_sensor) / m`` with
+    The mass is ``m = m_tool + m_sensor``, its centre ``(m_tool c_tool + m_sensor c_sensor) / m`` with
     ``c_tool = p_flange_sensor + R_flange_sensor p_sensor_com``.
 
-    `sensor_kg` and `p_flange_sensor_com_m` (3,) are of sensor and adapter, `height_m` is that of the sensor's origin
-    above the flange face. By default the centre is half way up, on the axis of the flange. Its height then counts as
-    known within the whole height, evenly distributed.
+    `sensor_kg` and `p_flange_sensor_com_m` (3,) are mass and centre of sensor and adapter; `height_m` is the height of
+    the sensor's origin above the flange face. By default the centre is at half this height on the flange axis, with a
+    uniform distribution over the height as its uncertainty.
     """
-    # The sensor cannot weigh itself, and gravity does not reveal where its origin is: both are configuration.
+    # Mass and height of the sensor are configured, because gravity does not determine them.
     tool_kg, p_sensor_com_m = true_tool(result)
     arm_m = result.R_flange_sensor @ p_sensor_com_m
     c_tool_m = np.array([0.0, 0.0, height_m]) + arm_m
@@ -302,7 +311,7 @@ def flange_load(
     share = tool_kg / mass_kg
     com_m = share * c_tool_m + (1 - share) * c_sensor_m
 
-    # Derivatives of (m, com) by the mass of the tool, then by the error coordinates of `Parameters.moved`.
+    # Derivatives of (m, com) with respect to the tool mass, and to the error coordinates of `Parameters.moved`.
     by_mass = np.concatenate([[1.0], (c_tool_m - com_m) / mass_kg])
     jacobian = np.zeros((4, 15))
     jacobian[:, 3:6] = np.outer(by_mass, result.gravity_force_base_N / (result.weight_N * result.g_m_s2))
@@ -318,14 +327,14 @@ def flange_load(
 
 
 def margin_in_words(mass_kg: float, model: str) -> str:
-    """Compare a load with the rated payload of an arm."""
+    """Describe the margin of a mass to the rated payload of an arm."""
     rated_kg = RATED_KG.get(model)
     if rated_kg is None:
-        return f"{mass_kg:.2f} kg, and the rated payload of a {model} is unknown: compare with its data sheet"
-    curve = "compare with the payload curve in its user manual, too"
+        return f"{mass_kg:.2f} kg; the rated payload of a {model} is unknown: compare with its data sheet"
+    curve = "also compare with the payload curve in its user manual"
     if mass_kg > rated_kg:
         over_kg = mass_kg - rated_kg
         return (
-            f"{over_kg:.2f} kg over the rated payload of a {model}, {rated_kg:g} kg: see the label of the arm; {curve}"
+            f"{over_kg:.2f} kg above the rated payload of a {model}, {rated_kg:g} kg: see the label of the arm; {curve}"
         )
     return f"{rated_kg - mass_kg:.2f} kg below the rated payload of a {model}, {rated_kg:g} kg; {curve}"

@@ -1,4 +1,4 @@
-"""The result of one check, and the check whether a calibration is of the connected devices and their mounting."""
+"""The result of a check, and the comparison of a calibration with the connected devices and their mounting."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,30 +15,31 @@ State = Literal["ok", "warning", "failed", "skipped"]
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """One property that was checked, as `doctor` prints it and preflight passes it on."""
+    """Result of checking one property, as `doctor` and the preflight checks report it."""
 
     name: str
     """Subject and property, such as "sensor.rate"."""
     state: State
     found: str
+    """The finding, with its values."""
     fix: str | None = None
-    """The command or the instruction that fixes it."""
+    """The remedy: a command or an instruction; None if there is nothing to fix."""
 
 
 def check_diagnosis(diagnosis: Diagnosis, device: str = "robot") -> Check:
-    """Return what the driver of a robot or a sensor found when it checked its own device."""
+    """Return the check for a diagnosis that a driver made of its own device."""
     state: State = "ok" if diagnosis.passed else "failed"
     return Check(f"{device}.{diagnosis.name}", state, diagnosis.found, diagnosis.fix or None)
 
 
 def verdict(checks: Sequence[Check]) -> State:
-    """Return the worst state of all."""
+    """Return the worst state of some checks."""
     states = {check.state for check in checks}
     return "failed" if "failed" in states else "warning" if "warning" in states else "ok"
 
 
 def merge_checks(name: str, checks: Sequence[Check]) -> Check:
-    """Merge checks into one with their worst state; it says what those in this state found."""
+    """Return one check with the worst state of several, and with the findings of those in this state."""
     state = verdict(checks)
     worst = [check for check in checks if check.state == state]
     fix = "; ".join(check.fix for check in worst if check.fix)
@@ -46,18 +47,18 @@ def merge_checks(name: str, checks: Sequence[Check]) -> Check:
 
 
 def who(info: DeviceInfo) -> str:
-    """Return a device's model, serial number and firmware in words."""
+    """Describe a device by model, serial number and firmware."""
     return f"{info.model}, serial {info.serial}, firmware {info.firmware}"
 
 
 @dataclass(frozen=True, slots=True)
 class _Belonging:
-    """Reasons against a calibration belonging to the connected devices, in words."""
+    """Result of comparing a calibration with the connected devices, as sentences."""
 
     others: tuple[str, ...]
-    """Devices that differ from those of the calibration."""
+    """Differences from the devices of the calibration."""
     unknown: tuple[str, ...]
-    """Devices of the same model where a serial number is unknown."""
+    """Devices of the same model that cannot be compared, because a serial number is unknown."""
 
 
 def compare_devices(
@@ -65,8 +66,8 @@ def compare_devices(
 ) -> _Belonging:
     """Compare the devices of a calibration with the connected ones, by role.
 
-    Serial numbers decide where both sides have one; elsewhere another model is another device. The label `mount` of the
-    mounting, None without one, must be the same; it is not compared if it is left out, or if the file is older.
+    Devices are compared by serial number if both have one, else by model. The mounting label `mount`, which may be
+    None, must be equal; it is not compared if it is omitted, or if the calibration is too old to have one.
     """
     made_with = result.provenance.get("devices")
     others, unknown = [], []
@@ -80,12 +81,14 @@ def compare_devices(
         elif model.casefold() != device.model.casefold():
             others.append(f"the calibration was made with the {role} {model}, but {device.model} is connected")
         else:
-            which = "it was made with" if serial == NOT_REPORTED else "connected"
+            which = "of the calibration" if serial == NOT_REPORTED else "connected now"
             why = f"the {role} {which} reports no serial number"
-            unknown.append(f"whether the calibration is of this {role} cannot be checked: {why}")
+            unknown.append(f"cannot check that the calibration belongs to this {role}: {why}")
     setup = result.provenance.get("setup")
     if mount is not ... and isinstance(setup, Mapping) and setup.get("mount", mount) != mount:
-        made_as, now = (f"[sensor] mount = {one!r}" if one else "no [sensor] mount" for one in (setup["mount"], mount))
+        made_as, now = (
+            f"[sensor] mount = {label!r}" if label else "no [sensor] mount" for label in (setup["mount"], mount)
+        )
         others.append(f"the calibration was made with {made_as}, but {now} is configured")
     return _Belonging(tuple(others), tuple(unknown))
 
@@ -93,7 +96,7 @@ def compare_devices(
 def check_calibration(
     result: "CalibrationResult", connected: Mapping[str, DeviceInfo], mount: str | EllipsisType | None = ...
 ) -> Check:
-    """Check that a calibration belongs to the connected devices, and as `compare_devices` does to the mounting."""
+    """Check that a calibration belongs to the connected devices and the mounting, see `compare_devices`."""
     name = "calibration.devices"
     belongs = compare_devices(result, connected, mount)
     if belongs.others:
@@ -103,6 +106,8 @@ def check_calibration(
     if isinstance(created, str):
         made = f"verdict {result.verdict}, made on {created[:10]} at {created[11:16]} UTC"
     if belongs.unknown:
-        fix = "add serial=… (from its label) to the sensor's address, and calibrate with it once"
+        fix = "add serial=… (from its label) to the sensor's address, then calibrate again"
         return Check(name, "warning", f"{made}; {'; '.join(belongs.unknown)}", fix)
-    return Check(name, "ok", f"{made}, with these devices" if connected else f"{made}; no device to compare with")
+    return Check(
+        name, "ok", f"{made}, with these devices" if connected else f"{made}; no connected device to compare with"
+    )

@@ -1,7 +1,7 @@
-"""Checks of this computer: disk, permissions, serial ports, CAN interfaces; and of the described tool and workcell.
+"""Checks of this computer (disk, permissions, serial ports, CAN interfaces) and of the described tool and workcell.
 
-Each finding names the exact command or action that fixes it. Nothing here opens a device. The places where Linux keeps
-its facts (/sys, /dev) are parameters. On a computer without them a check is skipped, which is never a failure.
+Each finding names the exact command or action that fixes it. No check opens a device. The system folders /sys and /dev
+are parameters; on a computer without them a check is skipped, which is not a failure.
 """
 
 import json
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
 SYS = Path("/sys")
 DEV = Path("/dev")
 
-# ARPHRD_CAN, in /sys/class/net/*/type.
+# ARPHRD_CAN: the content of /sys/class/net/*/type for a CAN interface.
 _CAN_INTERFACE = "280"
 _LEAST_BYTES, _FEW_BYTES = 200_000_000, 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class SensorAddress:
-    """A sensor's address in parts: protocol, port or host, options."""
+    """Address of a sensor in parts: protocol, port or host, options."""
 
     scheme: str
     address: str
@@ -44,7 +44,7 @@ class SensorAddress:
 
     @classmethod
     def of(cls, url: str) -> "SensorAddress":
-        """Split a sensor's address. Raises `BadUrl`."""
+        """Return the parts of a sensor's address. Raises `BadUrl`."""
         parts = split_url(url)
         return cls(parts.scheme, parts.address, dict(parse_qsl(parts.query)))
 
@@ -55,7 +55,7 @@ class SensorAddress:
 
     @property
     def serial_port(self) -> Path | None:
-        """Its serial port, also that of an slcan adapter."""
+        """Serial port of the sensor or of its slcan adapter; None without one."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
         is_path = self.address.startswith("/") and self.scheme != "ros2"
@@ -63,20 +63,20 @@ class SensorAddress:
 
     @property
     def can_interface(self) -> str | None:
-        """Its CAN interface of the kernel."""
+        """CAN interface of the kernel; None without one."""
         on_socketcan = self.scheme.endswith("-can") and self.options.get("interface", "socketcan") == "socketcan"
         return self.address if on_socketcan else None
 
     @property
     def host(self) -> str | None:
-        """The host that sends its samples over Ethernet."""
+        """Host that sends the samples over Ethernet; None for another connection."""
         if self.scheme == "robotiq-ft300" and not self.address.startswith("/"):
             return re.sub(r":\d+$", "", self.address).strip("[]")
         return self.address.partition("/")[0] if self._wire == "ethernet" else None
 
     @property
     def place(self) -> str | None:
-        """The argument with which `ftdrive devices --probe` looks for it; None where that is not possible."""
+        """Argument for `ftdrive devices --probe` that finds this sensor; None if it cannot be probed."""
         if not self.scheme.endswith("-can"):
             return None if self.serial_port is None else str(self.serial_port)
         base = {key: self.options[key] for key in ("base",) if key in self.options}
@@ -86,13 +86,13 @@ class SensorAddress:
 
     @property
     def bitrate(self) -> int:
-        """Required bit rate of its bus, bit/s."""
+        """Required bit rate of the CAN bus, bit/s."""
         kind = SENSORS.get(self.scheme)
         return int(self.options.get("bitrate", str(kind.bitrate if kind else 250_000)), 0)
 
 
 def check_disk(folder: Path) -> Check:
-    """Check that runs can be written into a folder, which need not exist yet, and that there is room for them."""
+    """Check that a folder, which may not exist yet, is writable and has enough free space."""
     name, there = "disk.runs", folder.absolute()
     while not there.exists():
         there = there.parent
@@ -104,17 +104,17 @@ def check_disk(folder: Path) -> Check:
     except OSError as error:
         return Check(name, "failed", f"{there} cannot be written to ({error})", "give another folder with --runs DIR")
     state: State = "failed" if free < _LEAST_BYTES else "warning" if free < _FEW_BYTES else "ok"
-    fix = None if state == "ok" else "make room, or give --runs DIR on another disk"
+    fix = None if state == "ok" else "free disk space, or give --runs DIR on another disk"
     return Check(name, state, f"{free / 1e9:.1f} GB free in {there}", fix)
 
 
 def check_workcell(cell: "CellConfig", model: str | None) -> Check:
-    """Check that tool and surroundings are described, possible for this arm, and measured."""
+    """Check that tool and surroundings are described, plausible for this arm, and measured."""
     from ftdrive.planning.planner import require_possible
 
     name = "workcell.measured"
     if not cell.tool.cylinders_mm:
-        fix = "describe what is mounted: [tool] cylinders_mm in ftdrive.toml, or --tool of calibrate"
+        fix = "describe the mounted equipment: set [tool] cylinders_mm in ftdrive.toml, or give --tool to calibrate"
         return Check(name, "warning", "no tool is described", fix)
     try:
         require_possible(cell, model)
@@ -129,31 +129,31 @@ def check_workcell(cell: "CellConfig", model: str | None) -> Check:
 
 
 def check_permissions(address: SensorAddress, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
-    """Check that this user may use the sensor's port, and that the port is set up for it."""
+    """Check that this user may access the sensor's port, and that the port is set up."""
     if (port := address.serial_port) is not None:
         return check_serial_port(port, sys=sys, dev=dev)
     if (interface := address.can_interface) is not None:
         return [check_can_interface(interface, address.bitrate, can_details(interface), sys=sys)]
-    found = f"not applicable: {address.scheme} at {address.address} uses no serial port and no CAN interface of Linux"
+    found = f"not applicable: {address.scheme} at {address.address} uses neither a serial port nor a CAN interface"
     return [Check("permissions.port", "skipped", found)]
 
 
 def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[Check]:
-    """Check a serial port: present, permitted, with a name that survives replugging, and fast."""
+    """Check that a serial port exists and is accessible, its name survives replugging, and its latency is low."""
     if not dev.is_dir():
-        return [Check("permissions.port", "skipped", f"not applicable: {port} has no file on this system")]
+        return [Check("permissions.port", "skipped", f"not applicable: this system has no device files such as {port}")]
     if not port.exists():
-        fix = "plug it in; ftdrive devices lists the ports"
+        fix = "plug the adapter in; ftdrive devices lists the ports"
         return [Check("permissions.port", "failed", f"{port} does not exist", fix)]
     real = Path(os.path.realpath(port))
     checks = [_check_access(port)]
     name = name_by_id(port, dev=dev)
     if name is None:
-        checks.append(Check("permissions.by-id", "skipped", "not applicable: the port has no name by id"))
+        checks.append(Check("permissions.by-id", "skipped", "not applicable: the port has no permanent name"))
     elif port.parent == name.parent:
         checks.append(Check("permissions.by-id", "ok", "the name survives replugging"))
     else:
-        found = f"{port} may be another device after replugging"
+        found = f"{port} may name another device after replugging"
         checks.append(Check("permissions.by-id", "warning", found, f"write {name} in the sensor's address"))
     timer = sys / "bus" / "usb-serial" / "devices" / real.name / "latency_timer"
     if not timer.exists():
@@ -167,14 +167,14 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
 
 
 def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
-    """Return the name of a serial port that survives replugging; None where it has none."""
+    """Return the permanent name of a serial port, which survives replugging; None without one."""
     by_id, real = dev / "serial" / "by-id", os.path.realpath(port)
     links = sorted(by_id.iterdir()) if by_id.is_dir() else []
     return next((link for link in links if os.path.realpath(link) == real), None)
 
 
 def latency_command(tty: str) -> str:
-    """Return the command that sets a USB serial adapter's delay to 1 ms until it is unplugged."""
+    """Return the command that sets the latency of a USB serial adapter to 1 ms until it is unplugged."""
     return f"echo 1 | sudo tee /sys/bus/usb-serial/devices/{tty}/latency_timer"
 
 
@@ -192,12 +192,12 @@ def _check_access(port: Path) -> Check:
         fix = f"sudo usermod -aG {group} $USER    (then log out and in again)"
     else:
         install = _udev_command(Path(os.path.realpath(port)).name)
-        fix = f"{install}    (then log out and in again; until the next plugging: sudo chmod a+rw {port})"
+        fix = f"{install}    (then log out and in again; until it is unplugged: sudo chmod a+rw {port})"
     return Check("permissions.port", "failed", f"{port} is not readable and writable", fix)
 
 
 def _udev_command(tty: str) -> str:
-    """Return the command that gives ports of this kind to the group dialout and adds the user to it."""
+    """Return the command that assigns such ports to the group dialout, and adds the user to this group."""
     rule = f'SUBSYSTEM=="tty", KERNEL=="{tty.rstrip("0123456789")}[0-9]*", GROUP="dialout", MODE="0660"'
     return (
         f"echo '{rule}' | sudo tee /etc/udev/rules.d/60-ftdrive.rules && sudo udevadm control --reload && "
@@ -207,12 +207,12 @@ def _udev_command(tty: str) -> str:
 
 def can_interfaces(sys: Path = SYS) -> list[str]:
     """Return the names of the kernel's CAN interfaces."""
-    found = sorted((sys / "class" / "net").glob("*/type"))
-    return [path.parent.name for path in found if path.read_text(encoding="ascii").strip() == _CAN_INTERFACE]
+    types = sorted((sys / "class" / "net").glob("*/type"))
+    return [path.parent.name for path in types if path.read_text(encoding="ascii").strip() == _CAN_INTERFACE]
 
 
 def can_details(interface: str) -> Mapping[str, Any]:
-    """Read kind, state and bitrate of a CAN interface with `ip`; empty where `ip` does not report them."""
+    """Return kind, state and bitrate of a CAN interface as far as the command `ip` reports them."""
     if (ip := shutil.which("ip", path=f"{os.environ.get('PATH', '')}:/usr/sbin:/sbin")) is None:
         return {}
     command = [ip, "-details", "-json", "link", "show", interface]
@@ -229,12 +229,12 @@ def can_details(interface: str) -> Mapping[str, Any]:
 
 
 def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any], *, sys: Path = SYS) -> Check:
-    """Check an interface of the kernel, by its `can_details`: present, up, not bus-off, and at the sensor's bitrate."""
+    """Check that a CAN interface of the kernel exists, is up, not bus-off, and at the bitrate, by its `can_details`."""
     name = "permissions.can"
     up = f"sudo ip link set {interface} up type can bitrate {bitrate}"
     if "/" in interface or interface.startswith("tty"):
         port = interface if "/" in interface else f"/dev/{interface}"
-        fix = f"for a sensor on a serial port give {port}, for a bus behind an adapter slcan://{port}?bitrate={bitrate}"
+        fix = f"for a sensor on a serial port give {port}, for a CAN adapter give slcan://{port}?bitrate={bitrate}"
         return Check(name, "failed", f"{interface} is not a CAN interface", fix)
     folder = sys / "class" / "net" / interface
     if not folder.exists():
@@ -247,11 +247,11 @@ def check_can_interface(interface: str, bitrate: int, details: Mapping[str, Any]
         return Check(name, "failed", f"{interface} is down", up)
     if details.get("state") == "BUS-OFF":
         fix = f"check wiring, termination and bitrate, then sudo ip link set {interface} type can restart"
-        return Check(name, "failed", f"{interface} has switched itself off (bus-off)", fix)
+        return Check(name, "failed", f"{interface} has switched off after bus errors (bus-off)", fix)
     found = details.get("bitrate")
     if found is not None and found != bitrate:
         fix = f"sudo ip link set {interface} down && {up}"
-        return Check(name, "failed", f"{interface} is at {found} bit/s, the sensor at {bitrate}", fix)
+        return Check(name, "failed", f"{interface} runs at {found} bit/s, but the sensor at {bitrate}", fix)
     state = details.get("state", details.get("kind", "state unknown"))
     rate = "bitrate unknown" if found is None else f"{found} bit/s"
     if state in {"ERROR-WARNING", "ERROR-PASSIVE"}:

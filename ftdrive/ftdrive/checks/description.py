@@ -1,6 +1,6 @@
-"""The description of a cell: the questions, what an answer means, how it is judged, and the draft of the answers.
+"""Description of a cell by answers: questions, meaning and checks of the answers, and their draft.
 
-Terminal, options, draft and page of `ftdrive init` are all made of `QUESTIONS`, and an answer is a text in all of them.
+Terminal, options, draft and page of `ftdrive init` all use `QUESTIONS`; an answer is a string in all of them.
 """
 
 import json
@@ -34,38 +34,38 @@ ROBOT, MODEL, SENSOR, TOOL, WALLS, BOXES = (
 )
 BASE_AXES: Final = (
     "Sides are along the base axes of the pendant (Move, feature Base): on a UR the cable leaves the base towards +y. "
-    "Above is +z, away from the mounting surface, also where the base hangs. Jog towards a wall to see its side."
+    "Above is +z, away from the mounting surface, even if the base hangs. Jog towards a wall to see its side."
 )
-_SILENT = "not read when this was written"
+_SILENT = "not read when this file was written"
 _LOOK_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class CellQuestion:
-    """One question about a cell."""
+    """A question about a cell."""
 
     key: str
-    """Of the configuration, such as "robot.host"."""
+    """Key of the configuration, such as "robot.host"."""
     label: str
     how: str
-    """How it is answered."""
+    """Form of the answer."""
     read: Callable[[str, str], Any]
-    """Returns the value of a text, one row of it where it repeats; takes the option too, for messages."""
+    """Returns the value of an answer, or of one row; its arguments are the option, for messages, and the text."""
     usual: str | None = None
-    """The answer of Enter; "" leaves the key unset, None asks again."""
+    """Answer that Enter gives; "" leaves the key unset, None asks again."""
     in_force: bool = False
-    """Whether a value of environment or user's file is the usual answer."""
+    """Whether Enter gives the value from the environment or the user's file."""
     repeats: bool = False
     choices: Sequence[str] = ()
 
     @property
     def option(self) -> str:
-        """The option of `ftdrive init`."""
+        """Option of `ftdrive init` for this question."""
         return RULES[self.key].option
 
     @property
     def name(self) -> str:
-        """The parameter of that option."""
+        """Name of the parameter of this option."""
         return self.option[2:].replace("-", "_")
 
 
@@ -83,22 +83,22 @@ QUESTIONS: Final = (
     CellQuestion(
         SENSOR, "Sensor address", "a URL such as ati-can://can0?bitrate=250000, or a port", _stripped, in_force=True
     ),
-    CellQuestion("sensor.height_mm", "Sensor height", "above the flange face, mm, measure it", _in(MM)),
-    CellQuestion("sensor.mass_kg", "Sensor mass", "with its adapter, kg, from scale or data sheet", _in(KG), ""),
-    CellQuestion("tool.name", "Name of the tool", "results are found by it", _stripped, in_force=True),
+    CellQuestion("sensor.height_mm", "Sensor height", "of its origin above the flange face, mm", _in(MM)),
+    CellQuestion("sensor.mass_kg", "Sensor mass", "including the adapter, kg, from a scale or data sheet", _in(KG), ""),
+    CellQuestion("tool.name", "Name of the tool", "results are stored under this name", _stripped, in_force=True),
     CellQuestion(
         TOOL,
         "Cylinder of sensor and tool",
-        "from, to and diameter, mm from the flange face, such as 0:60:90; then x and y of its axis, if it is beside "
-        "the flange's, such as 60:110:50:45:0 for a camera",
+        "from, to and diameter, mm from the flange face, such as 0:60:90; also x and y of its axis if it is not on the "
+        "flange axis, such as 60:110:50:45:0 for a camera",
         rows_reader(3, 5),
         repeats=True,
     ),
-    CellQuestion("tool.mass_kg", "Tool mass", "of what hangs on the sensor, kg, about", _in(KG), ""),
+    CellQuestion("tool.mass_kg", "Tool mass", "approximate mass below the sensor, kg", _in(KG), ""),
     CellQuestion(
         "workcell.mounting",
         "Mounting",
-        "floor, wall, ceiling, or degrees that the base leans to its -x",
+        "floor, wall, ceiling, or the lean of the base towards -x in degrees",
         _stripped,
         "floor",
         in_force=True,
@@ -112,49 +112,49 @@ BY_KEY: Final = {question.key: question for question in QUESTIONS}
 
 
 class Description:
-    """Answers, as texts, to `QUESTIONS`.
+    """Answers to `QUESTIONS`, as strings.
 
-    `in_force` has values by key of environment and user's file, and the defaults. With `simulate` the cell is emulated,
-    and no question is about its devices.
+    `in_force` has the values of environment, user's file and defaults by key. With `simulate` the cell is emulated, and
+    there are no questions about its devices.
     """
 
     def __init__(self, clock: Clock, in_force: Mapping[str, Any], *, simulate: bool = False) -> None:
         self.clock, self._in_force, self._simulate = clock, in_force, simulate
         self.texts: dict[str, list[str]] = {}
-        """Answers by key: one text, or one for each row."""
+        """Answers by key: one string, or one per row."""
         self.answered: set[str] = set()
-        """Keys that need no question."""
+        """Keys whose question is answered."""
         self.reports: dict[str, str] = {}
-        """What devices report about themselves, by the key of their address."""
+        """Reports of the devices about themselves, by the key of their address."""
         self.places: list[str] = []
-        """Where a sensor was found; its number is an answer."""
+        """Addresses at which sensors were found; the number of one of them is a valid answer."""
 
     @property
     def questions(self) -> list[CellQuestion]:
-        """Questions that this cell needs: none for what the robot reports."""
+        """Questions for this cell, without those that the robot itself answers."""
         known = {ROBOT, MODEL, SENSOR} if self._simulate else {MODEL} if ROBOT in self.reports else set()
         return [question for question in QUESTIONS if question.key not in known]
 
     @property
     def model(self) -> str | None:
-        """Model of the arm, where it is known."""
+        """Model of the arm; None if it is unknown."""
         return next(filter(None, self.texts.get(MODEL, [])), None)
 
     @property
     def without_shape(self) -> str:
-        """What follows if the arm has no measured shape; empty if it has one, or is not known."""
+        """Warning if the arm has no measured shape; empty if it has one, or if its model is unknown."""
         if self.model is None or model_named(self.model, controller_major=0) in SHAPES:
             return ""
         return f"the {self.model} has no measured shape, so no motion can be planned: use calibrate --manual"
 
     def usual(self, question: CellQuestion) -> str | None:
-        """Return the answer to a question that is left open; None if it must be answered."""
+        """Return the default answer to a question; None if it has none."""
         if question.in_force and (value := self._in_force[question.key]) is not None:
             return f"{value:g}" if isinstance(value, float) else str(value)
         return question.usual
 
     def value(self, question: CellQuestion, text: str) -> Any:
-        """Return what one answer means, or one row; None for "unknown". Raises `ConfigError` for a text of no use."""
+        """Return the value of an answer, or of one row; None for "unknown". Raises `ConfigError` if it is invalid."""
         if question.usual == "" and text.strip().lower() in ("", "none", "unknown"):
             return None
         if question.key == MODEL and ROBOT in self.reports:
@@ -164,13 +164,13 @@ class Description:
         return checked[0] if question.repeats else checked
 
     def judge(self, question: CellQuestion, text: str) -> None:
-        """Raise `ConfigError` unless an answer, or one row, can be used; a wall or box must leave the arm its room."""
+        """Raise `ConfigError` if an answer, or one row, is invalid, or if a wall or box contains the arm."""
         value = self.value(question, text)
         if question.key in (WALLS, BOXES) and value is not None:
             self._require_possible(question.key, (value,))
 
     def judge_rows(self, question: CellQuestion) -> None:
-        """Raise `ConfigError` unless all rows together can be used; the tool must not end before its sensor."""
+        """Raise `ConfigError` if the rows together are invalid, such as a tool that ends inside the sensor."""
         self._require_possible(question.key, self._rows(question))
 
     def _rows(self, question: CellQuestion) -> tuple[Any, ...]:
@@ -186,22 +186,22 @@ class Description:
         require_possible(CellConfig(RobotConfig(""), sensor, **{section: kind(**{name: rows})}), self.model)
 
     def look(self, key: str, text: str) -> str:
-        """Read the device at an address or place, keep what it reports, and return that in words.
+        """Read the device at an address, or on a port or bus; store and return its report.
 
-        `key` is `ROBOT` or `SENSOR`. Raises `DeviceError` if it does not answer, and `UsageError` for what can be no
-        address.
+        `key` is `ROBOT` or `SENSOR`. Raises `DeviceError` if the device does not answer, and `UsageError` for an
+        invalid address.
         """
         try:
             return self._look(key, text)
         except (OSError, UnicodeError) as error:
-            raise ConfigError(f"'{text[:60]}' cannot be an address ({error}): correct it") from error
+            raise ConfigError(f"'{text[:60]}' is not a valid address ({error}): correct it") from error
 
     def _look(self, key: str, text: str) -> str:
         if key == ROBOT:
-            # What another arm has reported is not the model of this one.
+            # Ignore the model that an earlier arm has reported.
             given = None if ROBOT in self.reports else self.model
-            found, words = _identify_robot(text, given, self.clock)
-            self.texts[MODEL] = [found]
+            model, words = _identify_robot(text, given, self.clock)
+            self.texts[MODEL] = [model]
             self.answered.add(MODEL)
             shown = words
         else:
@@ -214,20 +214,21 @@ class Description:
         return shown
 
     def keep(self, key: str, text: str) -> None:
-        """Keep an address that does not answer; the model that another arm has reported is asked for."""
+        """Store an address that does not answer; discard the model that an earlier arm has reported."""
         self.texts[key] = [text]
         if self.reports.pop(key, None) is not None and key == ROBOT:
             self.answered.discard(MODEL)
 
     @property
     def missing(self) -> list[CellQuestion]:
-        """Questions that must be answered, and are not."""
-        return [one for one in self.questions if not self.texts.get(one.key) and self.usual(one) is None]
+        """Open questions without a default answer."""
+        return [item for item in self.questions if not self.texts.get(item.key) and self.usual(item) is None]
 
     def cell(self) -> CellConfig:
         """Return the described cell; raises `ConfigError` if an answer is missing or cannot be used."""
-        for one in self.missing:
-            raise ConfigError(f"{one.option} is missing and has no default: {one.label}, {one.how}")
+        for question in self.missing:
+            label, how = question.label, question.how
+            raise ConfigError(f"{question.option} is missing and has no default: {label}, {how}")
         values: dict[str, dict[str, Any]] = {"robot": {"simulate": self._simulate}, "sensor": {}}
         for question in QUESTIONS:
             section, name = question.key.split(".")
@@ -242,7 +243,7 @@ class Description:
         return cell
 
     def found(self) -> dict[str, str]:
-        """Return what robot and sensor have reported, in words."""
+        """Return the reports of robot and sensor by role."""
         return {name: self.reports.get(key, _SILENT) for name, key in (("robot", ROBOT), ("sensor", SENSOR))}
 
     def file(self) -> str:
@@ -250,7 +251,7 @@ class Description:
         return cell_file(self.cell(), [f"{name.capitalize()}: {words}." for name, words in self.found().items()])
 
     def save(self, draft: Path) -> None:
-        """Write the answers to a draft, over the former one."""
+        """Write the answers to a draft; replace an earlier draft."""
         saved = datetime.now().astimezone().isoformat(timespec="minutes")
         document = {"format": FORMAT, "saved": saved, "simulate": self._simulate}
         answers = {"texts": self.texts, "answered": sorted(self.answered), "reports": self.reports}
@@ -259,12 +260,12 @@ class Description:
         partial.replace(draft)
 
     def load(self, draft: Path) -> None:
-        """Take the answers of a draft; raises `ConfigError` if it is none."""
+        """Read the answers of a draft; raises `ConfigError` if the file is not a draft."""
         document = _draft(draft)
         try:
             texts = dict(document["texts"])
             if document["simulate"] != self._simulate:
-                # An emulated cell has no address for a real one.
+                # Addresses of an emulated cell are not valid for a real one, and vice versa.
                 for key in (ROBOT, MODEL, SENSOR):
                     texts.pop(key, None)
             self.texts = {key: [*map(str, texts[key])] for key in BY_KEY if key in texts}
@@ -275,7 +276,7 @@ class Description:
 
 
 def saved_at(draft: Path) -> str:
-    """Return when a draft was saved, such as "10:42", with its day unless it is today; raises `ConfigError`."""
+    """Return when a draft was saved, such as "10:42", with the date unless it is today; raises `ConfigError`."""
     try:
         saved = datetime.fromisoformat(_draft(draft)["saved"])
     except (KeyError, TypeError, ValueError) as error:
@@ -293,7 +294,7 @@ def _draft(draft: Path) -> dict[str, Any]:
 
 
 def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, str]:
-    """Return the model of the arm at an address, and in words what it reports; raises `DeviceError`."""
+    """Return the model of the arm at an address, and its report; raises `DeviceError`."""
     with closing(build_arm(CellConfig(RobotConfig(host, model), SensorConfig(""), clock=clock))) as arm:
         arm.open()
         info, remote = arm.identify(), arm.in_remote_control()
@@ -302,7 +303,7 @@ def _identify_robot(host: str, model: str | None, clock: Clock) -> tuple[str, st
 
 
 def _identify_sensor(url: str, clock: Clock) -> str:
-    """Return in words which sensor is at an address, and its rate; raises `DeviceError` or `UsageError`."""
+    """Return the report of the sensor at an address, with its rate; raises `DeviceError` or `UsageError`."""
     with build_sensor(CellConfig(RobotConfig(""), SensorConfig(url), clock=clock)) as sensor:
         info = sensor.identify()
         rate_Hz = len(sensor.collect(_LOOK_S).t_host_ns) / _LOOK_S

@@ -1,4 +1,4 @@
-"""Discovery of robots and sensors at an address, port or bus. They are read, never changed or moved."""
+"""Discovery of sensors on ports and buses; devices are only read."""
 
 from pathlib import Path
 
@@ -17,29 +17,29 @@ _SLCAN = "slcan:///dev/ttyACM0?bitrate=250000"
 
 
 def is_place(text: str) -> bool:
-    """Return whether this names a port or bus to probe, not the address of a sensor."""
+    """Return whether a text names a port or bus to probe, not the address of a sensor."""
     return "://" not in text or text.startswith(tuple(f"{interface}://" for interface in _CAN))
 
 
 def sensor_at(place: str, clock: Clock = REAL) -> str:
-    """Probe a port or bus and return the address of its sensor; raises `UsageError` unless exactly one answers."""
+    """Return the address of the only sensor on a port or bus; raises `UsageError` unless exactly one answers."""
     answers = probe_place(place, clock)
     urls = [answer.url for answer in answers if answer.url]
     if len(urls) == 1:
         return urls[0]
     if urls:
-        raise ConfigError(f"{len(urls)} sensors answer on {place}: choose one, {' or '.join(urls)}")
+        raise ConfigError(f"{len(urls)} sensors answer on {place}: give the address of one, {' or '.join(urls)}")
     why = "; ".join(answer.what for answer in answers)
-    usual = "check its power and bit rate, or give its address (docs/reference/sensors.md lists the forms)"
+    usual = "check its power supply and bit rate, or give its address (forms: docs/reference/sensors.md)"
     raise ConfigError(f"no known sensor answers on {place}: {why or usual}")
 
 
 def probe_place(place: str, clock: Clock = REAL) -> list[Answer]:
-    """Probe a port or bus for known sensors, which are only read.
+    """Return the known sensors that answer on a port or bus; they are only read.
 
-    A place is a serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN
+    `place` is a serial port; a CAN interface of the kernel, ``can0`` or ``socketcan://can0?base=0x7F``; or a CAN
     adapter on a serial port with the bit rate of its bus, ``slcan:///dev/ttyACM0?bitrate=250000``. Raises `UsageError`
-    for another form, and `ConnectError` for a place that does not exist, is not up, or not permitted.
+    for another form, and `ConnectError` if the port or interface does not exist, is down, or is not accessible.
     """
     if "://" in place:
         return _ask_can(place, clock)
@@ -63,7 +63,7 @@ def _ask_can(url: str, clock: Clock) -> list[Answer]:
         bitrate = bitrate or details.get("bitrate")
         _must_pass([check_can_interface(channel, bitrate or 250_000, details)])
     elif bitrate is None:
-        raise ConfigError(f"{url} has no bit rate: add it, as in {_SLCAN}; a wrong one disturbs the bus")
+        raise ConfigError(f"{url} has no bit rate: add it, as in {_SLCAN}; a wrong bit rate disturbs the bus")
     else:
         _must_pass(check_serial_port(Path(channel.split("@")[0])))
     return probe_can(channel, interface=interface, bitrate=bitrate, base=base, clock=clock)
@@ -76,6 +76,6 @@ def _must_pass(checks: list[Check]) -> None:
 
 
 def places() -> list[str]:
-    """Return the ports and buses that can be probed: CAN interfaces of the kernel, and serial ports on USB by id."""
+    """Return the CAN interfaces of the kernel and the USB serial ports by permanent name, which can be probed."""
     ports = sorted(port.device for port in list_ports.comports() if port.vid is not None)
     return can_interfaces() + [str(name_by_id(Path(port)) or port) for port in ports]

@@ -1,4 +1,4 @@
-"""Checks of a sensor."""
+"""Checks of a force/torque sensor."""
 
 import math
 import shlex
@@ -28,7 +28,7 @@ from ftdrivers.errors import (
 )
 from ftdrivers.interfaces import Array, DeviceInfo, Fact, ForceTorqueSensor, FtSamples, Health, RobotArm
 
-# From the name of a check and the error of a sensor's driver.
+# Makes a check from the name of a check and the error of a sensor's driver.
 Blame = Callable[[str, DeviceError], Check]
 
 _LOOK_S: Final = 2.0
@@ -43,7 +43,7 @@ _LOAD: Final = 0.8
 # Share of the sensor's range at which a session stops the arm.
 SATURATION: Final = 0.9
 _MUCH_AT_REST: Final = 0.5
-# A smaller share of the weight at rest is likely to be compensated or zeroed.
+# A wrench at rest below this share of the weight is likely to be compensated or zeroed.
 _COMPENSATED: Final = 0.1
 AXES: Final = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
@@ -57,7 +57,7 @@ _SOURCE = {
 
 
 def check_identity(info: DeviceInfo) -> list[Check]:
-    """Check who a sensor is, and the source of its scale, range and sign."""
+    """Return checks of the identity of a sensor, and of the source of its scale, range and sign."""
     facts = info.facts
     identity = Check("sensor.identity", "ok", who(info))
     if "serial" not in facts:
@@ -98,11 +98,13 @@ def _check_sign(fact: Fact | None) -> Check:
 
 
 def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Check]:
-    """Report what the sensor itself adds to or changes about its readings; nothing where it does not."""
+    """Return checks of the software bias and tool transformation of the sensor, if it has any."""
     checks = []
     if bias is not None and isinstance(bias.value, tuple) and any(bias.value):
         numbers = ", ".join(f"{value:g}" for value in bias.value)
-        found = f"the sensor subtracts its software bias ({numbers}): a calibration holds only while it stays"
+        found = (
+            f"the sensor subtracts its software bias ({numbers}): a calibration is valid only until this bias changes"
+        )
         checks.append(Check("sensor.bias", "ok", found))
     if transformation is not None:
         found = f"the driver undoes the tool transformation of the sensor: {transformation.value}"
@@ -111,7 +113,7 @@ def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Chec
 
 
 def check_tool_weight(limits: ArrayLike | None, cell: CellConfig) -> Check:
-    """Check that twice the tool's weight, also at its end, fits into the sensor's range (6,); None is unknown."""
+    """Check that twice the tool's weight, even at the end of the tool, fits into the sensor's range (6,)."""
     name, mass_kg = "sensor.load", cell.tool.mass_kg
     if limits is None or mass_kg is None:
         unknown = "[tool] mass_kg is not set" if mass_kg is None else "the sensor's range is unknown"
@@ -120,17 +122,19 @@ def check_tool_weight(limits: ArrayLike | None, cell: CellConfig) -> Check:
     weight_N, length_m = mass_kg * cell.site.g_m_s2, max((row[1] for row in cell.tool.cylinders_mm), default=0.0) / 1e3
     share = max(2 * weight_N / range_N.min(), 2 * weight_N * length_m / range_Nm.min())
     found = f"twice the tool's weight is {100 * share:.0f} % of the sensor's range"
-    return Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "take a larger sensor")
+    return (
+        Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "use a sensor with a larger range")
+    )
 
 
 def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zero_is_arbitrary: bool) -> Check:
-    """Check that what a sensor reads at rest (n, 6), N and N·m, leaves enough of its range (6,); None is unknown.
+    """Check that the reading at rest (n, 6), N and N·m, leaves enough of the sensor's range (6,).
 
-    If the zero is arbitrary, the range holds for changes of the reading.
+    Skipped if the range is None, or if the zero is arbitrary: the range then applies to changes of the reading.
     """
     name = "sensor.rest"
     if zero_is_arbitrary:
-        found = "the zero of this sensor is arbitrary: its range holds for changes of the reading"
+        found = "the zero of this sensor is arbitrary, so its range applies to changes of the reading"
         return Check(name, "skipped", found)
     if limits is None:
         return Check(name, "skipped", "not compared with the reading at rest: the sensor's range is unknown")
@@ -141,17 +145,17 @@ def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zer
     share = rest[axis] / range_[axis]
     unit = "N" if axis < 3 else "N·m"
     found = f"at rest the sensor reads {rest[axis]:.1f} {unit} in {AXES[axis]}, {100 * share:.0f} % of its range"
-    fix = "take off what presses on the sensor, check its screws and its range, then zero it or take a larger one"
+    fix = "remove contact and load, check the screws and the configured range, then zero the sensor or use a larger one"
     if needed[axis] > SATURATION:
         return Check(name, "failed", found, fix)
     return Check(name, "ok", found) if share <= _MUCH_AT_REST else Check(name, "warning", found, fix)
 
 
 def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, permissions: Sequence[Check]) -> Check:
-    """Return an error of a sensor's driver, and what to do about it.
+    """Return the failed check for an error of a sensor's driver, with a remedy.
 
-    The error's own fix comes first. If the sensor was not reached and a permission is missing, that is the fix. If
-    neither names one, it is the usual fix for errors of this kind.
+    The remedy of the error comes first. If the sensor was not reached and a permission is missing, the remedy is that
+    of the permission. Without either it is the usual remedy for errors of this kind.
     """
     kind = error.__cause__ if isinstance(error, ConnectError) and isinstance(error.__cause__, DeviceError) else error
     fix = error.fix
@@ -164,40 +168,42 @@ def check_sensor_error(name: str, error: DeviceError, address: SensorAddress, pe
 
 
 def _not_reached(error: BaseException) -> bool:
-    """Return whether nothing came from a device; one whose answer is refused raises an error without a cause."""
+    """Return whether the device sent nothing; an error about an unexpected answer has no cause."""
     silent = isinstance(error, DeviceTimeout | StreamBroken)
     return silent or (isinstance(error, ConnectError) and error.__cause__ is not None)
 
 
 def _usual_fix(error: BaseException, address: SensorAddress) -> str:
     if isinstance(error, DeviceFault):
-        return "look the fault up in the sensor's manual; switch it off and on, then ftdrive doctor again"
+        return "look up the fault in the sensor's manual, switch the sensor off and on, then run ftdrive doctor again"
     if isinstance(error, ProtocolError):
-        return f"switch the sensor off and on; is it the one its address names? {_who_answers(address)}"
+        return f"switch the sensor off and on, and check that its address is right: {_who_answers(address)}"
     return f"check the sensor's supply and cable, then {_who_answers(address)}"
 
 
 def _who_answers(address: SensorAddress) -> str:
     if address.host is not None:
         return f"ping {address.host}"
-    return "ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
+    return (
+        "run ftdrive doctor again" if address.place is None else f"ftdrive devices --probe {shlex.quote(address.place)}"
+    )
 
 
 def check_compensated(wrench: Array, cell: CellConfig) -> Check:
-    """Check that a topic's wrench (n, 6) at rest has the weight of the tool or a bias in it, and is not near 0."""
+    """Check that a topic's wrench (n, 6) at rest contains the weight of the tool or a bias, and is not near 0."""
     name, mass_kg = "sensor.compensated", cell.tool.mass_kg
     if mass_kg is None:
-        return Check(name, "skipped", "[tool] mass_kg is not set: whether the topic is compensated is not known")
+        return Check(name, "skipped", "[tool] mass_kg is not set, so compensation of the topic cannot be detected")
     force_N, weight_N = float(np.linalg.norm(np.mean(wrench, axis=0)[:3])), mass_kg * cell.site.g_m_s2
-    found = f"the wrench has {force_N:.1f} N at rest, the tool weighs {weight_N:.1f} N"
+    found = f"the force at rest is {force_N:.1f} N, and the tool weighs {weight_N:.1f} N"
     if force_N > _COMPENSATED * weight_N:
         return Check(name, "ok", found)
-    fix = "give the topic of the raw wrench, or switch the compensation off; a zeroing that stays does no harm"
-    return Check(name, "warning", f"{found}: this wrench is already compensated or zeroed", fix)
+    fix = "give the topic of the raw wrench, or disable its compensation; a constant zeroing does no harm"
+    return Check(name, "warning", f"{found}: the topic is already compensated or zeroed", fix)
 
 
 def check_stream(samples: FtSamples, health: Health, address: SensorAddress, duration_s: float) -> list[Check]:
-    """Check two seconds of a sensor: rate, losses, age, status."""
+    """Return checks of a recording of `duration_s`: rate, lost samples, age and status."""
     return [
         check_rate(len(samples) / duration_s, health.nominal_rate_Hz, address),
         _check_lost(health, address),
@@ -207,18 +213,18 @@ def check_stream(samples: FtSamples, health: Health, address: SensorAddress, dur
 
 
 def check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress | None = None) -> Check:
-    """Compare the measured rate of a sensor with its nominal one."""
+    """Check that the measured rate of a sensor is near the nominal one."""
     if math.isnan(nominal_Hz):
-        return Check("sensor.rate", "ok", f"{rate_Hz:.0f} Hz, the sensor has no nominal rate")
+        return Check("sensor.rate", "ok", f"{rate_Hz:.0f} Hz; the sensor has no nominal rate")
     found, share = f"{rate_Hz:.1f} Hz (nominal {nominal_Hz:g})", rate_Hz / nominal_Hz
     if 1 - _RATE_TOLERANCE / 2 < share < 1 + _RATE_TOLERANCE:
         return Check("sensor.rate", "ok", found)
     port = None if address is None else address.serial_port
     fix = "close other programs, and try another USB port or cable"
     if address is None:
-        fix = "`ftdrive doctor` names likely causes"
+        fix = "run `ftdrive doctor`, which names likely causes"
     elif share > 1:
-        fix = "records come twice, or the sensor has another setting: set its rate again, then ftdrive doctor again"
+        fix = "samples are duplicated, or the sensor has another rate: set its rate, then run ftdrive doctor again"
     elif address.host is not None:
         fix = _BETTER_NETWORK
     elif port is not None and (tty := port.resolve().name).startswith("ttyUSB"):
@@ -227,16 +233,16 @@ def check_rate(rate_Hz: float, nominal_Hz: float, address: SensorAddress | None 
 
 
 def _check_lost(health: Health, address: SensorAddress) -> Check:
-    odd = ((health.out_of_order, "out of order"), (health.duplicated, "twice"))
-    came = "".join(f", {count} came {how}" for count, how in odd if count)
-    found = f"{health.lost} lost, {health.malformed} damaged of {health.received}{came}"
+    odd = ((health.out_of_order, "out of order"), (health.duplicated, "duplicated"))
+    also = "".join(f", {count} {how}" for count, how in odd if count)
+    found = f"{health.lost} lost, {health.malformed} damaged of {health.received}{also}"
     gone = max(health.lost, health.malformed, health.out_of_order)
     if not gone and not health.duplicated:
         return Check("sensor.lost", "ok", found)
-    state: State = "failed" if gone > 0.01 * health.received else "warning"  # of what comes twice nothing is missing
+    state: State = "failed" if gone > 0.01 * health.received else "warning"  # duplicates are no loss
     fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
-    if address.scheme == "ati-can":  # it is polled
-        fix += ", or run fewer programs on this computer: an answer that is read too late is lost too"
+    if address.scheme == "ati-can":  # the sensor is polled
+        fix += ", or run fewer programs on this computer: an answer that is read too late is also lost"
     return Check("sensor.lost", state, found, fix)
 
 
@@ -244,13 +250,13 @@ def _check_status(status: NDArray[np.uint32]) -> Check:
     found = f"status {', '.join(f'0x{int(word):x}' for word in np.unique(status))}"
     if not status.any():
         return Check("sensor.status", "ok", found)
-    return Check("sensor.status", "warning", found, "look the bits up in the sensor's manual; the driver continues")
+    return Check("sensor.status", "warning", found, "look up the bits in the sensor's manual; the driver continues")
 
 
 def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess) -> list[Check]:
-    """Check the noise of a sensor at rest, and predict from it the accuracy of a calibration with poses of `average_s`.
+    """Return checks of the noise at rest, and of the accuracy that a calibration with poses of `average_s` would have.
 
-    `guess` holds the mass, and the accuracy of sensor and arm; its noise is not used.
+    `guess` has the assumed mass, and the accuracy of sensor and arm; its noise is not used.
     """
     level = check_level(wrench)
     if level.state == "failed":
@@ -264,7 +270,7 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess
         for key, factor in (("p_sensor_com_m", 1e3), ("R_flange_sensor", 180 / np.pi))
     )
     mass_g = 1e3 * float(np.max(expected.sigma["mass_kg"]))
-    off = f"a sensor whose gain is {100 * guess.gain_sigma:.2g} % off"
+    off = f"a sensor gain error of {100 * guess.gain_sigma:.2g} %"
     accuracy = (
         f"for {guess.mass_kg:g} kg, 24 poses of {average_s:g} s and {off}, "
         f"one sigma: mass {mass_g:.2g} g, centre of mass {com_mm:.2g} mm, mounting {turn_deg:.2g}°"
@@ -273,13 +279,13 @@ def check_noise(wrench: Array, duration_s: float, average_s: float, guess: Guess
 
 
 def check_noise_change(wrench: Array, dataset: CalibrationDataset) -> Check:
-    """Compare the noise of a resting sensor (n, 6) with that of the poses of a calibration.
+    """Check that the noise of the resting sensor (n, 6) has not grown since a calibration.
 
-    Compared is the variance of a mean times its number of samples, which does not depend on the averaging time.
+    The comparison uses the variance of a mean times its number of samples, which is independent of the averaging time.
     """
     name = "noise.change"
     if dataset.wrench_cov is None or not (sampled := dataset.n_samples > 0).any():
-        return Check(name, "skipped", "the noise of the calibration is not known")
+        return Check(name, "skipped", "the noise of the calibration is unknown")
     if len(wrench) < LEAST_SAMPLES or not is_stationary(wrench):
         return Check(name, "skipped", "the reading is not steady")
     then = np.einsum("nii,n->ni", dataset.wrench_cov[sampled], dataset.n_samples[sampled])
@@ -289,14 +295,14 @@ def check_noise_change(wrench: Array, dataset: CalibrationDataset) -> Check:
     found = f"noise is {ratio[most]:.1f} times that of the calibration in {AXES[most]}"
     if ratio[most] < _MUCH_NOISE:
         return Check(name, "ok", found)
-    return Check(name, "warning", found, "look for vibration and loose cables, then ftdrive doctor")
+    return Check(name, "warning", found, "look for vibration and loose cables, then run ftdrive doctor")
 
 
 def check_level(wrench: Array) -> Check:
-    """Check that all six axes of a resting sensor (n, 6) are alive, finite and steady."""
+    """Check that the samples (n, 6) of a resting sensor are finite and steady, and that all six axes show noise."""
     name = "noise.level"
     if len(wrench) < LEAST_SAMPLES:
-        return Check(name, "failed", f"only {len(wrench)} samples", "check the sensor's rate")
+        return Check(name, "failed", f"only {len(wrench)} samples", "check the rate of the sensor")
     if not np.isfinite(wrench).all():
         return Check(name, "failed", "the sensor sends values that are not numbers", "check its cable and supply")
     if dead := [AXES[i] for i in np.flatnonzero(np.ptp(wrench, axis=0) == 0)]:
@@ -306,30 +312,32 @@ def check_level(wrench: Array) -> Check:
     force, torque = ", ".join(f"{s:.4f}" for s in sigma[:3]), ", ".join(f"{s:.5f}" for s in sigma[3:])
     found = f"σ ({force}) N, ({torque}) N·m"
     if not is_stationary(wrench):
-        return Check(name, "warning", f"{found}, but not steady", "keep hands and cables off, let it warm up")
+        return Check(
+            name, "warning", f"{found}, but not steady", "keep hands and cables off the sensor, and let it warm up"
+        )
     return Check(name, "ok", found)
 
 
 def examine_sensor(
     sensor: ForceTorqueSensor, address: SensorAddress, cell: CellConfig, guess: Guess, blame: Blame
 ) -> tuple[list[Check], bool]:
-    """Open a sensor and make every check of it at rest; return also whether it measures. `guess` as `check_noise`."""
-    found: list[Check] = []
+    """Open a sensor; return all checks at rest, and whether the sensor measures. `guess` is as in `check_noise`."""
+    checks: list[Check] = []
     name = "sensor.identity"
     try:
         sensor.open()
         info = sensor.identify()
-        found += check_identity(info)
+        checks += check_identity(info)
         name = "sensor.stream"
-        found += [check_diagnosis(one, "sensor") for one in sensor.diagnose()]
+        checks += [check_diagnosis(diagnosis, "sensor") for diagnosis in sensor.diagnose()]
         samples = sensor.collect(_LOOK_S)
         health = sensor.health()
     except DeviceError as error:
-        return [*found, blame(name, error)], False
+        return [*checks, blame(name, error)], False
     fact = info.facts.get("range")
     limits = None if fact is None else np.asarray(fact.value, dtype=np.float64)
     return [
-        *found,
+        *checks,
         check_tool_weight(limits, cell),
         check_rest(samples.wrench, limits, cell, zero_is_arbitrary=info.has_arbitrary_zero),
         *([check_compensated(samples.wrench, cell)] if address.scheme == "ros2" else []),
@@ -347,9 +355,9 @@ def examine_push(
     is_pushing: Callable[[], bool],
     blame: Blame,
 ) -> tuple[Check, dict[str, Any] | None]:
-    """Measure a push along +X of the base, and check it as `check_push`.
+    """Measure a push along +X of the base, and return the result of `check_push`.
 
-    An emulated cell pushes by itself. Elsewhere `is_pushing` asks for the push, and says whether there is one.
+    An emulated cell pushes by itself. Otherwise `is_pushing` asks for the push, and returns whether there will be one.
     """
     if sensor is None:
         return Check("push.sign", "skipped", "the sensor does not measure"), None
@@ -379,11 +387,11 @@ def examine_push(
 def check_push(
     change: Array, R_base_flange: Array | None, R_flange_sensor: Array | None, sign: int
 ) -> tuple[Check, dict[str, Any]]:
-    """Check the sign of a sensor from a push along +X of the base, along which its reading must move.
+    """Check the sign of a sensor by a push along +X of the base, in which direction the force must change.
 
-    `change` is force during the push minus force before, N, sensor axes. The orientations are None where unknown, and
-    `sign` is as configured. The second value has, for sensor, flange and base, force_N and the axis that moved most,
-    such as "-Y"; None where unknown.
+    `change` is the force during the push minus that before it, N, sensor axes. Unknown orientations are None; `sign` is
+    the configured one. The second result has, for sensor, flange and base axes, force_N and the axis of the largest
+    change, such as "-Y"; None for unknown axes.
     """
     flange = None if R_flange_sensor is None else R_flange_sensor @ change
     base = None if flange is None or R_base_flange is None else R_base_flange @ flange
@@ -395,15 +403,17 @@ def check_push(
     size_N = float(np.linalg.norm(change))
     found = f"{size_N:.1f} N: {words}"
     if size_N < _PUSH_N:
-        return Check("push.sign", "failed", found, f"push again, harder than {_PUSH_N:g} N, and hold"), moved
+        return Check("push.sign", "failed", found, f"push again with more than {_PUSH_N:g} N, and hold"), moved
     if base is None:
-        return Check("push.sign", "skipped", found, "give --calibration FILE: the mounting must be known"), moved
+        return Check(
+            "push.sign", "skipped", found, "give --calibration FILE, because the mounting must be known"
+        ), moved
     if abs(base[0]) < 0.8 * size_N:
         fix = "push along +X of the base; if you did, the sensor is mounted differently: ftdrive calibrate"
         return Check("push.sign", "failed", found, fix), moved
     if base[0] < 0:
         fix = f"set sign = {-sign} under [sensor] in the configuration, then calibrate again"
-        return Check("push.sign", "failed", f"{found}: it reports the reaction", fix), moved
+        return Check("push.sign", "failed", f"{found}: the sensor reports the reaction force", fix), moved
     return Check("push.sign", "ok", found), moved
 
 

@@ -54,7 +54,7 @@ def cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[CellCon
         raise Opened
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ftdrive.commands.calibrate.guide", guide)
+    monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", guide)
     return found
 
 

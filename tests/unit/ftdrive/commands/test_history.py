@@ -207,7 +207,7 @@ def calibrate_with(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
     """Have `ftdrive calibrate` end with this run."""
     loaded = CalibrationResult.load(folder / "calibration.json")
     outcome = SimpleNamespace(run=Run(folder), result=loaded, drift=None)
-    monkeypatch.setattr("ftdrive.commands.calibrate.guide", lambda *_: outcome)
+    monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", lambda *_: outcome)
 
 
 def test_a_calibration_never_fails_for_the_store_and_is_caught_up(

@@ -55,7 +55,7 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
     def guide(*_: object) -> None:
         raise Declined(text)
 
-    monkeypatch.setattr("ftdrive.commands.calibrate.guide", guide)
+    monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", guide)
     assert text in run(*HELD).stderr
 
 
@@ -264,7 +264,7 @@ def test_a_broken_pipe_of_a_device_is_no_closed_output(
     def lose(*_: object) -> None:
         raise BrokenPipeError(EPIPE, "Broken pipe")
 
-    monkeypatch.setattr("ftdrive.commands.calibrate.guide", lose)
+    monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", lose)
     assert cli_run(HELD) == 4
     assert "closed its connection" in capsys.readouterr().err
 
