@@ -1,15 +1,15 @@
-"""Run folders: what a session leaves, and what is solved and verified from it."""
+"""Run folders: the data of sessions, and the results and verifications from them."""
 
 from collections.abc import Iterable
 from pathlib import Path
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a folder is that of a run."""
+    """Return whether a folder is a run folder."""
     return (folder / "run.json").is_file()
 
 
 def run_folders(folders: Iterable[Path]) -> list[Path]:
-    """Return the runs among these folders, and those directly in them, each once and by name."""
-    found = {run.parent for one in folders for name in ("run.json", "*/run.json") for run in one.resolve().glob(name)}
-    return sorted(found)
+    """Return the run folders among these folders and directly in them, sorted by name without duplicates."""
+    names = ("run.json", "*/run.json")
+    return sorted({run.parent for folder in folders for name in names for run in folder.resolve().glob(name)})

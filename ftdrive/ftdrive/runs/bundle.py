@@ -1,9 +1,9 @@
-"""A bundle: a run in one zip file, without addresses and names, which `replay` and `solve` read like the run folder.
+"""A bundle: a run folder as one zip file without addresses and names, which `replay` and `solve` read.
 
 bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
-environment.json    versions of all packages, and the checks of the computer that need no device
-sensor.json         the sensor's matrix in the folder where the command runs, and later ones, redacted
-<run>/...           the files of the run folder; texts are redacted, poses are copied byte for byte
+environment.json    versions of all packages, and checks of the computer without devices
+sensor.json         the sensor matrices in the current folder, redacted
+<run>/...           the files of the run folder; text files are redacted, poses are copied byte by byte
 transcripts/...     the files of `ftdrive transcript record`, redacted
 """
 
@@ -53,32 +53,32 @@ _IPV4 = re.compile(r"(?<![\w.])\d{1,3}(?:\.\d{1,3}){3}(?![\w.]\d|\w)")
 _IPV6 = re.compile(r"(?<![\w:.])[0-9A-Fa-f]*:[0-9A-Fa-f:]+(?![\w:.])")
 _MAC = re.compile(r"(?<![\w:-])(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}(?![\w:-])")
 _HOST_FIELD = re.compile(r'"host": ?"([A-Za-z0-9.-]+)"|"said": ?{[^}]*"robot": ?"([A-Za-z0-9.-]+)"')
-# Ends of the schemes of addresses whose middle names no host of the cell.
+# Endings of URL schemes whose host part is not a host of the cell.
 _NO_NETWORK = ("can", "emulated", "http", "https", "file")
-# Names of accounts and hosts that identify nothing; their home directories are redacted.
+# Common names of accounts and hosts, which identify nobody; their home directories are redacted.
 _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "localhost"}
-# Fields whose four numbers are no address.
+# Fields whose groups of four numbers are versions, not addresses.
 _VERSIONS = ("versions", "packages", "firmware")
-# Bytes of which so many are printable are text. Others are measurements, which stay as they are.
+# Smallest share of printable bytes in a text. Other bytes are measurements, which are not changed.
 _TEXT_SHARE = 0.9
-# Fields of a transcript: bytes in hex.
+# Fields of a transcript with bytes in hexadecimal form.
 _ON_THE_WIRE = ("hex", "request", "reply")
 
 
-# From the kind of what was found, and its match, to what stands in its place.
+# Returns the replacement for a match of some kind, such as "ip".
 _Instead = Callable[[str, re.Match[str]], str]
 
 
 class Redaction:
-    """Replaces IP and MAC addresses, host names, user names and home directories; equal ones by equal placeholders.
+    """Replaces IP and MAC addresses, host names, user names and home directories by placeholders.
 
-    Serial numbers and names of serial ports stay, and so do loopback addresses. First `learn` from all texts, because a
-    name that one file gives away may stand alone in another.
+    Equal values get equal placeholders. Serial numbers, names of serial ports and loopback addresses are kept. Call
+    `learn` with all texts first, because a name that one file reveals may appear without context in another.
     """
 
     def __init__(self) -> None:
         self.placeholders: dict[str, str] = {}
-        """From what was redacted to its placeholder: never written to a file."""
+        """Placeholder of each redacted value; never written to a file."""
         self._names: dict[str, str] = {}
         # A container may have no name for its user.
         with suppress(OSError, KeyError):
@@ -88,13 +88,12 @@ class Redaction:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Different values redacted of each kind: ip, mac, host, user, home."""
+        """Number of different redacted values by kind: ip, mac, host, user, home."""
         kinds = [placeholder.strip("<>").partition("-")[0] for placeholder in self.placeholders.values()]
         return {kind: kinds.count(kind) for kind in sorted(set(kinds))}
 
     def learn(self, text: str) -> None:
-        """Learn names of hosts and users from a file: from paths, addresses, and the fields that name a host."""
-        # A name that one file reveals is replaced in all; a list of fields misses the next field.
+        """Collect names of hosts and users from paths, addresses and host fields of a file."""
         for value in _texts_of_file(text):
             for user in _HOME.findall(value):
                 self._learn_name("user", user)
@@ -105,9 +104,9 @@ class Redaction:
             self._learn_name("host", found[1] or found[2])
 
     def file(self, text: str) -> str:
-        """Redact a text file: the values of JSON, one document or one a line, and anything else as it stands.
+        """Return a redacted text file: the values of JSON, as one document or as lines, or the whole text.
 
-        Checksums that fitted the content fit the redacted content too; others stay, so that damage is still noticed.
+        Valid checksums are computed again; invalid ones stay, so that damage is still detected.
         """
         if (document := _parse_document(text)) is not None:
             if isinstance(document, dict) and "checksum" in document and not is_changed(document):
@@ -124,20 +123,20 @@ class Redaction:
         return json.dumps(self.json(document))
 
     def json(self, value: JSON, key: str = "") -> JSON:
-        """Redact all texts in a value of JSON; its keys stay."""
-        # JSON is parsed, so that escapes hide no name.
+        """Return a JSON value with redacted strings; its keys are kept."""
+        # JSON is parsed, so that no escape sequence hides a name.
         if key in _VERSIONS:
             return value
         if isinstance(value, dict):
-            return {name: self.json(one, name) for name, one in value.items()}
+            return {name: self.json(item, name) for name, item in value.items()}
         if isinstance(value, list):
-            return [self.json(one) for one in value]
+            return [self.json(item) for item in value]
         if not isinstance(value, str):
             return value
         return self._wire(value) if key in _ON_THE_WIRE else self.text(value)
 
     def text(self, text: str) -> str:
-        """Redact one text."""
+        """Return a redacted string."""
         return self._redacted(text, self._placeholder)
 
     def _redacted(self, text: str, instead: _Instead) -> str:
@@ -152,7 +151,7 @@ class Redaction:
         return text
 
     def _wire(self, text: str) -> str:
-        """Mask what bytes in hex spell, where they are text; their number stays, because lengths were sent too."""
+        """Return hexadecimal bytes with masked names, if the bytes are text; their number is kept."""
         try:
             sent = bytes.fromhex(text)
         except ValueError:
@@ -176,13 +175,13 @@ class Redaction:
 
     def _placeholder(self, kind: str, found: re.Match[str]) -> str:
         if found[0] not in self.placeholders:
-            number = 1 + sum(one.startswith(f"<{kind}-") for one in self.placeholders.values())
+            number = 1 + sum(placeholder.startswith(f"<{kind}-") for placeholder in self.placeholders.values())
             self.placeholders[found[0]] = f"<{kind}-{number}>"
         return self.placeholders[found[0]]
 
 
 def _is_address(text: str) -> bool:
-    """Check for an IP address that other computers can reach."""
+    """Return whether a text is an IP address that other computers can reach."""
     try:
         address = ipaddress.ip_address(text)
     except ValueError:
@@ -191,7 +190,7 @@ def _is_address(text: str) -> bool:
 
 
 def _parse_document(text: str) -> JSON | None:
-    """Parse an object or a list of JSON; None for anything else."""
+    """Return a JSON object or list; None for any other text."""
     try:
         document = parsed_json(text)
     except ValueError:
@@ -200,7 +199,7 @@ def _parse_document(text: str) -> JSON | None:
 
 
 def _texts_of_file(text: str) -> Iterator[str]:
-    """Yield the texts of a file: those in its JSON without escapes, and lines that are none."""
+    """Yield the strings in the JSON of a file, without escapes, and its lines that are not JSON."""
     for part in [text] if _parse_document(text) is not None else text.splitlines():
         document = _parse_document(part)
         yield from [part] if document is None else _values(document)
@@ -210,23 +209,23 @@ def _values(value: Any) -> Iterator[str]:
     if isinstance(value, str):
         yield value
     elif isinstance(value, (dict, list)):
-        for one in value.values() if isinstance(value, dict) else value:
-            yield from _values(one)
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _values(item)
 
 
 FORMAT: Final = "ftdrive.bundle/1"
-# Most bytes of all files of a bundle together, unpacked. An hour at 7 kHz is 3 GB.
+# Largest total size of an unpacked bundle, bytes. One hour at 7 kHz is 3 GB.
 MOST_BYTES: Final = 4_000_000_000
 MOST_FILES: Final = 20_000
 _COPY_AGAIN: Final = "copy the bundle again, or ask for a new one"
 
 
 def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> tuple[dict[str, int], list[str]]:
-    """Write a run folder, transcripts and the sensor's matrix to a new zip file, complete or not at all.
+    """Write a run folder, transcripts and the sensor matrices to a new zip file, completely or not at all.
 
-    Returns how many different values of each kind were redacted, and the files of the run that are neither text nor
-    poses, which are left out because they cannot be redacted. Raises `BadDataset` if the folder is no run folder,
-    `OSError` if `path` exists or cannot be written.
+    Returns the number of different redacted values by kind, and the files that are neither text nor poses, which are
+    left out because they cannot be redacted. Raises `BadDataset` if the folder is not a run folder, and `OSError` if
+    `path` exists or cannot be written.
     """
     folder = folder.resolve()
     if not is_run(folder):
@@ -234,9 +233,10 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
     redaction, left_out = Redaction(), []
     texts = {"environment.json": json.dumps(_environment(folder))}
     poses: dict[str, bytes] = {}
-    for file in sorted(one for one in folder.rglob("*") if (not one.is_dir() or one.is_symlink()) and one.name != LOCK):
+    members = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+    for file in sorted(path for path in members if path.name != LOCK):
         name = file.relative_to(folder.parent).as_posix()
-        # A pipe has no end, and memory has one.
+        # Reading a pipe may never end, and large files do not fit into memory.
         is_readable = file.is_file() and not file.is_symlink() and file.stat().st_size <= _MOST_IN_MEMORY
         content = read_file(file) if is_readable else None
         if content is not None and file.suffix == ".npz":
@@ -256,7 +256,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         redaction.learn(text)
     clean = {name: redaction.file(text) for name, text in texts.items()}
     emulated = None
-    with suppress(BadDataset):  # a damaged run is worth a report too
+    with suppress(BadDataset):  # a damaged run can be bundled too
         emulated = Run(folder).header().get("station") is not None
     about = {
         "format": FORMAT,
@@ -271,7 +271,7 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
         archive.writestr("bundle.json", json.dumps(about, indent=1))
         for name, text in clean.items():
             archive.writestr(name, text)
-        for name, content in poses.items():  # compressed already
+        for name, content in poses.items():  # already compressed
             archive.writestr(name, content, zipfile.ZIP_STORED)
     write_new(path, buffer.getvalue())
     return redaction.counts, left_out
@@ -279,12 +279,12 @@ def write_bundle(folder: Path, path: Path, transcripts: Sequence[Path] = ()) -> 
 
 @contextmanager
 def unpack(source: Path) -> Iterator[Path]:
-    """Yield the run folder in a bundle, which is deleted afterwards; any source but a .zip file as it is.
+    """Yield the unpacked run folder of a bundle, which is deleted afterwards; yield any other source unchanged.
 
     Raises
     ------
     BadBundle
-        The file is damaged, no bundle, too large, or has names that lead out of its folder.
+        The file is damaged, is not a bundle, is too large, or has names that lead out of its folder.
     """
     if source.suffix.lower() != ".zip" or source.is_dir():
         yield source
@@ -295,7 +295,9 @@ def unpack(source: Path) -> Iterator[Path]:
 
 def _extract(source: Path, folder: Path) -> Path:
     if (size := source.stat().st_size) > MOST_BYTES:
-        raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle {MOST_BYTES / 1e9:g} GB at most: check the name")
+        raise BadBundle(
+            f"{source} has {size / 1e9:.0f} GB, but a bundle has at most {MOST_BYTES / 1e9:g} GB: check the name"
+        )
     try:
         with open_file(source) as file, zipfile.ZipFile(file) as archive:
             _require_harmless(archive.infolist())
@@ -304,7 +306,7 @@ def _extract(source: Path, folder: Path) -> Path:
     except BadBundle as error:
         raise BadBundle(f"{source}: {error}") from error
     except FileNotFoundError as error:
-        raise BadBundle(f"{source} is not a bundle, it has no bundle.json: {_COPY_AGAIN}") from error
+        raise BadBundle(f"{source} is not a bundle, because it has no bundle.json: {_COPY_AGAIN}") from error
     except (*ZIP_DAMAGE, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (None, EINVAL):  # such as a full disk
             raise
@@ -321,10 +323,10 @@ def _run_in(folder: Path) -> Path:
 
 
 def _require_harmless(members: Sequence[zipfile.ZipInfo]) -> None:
-    """Check names and sizes before anything is written; `zipfile` reads no more than the size stated for a file."""
+    """Raise `BadBundle` for dangerous names or sizes; `zipfile` reads at most the stated size of a file."""
     if len(members) > MOST_FILES or sum(member.file_size for member in members) > MOST_BYTES:
         limits = f"{MOST_BYTES / 1e9:g} GB or {MOST_FILES} files"
-        raise BadBundle(f"it unpacks to more than {limits}: do not use this file, or unpack it by hand")
+        raise BadBundle(f"its unpacked content exceeds {limits}: do not use this file, or unpack it by hand")
     for member in members:
         path = PurePosixPath(member.filename)
         if path.is_absolute() or ".." in path.parts or "\\" in member.filename or ":" in member.filename:
@@ -342,7 +344,7 @@ def _decode_text(content: bytes) -> str | None:
 
 
 def _environment(folder: Path) -> dict[str, Any]:
-    """Return versions, and the checks of this computer and of the described cell."""
+    """Return versions, and checks of this computer and of the described cell."""
     packages = {about["Name"]: about["Version"] for about in (each.metadata for each in distributions())}
     facts: dict[str, Any] = {
         "versions": versions(),
@@ -355,7 +357,7 @@ def _environment(folder: Path) -> dict[str, Any]:
         cell = recorded_cell(Run(folder).header()["config"])
         checks = [check_disk(folder), check_workcell(cell, cell.robot.model)]
         checks += check_permissions(SensorAddress.of(cell.sensor.url))
-    # A damaged run is worth a report too.
+    # A damaged run can be bundled too.
     except (BadDataset, UsageError, TypeError) as error:
         return facts | {"error": str(error)}
     return facts | {"checks": [asdict(check) for check in checks]}

@@ -1,7 +1,7 @@
-"""A calibration as commands use it: the origin that files state, reading, the matrix of its sensor, and its marks.
+"""Reading of calibrations: origin, values of JSON documents, the sensor matrix, and the marks of a calibration.
 
-The matrix is in `sensor.json`, in the folder where commands run, beside ftdrive.toml. A later one is `sensor-2.json`,
-and so on; the newest counts. It belongs to the sensor, so it serves every tool.
+The sensor matrix is in `sensor.json` in the current folder, next to ftdrive.toml. Later matrices are `sensor-2.json`
+and so on; the newest one is used. The matrix belongs to the sensor, so it is used with every tool.
 """
 
 import logging
@@ -25,12 +25,12 @@ from ftdrive.cell.config import without_password
 from ftdrive.errors import NotAccepted
 from ftdrive.runs import is_run
 
-# A list of results needs no numpy.
+# A list of results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib import CalibrationResult, SensorMatrix
 
 _NAME: Final = re.compile(r"sensor(?:-(\d+))?\.json")
-# Facts of a sensor that change what its matrix means. Counts differ between calibration slots.
+# Facts of a sensor for which its matrix is valid. Counts differ between calibration slots.
 _FACTS: Final = {
     "counts_per_N": "counts per N",
     "counts_per_Nm": "counts per N·m",
@@ -43,7 +43,7 @@ _log = logging.getLogger(__name__)
 EMULATED: Final = "EMULATED"
 EDITED: Final = "EDITED BY HAND"
 FOREIGN: Final = "OF ANOTHER CELL"
-# What every output says of some calibrations: a mark, and its meaning in a sentence.
+# Marks that every output shows for some calibrations, with their meaning.
 MARKS: Final[Mapping[str, str]] = {
     EMULATED: "The cell was EMULATED: these are not the values of a real tool.",
     EDITED: "The file was EDITED BY HAND after it was solved: its verdict and its sigmas are not those of its numbers.",
@@ -52,46 +52,46 @@ MARKS: Final[Mapping[str, str]] = {
 
 
 def made_now() -> dict[str, Any]:
-    """Return what every file says of its making: when, by which command line, with which versions."""
+    """Return the origin that every file records: time, command line and versions."""
     argv = [without_password(word) for word in sys.argv]
     return {"created_utc": datetime.now(UTC).isoformat(), "argv": argv, "versions": versions()}
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of the software behind a result."""
-    found = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
-    return found | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
+    """Return the versions of the software that makes a result."""
+    own = {"ftdrive": __version__, "python": platform.python_version(), "platform": platform.platform()}
+    return own | {name: version(name) for name in ("numpy", "scipy", "python-can", "pyserial")}
 
 
 def at(document: Any, *keys: str) -> Any:
-    """Return the value below these keys; None if there is no such place."""
+    """Return the value at a path of keys in a document; None if it does not exist."""
     for key in keys:
         document = document.get(key) if isinstance(document, Mapping) else None
     return document
 
 
 def text_at(document: Any, *keys: str) -> str | None:
-    """Return a text that every database takes: without zero characters and halves of a surrogate pair."""
-    found = at(document, *keys)
-    return found.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(found, str) and found else None
+    """Return the string at a path of keys without NUL characters and lone surrogates, which databases reject."""
+    value = at(document, *keys)
+    return value.encode(errors="replace").decode().replace("\0", "\ufffd") if isinstance(value, str) and value else None
 
 
 def number_at(document: Any, *keys: str) -> float | None:
-    """Return a finite number; None for anything else."""
-    found = at(document, *keys)
-    usable = isinstance(found, int | float) and not isinstance(found, bool) and isfinite(found)
-    return float(found) if usable else None
+    """Return the finite number at a path of keys; None for any other value."""
+    value = at(document, *keys)
+    usable = isinstance(value, int | float) and not isinstance(value, bool) and isfinite(value)
+    return float(value) if usable else None
 
 
 def numbers_at(document: Any, n: int, *keys: str) -> list[float] | None:
-    """Return a list of n finite numbers; None for anything else."""
-    found = at(document, *keys)
-    known = [one for one in map(number_at, found) if one is not None] if isinstance(found, list) else []
-    return known if len(known) == n == len(found or ()) else None
+    """Return the list of n finite numbers at a path of keys; None for any other value."""
+    values = at(document, *keys)
+    numbers = [number for number in map(number_at, values) if number is not None] if isinstance(values, list) else []
+    return numbers if len(numbers) == n == len(values or ()) else None
 
 
 def time_at(document: Any, *keys: str) -> str | None:
-    """Return a time as UTC in ISO 8601 with microseconds, so that texts sort as times; None for anything else."""
+    """Return the time at a path of keys as UTC in ISO 8601 with microseconds, which sorts as text; else None."""
     try:
         return datetime.fromisoformat(at(document, *keys)).astimezone(UTC).isoformat(timespec="microseconds")
     except (TypeError, ValueError):
@@ -101,21 +101,21 @@ def time_at(document: Any, *keys: str) -> str | None:
 def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "CalibrationResult":
     """Read a calibration; `CalibrationResult.save` writes it.
 
-    If the present folder has a `sensor.json` of its sensor, the result decodes contacts with that.
+    If the current folder has a `sensor.json` of the sensor, the result decodes contacts with it.
 
     Parameters
     ----------
     path : str or Path
-        A calibration.json, or a run folder: its newest calibration.
+        A calibration.json, or a run folder with its newest calibration.
     accept_edited : bool
-        Accept a file that was edited by hand; the result is then `is_edited`.
+        Whether to accept a file that was edited by hand; the result is then marked by `is_edited`.
 
     Raises
     ------
     DataError
-        The file is not a calibration that this version can read, is damaged or was edited, or a load was on the tool.
+        The file is not a calibration of a known version, is damaged or edited, or was made with a load on the tool.
     OSError
-        It cannot be read.
+        The file cannot be read.
 
     Examples
     --------
@@ -137,50 +137,52 @@ def read_calibration(path: str | Path, *, accept_edited: bool = False) -> "Calib
         from ftdrive.runs.load import Load
 
         load = Load.of_header(result.provenance)
-        raise BadCalibration(f"{path} was made with {load}: use it with `ftdrive loads solve`, not as that of the tool")
+        raise BadCalibration(
+            f"{path} was made with {load}: use it in `ftdrive loads solve`, not as a calibration of the tool"
+        )
     return with_sensor(result)
 
 
 def require_accepted(result: "CalibrationResult", *, to_be_saved: bool = False) -> None:
-    """Raise `NotAccepted` for a rejected result that was shown; it mentions the missing file if one was requested."""
+    """Raise `NotAccepted` for a rejected result; `to_be_saved` adds that it was not saved."""
     if result.verdict == "rejected":
         unsaved = " and was not saved" if to_be_saved else ""
-        codes = ", ".join(dict.fromkeys(one.code for one in result.findings if one.severity != "note"))
+        codes = ", ".join(dict.fromkeys(item.code for item in result.findings if item.severity != "note"))
         raise NotAccepted(f"the result is rejected{unsaved}: its findings say what to fix ({codes})")
 
 
 def marks_of(calibration: "CalibrationResult", *, emulated: bool = False, foreign: bool = False) -> tuple[str, ...]:
-    """Return the `MARKS` of a calibration; `emulated` and `foreign` say so of what it is applied to."""
-    found = {
+    """Return the `MARKS` of a calibration; `emulated` and `foreign` describe the cell to which it is applied."""
+    applying = {
         EMULATED: emulated or calibration.provenance.get("station") is not None,
         EDITED: calibration.is_edited,
         FOREIGN: foreign,
     }
-    return tuple(mark for mark, applies in found.items() if applies)
+    return tuple(mark for mark, applies in applying.items() if applies)
 
 
 def sensor_files(folder: Path = Path()) -> list[Path]:
-    """Return the files of a folder, the oldest first."""
+    """Return the files of sensor matrices in a folder, the oldest first."""
     return sorted(filter(_file_number, folder.glob("sensor*.json")), key=_file_number)
 
 
 def next_sensor_file(folder: Path = Path()) -> Path:
-    """Return the name of the next file."""
+    """Return the path of the next sensor matrix."""
     number = 1 + max(map(_file_number, sensor_files(folder)), default=0)
     return folder / (f"sensor-{number}.json" if number > 1 else "sensor.json")
 
 
 def _file_number(path: Path) -> int:
-    """Return the number of a sensor's file; 0 of any other."""
+    """Return the number in the name of a sensor file; 0 for any other file."""
     name = _NAME.fullmatch(path.name)
     return int(name[1] or 1) if name else 0
 
 
 def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
-    """Return what identifies a sensor in the provenance of a result, or in what a dataset has.
+    """Return the identity of a sensor from the provenance of a result or the `meta` of a dataset.
 
-    Its model, serial number, counts per unit (which differ between calibration slots), range, sign, and whether it is
-    emulated; None for what is not reported.
+    The identity is model, serial number, counts per unit (which differ between calibration slots), range, sign, and
+    whether the sensor is emulated; a value that is not reported is None.
     """
     from ftdrivers.interfaces import NOT_REPORTED
 
@@ -194,26 +196,26 @@ def sensor_identity(origin: Mapping[str, Any]) -> dict[str, JSON]:
 
 
 def identity_mismatch(sensor: "SensorMatrix", identity: Mapping[str, JSON]) -> str:
-    """Return why a matrix is not that of a sensor with this identity, as half a sentence; empty if it is."""
+    """Return why a matrix does not belong to the sensor with this identity, as a clause; empty if it does."""
     theirs = sensor.provenance.get("sensor")
     if not isinstance(theirs, Mapping):
         return "it was saved without the model and the range of its sensor: run `ftdrive loads solve` again"
     if identity["serial"] is None or theirs.get("serial") is None:
         whose = "this calibration" if identity["serial"] is None else "that file"
-        return f"the sensor of {whose} reports no serial number: name it by serial=NAME in the sensor's address"
+        return f"the sensor of {whose} has no serial number: add serial=NAME to the sensor's address"
     words = {"serial": "serial number", "model": "model", **_FACTS, "emulated": "emulated"}
     for name, what in words.items():
         if (ours := _comparable(identity[name])) != (other := _comparable(theirs.get(name))):
-            return f"its {what} is {_shown(other)}, that of this calibration {_shown(ours)}"
+            return f"its {what} is {_shown(other)}, but {_shown(ours)} in this calibration"
     return ""
 
 
 def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "CalibrationResult":
-    """Return a calibration that decodes contacts by the newest matrix of its sensor in a folder, if there is one.
+    """Return the calibration with the newest matrix of its sensor in a folder, if there is one, to decode contacts.
 
-    A warning says why the newest matrix of the same serial number, or of a sensor without one, is not used.
+    A warning is logged if the newest matrix with the same serial number, or without one, cannot be used.
 
-    Raises `BadCalibration` or `OSError` if that file cannot be read.
+    Raises `BadCalibration` or `OSError` if a file cannot be read.
     """
     identity = sensor_identity(calibration.provenance)
     unused = ""
@@ -231,15 +233,15 @@ def with_sensor(calibration: "CalibrationResult", folder: Path = Path()) -> "Cal
 
 
 def _comparable(value: JSON) -> JSON:
-    """Return numbers without the rounding of a file."""
+    """Return a value with numbers rounded to 9 digits, for comparison."""
     if isinstance(value, list | tuple):
-        return [_comparable(one) for one in value]
+        return [_comparable(item) for item in value]
     return float(f"{value:.9g}") if isinstance(value, float | int) and not isinstance(value, bool) else value
 
 
 def _shown(value: JSON) -> str:
     if value is None:
-        return "not known"
+        return "unknown"
     if isinstance(value, list):
         return ", ".join(map(_shown, value))
     return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,4 +1,4 @@
-"""A weighed load on the tool during a run: as options describe it, and as run.json and the dataset keep it."""
+"""A weighed load on the tool during a run, from options, run.json or a dataset."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.sampling import Sampling
 from ftdrive.errors import ConfigError
 from ftdrive.planning.geometry.arm_model import STRING_M, WEIGHT_HEIGHT_M, WEIGHT_RADIUS_M
 
-# Of a mass without a sigma of its own: a kitchen scale.
+# Relative standard deviation of a mass without a given sigma, as of a kitchen scale.
 MASS_SHARE: Final = 1e-3
 _FARTHEST_MM: Final = 2000.0
 _HEAVIEST_KG: Final = 100.0
@@ -22,18 +22,18 @@ _SWING_ATTEMPTS: Final = 6
 
 
 class Load(KnownLoad):
-    """A weighed load of a session: hung on a string from a point of the tool, or gripped at an unknown place."""
+    """A weighed load of a session: hanging on a string from a point of the tool, or gripped at an unknown position."""
 
     __slots__ = ()
 
     @property
     def gripped(self) -> bool:
-        """Whether it is in the gripper, at an unknown place."""
+        """Whether the gripper holds the load at an unknown position."""
         return self.p_flange_m is None
 
     @property
     def p_flange_mm(self) -> tuple[float, float, float] | None:
-        """(3,) where it hangs, as options and run.json have it; None if it is gripped."""
+        """Hook (3,) of the load from the flange face, flange axes, mm; None if the load is gripped."""
         if self.p_flange_m is None:
             return None
         x, y, z = (round(1e3 * value, 6) for value in self.p_flange_m)
@@ -41,23 +41,24 @@ class Load(KnownLoad):
 
     @property
     def most_swing_N(self) -> float | None:
-        """Amplitude of the force of a swing of 5 degrees, above which a pose is repeated; None if it cannot swing."""
+        """Force amplitude of a swing by 5 degrees, above which a pose is repeated; None if the load is gripped."""
         return None if self.gripped else self.mass_kg * STANDARD_GRAVITY_M_S2 * sin(_MOST_SWING_RAD)
 
     def sampling(self, usual: Sampling) -> Sampling:
-        """Return how a pose is sampled: a swing needs several periods, and time to decay."""
+        """Return the sampling of a pose, which is longer for a hanging load to cover several periods of its swing."""
         return usual if self.gripped else replace(usual, average_s=_SWING_S, attempts=_SWING_ATTEMPTS)
 
     @property
     def questions(self) -> tuple[str, ...]:
-        """Safety questions about it, before the arm moves."""
+        """Safety questions about the load, asked before the arm moves."""
         if self.gripped:
             what = f"Does the gripper hold {self.mass_kg:g} kg firmly"
             return (f"{what}, and does [tool] cylinders_mm describe that load too?",)
         return (
-            f"A weight of {self.mass_kg:g} kg at {self.name} moves with the arm in the tour: a hazard. Is nothing and "
-            f"no one below and beside it, its string at most {1e3 * STRING_M:.0f} mm long, the weight at most "
-            f"{2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm high?",
+            f"A weight of {self.mass_kg:g} kg at {self.name} moves with the arm in the tour, which is a hazard. Is the "
+            f"space below and beside it free of people and objects, is its string at most {1e3 * STRING_M:.0f} mm "
+            "long, "
+            f"and is the weight at most {2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm high?",
         )
 
     def __str__(self) -> str:
@@ -65,10 +66,12 @@ class Load(KnownLoad):
 
     @classmethod
     def of(cls, mass: str, place: str | None, *, gripped: bool) -> Self:
-        """Read the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
+        """Return the load of the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
         mass_kg, sigma_kg = mass_of(mass)
         if (place is None) != gripped:
-            raise ConfigError("--load needs one of two: where it hangs, such as --at tip=0,0,200, or --gripped")
+            raise ConfigError(
+                "--load needs the position of the load: give either its hook, such as --at tip=0,0,200, or --gripped"
+            )
         if place is None:
             return cls("gripper", mass_kg, sigma_kg)
         name, p_flange_m = place_of(place)
@@ -77,16 +80,16 @@ class Load(KnownLoad):
     @classmethod
     def of_header(cls, header: Mapping[str, Any]) -> Self | None:
         """Return the load of run.json or of a dataset's `meta`; None without one."""
-        found = header.get("load")
-        if found is None:
+        stored = header.get("load")
+        if stored is None:
             return None
-        place_mm = found["p_flange_mm"]
+        place_mm = stored["p_flange_mm"]
         p_flange_m = None if place_mm is None else _in_m(place_mm)
-        sigma_m = found["place_sigma_mm"] / 1e3
-        return cls(found["name"], found["mass_kg"], found["mass_sigma_kg"], p_flange_m, sigma_m)
+        sigma_m = stored["place_sigma_mm"] / 1e3
+        return cls(stored["name"], stored["mass_kg"], stored["mass_sigma_kg"], p_flange_m, sigma_m)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as run.json has them."""
+        """Return the entry `load` of run.json."""
         return {
             "name": self.name,
             "mass_kg": self.mass_kg,
@@ -98,7 +101,7 @@ class Load(KnownLoad):
 
 
 def mass_of(text: str) -> tuple[float, float]:
-    """Read a mass and its sigma in kg, such as 2.0 or 2.0±0.002; raises `ConfigError`."""
+    """Return mass and standard deviation, kg, from a text such as 2.0 or 2.0±0.002; raises `ConfigError`."""
     try:
         mass_kg, *rest = (float(part) for part in re.split(r"±|\+/?-", text))
         sigma_kg = rest[0] if rest else MASS_SHARE * mass_kg
@@ -106,18 +109,20 @@ def mass_of(text: str) -> tuple[float, float]:
         raise ConfigError(f"the mass '{text}' is not a number of kg: give one such as 2.0 or 2.0±0.002") from None
     if len(rest) > 1 or not 0 < mass_kg <= _HEAVIEST_KG or not 0 < sigma_kg < mass_kg:
         raise ConfigError(
-            f"the mass '{text}' cannot be used: give more than 0 to {_HEAVIEST_KG:g} kg, and a sigma below the mass"
+            f"the mass '{text}' is out of range: give above 0 to {_HEAVIEST_KG:g} kg, and a sigma below the mass"
         )
     return mass_kg, sigma_kg
 
 
 def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
-    """Read a place, NAME=x,y,z in mm from the flange face; return it in m. Raises `ConfigError`."""
+    """Return name and position, m, from a text NAME=x,y,z in mm from the flange face; raises `ConfigError`."""
     name, given, numbers = text.partition("=")
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(f"the place '{text}' has no name: give one such as tip=0,0,200")
     if not given:
-        raise ConfigError(f"--at {name} has no place: give it in mm from the flange face, such as --at {name}=0,0,200")
+        raise ConfigError(
+            f"--at {name} has no position: give it in mm from the flange face, such as --at {name}=0,0,200"
+        )
     try:
         place_mm = [float(number) for number in numbers.split(",")]
     except ValueError:
@@ -125,7 +130,7 @@ def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
     if len(place_mm) != 3:
         raise ConfigError(f"the place '{text}' is not three numbers in mm: give one such as {name}=0,0,200")
     if not all(map(isfinite, place_mm)) or max(map(abs, place_mm)) > _FARTHEST_MM:
-        raise ConfigError(f"the place '{text}' is more than {_FARTHEST_MM / 1e3:g} m from the flange: is it in mm?")
+        raise ConfigError(f"the place '{text}' is more than {_FARTHEST_MM / 1e3:g} m from the flange: give it in mm")
     return name, _in_m(place_mm)
 
 

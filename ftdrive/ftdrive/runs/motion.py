@@ -1,4 +1,4 @@
-"""A recording of a free tool in motion, raw: every sample of sensor and arm, in one file of a run or in parts of it."""
+"""Raw recording of a free tool in motion: every sample of sensor and arm, in one file of a run or in several parts."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -16,7 +16,7 @@ from ftdrive.runs.numbers import DAMAGE, read_arrays, write_arrays
 from ftdrivers.interfaces import ArmStates, FtSamples
 
 FORMAT: Final = "ftdrive.motion/1"
-# Arrays and the shape of each sample; a sensor may have any number of counts.
+# Arrays with the shape of one sample; a sensor may have any number of counts.
 _WRENCH: Final = {"t_host_ns": (), "t_device_s": (), "seq": (), "counts": None, "wrench": (6,), "status": ()}
 _POSES: Final = {
     "t_host_ns": (),
@@ -30,15 +30,15 @@ _POSES: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionRecording:
-    """What was received while the tool moved."""
+    """Samples of sensor and arm while the tool moved."""
 
     samples: FtSamples
     states: ArmStates
     nominal_rate_Hz: float = math.nan
-    """Rate of a sensor that sends evenly; NaN for one that is polled."""
+    """Nominal rate of the sensor; NaN if the sensor is polled."""
 
     def save(self, path: Path) -> None:
-        """Write a new file; returns when it is on disk."""
+        """Write a new file; return when it is on disk."""
         wrench = {f"wrench_{name}": getattr(self.samples, name) for name in _WRENCH}
         poses = {f"pose_{name}": getattr(self.states, name) for name in _POSES}
         arrays = {"format": np.array(FORMAT), "nominal_rate_Hz": np.array(self.nominal_rate_Hz), **wrench, **poses}
@@ -46,22 +46,22 @@ class MotionRecording:
 
     @classmethod
     def load(cls, path: Path) -> "MotionRecording":
-        """Read a file; raises `BadDataset`."""
+        """Read a recording; raises `BadDataset`."""
         try:
             data = read_arrays(path)
             if str(data.get("format")) != FORMAT:
-                raise ValueError(f"its format is {data.get('format')}, this version reads {FORMAT}")
+                raise ValueError(f"its format is {data.get('format')}, but this version reads {FORMAT}")
             return cls(
                 FtSamples(*_signal_columns(data, "wrench", _WRENCH)),
                 ArmStates(*_signal_columns(data, "pose", _POSES)),
                 float(data["nominal_rate_Hz"]),
             )
         except DAMAGE as error:
-            raise BadDataset(f"{path} is not a recording in motion ({error}): take it from a copy") from error
+            raise BadDataset(f"{path} is not a recording in motion ({error}): restore it from a copy") from error
 
     @property
     def count(self) -> Array:
-        """The sensor's clock, else its count; NaN of a polled sensor, which has neither."""
+        """Time of the sensor's clock, s, else its sample number; NaN for a polled sensor, which has neither."""
         if np.isfinite(self.samples.t_device_s).all():
             return self.samples.t_device_s
         even = math.isfinite(self.nominal_rate_Hz)
@@ -69,19 +69,19 @@ class MotionRecording:
 
 
 def means_of(path: Path) -> tuple[Means, Means]:
-    """Return both streams as the estimator takes them, on the host's clock in s since the first sample.
+    """Return wrench and pose means for the estimator, with host times since the first sample, s.
 
-    The files of a recording in parts are read twice, so that only one of them is in memory; raises `BadDataset`.
+    The files of a recording in parts are read twice, so that only one is in memory at a time. Raises `BadDataset`.
     """
-    files = files_of(path)  # once, because a recording goes on while it is read
+    files = files_of(path)  # listed once, because the recording may still grow
     times = [
-        (one.samples.t_host_ns, one.count, one.states.t_host_ns, one.states.t_device_s)
-        for one in map(MotionRecording.load, files)
+        (part.samples.t_host_ns, part.count, part.states.t_host_ns, part.states.t_device_s)
+        for part in map(MotionRecording.load, files)
     ]
     wrench_ns, counts, poses_ns, poses_s = (list(column) for column in zip(*times, strict=True))
     received = [np.concatenate(each) for each in (wrench_ns, poses_ns)]
     if not all(map(len, received)):
-        raise BadDataset(f"{path} has samples of one device only: record again")
+        raise BadDataset(f"{path} has samples of only one device: record again")
     start_ns = int(min(each[0] for each in received))
     clocks = (received[0], np.concatenate(counts)), (received[1], np.concatenate(poses_s))
     wrench_s, pose_s = (
@@ -89,15 +89,15 @@ def means_of(path: Path) -> tuple[Means, Means]:
         for t_ns, count in clocks
     )
     wrench, poses = Means(), Means()
-    ends = np.cumsum([[len(one), len(other)] for one, other in zip(wrench_ns, poses_ns, strict=True)], axis=0)
-    for one, t_w, t_p in zip(
+    ends = np.cumsum([list(map(len, pair)) for pair in zip(wrench_ns, poses_ns, strict=True)], axis=0)
+    for part, t_w, t_p in zip(
         map(MotionRecording.load, files),
         np.split(wrench_s, ends[:-1, 0]),
         np.split(pose_s, ends[:-1, 1]),
         strict=True,
     ):
-        wrench.add(t_w, one.samples.wrench)
-        poses.add(t_p, np.hstack([one.states.R_base_flange.reshape(-1, 9), one.states.p_base_flange_m]))
+        wrench.add(t_w, part.samples.wrench)
+        poses.add(t_p, np.hstack([part.states.R_base_flange.reshape(-1, 9), part.states.p_base_flange_m]))
     return wrench, poses
 
 
@@ -114,8 +114,8 @@ def _signal_columns(
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the files of a recording: itself, or those of a folder in the order of their numbers."""
+    """Return the files of a recording: the file itself, or the parts in a folder in order."""
     files = sorted(path.glob("*.npz"), key=lambda file: file.stem.zfill(9)) if path.is_dir() else [path]
     if not files:
-        raise BadDataset(f"{path} has no samples yet: record for some seconds")
+        raise BadDataset(f"{path} has no samples yet: record for a few seconds")
     return files

@@ -10,12 +10,12 @@ from ftcalib.model import Array
 from ftcalib.routine import MOVED_RAD, DriftCheck, PoseRecord, drift_check, is_return, turned_rad
 
 _SIGNIFICANT = 4.0
-# Findings of a result that changed between two poses.
+# Findings of a change between two poses.
 _CHANGES = {"com_shifted", "load_changed", "bias_stepped", "sensor_turned", "sensor_changed"}
 
 
 def pose_names(records: Sequence[PoseRecord]) -> tuple[str, ...]:
-    """Name the rows of a run's dataset: R and the number of the orientation."""
+    """Return names of the rows of a run's dataset: R and the number of the orientation."""
     return tuple(f"R{number:02d}" for number in numbers_in_dataset(records))
 
 
@@ -25,9 +25,9 @@ def numbers_in_dataset(records: Sequence[PoseRecord]) -> tuple[int, ...]:
 
 
 def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Finding, ...]:
-    """Explain outlying poses of a tour, most important first; empty for a quiet run, and without records.
+    """Return findings about outlier poses of a tour, most important first; empty without outliers or records.
 
-    `result` is that of the dataset of these records, which are in the order of the tour.
+    `result` is the result of the dataset of these records, which are in the order of the tour.
     """
     if not records:
         return ()
@@ -36,7 +36,7 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
     names, found = pose_names(records), find_moved(records)
-    if any(one.code in _CHANGES for one in result.findings):  # which explains the rest
+    if any(finding.code in _CHANGES for finding in result.findings):  # the change explains the outliers
         return tuple(found)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
     pulled = [row for row in odd if np.abs(result.residuals[row] / _sigma(result))[:3].max() > _SIGNIFICANT]
@@ -63,7 +63,7 @@ def _steady(record: PoseRecord) -> bool:
 
 
 def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
-    """Name the poses that were not steady; each row of a dataset has one record."""
+    """Return findings about poses that were not steady; each row of the dataset has one record."""
     found = []
     for record, name in zip(records, pose_names(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
@@ -75,21 +75,21 @@ def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
-    if "residual_sigma" not in result.quality:  # a new tool, or an update
+    if "residual_sigma" not in result.quality:  # as for a new tool or an update
         return []
     spread = np.asarray(result.quality["residual_sigma"], dtype=np.float64)
     return out_of_line(spread, np.ones(len(spread), bool) if result.weights is None else result.weights > 0.5)
 
 
 def _sigma(result: CalibrationResult) -> Array:
-    """(6,) noise of a pose: as measured, or the typical residual if that is larger."""
+    """Return the noise (6,) of a pose: the measured noise, or the typical residual if that is larger."""
     typical = 1.4826 * np.median(np.abs(result.residuals), axis=0)
     least = np.zeros(6) if result.measured_sigma is None else result.measured_sigma
     return np.maximum(np.maximum(typical, least), 1e-9)
 
 
 def _drifts_alike(result: CalibrationResult, again: DriftCheck) -> bool:
-    """Check whether the drift in the fit is at least half of the largest change of the first pose."""
+    """Return whether the drift in the fit is at least half of the largest change of the first pose."""
     if result.drift is None:
         return False
     k = np.abs(again.change / again.sigma).argmax()

@@ -1,18 +1,18 @@
 """A run folder: the plan, every pose with its raw samples, and the results.
 
-run.json          ftdrive.run/1: when, with what, command line, versions, configuration, devices
-plan.json         ftdrive.plan/2: the plan the arm followed; not where a person moved it
-events.ndjson     what happened, one object a line, as `ftdrive.session.events` has it
-motion.npz        ftdrive.motion/1: every sample of sensor and arm while the tool moved; motion-2.npz likewise
-motion/1.npz ...  the same in parts, each on disk within seconds, of a recording that may end at any time
-poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz took its place
+run.json          ftdrive.run/1: time, command line, versions, configuration, devices
+plan.json         ftdrive.plan/2: the plan that the arm followed; missing if the operator moved the arm
+events.ndjson     the events of the session, one object per line, see `ftdrive.session.events`
+motion.npz        ftdrive.motion/1: every sample of sensor and arm while the tool moved; later ones are motion-2.npz ...
+motion/1.npz ...  such a recording in parts, each on disk within seconds, for a recording that may end at any time
+poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz replaces 01.npz
 dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
-calibration.json  ftdrive.calibration/2: the result; calibration-2.json likewise. Of a verification: the accepted update
+calibration.json  ftdrive.calibration/2: the result, or the accepted update of a verification; later calibration-2.json
 verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verification`
 solved-0.1.0.json ftdrive.calibration/2: the result of a later version; see `ftdrive.fleet.resolve`
-lock              which process adds poses, or did so last
+lock              the process that adds poses, or the last one that did
 
-Damage is refused: JSON files have a checksum, each line of events.ndjson a CRC-32, and each array of a pose too.
+Damaged files are rejected: JSON files have a checksum, and each line of events.ndjson and each array a CRC-32.
 """
 
 import logging
@@ -48,23 +48,23 @@ RUN_FORMAT = "ftdrive.run/1"
 RECORDING_FORMAT = "ftdrive.recording/1"
 log = logging.getLogger(__name__)
 
-# The event of a pose that is on disk, `ftdrive.session.events.PoseTaken`.
+# Name of the event `ftdrive.session.events.PoseTaken`.
 POSE = "pose-taken"
 
-_RESTORE = "take it from a copy"
+_RESTORE = "restore it from a copy"
 LOCK: Final = "lock"
 # Columns of a recording, named as in `FtSamples`.
 _SAMPLE_COLUMNS = ("t_host_ns", "t_device_s", "seq", "counts", "wrench", "status")
 
-# How a session moves from pose to pose.
+# Mode of a session: how the arm moves, or how the motion is recorded.
 Mode = Literal["auto", "step", "manual", "listen", "sweep", "passive"]
-# Modes that record in motion; such a recording is not continued.
+# Modes that record in motion; such a run cannot be resumed.
 IN_MOTION: Final = ("sweep", "passive")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """One look at the arm, read back from a recording."""
+    """A state of the arm, read from a recording."""
 
     t_host_ns: int
     q_rad: Array
@@ -72,13 +72,13 @@ class Reading:
 
 
 class Run(Displayed):
-    """A run folder on disk. In a `with` block no other process can add poses.
+    """A run folder on disk. During a `with` block no other process can add poses.
 
     Parameters
     ----------
     folder : str or Path
     clock : Clock
-        Of the cell whose poses are added: each is kept with what to add to its `t_host_ns` for UTC.
+        Clock of the cell that adds poses; each pose records the offset from its `t_host_ns` to UTC.
 
     Examples
     --------
@@ -94,15 +94,15 @@ class Run(Displayed):
 
     def __init__(self, folder: str | Path, clock: Clock = REAL) -> None:
         self.folder = Path(folder)
-        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # the anchor of all times in the files
+        self._clock_offset_ns = time.time_ns() - clock.now_ns()  # from host times in the files to UTC
         self._events_lock = threading.Lock()
         self._held = ExitStack()
 
     def __enter__(self) -> Self:
-        """Lock the folder until the block or the process ends; raises `ConfigError` if another process holds it."""
+        """Lock the folder until the block or the process ends; raises `ConfigError` if another process uses it."""
         try:
             import fcntl
-        except ImportError:  # not on Windows, where no session runs
+        except ImportError:  # on Windows, where no session runs
             return self
         with ExitStack() as stack:
             file = stack.enter_context((self.folder / LOCK).open("a+"))
@@ -113,8 +113,8 @@ class Run(Displayed):
                 raise ConfigError(
                     f"{self.folder} is in use by {file.read() or 'another process'}: wait until it ends, or end it"
                 ) from error
-            except OSError as error:  # of a network drive without locks
-                log.warning("%s cannot be locked (%s): do not resume this run twice at once", self.folder, error)
+            except OSError as error:  # such as a network drive without locks
+                log.warning("%s cannot be locked (%s): do not resume this run in two processes", self.folder, error)
             file.truncate(0)
             file.write(f"process {os.getpid()} on {platform.node()} since {datetime.now(UTC):%Y-%m-%d %H:%M:%S} UTC")
             file.flush()
@@ -131,19 +131,19 @@ class Run(Displayed):
             header = self.header()
         except (BadDataset, OSError) as error:
             return Summary(title, notes=[str(error)])
-        taken = "a recording in motion" if self.in_motion else f"poses {len(self.stops())}"
+        data = "a recording in motion" if self.in_motion else f"{len(self.stops())} poses"
         devices = header.get("devices", {})
         rows = [
             Row("made by", [f"{self.command}, {header.get('created_utc', 'at an unknown time')}"]),
-            *(Row(name, [f"{one.get('model')} {one.get('serial')}"]) for name, one in devices.items()),
-            Row("data", [taken]),
+            *(Row(role, [f"{device.get('model')} {device.get('serial')}"]) for role, device in devices.items()),
+            Row("data", [data]),
             Row("calibration", [self.calibration_path.name if self.calibration_path.exists() else "none"]),
         ]
         return Summary(title, rows)
 
     @classmethod
     def create(cls, parent: Path, name: str, description: Mapping[str, Any], clock: Clock = REAL) -> "Run":
-        """Make a new folder `<UTC time>-<name>` and write its run.json."""
+        """Make a new folder `<UTC time>-<name>` with its run.json, and return the run."""
         made = made_now()
         now = datetime.fromisoformat(made["created_utc"])
         folder = parent / f"{now:%Y-%m-%dT%H%M%SZ}-{name}"
@@ -160,28 +160,28 @@ class Run(Displayed):
 
     @property
     def calibration_path(self) -> Path:
-        """Where the newest result is kept."""
+        """Path of the newest result."""
         return newest_path(self.folder / "calibration.json")
 
     @property
     def dataset_path(self) -> Path:
-        """Where the newest dataset is kept."""
+        """Path of the newest dataset."""
         return newest_path(self.folder / "dataset.json")
 
     @property
     def motion_path(self) -> Path:
-        """Where the newest recording in motion is kept: a file, or a folder of parts."""
+        """Path of the newest recording in motion: a file, or a folder of parts."""
         folder = self.folder / "motion"
         return folder if folder.is_dir() else newest_path(self.folder / "motion.npz")
 
     @property
     def in_motion(self) -> bool:
-        """Whether it holds a recording in motion instead of poses."""
+        """Whether the run has a recording in motion instead of poses."""
         return self.motion_path.is_file() or any(self.motion_path.glob("*.npz"))
 
     @property
     def plan_path(self) -> Path:
-        """Where the plan is kept."""
+        """Path of the plan."""
         return self.folder / "plan.json"
 
     @property
@@ -191,20 +191,20 @@ class Run(Displayed):
 
     @property
     def mode(self) -> "Mode":
-        """How its session went from pose to pose. Raises `BadDataset`."""
+        """Mode of the session. Raises `BadDataset`."""
         mode: Mode = self.header().get("mode", "auto")
         return mode
 
     @property
     def resume_command(self) -> str:
-        """Command that continues the run."""
+        """Command that resumes the run."""
         return f"ftdrive {self.command} --resume {shlex.quote(str(self.folder))}"
 
     @property
     def how_to_go_on(self) -> str:
-        """What to do about a run without data for a result. Raises `BadDataset`."""
+        """Instruction for a run without enough data for a result. Raises `BadDataset`."""
         if self.mode in IN_MOTION:
-            return f"start again with --{self.mode}, because a recording in motion is not continued"
+            return f"start again with --{self.mode}, because a recording in motion cannot be resumed"
         return f"continue it with {self.resume_command}"
 
     @property
@@ -215,23 +215,23 @@ class Run(Displayed):
 
     @property
     def solve_command(self) -> str:
-        """Command that solves the poses taken."""
+        """Command that solves the poses of the run."""
         with_it = "" if self.method == "ml" else f" --method {self.method}"
         return f"ftdrive solve {shlex.quote(str(self.folder))}{with_it}"
 
     def new_path(self, name: str, ending: str = ".json") -> Path:
-        """Give the next free path for a file that may be written again: name.json, name-2.json and so on."""
+        """Return the next free path of a name: name.json, name-2.json and so on."""
         return unused_path(self.folder / f"{name}{ending}")
 
     def append_event(self, event: Mapping[str, Any], *, sync: bool = False) -> None:
-        """Add a line to events.ndjson, or nothing; with `sync` return when it is on disk. Any thread."""
+        """Append a line to events.ndjson; with `sync` return when it is on disk. Any thread may call this method."""
         with self._events_lock, self._events_path.open("ab", buffering=0) as file:
             append_lines(file, file.tell(), [event])
             if sync:
                 os.fsync(file.fileno())
 
     def events(self) -> Iterator[Mapping[str, Any]]:
-        """Read events.ndjson; a last line cut off by a power failure is ignored. Raises `BadDataset` for any other."""
+        """Yield the events of the run; an incomplete last line is ignored. Raises `BadDataset` for other damage."""
         path = self._events_path
         text = read_file(path).decode(errors="replace") if path.exists() else ""
         *lines, rest = text.split("\n")
@@ -239,7 +239,7 @@ class Run(Displayed):
             if (event := parse_line(line)) is None:
                 raise BadDataset(f"{path}: line {number} is damaged: {_RESTORE}")
             yield event
-        # What follows the last line is an event if only the end of its line is damaged.
+        # The rest is an event if only its newline is missing or damaged.
         if (event := parse_line(rest) or parse_line(rest[:-1])) is not None:
             yield event
 
@@ -248,18 +248,20 @@ class Run(Displayed):
         return self.folder / "events.ndjson"
 
     def _remove_incomplete_event(self) -> None:
-        """Remove what a power failure left of the last line, so that the next event begins a new one."""
+        """Remove an incomplete last line after a power failure, so that the next event starts a new line."""
         if self._events_path.exists():
             os.truncate(self._events_path, read_file(self._events_path).rfind(b"\n") + 1)
 
     def temperature_C(self) -> float | None:
-        """Return the mean temperature of the sensor over the poses; None where it reported none."""
-        found = {event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE}
-        known = [float(value) for value in found.values() if isinstance(value, int | float)]
+        """Return the mean temperature of the sensor over the poses, °C; None if it reported none."""
+        by_stop = {
+            event.get("stop"): event.get("temperature_C") for event in self.events() if event.get("event") == POSE
+        }
+        known = [float(value) for value in by_stop.values() if isinstance(value, int | float)]
         return sum(known) / len(known) if known else None
 
     def header(self) -> Mapping[str, Any]:
-        """Read run.json; raises `BadDataset` if it is damaged."""
+        """Return the contents of run.json; raises `BadDataset` if it is damaged."""
         path = self.folder / "run.json"
         if not path.exists():
             raise BadDataset(f"{self.folder} is not a run folder: it has no run.json")
@@ -274,19 +276,20 @@ class Run(Displayed):
         return _Whole(path, header)
 
     def header_to_resume(self) -> Mapping[str, Any]:
-        """Read run.json; raises `BadDataset` also if the plan of the run is lost."""
+        """Return the contents of run.json; raises `BadDataset` also if the plan of the run is missing."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
             header["config"][section][key]  # raises if it is missing
         if self.mode in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
-                f"{self.plan_path} is lost, and without its plan a run cannot go on: {_RESTORE}, or solve the poses "
-                f"that are there with {self.solve_command}"
+                f"{self.plan_path} is missing, and without its plan the run cannot be resumed: {_RESTORE}, or solve "
+                "the "
+                f"poses taken so far with {self.solve_command}"
             )
         return header
 
     def commit(self, record: PoseRecord) -> PoseRecord:
-        """Write one pose; returns it, as `records` reads it, when it is on disk."""
+        """Write a pose; return it, as `records` reads it, when it is on disk."""
         record = replace(record, clock_offset_ns=record.clock_offset_ns or self._clock_offset_ns)
         readings: dict[str, Any] = {
             f"{when}_{name}": np.asarray(getattr(reading, name))
@@ -308,22 +311,22 @@ class Run(Displayed):
         return record
 
     def records(self) -> list[PoseRecord]:
-        """Read every pose, in the order of the tour; of a pose taken again, the newest."""
+        """Return every pose in the order of the tour; of a pose taken again, only the newest."""
         return [_read_pose_record(newest_path(self.folder / "poses" / f"{stop:02d}.npz")) for stop in self.stops()]
 
     def stops(self) -> list[int]:
-        """Return the stops taken, without reading them."""
+        """Return the stops with a pose, without reading the poses."""
         names = {path.stem.partition("-")[0] for path in (self.folder / "poses").glob("*.npz")}
         return sorted(int(name) for name in names if name.isdecimal())
 
 
 _Kind = tuple[str, Callable[[Any], bool]]
-_TEXT: _Kind = "a text", lambda value: isinstance(value, str)
-_TEXT_OR_NULL: _Kind = "a text or null", lambda value: isinstance(value, str | None)
-_TEXTS: _Kind = "a list of texts", lambda value: isinstance(value, list) and all(map(_TEXT[1], value))
+_TEXT: _Kind = "a string", lambda value: isinstance(value, str)
+_TEXT_OR_NULL: _Kind = "a string or null", lambda value: isinstance(value, str | None)
+_TEXTS: _Kind = "a list of strings", lambda value: isinstance(value, list) and all(map(_TEXT[1], value))
 _OBJECT: _Kind = "an object", lambda value: isinstance(value, dict)
 _OBJECTS: _Kind = "an object of objects", lambda value: _OBJECT[1](value) and all(map(_OBJECT[1], value.values()))
-# Types of the fields of run.json; `recorded` checks those of config.
+# Types of the fields of run.json; `read_recorded` checks those of config.
 _KINDS: Mapping[str, _Kind] = {
     "config": _OBJECTS,
     "command": _TEXT,
@@ -348,15 +351,15 @@ _KINDS: Mapping[str, _Kind] = {
 def _require_kinds(header: Mapping[str, Any]) -> None:
     for place, (words, fits) in _KINDS.items():
         *above, name = place.split(".")
-        found = header
-        for one in above:
-            found = found.get(one, {})
-        if name in found and not fits(found[name]):
-            raise BadDataset(f"'{place}' is {found[name]!r} and not {words}, the file is damaged: {_RESTORE}")
+        section = header
+        for key in above:
+            section = section.get(key, {})
+        if name in section and not fits(section[name]):
+            raise BadDataset(f"'{place}' is {section[name]!r}, not {words}; the file is damaged: {_RESTORE}")
 
 
 class _Whole(dict[str, Any]):
-    """An object of run.json; a missing key raises an error that names the file."""
+    """A JSON object of run.json; a missing key raises `BadDataset`, which names the file."""
 
     def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
         super().__init__(
@@ -365,15 +368,15 @@ class _Whole(dict[str, Any]):
         self._path = path
 
     def __missing__(self, name: str) -> Any:
-        raise BadDataset(f"{self._path} is damaged, it has no '{name}': {_RESTORE}")
+        raise BadDataset(f"{self._path} is damaged, because it has no '{name}': {_RESTORE}")
 
 
 def _read_pose_record(path: Path) -> PoseRecord:
     try:
         data = read_arrays(path)
-        found = str(data.get("format"))
-        if found != RECORDING_FORMAT:
-            raise BadDataset(f"{path} has format {found!r}: this version reads {RECORDING_FORMAT}")
+        version = str(data.get("format"))
+        if version != RECORDING_FORMAT:
+            raise BadDataset(f"{path} has format {version!r}, but this version reads {RECORDING_FORMAT}")
         before, after = (
             Reading(int(data[f"{when}_t_host_ns"]), data[f"{when}_q_rad"], data[f"{when}_R_base_flange"])
             for when in ("before", "after")

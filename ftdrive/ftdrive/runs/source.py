@@ -1,4 +1,4 @@
-"""Datasets, calibrations and recorded runs from any place that commands accept: run folders and single files."""
+"""Reading and solving of the data sources that commands accept: run folders, datasets and tables."""
 
 import hashlib
 import tomllib
@@ -37,7 +37,7 @@ from ftdrivers.ur.kinematics import MODELS, model_named
 
 
 class RecordedRun:
-    """Arm and sensor in one, as `ftcalib.routine` wants them; neither moves nor waits."""
+    """Arm and sensor played back from records, for `ftcalib.routine`; nothing moves or waits."""
 
     def __init__(self, records: Sequence[PoseRecord]) -> None:
         self._records = list(records)
@@ -45,13 +45,13 @@ class RecordedRun:
         self._collected = False
 
     def go_on_to(self, q_rad: Array) -> None:
-        """Go on to the next recorded stop, which must be at these joint angles (6,)."""
+        """Advance to the next recorded stop, which must have these joint angles (6,)."""
         self._stop += 1
         if not np.array_equal(q_rad, self._records[self._stop].pose.q_rad):
-            raise ValueError(f"stop {self._stop + 1} of the recording went elsewhere than the routine now asks")
+            raise ValueError(f"stop {self._stop + 1} of the recording has other joint angles than the routine requests")
 
     def wait_until_still(self, **_: object) -> None:
-        """Begin a look at the pose."""
+        """Start the measurement of a pose."""
         self._collected = False
 
     def state(self) -> ArmReading:
@@ -60,7 +60,7 @@ class RecordedRun:
         return record.after if self._collected else record.before
 
     def collect(self, _duration_s: float, /) -> WrenchSamples:
-        """Give the samples of this stop."""
+        """Return the samples of this stop."""
         self._collected = True
         return self._records[self._stop].samples
 
@@ -73,29 +73,29 @@ _UNDESCRIBED: Final = Setup()
 
 @dataclass(frozen=True, slots=True)
 class SolveOptions:
-    """Options of `ftdrive solve` and `ftdrive report`: what is known of the data, and how they are solved."""
+    """Options of `ftdrive solve` and `ftdrive report`: facts about the data, and the method of solution."""
 
     method: str = "ml"
-    """A `ftcalib.result.Method`; "all" compares them."""
+    """A `ftcalib.result.Method`, or "all" to compare the methods."""
     orientation: Orientation = "R_base_flange"
-    """Of the rotations in a CSV file."""
+    """Direction of the rotations in a CSV file."""
     drift: Drift = "auto"
     known: Known | None = None
-    """A known direction of gravity means a base that is level with respect to the mounting."""
+    """Known values. A known direction of gravity means that the base is level with respect to its mounting."""
     up_in_base: Sequence[float] | None = None
-    """(3,) declared up direction, instead of that of a run's mounting."""
+    """(3,) declared up direction in base, which replaces that of the mounting in a run."""
     as_published: bool = False
     earlier: CalibrationResult | None = None
-    """The result that gives a new tool its mounting, base and gain."""
+    """Result with the mounting, base and gain for a new tool."""
     pair: tuple[Path, Path] | None = None
-    """Files of wrench and orientation of a recording in motion."""
+    """Files of wrench and orientation, which together are a recording in motion."""
     point_mass: bool = False
     topics: tuple[str | None, str | None] = (None, None)
-    """Topics of a bag: wrench and pose."""
+    """Topics of a ROS bag: wrench and pose."""
     table: TableOptions | None = None
-    """What is known of a table of another program; None if nothing is."""
+    """Facts about a table of another program; None if there are none."""
     words: tuple[str, ...] = ()
-    """The same as typed, quoted for a shell."""
+    """These options as typed, quoted for a shell."""
 
     @classmethod
     def of_solve(  # noqa: PLR0913 - the options of the command
@@ -123,30 +123,31 @@ class SolveOptions:
         output: Path | None,
         simulate: bool,
     ) -> Self:
-        """Return what the options of `ftdrive solve` mean; raises `ConfigError` if they contradict each other."""
+        """Return the parsed options of `ftdrive solve`; raises `ConfigError` if they contradict each other."""
         if (wrench is None) != (orientation_file is None) or (wrench is not None and sources):
-            raise ConfigError("--wrench and --orientation-file are one recording: give both, and no DATASET")
+            raise ConfigError("--wrench and --orientation-file are parts of one recording: give both, and no DATASET")
         pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
         if not (sources or pair or simulate):
             raise ConfigError("no data: give a run folder, a dataset.json or a CSV file, or --simulate")
         others = (earlier, pair, test, mass_kg, level_deg, mounting_deg, up)
-        if cases and (method != "ml" or drift != "auto" or joined or any(one is not None for one in others)):
+        if cases and (method != "ml" or drift != "auto" or joined or any(option is not None for option in others)):
             raise ConfigError(
-                "--table-iii has methods and test sets of its own: leave out --method, --test and other data, --drift "
-                "and known values"
+                "--table-iii defines its methods and test sets: leave out --method, --test, other data, --drift and "
+                "known "
+                "values"
             )
         if test is not None and method != "all":
             raise ConfigError("--test compares methods: add --method all")
         if as_published and method != "all" and not method.startswith("carlson-"):
-            raise ConfigError("--as-published is for --method carlson-... and all: every other method has one form")
+            raise ConfigError("--as-published applies only to --method carlson-... and all: leave it out")
         if (earlier is not None or joined) and (method != "ml" or (earlier is not None and joined)):
-            raise ConfigError("--from and --together are for --method ml, one of the two at a time")
+            raise ConfigError("--from and --together need --method ml and exclude each other: leave one of them out")
         if joined and pair is not None:
             raise ConfigError("--together joins poses at rest: leave out --wrench and --orientation-file")
         if joined and len(sources) < 2:
             raise ConfigError("--together joins two runs or more: name them, the oldest first")
         if output is not None and ((len(sources) > 1 and not joined) or method == "all" or cases):
-            raise ConfigError("--output takes one result: give one dataset and one method")
+            raise ConfigError("--output saves one result: give one dataset and one method")
         return cls(
             method,
             orientation,
@@ -187,7 +188,7 @@ def up_direction(up: str | None) -> list[float] | None:
         return None
     direction = parse_numbers("--up", up, ",", (3,))
     if not any(direction):
-        raise ConfigError(f"--up is {up}, which is no direction: give 0,0,1 for a robot on a floor")
+        raise ConfigError(f"--up is {up}, which is not a direction: give 0,0,1 for a robot on a floor")
     return direction
 
 
@@ -204,7 +205,7 @@ def table_options(
     model: str | None,
     urdf: str | None,
 ) -> TableOptions:
-    """Return what the options of a command say of a table. Raises `ConfigError` or `OSError`."""
+    """Return the options of a command that describe a table. Raises `ConfigError` or `OSError`."""
     offset = [0.0] * 6 if tcp is None else parse_numbers("--tcp", tcp, ",", (3, 6))
     turn = [*offset, 0.0, 0.0, 0.0][3:6]
     named, text = ({}, {}) if columns is None else _named_columns(columns)
@@ -223,24 +224,24 @@ def table_options(
 
 
 def _named_columns(text: str) -> tuple[Mapping[str, str], Mapping[str, Any]]:
-    """Return the columns that an option or a TOML file names, and what the file says of the text."""
+    """Return the columns by signal from an option or a TOML file, and the section `text` of the file."""
     if text.endswith(".toml"):
         try:
-            found = tomllib.loads(read_file(text).decode())
-            columns = found["columns"] if "text" not in found else found.get("columns", {})
+            document = tomllib.loads(read_file(text).decode())
+            columns = document["columns"] if "text" not in document else document.get("columns", {})
         except (KeyError, ValueError) as error:
             raise ConfigError(
-                f'{text} names no columns ({error}): write [columns] and lines like fx = "Force X"'
+                f'{text} has no columns ({error}): write [columns] and lines such as fx = "Force X"'
             ) from error
-        return {str(name): str(column) for name, column in columns.items()}, found.get("text", {})
+        return {str(name): str(column) for name, column in columns.items()}, document.get("text", {})
     pairs = [part.partition("=") for part in text.split(",")]
     if not all(name.strip() and column.strip() for name, _, column in pairs):
-        raise ConfigError(f'--columns {text}: give NAME=COLUMN with commas between, such as "t=Time,fx=Force X"')
+        raise ConfigError(f'--columns {text}: give NAME=COLUMN separated by commas, such as "t=Time,fx=Force X"')
     return {name.strip(): column.strip() for name, _, column in pairs}, {}
 
 
 def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Array, Array]] | None:
-    """Return what makes poses of joint angles (n, 6)."""
+    """Return the forward kinematics of joint angles (n, 6); None without a model or URDF."""
     if model is not None and urdf is not None:
         raise ConfigError("--model and --urdf both describe the arm: leave one out")
     if urdf is not None:
@@ -252,8 +253,8 @@ def _forward(model: str | None, urdf: str | None) -> Callable[[Array], tuple[Arr
         raise ConfigError(f"--model {model}: the models are {', '.join(MODELS)}; another arm needs --urdf FILE")
 
     def forward(q_rad: Array) -> tuple[Array, Array]:
-        found = frames(MODELS[name], q_rad)
-        return found.R_base_flange, found.flange_m
+        at_joints = frames(MODELS[name], q_rad)
+        return at_joints.R_base_flange, at_joints.flange_m
 
     return forward
 
@@ -272,14 +273,14 @@ def _load_chain(urdf: str) -> Chain:
         raise ConfigError(f"--urdf {urdf}: {failure}") from failure
     if len(chain.names) != 6:
         raise ConfigError(
-            f"--urdf {urdf}: {len(chain.names)} joints move, 6 are read: give the links, FILE?flange=LINK"
+            f"--urdf {urdf}: the chain has {len(chain.names)} moving joints, not 6: give its end, FILE?flange=LINK"
         )
     return chain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedData:
-    """What a place holds."""
+    """Poses at rest, with everything that is known about them."""
 
     dataset: CalibrationDataset
     provenance: dict[str, Any]
@@ -288,9 +289,9 @@ class RecordedData:
     """The described cell."""
     known: Known | None = None
     records: Sequence[PoseRecord] = ()
-    """Only of a run."""
+    """Records of a run; empty for other sources."""
     earlier: CalibrationResult | None = None
-    """The result that gives a new tool its mounting, base and gain."""
+    """Result with the mounting, base and gain for a new tool."""
 
     def solve(
         self,
@@ -300,7 +301,7 @@ class RecordedData:
         as_published: bool = False,
         earlier: CalibrationResult | None = None,
     ) -> CalibrationResult:
-        """Calibrate; with an earlier result, given or of the run, only the tool is new."""
+        """Return the calibration; with an earlier result, given or recorded in the run, only of a new tool."""
         earlier = earlier or self.earlier
         if earlier is not None:
             require_same_cell(earlier, self.provenance)
@@ -318,14 +319,14 @@ class RecordedData:
 
     @property
     def p_flange_sensor_m(self) -> Array:
-        """(3,) sensor origin from the flange face, where its height is described; else there."""
+        """(3,) sensor origin from the flange face, flange axes; zero if the height is not configured."""
         return np.array([0.0, 0.0, self.setup.sensor_height_m or 0.0])
 
     @property
     def truth(self) -> Parameters | None:
-        """What a perfect calibration finds, of an emulated cell that is described in the run."""
+        """True parameters, if the run is of an emulated cell."""
         truth = (self.provenance.get("station") or {}).get("truth")
-        return None if truth is None else Parameters(*(np.array(truth[one.name]) for one in fields(Parameters)))
+        return None if truth is None else Parameters(*(np.array(truth[item.name]) for item in fields(Parameters)))
 
 
 def read_source(source: Path, options: SolveOptions) -> RecordedData:
@@ -348,10 +349,12 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         found = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.has_nominal_kinematics:
             found = replace(found, setup=replace(found.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
-        if table.gravity_is_measured:  # its direction is that of the base by definition
+        if table.gravity_is_measured:  # so that its direction defines the base
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
-        raise ConfigError(f"{source.name} is no table: leave out the options that describe one, such as --columns")
+        raise ConfigError(
+            f"{source.name} is not a table: leave out the options that describe a table, such as --columns"
+        )
     up_in_base = options.up_in_base
     if up_in_base is not None:
         provenance = {**found.provenance, "up_in_base": list(up_in_base)}
@@ -365,18 +368,18 @@ _TAKEN: Final = "give a path, a DataFrame, arrays by name, or a pair (R_base_fla
 
 
 def as_source(source: Any) -> Any:
-    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either, from what users give.
+    """Return a dataset, a recording, or a Path, DataFrame or mapping that may be either, from a user's argument.
 
-    A pair is R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m. Raises `BadDataset` for
-    arrays of other shapes, and `TypeError` for anything else, with the call that helps.
+    A pair has R_base_flange (n, 3, 3), or n Rotations, and the wrenches (n, 6), N and N·m. Raises `BadDataset` for
+    arrays of other shapes, and `TypeError`, whose message names the right call, for other arguments.
     """
     if isinstance(source, str):
         return Path(source)
     if isinstance(source, Run):
         return source.folder
     if isinstance(source, CalibrationResult):
-        raise TypeError("this is a result, which is solved already: print it, or solve the data that it was made of")
-    if isinstance(source, tuple | list) and len(source) == 2 and not any(isinstance(one, Mapping) for one in source):
+        raise TypeError("this is a result, which is already solved: print it, or solve its data")
+    if isinstance(source, tuple | list) and len(source) == 2 and not any(isinstance(part, Mapping) for part in source):
         try:
             return CalibrationDataset.of(*source)
         except (BadDataset, ValueError) as error:
@@ -384,8 +387,8 @@ def as_source(source: Any) -> Any:
     is_table = isinstance(source, Mapping) or hasattr(source, "columns")
     if is_table or isinstance(source, Path | CalibrationDataset) or hasattr(source, "pieces"):
         return source
-    found = f"an array of shape {source.shape}" if isinstance(source, np.ndarray) else type(source).__name__
-    raise TypeError(f"{found} has no names of columns: {_TAKEN}")
+    kind = f"an array of shape {source.shape}" if isinstance(source, np.ndarray) else type(source).__name__
+    raise TypeError(f"{kind} has no column names: {_TAKEN}")
 
 
 def read_dataset(
@@ -399,18 +402,18 @@ def read_dataset(
         A run folder, a dataset.json, a table of any program (text, DataFrame of pandas or Polars, arrays by name), or
         R_base_flange (n, 3, 3) and the wrenches (n, 6).
     orientation : {"R_base_flange", "R_flange_base"}
-        Of the rotations in a table: flange to base coordinates, like a robot pose, or the inverse.
+        Direction of the rotations in a table: flange to base coordinates, as in a robot pose, or the inverse.
     table : TableOptions, optional
-        What the table does not say: names of columns, units, order of angles, TCP.
+        Facts that the table lacks: names of columns, units, order of angles, TCP.
 
     Raises
     ------
     DataError
-        The message names the file, and the row or the field.
+        The data are invalid; the message names the file, and the row or the field.
     OSError
-        It cannot be read.
+        The file cannot be read.
     TypeError
-        The source is nothing of this; the message names the call that helps.
+        The source has another type; the message names the right call.
 
     Examples
     --------
@@ -423,32 +426,32 @@ def read_dataset(
     if isinstance(source, CalibrationDataset):
         return source
     if hasattr(source, "pieces"):
-        raise TypeError("this is a recording in motion, which has no poses at rest: ftdrive.solve(recording) solves it")
+        raise TypeError("this is a recording in motion without poses at rest: solve it with ftdrive.solve(recording)")
     if not isinstance(source, Path):
         return Table(source, table).dataset(orientation)
     return read_source(source, SolveOptions(orientation=orientation, table=table)).dataset
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if a rejected result, or one of another sensor, arm or mount, is to serve a new tool.
+    """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or of another cell.
 
-    What a file does not name is not compared.
+    Sensor, arm and mount are compared as far as both sides name them.
     """
     if earlier.verdict == "rejected":
-        raise ConfigError(f"--from: result {earlier.id} is rejected: take an accepted one")
+        raise ConfigError(f"--from: result {earlier.id} is rejected: give an accepted one")
     for what, *place, fix in (
-        ("sensor", "devices", "sensor", "serial", ": take one of the same sensor"),
-        ("arm", "devices", "arm", "serial", ": take one of the same arm"),
+        ("sensor", "devices", "sensor", "serial", ": give a result of the same sensor"),
+        ("arm", "devices", "arm", "serial", ": give a result of the same arm"),
         ("mount", "setup", "mount", ""),
     ):
         before, now = at(earlier.provenance, *place), at(provenance, *place)
         if before and now and before != now:
-            raise ConfigError(f"--from: result {earlier.id} is of {what} {before}, the new data of {now}{fix}")
+            raise ConfigError(f"--from: result {earlier.id} is of the {what} {before}, but the new data of {now}{fix}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Circumstances:
-    """What is known of the data of a run beside them."""
+    """Facts about the data of a run, from its header and events."""
 
     g_m_s2: float
     setup: Setup
@@ -457,7 +460,7 @@ class Circumstances:
     """Devices, run, cell and temperature."""
 
     def provenance(self) -> dict[str, Any]:
-        """Return the provenance of a result that is made now."""
+        """Return the provenance of a result that is made at this time."""
         return {**made_now(), **self.origin}
 
 
@@ -467,14 +470,14 @@ class Outcome:
 
     run: Run
     dataset: CalibrationDataset | None
-    """None of a run in motion."""
+    """Poses at rest; None for a run in motion."""
     result: CalibrationResult
     drift: DriftCheck | None
 
 
 def solve_and_save(run: Run) -> Outcome:
-    """Solve a run from its files, so that the files suffice to repeat it. Raises `OSError` if they cannot be saved."""
-    # Solved from its files and not from memory, so a replay agrees to the last digit.
+    """Solve a run and save dataset and result; raises `OSError` if they cannot be saved."""
+    # The data come from the files, not from memory, so that a replay gives the same result to the last digit.
     outcome = Outcome(run, None, solve_in_motion(run), None) if run.in_motion else solve_records(run, run.records())
     try:
         if outcome.dataset is not None:
@@ -482,10 +485,10 @@ def solve_and_save(run: Run) -> Outcome:
         if outcome.result.verdict != "rejected":
             outcome.result.save(run.new_path("calibration"))
     except OSError as error:
-        kept = "all poses are" if outcome.dataset is not None else "the recording is"
+        saved = "all poses are" if outcome.dataset is not None else "the recording is"
         raise OSError(
-            f"{error.strerror or error}: the result is not saved, but {kept}. Make room in {run.folder}, then "
-            f"{run.solve_command} --output FILE"
+            f"{error.strerror or error}: the result is not saved, but {saved}. Free disk space in {run.folder}, then "
+            f"run {run.solve_command} --output FILE"
         ) from error
     return outcome
 
@@ -493,7 +496,7 @@ def solve_and_save(run: Run) -> Outcome:
 def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
-    """Solve the recording of a run in motion; with the earlier result of a new tool that is given, or its own."""
+    """Return the solution of a run in motion; for a new tool with the given or the recorded earlier result."""
     found, earlier = circumstances_of(run), earlier or _earlier_of(run)
     if earlier is not None:
         require_same_cell(earlier, found.origin)
@@ -517,13 +520,13 @@ def solve_in_motion(
 
 
 def solve_records(run: Run, records: Sequence[PoseRecord]) -> Outcome:
-    """Solve records of a run, as they are on disk or as a replay gives them."""
+    """Return the outcome of a run from its records, or from those of a replay."""
     data = _recorded_data(run, records)
     return Outcome(run, data.dataset, data.solve(run.method), drift_check(records))
 
 
 def _earlier_of(run: Run) -> CalibrationResult | None:
-    """Return the result from which a run of a new tool takes mounting, base and gain; None for any other run."""
+    """Return the result with mounting, base and gain for a run of a new tool; None for any other run."""
     document = run.header().get("earlier")
     return None if document is None else CalibrationResult.from_dict(document)
 
@@ -540,24 +543,24 @@ def _recorded_data(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
 
 
 def circumstances_of(run: Run) -> Circumstances:
-    """Return what `solve` takes beside the data of a run, without reading them.
+    """Return the facts that `solve` needs besides the data of a run; the data are not read.
 
-    A tool with a load is another tool, with another name, so that its result serves no session of the tool alone.
+    A tool with a load gets another name, so that its result is not used for the tool alone.
     """
     header = run.header()
     config, load = header["config"], Load.of_header(header)
     sensor, tool, workcell, robot = (config.get(name, {}) for name in ("sensor", "tool", "workcell", "robot"))
     payload_kg = p_flange_payload_m = None
     for event in run.events():
-        if event.get("event") == "weighed":  # the last one counts
+        if event.get("event") == "weighed":  # the last event is used
             payload_kg, p_flange_payload_m = event["payload_kg"], event.get("p_flange_payload_m")
     tool_kg, mounting, height_mm = tool.get("mass_kg"), workcell.get("mounting"), sensor.get("height_mm")
     tool_kg = tool_kg + load.mass_kg if load and tool_kg else tool_kg
     tool_sigma_kg = None if load else tool.get("mass_sigma_kg")
-    # The centre of mass of a tool with a load may be anywhere between the two.
+    # With a load, the centre of mass may be outside the cylinders of the tool.
     cylinders_mm = [list(row) for row in tool.get("cylinders_mm", ())] if workcell.get("measured") and not load else []
     ranges = [sensor["range_N"], sensor["range_Nm"]] if sensor.get("range_N") and sensor.get("range_Nm") else None
-    # What a result is bound to or compared with.
+    # Facts to which a result is bound, or with which it is compared.
     described = {
         "payload_kg": payload_kg,
         "p_flange_payload_m": p_flange_payload_m,

@@ -1,11 +1,11 @@
-"""Verifications: from the poses of a run to their outcome, its file, and the last one of a calibration.
+"""Verifications: the outcome of a run, its file, and the search for the last verification of a calibration.
 
 verification.json   ftdrive.verification/1, in the run folder of the poses: calibration, limits, poses, outcome
-calibration.json    in the same folder, if the operator accepted an update: its provenance names the parent
+calibration.json    in the same folder, if the operator accepted an update; its provenance names the parent
 
-A verification belongs to a calibration by its id, whatever the paths. `verification_near` looks for `verification.json`
-in the run folders beside that of the calibration, in those in `runs` beside the calibration file, and in those in
-`runs` of the current folder.
+A verification belongs to a calibration by the id, regardless of paths. `verification_near` searches the run folders
+next to that of the calibration, those in `runs` next to the calibration file, and those in `runs` of the current
+folder.
 """
 
 import hashlib
@@ -22,7 +22,7 @@ from ftcalib.errors import BadCalibration, BadDataset, NotObservable
 from ftcalib.files import JSON, check_format, object_of, read_file, write_object
 from ftdrive.runs.calibration import at, made_now, marks_of, number_at, numbers_at, text_at, time_at
 
-# The record alone needs no numpy: a list of results starts without it.
+# A list of results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib import CalibrationDataset, CalibrationResult
     from ftcalib.after.state import Update
@@ -32,56 +32,56 @@ if TYPE_CHECKING:
     from ftdrive.runs.run import Run
 
 FORMAT: Final = "ftdrive.verification/1"
-# Largest differences of force (N) and torque (N·m) that pass. If either is given, they decide instead of the predicted
-# uncertainty.
+# Largest allowed differences of force, N, and torque, N·m. If one is given, the limits replace the statistical test.
 Limits = tuple[float | None, float | None]
 NO_LIMITS: Final = None, None
-# Share of verifications of an unchanged cell that fail.
+# False-alarm rate: share of the verifications of an unchanged cell that fail.
 FALSE_ALARMS: Final = 0.01
-# A recording keeps so many fields of a verification, the first ones.
+# Number of fields of a verification that a recording stores, from the first one.
 _RECORDED: Final = 8
 # Parts of a calibration's provenance that an update keeps.
 _COPIED: Final = ("devices", "station", "setup", "edited")
 
 
 class VerificationRecord(NamedTuple):
-    """The outcome of a verification of a calibration: a tuple, because a fleet reads 20,000 of them a minute."""
+    """Outcome of a verification of a calibration; a tuple, because a fleet reads 20,000 of them per minute."""
 
     path: str
-    """verification.json, in its run folder."""
+    """Path of verification.json in its run folder."""
     calibration_id: str
     created_utc: str | None
-    """As ISO 8601 with microseconds, so that texts sort as times; None of a file that does not say it."""
+    """UTC in ISO 8601 with microseconds, which sorts as text; None if the file has no time."""
     passed: bool
     change: str | None
-    """What has changed, such as "bias"; None if nothing, or if no change explains the readings."""
+    """Change that explains the readings, such as "bias"; None without a change or an explanation."""
     reason: str | None
+    """Why the verification failed."""
     force_max_N: float | None = None
-    """Largest difference, as `torque_max_Nm`; not in the store."""
     torque_max_Nm: float | None = None
+    """Largest differences of force and torque; not in the store."""
     id: str = ""
-    """12 hex digits of the SHA-256 of its file; empty in a recording, which keeps nothing of what follows."""
+    """First 12 hex digits of the SHA-256 of the file; this and the following fields are unset in a recording."""
     temperature_C: float | None = None
     bias_change: Sequence[float] | None = None
-    """(6,) change of the bias since the calibration, in N, then N·m, sensor frame."""
+    """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
     bias_change_sigma: Sequence[float] | None = None
-    """(6,) its standard deviation from the readings of this verification."""
+    """(6,) standard deviation of that change from the readings of this verification."""
     calibration_sigma: Sequence[float] | None = None
-    """(6,) its standard deviation from the calibration, which all its verifications share."""
+    """(6,) standard deviation of that change from the calibration, common to all its verifications."""
 
     @property
     def run(self) -> str:
-        """Name of its run folder."""
+        """Name of the run folder."""
         return Path(self.path).parent.name
 
     @property
     def shows_bias(self) -> bool:
-        """Whether the change of the bias that it has estimated counts: another change, or a hand, spoils that."""
+        """Whether the estimated change of the bias is valid, which another change or a contact would spoil."""
         return self.passed or self.change == "bias"
 
     @classmethod
     def load(cls, path: Path) -> Self:
-        """Read a verification.json; unknown fields are ignored. Raises `BadCalibration` or `OSError`."""
+        """Read a verification.json, ignoring unknown fields. Raises `BadCalibration` or `OSError`."""
         content = read_file(path)
         document = object_of(content, BadCalibration)
         check_format(document, FORMAT, BadCalibration)
@@ -92,24 +92,24 @@ class VerificationRecord(NamedTuple):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from what a recording keeps; unknown fields are ignored. Raises `BadCalibration`."""
+        """Return the verification that a recording stores, ignoring unknown fields. Raises `BadCalibration`."""
         path, calibration_id = str(document.get("path")), text_at(document, "calibration_id")
         largest = number_at(document, "force_max_N"), number_at(document, "torque_max_Nm")
         passed = document.get("passed")
         if calibration_id is None or not isinstance(passed, bool) or None in largest:
             raise BadCalibration(
-                f"{Path(path).name} lacks the id of its calibration or the outcome: the file is damaged"
+                f"{Path(path).name} lacks the calibration id or the outcome, so it is damaged: restore it from a copy"
             )
         made, change = time_at(document, "created_utc"), text_at(document, "change")
         return cls(path, calibration_id, made, passed, change, text_at(document, "reason"), *largest)
 
     def to_dict(self, names: Sequence[str] = ()) -> dict[str, Any]:
-        """Return fields as JSON, by default those of streams and recordings; `run` may be one of them."""
+        """Return named fields as JSON, by default those of streams and recordings; `run` is also allowed."""
         values = {**self._asdict(), "run": self.run}
         return {name: values[name] for name in names or self._fields[:_RECORDED]}
 
     def in_words(self, now: datetime | None) -> str:
-        """Return the result and its age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
+        """Describe outcome and age, such as "verified 2 h ago"; the age is 0 if `now` is None."""
         made = self.created_utc
         age = timedelta(0) if now is None or made is None else now - datetime.fromisoformat(made)
         if self.passed:
@@ -118,27 +118,27 @@ class VerificationRecord(NamedTuple):
 
 
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
-    """Return the newest verification of a calibration; None without one. Files that cannot be read are ignored.
+    """Return the newest verification of a calibration; None without one. Unreadable files are ignored.
 
-    `place` is a calibration file, which need not be there, or its run folder.
+    `place` is the calibration file, which may not exist, or its run folder.
     """
-    # Searched by the id of the calibration: a run folder that is complete gets no more files.
-    folder, found = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
+    # By id, because the calibration's own run folder is complete and gets no more files.
+    folder, records = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
     for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):
         for file in sorted(parent.glob("*/verification*.json")):
             with suppress(BadCalibration, OSError):
-                found.append(VerificationRecord.load(file))
-    return newest(record for record in found if record.calibration_id == calibration_id)
+                records.append(VerificationRecord.load(file))
+    return newest(record for record in records if record.calibration_id == calibration_id)
 
 
 def newest(records: Iterable[VerificationRecord]) -> VerificationRecord | None:
-    """Return the verification that was made last; None without any that has a time."""
+    """Return the newest verification; None if none has a time."""
     timed = (record for record in records if record.created_utc is not None)
     return max(timed, key=lambda record: record.created_utc or "", default=None)
 
 
 def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "CalibrationDataset | None":
-    """Read the poses of a calibration, of which `place` is the file or its folder; None if they are not there."""
+    """Return the poses of a calibration, next to its file or in its folder `place`; None if they are missing."""
     for path in sorted((place if place.is_dir() else place.parent).glob("dataset*.json")):
         with suppress(BadDataset, OSError):
             dataset = ftcalib.CalibrationDataset.load(path)
@@ -148,13 +148,13 @@ def fitted_dataset(calibration: "CalibrationResult", place: Path) -> "Calibratio
 
 
 def age_in_words(age: timedelta) -> str:
-    """Return an age in minutes, hours or days."""
+    """Describe an age in minutes, hours or days."""
     hours = max(0.0, age.total_seconds()) / 3600
     return f"{hours * 60:.0f} min" if hours < 1 else f"{hours:.0f} h" if hours < 48 else f"{hours / 24:.0f} d"
 
 
 def age_and_check(calibration: "CalibrationResult", last: VerificationRecord | None, now: datetime) -> str:
-    """Return the age of a calibration, if its file says when it was made, and the result of its last verification."""
+    """Describe the age of a calibration, if its time is known, and its last verification."""
     created = calibration.provenance.get("created_utc")
     age = f"{age_in_words(now - datetime.fromisoformat(created))} old, " if isinstance(created, str) else ""
     return age + ("not verified" if last is None else last.in_words(now))
@@ -162,7 +162,7 @@ def age_and_check(calibration: "CalibrationResult", last: VerificationRecord | N
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verified:
-    """A verification run, compared with the calibration."""
+    """A verification run with its comparison to the calibration."""
 
     run: "Run"
     calibration: "CalibrationResult"
@@ -170,20 +170,20 @@ class Verified:
     limits: Limits
     dataset: "CalibrationDataset"
     records: "tuple[PoseRecord, ...]"
-    """One for each row of the dataset."""
+    """One record per row of the dataset."""
     verification: "Verification"
     drift: "DriftCheck | None"
     path: Path
-    """verification.json"""
+    """Path of verification.json."""
 
     @property
     def force_N(self) -> "Array":
-        """(n,) norm of the difference at each pose."""
+        """(n,) norm of the force difference at each pose."""
         return self._differences(slice(3))
 
     @property
     def torque_Nm(self) -> "Array":
-        """(n,) norm of the difference at each pose."""
+        """(n,) norm of the torque difference at each pose."""
         return self._differences(slice(3, 6))
 
     def _differences(self, axes: slice) -> "Array":
@@ -193,51 +193,51 @@ class Verified:
 
     @property
     def passed(self) -> bool:
-        """Whether the calibration holds, by the limits given or by its predicted uncertainty."""
+        """Whether the calibration is still valid, by the given limits or else by the statistical test."""
         return bool(self.verification.passed) if self.limits == NO_LIMITS else not self.exceeded
 
     @property
     def exceeded(self) -> tuple[str, ...]:
-        """Limits that a pose exceeds, in words with the values."""
-        found = (self.force_N, "--max-force", "N"), (self.torque_Nm, "--max-torque", "N·m")
+        """Descriptions of the limits that a pose exceeds, with the values."""
+        largest = (self.force_N, "--max-force", "N"), (self.torque_Nm, "--max-torque", "N·m")
         return tuple(
             f"{sizes.max():.3g} {unit} is above {option} {limit:g} {unit}"
-            for (sizes, option, unit), limit in zip(found, self.limits, strict=True)
+            for (sizes, option, unit), limit in zip(largest, self.limits, strict=True)
             if limit is not None and sizes.max() > limit
         )
 
     @property
     def failure(self) -> str:
-        """Why it failed."""
+        """Why the verification failed."""
         return self.verification.reason if self.limits == NO_LIMITS else "; ".join(self.exceeded)
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """Marks of the calibration, and that of a verification in an emulated cell."""
+        """Marks of the calibration, and the mark of an emulated cell."""
         return marks_of(self.calibration, emulated=self.run.header().get("station") is not None)
 
     @property
     def update(self) -> "Update | None":
-        """The smallest sufficient update; None if the calibration holds, or if only a new calibration helps."""
+        """The smallest sufficient update; None if none is needed, or if only a new calibration helps."""
         return self.verification.update
 
     def next_command(self, saved: Path | None, again: str = "") -> str:
-        """Return what to type after it, where the update is saved; `again` are options, such as " --simulate"."""
+        """Return the next command to type; `saved` is the path of a saved update, `again` has further options."""
         if saved is not None:
             return f"ftdrive live --calibration {quote(str(saved))}{again}"
         if self.passed:
             return "ftdrive history   (age and trends of all calibrations)"
-        return f"ftdrive calibrate{again}   (the calibration does not hold any more)"
+        return f"ftdrive calibrate{again}   (the calibration is no longer valid)"
 
     @property
     def updated(self) -> str:
-        """What the update replaces, in words."""
+        """Description of the values that the update replaces."""
         kind = None if self.update is None else self.update.kind
         return "all values" if kind == "all" else f"the {kind}"
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the content of verification.json."""
-        found, header = self.verification, self.run.header()
+        """Return the contents of verification.json."""
+        outcome, header = self.verification, self.run.header()
         return {
             "format": FORMAT,
             "schema_version": 1,
@@ -252,9 +252,9 @@ class Verified:
             "devices": header.get("devices", {}),
             "temperature_C": self.run.temperature_C(),
             "passed": self.passed,
-            "change": found.change,
-            "alternatives": list(found.alternatives),
-            "reason": found.reason,
+            "change": outcome.change,
+            "alternatives": list(outcome.alternatives),
+            "reason": outcome.reason,
             "update": None if self.update is None else self.update.kind,
             "limits": {
                 "force_N": self.limits[0],
@@ -263,10 +263,10 @@ class Verified:
             },
             "force_max_N": float(self.force_N.max()),
             "torque_max_Nm": float(self.torque_Nm.max()),
-            "chi2": found.chi2,
-            "dof": found.dof,
-            "p_value": found.p_value,
-            "bias_change": found.to_dict()["bias_change"],
+            "chi2": outcome.chi2,
+            "dof": outcome.dof,
+            "p_value": outcome.p_value,
+            "bias_change": outcome.to_dict()["bias_change"],
             "poses": [self._pose(row) for row in range(len(self.records))],
             "drift_check": None if self.drift is None else self.drift.to_dict(),
             "dataset_sha256": self.dataset.sha256(),
@@ -289,7 +289,7 @@ class Verified:
 
 
 def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: Limits) -> Verified:
-    """Compare the poses of a run with the calibration of a file; write dataset.json and verification.json."""
+    """Compare the poses of a run with a calibration; write dataset.json and verification.json, return the result."""
     from ftcalib.after.verification import verify
     from ftcalib.data.dataset import pooled_covariance
     from ftcalib.routine import dataset_from, drift_check, is_return
@@ -297,29 +297,29 @@ def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits:
     records = run.records()
     dataset = dataset_from(records, {"run": run.folder.name, "devices": run.header().get("devices", {})})
     if dataset.wrench_cov is None:
-        raise BadDataset(f"{run.folder} has no noise of its poses: repeat the verification")
+        raise BadDataset(f"{run.folder} has poses without noise: repeat the verification")
     wrench_cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
     fitted = fitted_dataset(calibration, path)
-    found = verify(
+    outcome = verify(
         calibration, dataset.R_base_flange, dataset.wrench, wrench_cov, fitted=fitted, false_alarms=FALSE_ALARMS
     )
-    kept = tuple(record for record in records if not is_return(record, records))
+    in_dataset = tuple(record for record in records if not is_return(record, records))
     file = run.new_path("verification")
-    verified = Verified(run, calibration, path, limits, dataset, kept, found, drift_check(records), file)
+    verified = Verified(run, calibration, path, limits, dataset, in_dataset, outcome, drift_check(records), file)
     dataset.save(run.new_path("dataset"))
     write_object(file, verified.to_dict())
     return verified
 
 
 def save_update(verified: Verified) -> Path:
-    """Save the update as a new calibration in the run folder of the verification; its provenance names the parent.
+    """Save the update as a new calibration in the run folder of the verification, and return its path.
 
-    Raises `NotObservable` if the verification has no update.
+    Its provenance names the parent. Raises `NotObservable` if the verification has no update.
     """
     from ftcalib.after.state import apply_update
 
     if verified.update is None:
-        raise NotObservable("no update makes up for the change: calibrate again")
+        raise NotObservable("no update compensates the change: calibrate again")
     old, run = verified.calibration, verified.run
     provenance = {
         **made_now(),

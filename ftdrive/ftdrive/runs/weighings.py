@@ -1,10 +1,10 @@
-"""Weighings of a tool: a file for each day (UTC), to which every program that weighs adds lines.
+"""Weighings of a tool: one file per day (UTC), to which every weighing program appends lines.
 
     {"format": "ftdrive.weighings/1", "day": "2026-11-26", "tool": "gripper", …, "crc32": "…"}
     {"t_utc": "2026-11-26T10:15:00+00:00", "mass_kg": 0.2503, "mass_sigma_kg": 0.0004, …, "crc32": "…"}
     {"t_utc": "2026-11-26T10:15:05+00:00", "refused": "cable", "crc32": "…"}
 
-The file has every weighing. The store has one row for it, however many there are.
+The file has every weighing. The store has one row per file.
 """
 
 import hashlib
@@ -23,20 +23,21 @@ from ftdrive.runs.numbers import append_lines, parse_line
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
-# Why nothing was weighed: the codes of `ftdrive.stream.weighing.WORDS`. Each is a column of the store: a change raises
-# `ftdrive.store.database.SCHEMA`.
+# Reasons without a mass: the codes of `ftdrive.stream.weighing.WORDS`. Each code is a column of the store, so that a
+# change must increase `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
-    "other",  # of a newer version
+    "other",  # any code of a newer version
 )
-# Bytes that contain the end of the line before, if a power failure cut the last one off.
+# Number of bytes at the end of a file that contain a complete line end, even after a power failure.
 _TAIL: Final = 1 << 16
 
 
 def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: Sequence[Mapping[str, JSON]]) -> Path:
-    """Add lines to the file of an origin, the rest of its header, on a day (ISO 8601); return it when they are on disk.
+    """Append lines to the file of a day (ISO 8601), and return its path when they are on disk.
 
-    Other programs may add lines at the same time. Raises `OSError`; the file is then as it was.
+    `origin` has the other fields of the header. Other programs may append lines at the same time. Raises `OSError`; the
+    file is then unchanged.
     """
     import fcntl
 
@@ -48,7 +49,7 @@ def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: 
         end = file.seek(0, os.SEEK_END)
         file.seek(max(0, end - _TAIL))
         tail = file.read()
-        # A power failure may have cut off the last line.
+        # Remove a last line that a power failure has cut off.
         begin = end - len(tail) + tail.rfind(b"\n") + 1
         file.truncate(begin)
         append_lines(file, begin, [*([] if begin else [{"format": FORMAT, "day": day, **origin}]), *lines])
@@ -62,13 +63,13 @@ def append_weighings(folder: Path, origin: Mapping[str, JSON], day: str, lines: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeighingDay:
-    """The weighings of one day (UTC) with one calibration on one arm: a file, or the sum of several."""
+    """The weighings of one day (UTC) with one calibration on one arm: one file, or the sum of several files."""
 
     id: str
-    """Name of the file without its ending."""
+    """Name of the file without its extension."""
     path: str
     day: str = ""
-    """As ISO 8601."""
+    """Day in ISO 8601."""
     tool: str | None = None
     arm_serial: str | None = None
     sensor_serial: str | None = None
@@ -76,25 +77,26 @@ class WeighingDay:
     calibration_id: str | None = None
     emulated: bool = False
     size: int = 0
-    """Bytes that were read; what a file has beyond them is new."""
+    """Number of bytes that were read; further bytes of the file are new."""
     weighings: int = 0
-    """Number of weighings of a part: an empty gripper does not count."""
+    """Number of weighed parts, without those of an empty gripper."""
     refusals: Mapping[str, int]
-    """By the codes of `REFUSALS`."""
+    """Numbers of attempts without a mass, by the codes of `REFUSALS`."""
     last_utc: str | None = None
-    """When the last part was weighed."""
+    """Time at which the last part was weighed."""
     mass_kg: float | None = None
     mass_sigma_kg: float | None = None
 
     @classmethod
     def load(cls, path: Path, before: Self | None = None) -> Self:
-        """Read a file, or on from what was read `before`; a last line without its end does not count.
+        """Read a file, or continue from the state `before`; an incomplete last line is not read.
 
         Raises
         ------
         BadDataset
-            The file is damaged or of another format.
+            The file is damaged, or has another format.
         OSError
+            The file cannot be read.
         """
         found = before or cls(id=path.stem, path=str(path), refusals=dict.fromkeys(REFUSALS, 0))
         size, weighings, refusals, last = found.size, found.weighings, {**found.refusals}, None
@@ -104,7 +106,7 @@ class WeighingDay:
                 if not line.endswith(b"\n"):
                     break
                 if (content := parse_line(line.decode(errors="replace"))) is None:
-                    raise BadDataset(f"line {number} of the weighings is damaged: take the file from a copy")
+                    raise BadDataset(f"line {number} of the weighings is damaged: restore the file from a copy")
                 if number == 1:
                     check_format(content, FORMAT, BadDataset)
                     names = ("tool", "arm_serial", "sensor_serial", "robot_host", "calibration_id")
@@ -114,7 +116,7 @@ class WeighingDay:
                 elif (code := content.get("refused")) is not None:
                     refusals[code if code in refusals else "other"] += 1
                 elif content.get("is_something"):
-                    weighings += not content.get("poses", 1) > 1  # more poses of the same part
+                    weighings += not content.get("poses", 1) > 1  # further poses of the same part
                     last = content
                 size += len(line)
         if not size:
@@ -126,17 +128,17 @@ class WeighingDay:
 
 
 def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:
-    """Sum up the files of each tool and arm, and keep the last weighing; the oldest first.
+    """Return the sum of the last day of each tool and arm with its last weighing, the oldest first.
 
-    A tool has several files on a day if it was calibrated meanwhile.
+    A tool has several files on a day if it was calibrated on that day.
     """
-    found = dict[tuple[object, ...], WeighingDay]()
-    for one in sorted(days, key=lambda one: (one.day, one.last_utc or "", one.id)):
-        key = (one.tool, one.arm_serial, one.robot_host, one.emulated)
-        before = found.pop(key, None)
-        if before is not None and before.day == one.day:
-            refusals = {code: number + before.refusals[code] for code, number in one.refusals.items()}
-            found[key] = replace(one, weighings=one.weighings + before.weighings, refusals=refusals)
+    last = dict[tuple[object, ...], WeighingDay]()
+    for part in sorted(days, key=lambda part: (part.day, part.last_utc or "", part.id)):
+        key = (part.tool, part.arm_serial, part.robot_host, part.emulated)
+        before = last.pop(key, None)
+        if before is not None and before.day == part.day:
+            refusals = {code: number + before.refusals[code] for code, number in part.refusals.items()}
+            last[key] = replace(part, weighings=part.weighings + before.weighings, refusals=refusals)
         else:
-            found[key] = one
-    return [*found.values()]
+            last[key] = part
+    return [*last.values()]

@@ -1,6 +1,6 @@
-"""The store of results and verifications: an index of run folders. The folders stay the truth.
+"""The store of results and verifications: an index of run folders, which remain the source of the data.
 
-The database is imported by the first function that needs it: most commands neither look up nor index a result.
+Functions import the database only when they need it, because most commands do not use the store.
 """
 
 from collections.abc import Callable
@@ -15,22 +15,22 @@ if TYPE_CHECKING:
 
 
 def store_url() -> str | None:
-    """Return [store] url from environment and files; None is the user's store."""
+    """Return [store] url from environment and files; None for the default store of the user."""
     url: str | None = settings()["store.url"].value
     return url
 
 
 def open_store(url: str | None = None) -> "Store":
-    """Return the store at an address, else that of environment and files."""
+    """Return the store at an address, by default at that of environment and files."""
     from ftdrive.store.store import Store
 
     return Store(url or store_url())
 
 
 def index_run(folder: Path, say: Callable[[str], object], cell: CellConfig | None = None) -> None:
-    """Add a run to the store, and the runs beside it that it lacks; if that fails, `say` gets one sentence.
+    """Add a run, and the other new runs in its parent folder, to the store; report an error by one call of `say`.
 
-    The run folder is complete without the store, and the next call adds it. Without a real cell the store is that of
+    The run folder is complete without the store, and a later call adds it. Without `cell` the store is that of
     environment and files.
     """
     from ftdrive.store.store import Store
@@ -38,4 +38,4 @@ def index_run(folder: Path, say: Callable[[str], object], cell: CellConfig | Non
     try:
         Store(store_url() if cell is None else cell.store.url).index(folder.resolve().parent)
     except (BadStore, ConfigError, OSError) as error:
-        say(f" The run is saved but not in the history yet, because {error}.")
+        say(f" The run is saved, but not yet in the history, because {error}.")

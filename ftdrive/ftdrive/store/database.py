@@ -1,7 +1,7 @@
-"""The database behind a store: its address, its lock, its tables and their version, and its errors in words.
+"""The database of a store: address, lock, tables with their version, and error messages.
 
-The columns are the fields of the records. A change of those of results, verifications or weighings raises `SCHEMA`:
-an older index is then built again from its files.
+The columns are the fields of the records. A change of the fields of results, verifications or weighings must increase
+`SCHEMA`; an older index is then rebuilt from its files.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -41,11 +41,11 @@ from ftdrive.runs.weighings import REFUSALS, WeighingDay
 from ftdrive.store.records import Record, StoredCell, StoredResult
 from ftdrivers.installation import missing_extra
 
-# Version of the index, kept in the database.
+# Version of the index, stored in the database.
 SCHEMA: Final = 4
 
 AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Fields of a verification with a column for each component: 18 columns are read three times as fast as JSON in one.
+# Fields of a verification with one column per component: 18 columns are read three times as fast as one JSON column.
 WRENCHES = ("bias_change", "bias_change_sigma", "calibration_sigma")
 
 metadata: Final = MetaData()
@@ -56,7 +56,7 @@ _TYPES: Final = {str: String, int: Integer, float: Float, bool: Boolean}
 def _define_table(
     name: str, record: type, *more: Column[Any], key: str = "id", index: Collection[str] = (), without: Collection[str]
 ) -> Table:
-    """Make a table with the fields of a record, as JSON where no type of a database fits, and `more` columns."""
+    """Return a table with the fields of a record, as JSON if no other column type fits, and `more` columns."""
     columns = list[Column[Any]]()
     for field, hint in get_type_hints(record).items():
         is_optional = isinstance(hint, UnionType)
@@ -96,19 +96,19 @@ RECORDS: Final[Mapping[type[Record], Table]] = {
     WeighingDay: weighings,
 }
 
-# Collation that sorts texts alike everywhere.
+# Collation that sorts strings in the same order in both databases.
 _BYTE_ORDER: Final = {"sqlite": "BINARY", "postgresql": "C"}
 # Key of the advisory lock of all writers: "ftdrive" in ASCII.
 _WRITERS: Final = 0x66746472697665
 
 
 def default_file() -> Path:
-    """Return the store of a user; it need not exist."""
+    """Return the path of the user's default store, which may not exist."""
     return user_folder("data") / "store.sqlite"
 
 
 class Database:
-    """An SQLite file or a PostgreSQL database; parameters and errors as of `ftdrive.store.store.Store`."""
+    """An SQLite file or a PostgreSQL database; parameters and errors are those of `ftdrive.store.store.Store`."""
 
     def __init__(self, url: str | None, wait_s: float) -> None:
         self._wait_s = wait_s
@@ -121,8 +121,8 @@ class Database:
                     f"[store] url begins with {self._dialect}: give sqlite:////PATH or postgresql+psycopg://…"
                 )
             self._engine: Engine = create_engine(self._url, poolclass=NullPool, connect_args=self._limits())
-        except (ArgumentError, NoSuchModuleError, ValueError) as error:  # ValueError of a port that is no number
-            raise ConfigError("[store] url is no address of a database: give one such as sqlite:////PATH") from error
+        except (ArgumentError, NoSuchModuleError, ValueError) as error:  # ValueError for a port that is not a number
+            raise ConfigError("[store] url is not a database address: give one such as sqlite:////PATH") from error
         except ImportError as error:
             raise ConfigError(
                 missing_extra(f"[store] url = {self.name!r}", error.name or "psycopg", "fleet")
@@ -130,13 +130,13 @@ class Database:
 
     @property
     def name(self) -> str:
-        """The file, or the address without its password."""
+        """File, or address without its password."""
         return (self._is_sqlite and self._url.database) or self._url.render_as_string()
 
     @contextmanager
     def reading(self) -> Iterator[Connection | None]:
-        """Connect; None if there are no tables yet."""
-        if self._file is not None and not self._file.exists():  # connecting would create it
+        """Yield a connection for reading; None if there are no tables yet."""
+        if self._file is not None and not self._file.exists():  # a connection would create the file
             yield None
             return
         with self._connected("read") as connection:
@@ -144,17 +144,19 @@ class Database:
 
     @contextmanager
     def writing(self) -> Iterator[Connection]:
-        """Connect as the only writer, and commit at the end.
+        """Yield a connection as the only writer, and commit at the end.
 
         Missing tables are created. The index of an older version is replaced by an empty one; cells are kept.
         """
-        # Writers take turns by one lock: with locks of rows, two writers of the same copies wait for each other.
+        # One lock for all writers, because row locks of two writers may cause a deadlock.
         if self._file is not None:
             with self._naming_store("written"):
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
-                connection.exec_driver_sql("BEGIN IMMEDIATE")  # else two writers that read first cannot both go on
+                connection.exec_driver_sql(
+                    "BEGIN IMMEDIATE"
+                )  # otherwise two writers that have read first would block each other
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
             if self._version(connection) != SCHEMA:
@@ -165,16 +167,18 @@ class Database:
             connection.commit()
 
     def paths_of_older(self) -> set[str] | None:
-        """Return the files that an index of an older version names; None if there is no such index."""
+        """Return the paths in an index of an older version; None if there is no such index."""
         with self.reading() as connection:
             return None if connection is None or self._version(connection) == SCHEMA else all_paths(connection)
 
     def upsert(self, table: Table, first_by: str | None = None) -> Any:
-        """Return a statement that inserts rows, or replaces those with the same primary key.
+        """Return a statement that inserts rows, or replaces rows with the same primary key.
 
-        With `first_by`, it replaces only rows that have a greater text in this column.
+        With `first_by`, only rows with a greater string in this column are replaced.
         """
-        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # that of the other is slow
+        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(
+            table
+        )  # importing the other dialect is slow
         new = {column.name: insert.excluded[column.name] for column in table.columns}
         key = [column.name for column in table.primary_key]
         where = None
@@ -183,26 +187,26 @@ class Database:
         return insert.on_conflict_do_update(index_elements=key, set_=new, where=where)
 
     def _version(self, connection: Connection) -> int | None:
-        """Return the version of the tables, 0 where it is lost; None where there are no tables."""
-        # No migrations: the run folders are the truth, and an older index is built again.
+        """Return the version of the tables; 0 if it is missing, None without tables."""
+        # There are no migrations, because an older index is rebuilt from the run folders.
         if not inspect(connection).has_table(schema.name):
             return None
         version = connection.scalar(select(schema.c.version)) or 0
         if version > SCHEMA:
             raise BadStore(
-                f"the store {self.name} has version {version}, this ftdrive uses version {SCHEMA}: "
+                f"the store {self.name} has version {version}, but this ftdrive uses version {SCHEMA}: "
                 "install a newer ftdrive"
             )
         return version
 
     @property
     def _file(self) -> Path | None:
-        """The SQLite file; None for a server, memory or a file: URI."""
+        """SQLite file; None for a server, a database in memory, or a file: URI."""
         path = self._url.database or ""
         return Path(path) if self._is_sqlite and path and not path.startswith("file:") else None
 
     def _limits(self) -> dict[str, Any]:
-        """Return for how long the driver waits for a lock, or for a server that does not answer."""
+        """Return the time-outs of the driver for locks and for a server that does not answer."""
         if self._is_sqlite:
             return {"timeout": self._wait_s}
         wait_s = max(2, round(self._wait_s))
@@ -229,12 +233,12 @@ class Database:
         except (DBAPIError, OSError) as error:
             reason = " ".join(str(error.orig if isinstance(error, DBAPIError) else error).split())
             raise BadStore(
-                f"the store {self.name} cannot be {verb} ({reason}): check its address, and who may use it"
+                f"the store {self.name} cannot be {verb} ({reason}): check its address and permissions"
             ) from error
 
 
 def all_paths(connection: Connection) -> set[str]:
     """Return the path of every record, in an index of any version."""
-    kept = {*inspect(connection).get_table_names()}
-    tables = [table for table in RECORDS.values() if table.name in kept]
+    existing = {*inspect(connection).get_table_names()}
+    tables = [table for table in RECORDS.values() if table.name in existing]
     return {path for table in tables for path in connection.scalars(select(table.c.path))}

@@ -1,4 +1,4 @@
-"""What a list of results says: trends of bias and payload, ages, failed verifications, temperatures."""
+"""Trends of bias and payload in a list of results, and warnings about age, verifications and temperature."""
 
 from collections.abc import Iterator, Sequence
 from datetime import datetime
@@ -11,32 +11,32 @@ from ftdrive.store.records import StoredResult
 if TYPE_CHECKING:
     from ftdrive.store.trends import QuantityTrend
 
-# A calibration that was neither made nor verified for so long should be verified.
+# Largest age of a calibration or its last verification, in days, without a warning.
 OLD_DAYS: Final = 30.0
 OTHER_TEMPERATURE_K: Final = 10.0
-# Results with a trend.
+# Smallest number of results for a trend.
 _FEWEST = 3
 
 
 def age_days(created_utc: str | None, now: datetime) -> float | None:
-    """Return the days since a time; None where the time is unknown."""
+    """Return the number of days since a time; None if the time is unknown."""
     return None if created_utc is None else (now - datetime.fromisoformat(created_utc)).total_seconds() / 86400
 
 
 def drifts(results: Sequence[StoredResult]) -> list["QuantityTrend"]:
-    """Fit the trends of each tool with three results or more over three days; a rejected result does not count."""
+    """Return the trends of each tool with at least three accepted results over three days or more."""
     long = [series for series in _series(results) if len(series) >= _FEWEST]
-    if not long:  # numpy takes as long as all else of a short list
+    if not long:  # avoid the import of numpy, which takes as long as the rest of the command
         return []
     from ftdrive.store.trends import trends_of
 
-    return [one for series in long for one in trends_of(series)]
+    return [drift for series in long for drift in trends_of(series)]
 
 
 def warnings(
     results: Sequence[StoredResult], verifications: Sequence[VerificationRecord], now: datetime
 ) -> Iterator[str]:
-    """Yield what to do about the newest calibration of each tool: old, failed, or at another temperature."""
+    """Yield warnings about the newest calibration of each tool: old, failed, or made at another temperature."""
     for series in _series(results):
         newest = series[-1]
         what = f"{newest.tool}: the newest calibration, {newest.id[:6]},"
@@ -52,16 +52,16 @@ def warnings(
             change_K = last.temperature_C - newest.temperature_C
             if abs(change_K) > OTHER_TEMPERATURE_K:
                 words = f"{abs(change_K):.0f} K {'warmer' if change_K > 0 else 'colder'}"
-                yield f"{what} was made at {newest.temperature_C:.0f} °C, {last.run} was {words}: verify it when warm"
+                yield f"{what} was made at {newest.temperature_C:.0f} °C, but {last.run} was {words}: verify it when warm"
 
 
 def _series(results: Sequence[StoredResult]) -> Iterator[list[StoredResult]]:
     """Yield the accepted results of each tool on each arm, sensor and mount, the oldest first."""
 
-    def cell(one: StoredResult) -> tuple[str, ...]:
-        return tuple(str(part) for part in (one.tool, one.arm_serial, one.sensor_serial, one.mount))
+    def cell(result: StoredResult) -> tuple[str, ...]:
+        return tuple(str(part) for part in (result.tool, result.arm_serial, result.sensor_serial, result.mount))
 
-    accepted = [one for one in results if one.verdict != "rejected" and one.tool is not None and one.created_utc]
-    accepted.sort(key=lambda one: (cell(one), one.created_utc))
+    accepted = [item for item in results if item.verdict != "rejected" and item.tool is not None and item.created_utc]
+    accepted.sort(key=lambda item: (cell(item), item.created_utc))
     for _, series in groupby(accepted, cell):
         yield list(series)

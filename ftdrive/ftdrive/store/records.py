@@ -1,4 +1,4 @@
-"""What the store keeps: of a run folder, read from its files, and of a cell, as it was configured."""
+"""Records of the store: results, verifications and weighings from run folders, and configured cells."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
@@ -12,23 +12,23 @@ from ftdrive.runs.calibration import EMULATED, at, marks_of, number_at, numbers_
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.runs.weighings import FILES, FOLDER, WeighingDay
 
-# A list of results needs no numpy.
+# A list of results must not import numpy.
 if TYPE_CHECKING:
     from ftcalib.model import Array, Parameters
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredResult:
-    """One calibration; what its file does not say is None."""
+    """A calibration; values that its file lacks are None."""
 
     id: str
-    """`CalibrationResult.id`."""
+    """Id of the result, see `CalibrationResult.id`."""
     path: str
-    """The calibration file."""
+    """Path of the calibration file."""
     run: str
-    """Name of its run folder."""
+    """Name of the run folder."""
     created_utc: str | None
-    """As ISO 8601 with microseconds, so that texts sort as times."""
+    """UTC in ISO 8601 with microseconds, which sorts as text."""
     tool: str | None
     arm_serial: str | None
     arm_model: str | None
@@ -42,53 +42,53 @@ class StoredResult:
     mass_kg: float
     g_m_s2: float
     numbers: dict[str, JSON]
-    """The fields of `Parameters` and `covariance`, as in the file."""
+    """Fields of `Parameters`, and `covariance`, as in the file."""
     dataset_sha256: str | None
     parent: str | None
     """Id of the calibration that this one updates."""
     update: str | None
-    """What was updated, such as "bias"."""
+    """Kind of the update, such as "bias"; None for a full calibration."""
     temperature_C: float | None
-    """Temperature of the sensor, where a device reports it."""
+    """Temperature of the sensor, if it reports one."""
     payload_kg: float | None
-    """That the controller reported during the calibration."""
+    """Payload that the controller reported during the calibration."""
     payload_com_m: list[float] | None
-    """(3,) centre of mass of that payload, flange axes."""
+    """(3,) centre of mass of this payload, flange axes."""
     emulated: bool = False
     """Whether the cell was emulated."""
 
     @property
     def parameters(self) -> "Parameters":
-        """Estimates; with `covariance` they make a `ftcalib.after.series.Estimated`."""
+        """Estimates; with `covariance` the record satisfies `ftcalib.after.series.Estimated`."""
         import numpy as np
 
         from ftcalib.model import Parameters
 
-        return Parameters(**{one.name: np.array(self.numbers[one.name]) for one in fields(Parameters)})
+        return Parameters(**{item.name: np.array(self.numbers[item.name]) for item in fields(Parameters)})
 
     @property
     def covariance(self) -> "Array":
-        """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        """(15, 15) covariance of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
         import numpy as np
 
         return np.array(self.numbers["covariance"], dtype=np.float64)
 
     @property
     def mass_sigma_kg(self) -> float:
-        """One standard deviation of the mass, without the sensor's gain, which all results of a sensor share."""
+        """Standard deviation of the mass, without the gain error, which all results of a sensor have in common."""
         return self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
 
     def to_dict(self, age_days: float | None, check: VerificationRecord | None) -> dict[str, Any]:
-        """Return it with its age and last verification as JSON."""
+        """Return the record with its age and last verification as JSON."""
         import numpy as np
 
         from ftcalib.model import BIASES
 
-        kept = {name: value for name, value in asdict(self).items() if name != "numbers"}
+        columns = {name: value for name, value in asdict(self).items() if name != "numbers"}
         bias = {name: self.numbers[name] for name in ("force_bias_N", "torque_bias_Nm", "p_sensor_com_m")}
         sigma = np.sqrt(np.diag(self.covariance))[BIASES].tolist()
         return {
-            **kept,
+            **columns,
             "age_days": age_days,
             "mass_sigma_kg": self.mass_sigma_kg,
             **bias,
@@ -99,11 +99,11 @@ class StoredResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredCell:
-    """One cell of a fleet. No run folder contains it, so a rebuild of the store keeps it."""
+    """A cell of a fleet. Run folders do not contain cells, so a rebuild of the store keeps them."""
 
     name: str
     config: str
-    """Absolute path of its configuration file."""
+    """Absolute path of the configuration file."""
     verify_every_days: float
     arm_serial: str | None
     robot_host: str | None
@@ -112,7 +112,7 @@ class StoredCell:
 
 
 Record = StoredResult | VerificationRecord | WeighingDay
-# Fields of a verification that the store and the list of results have.
+# Fields of a verification in the store and in the list of results.
 STORED: Final = (
     *("id", "path", "run", "calibration_id", "created_utc", "passed", "change", "reason", "temperature_C"),
     *("bias_change", "bias_change_sigma", "calibration_sigma"),
@@ -120,19 +120,19 @@ STORED: Final = (
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files that become records, of runs or of the runs in folders, each once and by name.
+    """Return the files that become records in run folders, or directly in folders of runs, without duplicates.
 
-    A folder of weighings counts as a run.
+    A folder of weighings is treated as a run folder.
     """
-    folders = [one.resolve() for one in folders]
-    weighings = (one for folder in folders for one in (folder, folder / FOLDER) if one.name == FOLDER)
+    folders = [folder.resolve() for folder in folders]
+    weighings = (path for folder in folders for path in (folder, folder / FOLDER) if path.name == FOLDER)
     names = ("calibration*.json", "verification*.json", FILES)
     runs = sorted({*run_folders(folders), *weighings})
     return [path for run in runs for name in names for path in sorted(run.glob(name))]
 
 
 def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
-    """Read files; the second list names those that were left out, each with the reason."""
+    """Return the records of files, and a description of each file that could not be read."""
     records, unreadable = list[Record](), list[str]()
     for path in paths:
         try:
@@ -143,9 +143,9 @@ def read_records(paths: Iterable[Path]) -> tuple[list[Record], tuple[str, ...]]:
 
 
 def _read_record_file(path: Path) -> Record:
-    """Read one file of a run folder or of weighings; fields that this version does not know are ignored.
+    """Return the record of a file, ignoring unknown fields.
 
-    Raises `BadCalibration` or `BadDataset` for a damaged file or another format, or `OSError`.
+    Raises `BadCalibration` or `BadDataset` for a damaged file or another format, and `OSError`.
     """
     if path.match(FILES):
         return WeighingDay.load(path)
@@ -159,7 +159,7 @@ def _result(path: Path) -> StoredResult:
     result = CalibrationResult.load(path)
     try:
         header = Run(path.parent).header()
-    except (DataError, OSError):  # the calibration file alone suffices
+    except (DataError, OSError):  # the calibration file alone is sufficient
         header = {}
     provenance, setup = result.provenance, at(result.provenance, "setup")
     named = provenance if at(provenance, "devices") else header
@@ -184,7 +184,7 @@ def _result(path: Path) -> StoredResult:
         mass_kg=result.mass_kg,
         g_m_s2=result.g_m_s2,
         numbers={
-            **{one.name: getattr(result.parameters, one.name).tolist() for one in fields(result.parameters)},
+            **{item.name: getattr(result.parameters, item.name).tolist() for item in fields(result.parameters)},
             "covariance": result.covariance.tolist(),
         },
         dataset_sha256=text_at(provenance, "dataset_sha256"),

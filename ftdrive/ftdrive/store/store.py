@@ -1,4 +1,4 @@
-"""The store itself: results, verifications and cells, written from run folders and rebuilt from them at any time."""
+"""The store: an index of results, verifications and weighings, which can be rebuilt from run folders, and cells."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +16,7 @@ from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
-# For another writer.
+# Time-out for another writer, s.
 WAIT_S = 5.0
 
 _MOST = 5000
@@ -26,33 +26,33 @@ _Stored = TypeVar("_Stored")
 
 @dataclass(frozen=True, slots=True)
 class Indexed:
-    """What one call of `Store.index` has read."""
+    """Numbers of records that a call of `Store.index` has read."""
 
     results: int
     verifications: int
     weighings: int
-    """Files, each of one day."""
+    """Number of files of weighings, one per day."""
     unreadable: tuple[str, ...]
-    """Files that were left out, each with the reason."""
+    """Descriptions of the files that could not be read."""
 
 
 class Store:
-    """An index of run folders, and the cells of a fleet. Nothing is opened before the first call of a method.
+    """An index of run folders, and the cells of a fleet; the database is opened by the first method call.
 
-    `url` is that of an SQLite file or a PostgreSQL database, as SQLAlchemy has it, by default a file of the user.
-    `wait_s` is for another writer, and for a server that does not answer. Raises `ConfigError` for an address that is
-    not one of a database, or if its driver is missing; every method raises `BadStore` if the database cannot be read
-    or written, or is of a newer version.
+    `url` is the address of an SQLite file or a PostgreSQL database in the form of SQLAlchemy, by default a file of the
+    user. `wait_s` is the time-out for another writer, and for a server that does not answer. Raises `ConfigError` for
+    an invalid address or a missing driver. Every method raises `BadStore` if the database cannot be read or written, or
+    has a newer version.
     """
 
     def __init__(self, url: str | None = None, *, wait_s: float = WAIT_S) -> None:
         self._database = Database(url, wait_s)
         self.name = self._database.name
-        """The file, or the address without its password."""
+        """File, or address without its password."""
 
     @cached_property
     def _current(self) -> Database:
-        """The database; an index of an older version is first built again from the files that it names."""
+        """The database; an index of an older version is first rebuilt from the files that it names."""
         if (paths := self._database.paths_of_older()) is not None:
             records, _ = read_records(map(Path, sorted(paths)))
             with self._database.writing() as connection:
@@ -62,10 +62,10 @@ class Store:
     # -------------------------------------------------------------------------------------------------------- writing
 
     def index(self, *folders: Path) -> Indexed:
-        """Add what is new in these run folders, or in the run folders that they contain.
+        """Add the new files in these run folders, or in the run folders that they contain; return their numbers.
 
-        A file that is known by its path is not read again, because no file of a run is ever overwritten. One of
-        weighings is, if it has grown.
+        A file with a known path is not read again, because files of a run are never overwritten; a file of weighings
+        is read again if it has grown.
         """
         paths = record_paths(folders)
         with self._current.reading() as connection:
@@ -73,9 +73,9 @@ class Store:
         return self._add(path for path in paths if str(path) not in known)
 
     def rebuild(self, *folders: Path) -> Indexed:
-        """Read these folders and all that were indexed before again, and forget runs that were deleted.
+        """Read these folders and all indexed folders again, and remove deleted runs from the index.
 
-        Runs whose parent folder cannot be reached are kept: a disk may be missing, or another computer has them.
+        Runs whose parent folder is not accessible are kept, because they may be on another disk or computer.
         """
         with self._current.reading() as connection:
             known = set() if connection is None else all_paths(connection)
@@ -84,18 +84,18 @@ class Store:
         return self._add(record_paths([*folders, *parents]), forget=gone)
 
     def put_weighings(self, record: WeighingDay) -> None:
-        """Insert the weighings of a day, or replace them."""
+        """Insert or replace the weighings of a day."""
         with self._current.writing() as connection:
             self._write(connection, [record])
 
     def put_cells(self, cells: Iterable[StoredCell]) -> None:
-        """Insert cells, or replace those of the same name: all or none."""
+        """Insert cells, or replace cells of the same name; all of them or none."""
         if rows := [_to_row(cell) for cell in cells]:
             with self._current.writing() as connection:
                 connection.execute(self._database.upsert(database.cells), rows)
 
     def remove_cells(self, names: Iterable[str]) -> None:
-        """Remove cells by name; an unknown one is no error."""
+        """Remove cells by name; ignore unknown names."""
         by_name = delete(database.cells).where(database.cells.c.name == bindparam("cell"))
         with self._current.writing() as connection:
             for name in names:
@@ -107,14 +107,14 @@ class Store:
             with self._current.writing() as connection:
                 self._write(connection, records, forget)
         kinds = (StoredResult, VerificationRecord, WeighingDay)
-        results, verifications, weighings = (sum(isinstance(one, kind) for one in records) for kind in kinds)
+        results, verifications, weighings = (sum(isinstance(record, kind) for record in records) for kind in kinds)
         return Indexed(results, verifications, weighings, unreadable)
 
     def _write(self, connection: Connection, records: Sequence[Record], forget: Sequence[str] = ()) -> None:
-        """Insert records; of two files with the same content the first by path counts, whatever the order."""
+        """Insert records; of several files with the same content, the first path is stored."""
         # The key is the content: a copied or moved run is one result, also on two computers.
         for kind, table in database.RECORDS.items():
-            rows = [_to_row(one) for one in records if isinstance(one, kind)]
+            rows = [_to_row(record) for record in records if isinstance(record, kind)]
             same = _paths_where(connection, table, table.c.id, [row["id"] for row in rows])
             if gone := [*forget, *(path for path in same if not Path(path).exists())]:
                 which = delete(table).where(table.c.path == bindparam("gone"))
@@ -125,56 +125,56 @@ class Store:
     # -------------------------------------------------------------------------------------------------------- reading
 
     def results(self, tool: str | None = None) -> list[StoredResult]:
-        """Return all results, or those of a tool, the oldest first."""
+        """Return all results, or the results of a tool, the oldest first."""
         table = database.results
         return self._read(_oldest_first(table).where(*_is(table.c.tool, tool)), _by_name(StoredResult))
 
     def find(self, start: str) -> list[StoredResult]:
-        """Return the results whose id begins so."""
+        """Return the results whose id begins with this text."""
         query = select(database.results).where(database.results.c.id.startswith(start, autoescape=True))
         return self._read(query, _by_name(StoredResult))
 
     def verifications(self, calibration_id: str | None = None) -> list[VerificationRecord]:
-        """Return all verifications, or those of a calibration, the oldest first."""
+        """Return all verifications, or the verifications of a calibration, the oldest first."""
         table = database.verifications
         return self._read(_oldest_first(table).where(*_is(table.c.calibration_id, calibration_id)), _to_verification)
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
-        """Return the newest verification of a calibration, if there is one."""
+        """Return the newest verification of a calibration; None without one."""
         return next(reversed(self.verifications(calibration_id)), None)
 
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
-        """Return the last days with weighings, or those of a tool, the oldest first."""
+        """Return the weighings of the last `most` days with any, or with any of a tool, the oldest first."""
         table = database.weighings
         newest_first = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
         query = select(table).where(*_is(table.c.tool, tool)).order_by(*newest_first).limit(most)
         return self._read(query, _to_weighings)[::-1]
 
     def last_weighings(self, since_day: str, tool: str | None = None) -> list[WeighingDay]:
-        """Return the last day with weighings of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
+        """Return the last weighing day of each tool on each arm since a day (ISO 8601, UTC), the oldest first."""
         return sum_up(self._read(_last_weighings(since_day, tool), _to_weighings))
 
     def cells(self) -> list[StoredCell]:
-        """Return all cells by name."""
+        """Return all cells, sorted by name."""
         return sorted(self._read(select(database.cells), _by_name(StoredCell)), key=lambda cell: cell.name)
 
     def fleet(
         self, newest: int, since: datetime
     ) -> tuple[list[StoredCell], list[StoredResult], list[VerificationRecord], list[WeighingDay]]:
-        """Return what a fleet needs, in one look at the database: cells, results and checks, the oldest first.
+        """Return cells, results, verifications and weighings of a fleet from one database connection, the oldest first.
 
-        Of each tool on each arm it has the `newest` results that are not rejected, of verifications and weighings those
-        from `since` on. Also `last_weighings`.
+        The results are the `newest` accepted ones of each tool on each arm; verifications and weighings are those since
+        a time, weighings as in `last_weighings`.
         """
         start = since.astimezone(UTC).isoformat(timespec="microseconds")
         checks = select(database.verifications).where(database.verifications.c.created_utc >= start)
         with self._current.reading() as connection:
             cells = _query(connection, select(database.cells), _by_name(StoredCell))
             results = _query(connection, _newest_accepted(newest), _by_name(StoredResult))
-            found = _query(connection, checks, _to_verification)
+            verifications = _query(connection, checks, _to_verification)
             weighings = _query(connection, _last_weighings(start[:10]), _to_weighings)
         cells.sort(key=lambda cell: cell.name)
-        return cells, results, sorted(found, key=attrgetter("created_utc")), sum_up(weighings)
+        return cells, results, sorted(verifications, key=attrgetter("created_utc")), sum_up(weighings)
 
     def _read(self, query: Select[Any], make: Callable[[Row[Any]], _Stored]) -> list[_Stored]:
         with self._current.reading() as connection:
@@ -186,7 +186,7 @@ def _query(connection: Connection | None, query: Select[Any], make: Callable[[Ro
 
 
 def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
-    """Return those of the paths that have a record of the whole file."""
+    """Return the paths whose whole file is in the store."""
     texts = [str(path) for path in paths]
     known = {
         path for table in database.RECORDS.values() for path in _paths_where(connection, table, table.c.path, texts)
@@ -201,7 +201,7 @@ def _paths_in_store(connection: Connection, paths: Sequence[Path]) -> set[str]:
 
 
 def _paths_where(connection: Connection, table: Table, column: Column[Any], values: Sequence[str]) -> Iterator[str]:
-    """Yield the paths of the rows whose column has one of the values; a statement takes only so many of them."""
+    """Yield the paths of the rows with one of the values in a column, in statements of limited size."""
     for start in range(0, len(values), _MOST):
         yield from connection.scalars(select(table.c.path).where(column.in_(values[start : start + _MOST])))
 
@@ -216,21 +216,21 @@ def _oldest_first(table: Table) -> Select[Any]:
 
 def _newest_accepted(most: int) -> Select[Any]:
     table = database.results
-    one = (table.c.arm_serial, table.c.robot_host, table.c.tool)
+    key = (table.c.arm_serial, table.c.robot_host, table.c.tool)
     newest_first = (table.c.created_utc.desc(), table.c.id.desc())
-    rank = func.row_number().over(partition_by=one, order_by=newest_first).label("rank")
+    rank = func.row_number().over(partition_by=key, order_by=newest_first).label("rank")
     accepted = (table.c.verdict != "rejected", table.c.created_utc.is_not(None))
-    found = select(table.c.id, rank).where(*accepted).subquery()
-    return _oldest_first(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank <= most)))
+    ranked = select(table.c.id, rank).where(*accepted).subquery()
+    return _oldest_first(table).where(table.c.id.in_(select(ranked.c.id).where(ranked.c.rank <= most)))
 
 
 def _last_weighings(since_day: str, tool: str | None = None) -> Select[Any]:
-    """Select the files of the last day of each tool on each arm."""
+    """Return a query for the files of the last day of each tool on each arm."""
     table = database.weighings
     key = (table.c.tool, table.c.arm_serial, table.c.robot_host, table.c.emulated)
     rank = func.rank().over(partition_by=key, order_by=table.c.day.desc()).label("rank")
-    found = select(table.c.id, rank).where(table.c.day >= since_day, *_is(table.c.tool, tool)).subquery()
-    return select(table).where(table.c.id.in_(select(found.c.id).where(found.c.rank == 1)))
+    ranked = select(table.c.id, rank).where(table.c.day >= since_day, *_is(table.c.tool, tool)).subquery()
+    return select(table).where(table.c.id.in_(select(ranked.c.id).where(ranked.c.rank == 1)))
 
 
 def _to_row(record: Record | StoredCell) -> dict[str, Any]:
@@ -247,7 +247,7 @@ def _by_name(kind: Callable[..., _Stored]) -> Callable[[Row[Any]], _Stored]:
 
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
-    # By place, because a name takes as long as all the rest.
+    # By position, because access by name would double the time.
     wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (8, 14, 20)]
     return VerificationRecord._make((*row[:6], None, None, *row[6:8], *wrenches))
 

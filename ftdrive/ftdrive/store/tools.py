@@ -15,21 +15,21 @@ from ftdrive.store.store import Store
 from ftdrive.store.trends import sensor_biases
 from ftdrivers.interfaces import NOT_REPORTED, Array, DeviceInfo
 
-# Searched beside the store, so that a run that is not indexed yet counts too.
+# Folder that is searched besides the store, for runs that are not indexed yet.
 RUNS = Path("runs")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tool:
-    """A calibration that was found by the name of its tool."""
+    """Calibration of a named tool."""
 
     calibration: CalibrationResult
     path: Path
     warnings: tuple[str, ...]
     temperature: BiasTemperature | None = None
-    """How the bias of the sensor follows its temperature, where that predicts other runs better."""
+    """Dependence of the sensor bias on its temperature, if it improves the prediction of other runs."""
     hour_change: Array | None = None
-    """(6,) how far that bias moves in an hour, one standard deviation, N and N·m; None where no runs show it."""
+    """(6,) standard deviation of the change of the bias in one hour, N and N·m; None without enough runs."""
 
 
 def calibration_of_tool(
@@ -43,31 +43,37 @@ def calibration_of_tool(
 ) -> Tool:
     """Return the newest accepted calibration of a tool, a `[tool] name`, on these devices and this `[sensor] mount`.
 
-    With `force`, if none is of these devices, it is the newest of any, also one that was edited by hand. `url` is that
-    of the store. Raises `ConfigError` if there is none, with the tools that are calibrated on these devices.
+    With `force` and no calibration of these devices, it is the newest of any devices, even if edited by hand. `url` is
+    the address of the store. Raises `ConfigError` without a calibration, and names the tools calibrated on these
+    devices.
     """
-    # A tool is a name in its runs, so nothing has to be edited after a calibration.
     store, warnings = Store(url), list[str]()
     results: list[StoredResult] = []
     try:
         results = store.results()
     except BadStore as error:
-        warnings.append(f"the run folders in {RUNS} are searched, because {error}")
-    indexed = {one.path for one in results}
+        warnings.append(f"only the run folders in {RUNS} are searched, because {error}")
+    indexed = {result.path for result in results}
     unindexed, _ = read_records(path for path in record_paths([RUNS]) if str(path) not in indexed)
-    results += [one for one in unindexed if isinstance(one, StoredResult)]
+    results += [result for result in unindexed if isinstance(result, StoredResult)]
     accepted = sorted(
-        (one for one in results if one.verdict != "rejected"), key=lambda one: one.created_utc or "", reverse=True
+        (result for result in results if result.verdict != "rejected"),
+        key=lambda result: result.created_utc or "",
+        reverse=True,
     )
-    ours = [one for one in accepted if _may_belong(one, arm, sensor)]
-    for one in (one for one in ours if one.tool == name):
-        if (loaded := _load_result(one)) and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
-            return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)), *_of_sensor(store, one, results))
+    ours = [result for result in accepted if _may_belong(result, arm, sensor)]
+    for result in (result for result in ours if result.tool == name):
+        if (loaded := _load_result(result)) and not compare_devices(
+            loaded, {"arm": arm, "sensor": sensor}, mount
+        ).others:
+            return Tool(
+                loaded, Path(result.path), (*warnings, *_failed(store, result)), *_of_sensor(store, result, results)
+            )
     if force:
-        for one in (one for one in accepted if one.tool == name):
-            if loaded := _load_result(one, accept_edited=True):
-                return Tool(loaded, Path(one.path), (*warnings, *_failed(store, one)))
-    known = sorted({one.tool for one in ours if one.tool and one.tool != name})
+        for result in (result for result in accepted if result.tool == name):
+            if loaded := _load_result(result, accept_edited=True):
+                return Tool(loaded, Path(result.path), (*warnings, *_failed(store, result)))
+    known = sorted({result.tool for result in ours if result.tool and result.tool != name})
     instead = f", or choose one of {', '.join(known)}" if known else ""
     raise ConfigError(
         f"there is no accepted calibration of the tool '{name}' with the arm {arm.serial}, the sensor {sensor.serial} "
@@ -76,38 +82,38 @@ def calibration_of_tool(
     )
 
 
-def _may_belong(one: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
-    """Compare serial numbers, without reading the file."""
-    pairs: Iterable[tuple[str | None, str]] = ((one.arm_serial, arm.serial), (one.sensor_serial, sensor.serial))
+def _may_belong(result: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
+    """Return whether the serial numbers of a stored result may be those of the devices."""
+    pairs: Iterable[tuple[str | None, str]] = ((result.arm_serial, arm.serial), (result.sensor_serial, sensor.serial))
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 
 
-def _load_result(one: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
+def _load_result(result: StoredResult, *, accept_edited: bool = False) -> CalibrationResult | None:
     try:
-        return with_sensor(CalibrationResult.load(Path(one.path), accept_edited=accept_edited))
+        return with_sensor(CalibrationResult.load(Path(result.path), accept_edited=accept_edited))
     except (BadCalibration, OSError):
         return None
 
 
 def _of_sensor(
-    store: Store, one: StoredResult, results: Iterable[StoredResult]
+    store: Store, result: StoredResult, results: Iterable[StoredResult]
 ) -> tuple[BiasTemperature | None, Array | None]:
-    """Return what other runs of the sensor show: how its bias follows a known temperature, and moves in an hour."""
-    same = (one.sensor_serial, one.arm_serial, one.mount)
-    alike = [each for each in results if (each.sensor_serial, each.arm_serial, each.mount) == same]
+    """Return the temperature dependence of the sensor's bias, and its change in one hour, from all runs of the sensor."""
+    key = (result.sensor_serial, result.arm_serial, result.mount)
+    of_sensor = [other for other in results if (other.sensor_serial, other.arm_serial, other.mount) == key]
     try:
-        checks = [check for each in alike for check in store.verifications(each.id)]
+        checks = [check for other in of_sensor for check in store.verifications(other.id)]
     except BadStore:
         return None, None
-    fit, hour_change = next(iter(sensor_biases(alike, checks).values()), (None, None))
-    is_known = one.temperature_C is not None and fit is not None and any(fit.predicts)
+    fit, hour_change = next(iter(sensor_biases(of_sensor, checks).values()), (None, None))
+    is_known = result.temperature_C is not None and fit is not None and any(fit.predicts)
     return fit if is_known else None, hour_change
 
 
-def _failed(store: Store, one: StoredResult) -> Iterator[str]:
-    """Yield a warning if the last verification has failed."""
+def _failed(store: Store, result: StoredResult) -> Iterator[str]:
+    """Yield a warning if the last verification of a result has failed."""
     try:
-        last = store.last_verification(one.id)
+        last = store.last_verification(result.id)
     except BadStore:
         return
     if last is not None and not last.passed:

@@ -1,4 +1,4 @@
-"""Changes of bias and payload over the results of one tool, and of a sensor's bias with its temperature."""
+"""Trends of bias and payload over the results of a tool, and dependence of a sensor's bias on temperature."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -14,16 +14,16 @@ from ftcalib.rounding import with_sigma
 from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredResult
 
-# Largest p-value of a trend that counts.
+# Significance level of a trend.
 SIGNIFICANT: Final = 0.01
-# Results within fewer days have no trend: a change per 30 days would be extrapolated too far.
+# Shortest time span of a trend; a change per 30 days from a shorter one would be extrapolated too far.
 SHORTEST_DAYS: Final = 3.0
 
 _MONTH_DAYS = 30.0
-# Runs so far apart show what the bias does while a cell works; so many pairs of them count.
+# Time between two runs from which the change of the bias in one hour is estimated, and smallest number of such pairs.
 _NEAR_H: Final = (0.25, 6.0)
 _FEWEST_PAIRS: Final = 3
-# Of chi2 with one degree of freedom.
+# Median of the chi-squared distribution with one degree of freedom.
 _MEDIAN: Final = 0.4549
 _VECTORS: Final = {
     "force bias": ("force_bias_N", "N", 1.0),
@@ -34,18 +34,18 @@ _VECTORS: Final = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuantityTrend:
-    """Linear change of one quantity over the results of one tool on one sensor, arm and mount."""
+    """Linear trend of a quantity over the results of one tool on one sensor, arm and mount."""
 
     tool: str
     sensor_serial: str | None
     quantity: str
     unit: str
     trend: Trend
-    """Per 30 days, in `unit`."""
+    """Change per 30 days, in `unit`."""
 
     @property
     def is_significant(self) -> bool:
-        """Whether chance explains it in less than one case of 100."""
+        """Whether the p-value of the trend is below 0.01."""
         return self.trend.p_value < SIGNIFICANT
 
     def to_dict(self) -> dict[str, Any]:
@@ -73,7 +73,7 @@ class QuantityTrend:
 
 
 def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
-    """Yield the trends of the results of one tool on one arm, sensor and mount, the oldest first."""
+    """Yield the trends of results of one tool on one arm, sensor and mount, which are sorted by time."""
     for quantity, unit, rows in _quantities(series):
         days = {row[0] for row in rows}
         if len(days) < FEWEST_ESTIMATES or max(days) - min(days) < SHORTEST_DAYS:
@@ -84,33 +84,33 @@ def trends_of(series: Sequence[StoredResult]) -> Iterator[QuantityTrend]:
 
 
 def _quantities(series: Sequence[StoredResult]) -> Iterator[tuple[str, str, list[tuple[float, Array, Array]]]]:
-    """Yield each quantity with its unit, and (days, value, covariance) of the results that have estimated it.
+    """Yield each quantity with its unit, and (days, value, covariance) of the results that estimate it.
 
-    A value that equals an earlier one was copied by an update; one without variance was taken as known.
+    A value equal to an earlier one is a copy in an update; a value without variance was given as known.
     """
     first = datetime.fromisoformat(str(series[0].created_utc))
-    days = [(datetime.fromisoformat(str(one.created_utc)) - first).total_seconds() / 86400 for one in series]
+    days = [(datetime.fromisoformat(str(result.created_utc)) - first).total_seconds() / 86400 for result in series]
     for quantity, (name, unit, scale) in _VECTORS.items():
         rows = slice(PARAMETER_NAMES.index(f"{name}.x"), PARAMETER_NAMES.index(f"{name}.z") + 1)
-        values = [scale * getattr(one.parameters, name) for one in series]
-        covariances = [scale**2 * one.covariance[rows, rows] for one in series]
+        values = [scale * getattr(result.parameters, name) for result in series]
+        covariances = [scale**2 * result.covariance[rows, rows] for result in series]
         yield quantity, unit, _estimated(days, values, covariances)
-    masses = [np.array([one.mass_kg]) for one in series]
-    yield "mass", "kg", _estimated(days, masses, [np.array([[one.mass_sigma_kg**2]]) for one in series])
+    masses = [np.array([result.mass_kg]) for result in series]
+    yield "mass", "kg", _estimated(days, masses, [np.array([[result.mass_sigma_kg**2]]) for result in series])
 
 
 def _estimated(
     days: Sequence[float], values: Sequence[Array], covariances: Sequence[Array]
 ) -> list[tuple[float, Array, Array]]:
-    kept = list[tuple[float, Array, Array]]()
+    rows = list[tuple[float, Array, Array]]()
     for day, value, covariance in zip(days, values, covariances, strict=True):
-        copied = any(np.array_equal(value, earlier) for _, earlier, _ in kept)
+        copied = any(np.array_equal(value, earlier) for _, earlier, _ in rows)
         if not copied and np.linalg.eigvalsh(covariance)[0] > 1e-12 * np.trace(covariance) > 0:
-            kept.append((day, value, covariance))
-    return kept
+            rows.append((day, value, covariance))
+    return rows
 
 
-# Serial number of a sensor, that of its arm, and its mount.
+# Serial numbers of a sensor and its arm, and the mount.
 Mounted = tuple[str, str | None, str | None]
 
 
@@ -125,14 +125,14 @@ class _Run(NamedTuple):
 def sensor_biases(
     results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]
 ) -> dict[Mounted, tuple[BiasTemperature | None, Array | None]]:
-    """Return how the bias of each sensor follows its temperature, and how far it moves in an hour; None without data.
+    """Return the temperature dependence of each sensor's bias, and its change in one hour; None without enough data.
 
-    The latter is (6,) one standard deviation, N and N·m, of a random walk between successive runs of one tool within a
-    quarter of an hour to six hours. The median counts, over the axes of force and torque each, so that a moved cable
-    does not. It takes three such pairs.
+    The change is the standard deviation (6,), N and N·m, of a random walk, from at least three pairs of successive runs
+    of one tool that are 15 min to 6 h apart. The estimate is a median over pairs and axes, separately for force and
+    torque, so that it is robust against a moved cable.
     """
     runs = _runs(results, verifications)
-    return {mounted: (_temperature(found), _hour_change(found)) for mounted, found in runs.items()}
+    return {mounted: (_temperature(series), _hour_change(series)) for mounted, series in runs.items()}
 
 
 def _temperature(runs: Sequence[_Run]) -> BiasTemperature | None:
@@ -156,26 +156,26 @@ def _hour_change(runs: Sequence[_Run]) -> Array | None:
 
 
 def _runs(results: Iterable[StoredResult], verifications: Sequence[VerificationRecord]) -> dict[Mounted, list[_Run]]:
-    """Collect what has shown the bias of each sensor, the oldest first."""
+    """Return the runs that estimate the bias of each sensor, the oldest first."""
     runs = dict[Mounted, list[_Run]]()
     made = dict[str, tuple[list[_Run], StoredResult]]()
-    for one in results:
-        if one.verdict == "rejected" or one.sensor_serial is None or one.emulated:
+    for result in results:
+        if result.verdict == "rejected" or result.sensor_serial is None or result.emulated:
             continue
-        found = runs.setdefault((one.sensor_serial, one.arm_serial, one.mount), [])
-        made[one.id] = found, one
-        if one.update in (None, "tool") and one.created_utc is not None:
-            sigma = np.sqrt(np.diag(one.covariance)[BIASES])
-            time = datetime.fromisoformat(one.created_utc)
-            found.append(_Run(time, one.tool, one.temperature_C, one.parameters.bias, sigma))
+        series = runs.setdefault((result.sensor_serial, result.arm_serial, result.mount), [])
+        made[result.id] = series, result
+        if result.update in (None, "tool") and result.created_utc is not None:
+            sigma = np.sqrt(np.diag(result.covariance)[BIASES])
+            time = datetime.fromisoformat(result.created_utc)
+            series.append(_Run(time, result.tool, result.temperature_C, result.parameters.bias, sigma))
     for check in verifications:
         if check.calibration_id not in made or not check.shows_bias:
             continue
-        found, calibration = made[check.calibration_id]
+        series, calibration = made[check.calibration_id]
         change, sigma_6 = check.bias_change, check.bias_change_sigma
         if change is None or sigma_6 is None or check.created_utc is None:
             continue
         bias = calibration.parameters.bias + change
         time = datetime.fromisoformat(check.created_utc)
-        found.append(_Run(time, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
-    return {mounted: sorted(found, key=lambda run: run.created_utc) for mounted, found in runs.items()}
+        series.append(_Run(time, calibration.tool, check.temperature_C, bias, np.array(sigma_6)))
+    return {mounted: sorted(series, key=lambda run: run.created_utc) for mounted, series in runs.items()}

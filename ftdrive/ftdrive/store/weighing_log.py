@@ -1,4 +1,4 @@
-"""Keeps the weighings of a running program: in its file of the day, and in the store."""
+"""Log of the weighings of a running program, in a file per day and in the store."""
 
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -14,23 +14,24 @@ from ftdrive.cell.config import user_folder
 from ftdrive.errors import ConfigError
 from ftdrive.runs.weighings import FOLDER, WeighingDay, append_weighings
 
-# Time between two writes to the store.
+# Time between two writes to the store, s.
 EVERY_S: Final = 30.0
-# So long the end of a program waits for the last write: a store is waited for 5 s.
+# Time-out of the last write at the end of a program, s; the store has a time-out of 5 s.
 _GOODBYE_S: Final = 6.0
-# Lines that wait for a disk; then the oldest are lost.
+# Largest number of lines that wait for the disk; beyond it the oldest lines are lost.
 _MOST_WAITING: Final = 1000
-_NOT_INDEXED: Final = "Weighings are kept but not in the history yet"
-# Day and content.
+_NOT_INDEXED: Final = "Weighings are saved, but not yet in the history"
+# A line: day and content.
 _Line = tuple[str, Mapping[str, JSON]]
 
 
 class WeighingLog:
-    """Writes in a thread of its own, so that a slow disk or database never delays a stream.
+    """Log that writes in a separate thread, so that a slow disk or database never delays a stream.
 
-    A failed write is reported once, and repeated with the next. `origin` has `tool`, `calibration_id`, `arm_serial`,
-    `sensor_serial`, `robot_host` and `emulated`; `url` is that of the store. `say` takes a sentence for the operator,
-    from any thread. `folder` is by default that of the user; `every_s` is the time between two writes to the store, s.
+    A failed write is reported once, and repeated with the next write. `origin` has `tool`, `calibration_id`,
+    `arm_serial`, `sensor_serial`, `robot_host` and `emulated`; `url` is the address of the store. `say` receives a
+    sentence for the operator, from any thread. `folder` is by default in the user's data folder; `every_s` is the time
+    between two writes to the store, s.
     """
 
     def __init__(
@@ -47,12 +48,12 @@ class WeighingLog:
         self._folder = folder or user_folder("data") / FOLDER
         self._lines = SimpleQueue[_Line | None]()
         self._waiting = list[_Line]()
-        # File of the day that is written, and what was read of it.
+        # Day of the current file, its path, and its state when it was last read.
         self._day, self._path = "", Path()
         self._read: WeighingDay | None = None
         # Whether the file has lines that the store lacks.
         self._is_new = False
-        # Whether the store may lack other files of the folder.
+        # Whether the store may lack other files in the folder.
         self._lacks_older = True
         self._store: Any = None
         self._said = set[str]()
@@ -60,12 +61,12 @@ class WeighingLog:
         self._thread.start()
 
     def keep(self, values: Mapping[str, JSON]) -> None:
-        """Keep a weighing, as `ftdrive.stream.weighing.load_values` has it, or why there is none; returns at once."""
+        """Log a weighing, as from `ftdrive.stream.weighing.load_values`, or the reason without one; return at once."""
         t_utc = self._now().isoformat(timespec="milliseconds")
         self._lines.put((t_utc[:10], {"t_utc": t_utc, **values}))
 
     def close(self) -> None:
-        """Write what is left; waits for some seconds at most."""
+        """Write the remaining lines; wait a few seconds at most."""
         self._lines.put(None)
         self._thread.join(_GOODBYE_S)
 
@@ -77,25 +78,25 @@ class WeighingLog:
         while not ends:
             new = self._next(max(0.0, due_s - monotonic()) if self._is_new else None)
             ends = None in new
-            self._waiting = [*self._waiting, *(one for one in new if one is not None)][-_MOST_WAITING:]
+            self._waiting = [*self._waiting, *(line for line in new if line is not None)][-_MOST_WAITING:]
             if self._waiting:
-                self._attempt("Weighings are not kept", self._append)
+                self._attempt("Weighings are not saved", self._append)
             if self._is_new and (ends or monotonic() >= due_s):
                 self._index()
                 due_s = monotonic() + self._every_s
 
     def _next(self, timeout_s: float | None) -> list[_Line | None]:
-        """Wait for lines; None is the end."""
+        """Wait for lines and return them; None marks the end."""
         try:
-            found = [self._lines.get(timeout=timeout_s)]
+            lines = [self._lines.get(timeout=timeout_s)]
         except Empty:
             return []
         while not self._lines.empty():
-            found.append(self._lines.get())
-        return found
+            lines.append(self._lines.get())
+        return lines
 
     def _open(self) -> None:
-        """Import the database, before there is anything to write."""
+        """Open the store, before there is anything to write."""
         from ftdrive.store.store import Store
 
         self._store = Store(self._url)
@@ -109,18 +110,18 @@ class WeighingLog:
                 self._day, self._read = day, None
             lines = [line for at, line in self._waiting if at == day]
             self._path = append_weighings(self._folder, self._origin, day, lines)
-            self._waiting = [one for one in self._waiting if one[0] != day]
+            self._waiting = [line for line in self._waiting if line[0] != day]
             self._is_new = True
 
     def _index(self) -> None:
         self._attempt(_NOT_INDEXED, self._put_weighings)
 
     def _put_weighings(self) -> None:
-        # One row a file and day: a row for each weighing would be 6 million a year and cell.
+        # One row per file; one row per weighing would be 6 million per year and cell.
         if self._store is None:
             self._open()
         if self._lacks_older:
-            self._store.index(self._folder)  # what an outage kept from the store
+            self._store.index(self._folder)  # files that an outage kept out of the store
             self._lacks_older = False
         self._read = WeighingDay.load(self._path, self._read)
         self._store.put_weighings(self._read)
