@@ -1,1 +1,1 @@
-"""Many cells: their state, findings across them, solving again, metrics."""
+"""Fleets of cells: states, findings across cells, metrics, and solving of many runs again."""

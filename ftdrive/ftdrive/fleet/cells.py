@@ -1,4 +1,4 @@
-"""The cells of a fleet, each with its configuration and how often it is verified, and what the store has of each.
+"""The cells of a fleet with their configurations and verification intervals, and their records in the store.
 
     format = "ftdrive.cells/1"
 
@@ -7,7 +7,7 @@
     verify_every_days = 7
     arm_serial = "20225500001"         # optional; default: [robot] serial of the configuration
 
-A run belongs to a cell by the serial number of its arm if the cell has one, else by the address of its controller.
+A run belongs to the cell with the serial number of its arm or, if a cell has none, with the address of its controller.
 """
 
 import os
@@ -41,16 +41,16 @@ def read_cells(path: Path) -> list[StoredCell]:
     Raises
     ------
     ConfigError
-        With file, cell, key and what to do: no TOML, another format, an unknown key, a configuration that cannot be
-        read or has no address of a controller, a variable of the environment that would replace it.
+        The file is not TOML, has another format or an unknown key, a configuration cannot be read or lacks the address
+        of the controller, or an environment variable would replace it. The message names file, cell, key and remedy.
     OSError
         The file cannot be read.
     """
     refuse_variables()
     document = read_toml(path)
     if document.get("format") != FORMAT:
-        found = repr(document.get("format")) if "format" in document else "missing"
-        raise ConfigError(f'{path}: the format is {found}: write format = "{FORMAT}" into its first line')
+        version = repr(document.get("format")) if "format" in document else "missing"
+        raise ConfigError(f'{path}: the format is {version}: write format = "{FORMAT}" into its first line')
     cells = document.get("cells")
     unknown = sorted(document.keys() - {"format", "cells"})
     if unknown or not isinstance(cells, Mapping) or not cells:
@@ -60,19 +60,19 @@ def read_cells(path: Path) -> list[StoredCell]:
 
 
 def refuse_variables() -> None:
-    """Raise `ConfigError` if a variable of the environment would replace a value of every cell."""
-    if found := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
-        raise ConfigError(f"{found[0]} is set and would replace a value of every cell: unset it")
+    """Raise `ConfigError` if an environment variable would replace a value in every cell."""
+    if names := sorted(name for name in os.environ if name.startswith(_OF_ONE_CELL)):
+        raise ConfigError(f"{names[0]} is set and would replace a value of every cell: unset it")
 
 
 def refuse_ambiguous(cells: Iterable[StoredCell]) -> None:
-    """Raise `ConfigError` if runs could belong to either of two cells."""
+    """Raise `ConfigError` if a run could belong to two cells."""
     seen = dict[tuple[str, str], str]()
     for cell in cells:
         key = ("arm_serial", cell.arm_serial) if cell.arm_serial else ("[robot] host", cell.robot_host or "")
         other = seen.setdefault(key, cell.name)
         if other != cell.name:
-            fix = "remove one of them" if cell.arm_serial else "give each its arm_serial"
+            fix = "remove one of the cells" if cell.arm_serial else "set arm_serial in each cell"
             raise ConfigError(
                 f"the cells {other} and {cell.name} have the same {key[0]} {key[1]}, so a run could belong to "
                 f"either: {fix}"
@@ -80,7 +80,7 @@ def refuse_ambiguous(cells: Iterable[StoredCell]) -> None:
 
 
 class Owners:
-    """Finds the cell of a result or weighing: by the serial number of the arm, else the address of the controller."""
+    """Assigns results and weighings to cells, by serial number of the arm or by address of the controller."""
 
     def __init__(self, cells: Iterable[StoredCell]) -> None:
         cells = tuple(cells)
@@ -96,7 +96,7 @@ class Owners:
 def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     place = f"{path}: [cells.{name}]"
     if not _NAME.fullmatch(name):
-        raise ConfigError(f"{place} is no name of a cell: use up to 40 letters, digits, '-', '_' and '.'")
+        raise ConfigError(f"{place} is not a valid cell name: use up to 40 letters, digits, '-', '_' and '.'")
     if not isinstance(table, Mapping):
         raise ConfigError(f'{place} is {table!r}: write a table with config = "…" and verify_every_days = 7')
     if unknown := sorted(table.keys() - set(_KEYS)):
@@ -104,17 +104,23 @@ def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     config, days, serial = (table.get(key) for key in _KEYS)
     if not isinstance(config, str) or not config:
         raise ConfigError(f'{place} config is {config!r}: give the path of its ftdrive.toml, such as "{name}.toml"')
-    if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # nan is neither
-        raise ConfigError(f"{place} verify_every_days is {days!r}: give the days between two verifications, such as 7")
+    if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # false for nan
+        raise ConfigError(
+            f"{place} verify_every_days is {days!r}: give the number of days between two verifications, such as 7"
+        )
     if serial is not None and not (isinstance(serial, str) and serial):
-        raise ConfigError(f'{place} arm_serial is {serial!r}: give the serial number as text, such as "20225500001"')
+        raise ConfigError(
+            f'{place} arm_serial is {serial!r}: give the serial number as a string, such as "20225500001"'
+        )
     file = (path.parent / config).resolve()
     if not file.is_file():
-        raise ConfigError(f"{place} config: {file} does not exist: `ftdrive init` writes one, or fix the path")
+        raise ConfigError(
+            f"{place} config: {file} does not exist: correct the path, or write the file with `ftdrive init`"
+        )
     found = settings(file)
     host = found["robot.host"].value
     if host is None:
-        raise ConfigError(f"{place}: {file} has no [robot] host: write it there")
+        raise ConfigError(f"{place}: {file} has no [robot] host: add it there")
     return StoredCell(
         name=name,
         config=str(file),
@@ -126,63 +132,62 @@ def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     )
 
 
-# Age of the oldest verification that is read: a drift of the bias shows within weeks.
-# All verifications would take four times as long after a year and find no drift sooner.
+# Age of the oldest verification that is read. A drift of the bias appears within weeks; reading all verifications would
+# take four times as long after a year and detect no drift earlier.
 WINDOW: Final = timedelta(days=90)
-# Results of each tool of a cell that are read: the newest, and what it is compared with.
-# The time must not grow with the age of the fleet.
+# Number of the newest results of each tool that are read, so that the time does not grow with the age of the fleet.
 NEWEST: Final = 3
 
 
-# A row for each verification of a calibration: days since it, and how far the bias has changed, force first, N and N·m.
+# One row per verification: days since the calibration, and change of the bias, force first, N and N·m.
 Changes = NDArray[np.void]
 _COLUMNS: Final = np.dtype(
     [
         ("t_days", float),
-        ("temperature_C", float),  # nan where it is not known
+        ("temperature_C", float),  # nan if unknown
         ("change", float, 6),
-        ("sigma", float, 6),  # of the readings of this verification
-        ("calibration_sigma", float, 6),  # of the calibration, common to all
+        ("sigma", float, 6),  # from the readings of this verification
+        ("calibration_sigma", float, 6),  # from the calibration, common to all verifications
     ]
 )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Results and verifications of a fleet."""
+    """Results, verifications and weighings of a fleet."""
 
     cells: tuple[StoredCell, ...]
     results: Mapping[str, Sequence[StoredResult]]
     """The newest accepted results of each tool, by cell, the oldest first."""
     checks: Mapping[str, Sequence[VerificationRecord]]
-    """Verifications by calibration, the oldest first; none without a time, or older than `WINDOW`."""
+    """Verifications by calibration, the oldest first, of the last `WINDOW`."""
     changes: Mapping[str, Changes]
-    """By calibration, where its verifications have them."""
+    """Changes of the bias by calibration, if its verifications have estimated any."""
     weighings: Mapping[tuple[str | None, str | None, bool], WeighingDay]
-    """The last weighing by cell and tool, and whether the cell was emulated."""
+    """The last weighing day by cell, tool, and whether the cell was emulated."""
     now: datetime
 
     @classmethod
     def read(cls, store: Store, now: datetime) -> Self:
-        """Read the store; raises `BadStore`."""
+        """Return the contents of a store; raises `BadStore`."""
         cells, newest, recent, weighings = store.fleet(NEWEST, now - WINDOW)
         owners = Owners(cells)
         results: dict[str, list[StoredResult]] = {cell.name: [] for cell in cells}
-        for one in newest:
-            if (name := owners.cell_of(one)) is not None:
-                results[name].append(one)
+        for result in newest:
+            if (name := owners.cell_of(result)) is not None:
+                results[name].append(result)
         checks = dict[str, list[VerificationRecord]]()
         for check in recent:
             checks.setdefault(check.calibration_id, []).append(check)
-        known = [one for found in results.values() for one in found if one.id in checks]
-        changes = {one.id: found for one in known if (found := _bias_changes(one, checks[one.id])) is not None}
-        last = {(owners.cell_of(one), one.tool, one.emulated): one for one in weighings}
+        checked = [result for of_cell in results.values() for result in of_cell if result.id in checks]
+        changes = {item.id: rows for item in checked if (rows := _bias_changes(item, checks[item.id])) is not None}
+        last = {(owners.cell_of(day), day.tool, day.emulated): day for day in weighings}
         return cls(tuple(cells), results, checks, changes, last, now)
 
     def newest(self, cell: StoredCell) -> Iterator[StoredResult]:
-        """Yield the newest result of each tool in use, in the order of their names.
+        """Yield the newest result of each tool in use, sorted by tool name.
 
-        In use are the tool of the configuration, the one calibrated last, and each that was calibrated or verified
+        Tools in use are the configured tool, the tool calibrated last, and every tool that was calibrated or verified
         within `WINDOW`.
         """
         by_tool = {one.tool: one for one in self.results[cell.name]}
@@ -195,19 +200,19 @@ class Observed:
 
 
 def _bias_changes(result: StoredResult, checks: Sequence[VerificationRecord]) -> Changes | None:
-    """Return how the bias has changed since a calibration; None if no verification has this."""
+    """Return the changes of the bias since a calibration; None if no verification has estimated any."""
     start = when(result)
     rows = [
-        ((when(one) - start).total_seconds() / 86400, one.temperature_C, *change, *sigma, *common)
-        for one in checks
-        if one.shows_bias and (change := one.bias_change)
-        if (sigma := one.bias_change_sigma) and (common := one.calibration_sigma)
+        ((when(check) - start).total_seconds() / 86400, check.temperature_C, *change, *sigma, *common)
+        for check in checks
+        if check.shows_bias and (change := check.bias_change)
+        if (sigma := check.bias_change_sigma) and (common := check.calibration_sigma)
     ]
-    changes = np.array(rows, np.float64).reshape(-1, 20).view(_COLUMNS)[:, 0]  # of None becomes nan
+    changes = np.array(rows, np.float64).reshape(-1, 20).view(_COLUMNS)[:, 0]  # None becomes nan
     changes = changes[changes["sigma"].min(axis=1, initial=np.inf) > 0]
     return changes if len(changes) else None
 
 
-def when(one: StoredResult | VerificationRecord) -> datetime:
-    """Return the time of a record that has one."""
-    return datetime.fromisoformat(str(one.created_utc))
+def when(record: StoredResult | VerificationRecord) -> datetime:
+    """Return the time of a record, which must have one."""
+    return datetime.fromisoformat(str(record.created_utc))

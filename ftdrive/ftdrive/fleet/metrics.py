@@ -1,4 +1,4 @@
-"""The state of a fleet as metrics of Prometheus."""
+"""Prometheus metrics of the state of a fleet."""
 
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
@@ -19,17 +19,17 @@ except ImportError:
 
 
 def _seconds(time: datetime | str | None) -> float | None:
-    # A time and not an age: an age would stand still when the server does.
+    # A time, because an age would not grow while the server hangs.
     time = datetime.fromisoformat(time) if isinstance(time, str) else time
     return None if time is None else time.timestamp()
 
 
 def _labels(*texts: str | None) -> list[str]:
-    """Return labels without control characters, which files and devices may contain."""
+    """Return label values without control characters, which may come from files and devices."""
     return [visible(text or "") for text in texts]
 
 
-# Metrics with the labels `TOOL`: what they mean, and their value; a value of None is left out.
+# Metrics with the labels `TOOL`: help text, and function of the value; a value of None is left out.
 OF_TOOL: Final[Mapping[str, tuple[str, Callable[[CellState], float | None]]]] = {
     "ftdrive_calibration_timestamp_seconds": (
         "When the newest accepted calibration was made.",
@@ -83,10 +83,10 @@ NAMES: Final = (*OF_TOOL, WEIGHINGS, REFUSALS, CELL_INFO, FINDING, STORE_UP, STA
 
 
 class MetricsServer(Collector):
-    """Serves the newest state at /metrics, without a process or platform metric beside it.
+    """Server of the newest state at /metrics, without metrics of process or platform.
 
-    Port 0 lets the system choose; see `port`. `page` returns the page of the fleet, which is served at / and made for
-    each load; it may raise `BadStore`. Raises `ConfigError` for an address that cannot be used.
+    With port 0 the system chooses the port, see `port`. `page` returns the page of the fleet for each request of /; it
+    may raise `BadStore`. Raises `ConfigError` for an address that cannot be used.
     """
 
     def __init__(self, host: str, port: int, page: Callable[[], str]) -> None:
@@ -101,14 +101,14 @@ class MetricsServer(Collector):
         except OSError as error:
             self._stop()
             raise ConfigError(
-                f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another"
+                f"/metrics cannot be served at {host}:{port} ({error.strerror}): choose another address"
             ) from None
         self._metrics = self._server.get_app()
         self._server.set_app(self._answer)
         self.port = self._gate.port
 
     def update(self, fleet: Fleet, read: datetime, store_up: bool) -> None:
-        """Serve this state from now on, which was read at `read`, UTC."""
+        """Serve this state, which was read at time `read`, UTC."""
         self._newest = fleet, read, store_up
 
     def _answer(self, request: dict[str, Any], start: Any) -> Any:
@@ -122,7 +122,7 @@ class MetricsServer(Collector):
         return [text.encode()]
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop the server."""
         self._gate.close()
         self._stop()
 
@@ -132,8 +132,8 @@ class MetricsServer(Collector):
         self._thread.join()
 
     def collect(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
-        """Yield the metrics; called by a thread for each scrape."""
-        # The server may set another one meanwhile.
+        """Yield the metrics; a thread calls this for each scrape."""
+        # `update` may replace the state meanwhile.
         if (newest := self._newest) is None:
             return
         fleet, read, store_up = newest
@@ -141,27 +141,27 @@ class MetricsServer(Collector):
         yield GaugeMetricFamily(STATE_TIME, "When the state was read from the store.", value=read.timestamp())
         cells = fleet.cells
         info = GaugeMetricFamily(CELL_INFO, "1 for each tool of each cell.", labels=CELL_INFO_LABELS)
-        for one in cells:
-            about = (one.arm_serial, one.sensor_serial, one.sensor_model, one.calibration_id, one.verdict)
-            info.add_metric(_labels(one.cell, one.tool, *about, "true" if one.emulated else "false"), 1)
+        for state in cells:
+            about = (state.arm_serial, state.sensor_serial, state.sensor_model, state.calibration_id, state.verdict)
+            info.add_metric(_labels(state.cell, state.tool, *about, "true" if state.emulated else "false"), 1)
         yield info
         for name, (help_text, value_of) in OF_TOOL.items():
             family = GaugeMetricFamily(name, help_text, labels=TOOL)
-            for one in cells:
-                if (value := value_of(one)) is not None:
-                    family.add_metric(_labels(one.cell, one.tool), value)
+            for state in cells:
+                if (value := value_of(state)) is not None:
+                    family.add_metric(_labels(state.cell, state.tool), value)
             yield family
         weighings = CounterMetricFamily(WEIGHINGS, "Parts weighed on the last day.", labels=TOOL)
         refusals = CounterMetricFamily(REFUSALS, "Weighings refused on the last day.", labels=(*TOOL, "code"))
-        for one in cells:
-            if one.weighings is not None:
-                weighings.add_metric(_labels(one.cell, one.tool), one.weighings.weighings)
-                for code, number in one.weighings.refusals.items():
+        for state in cells:
+            if state.weighings is not None:
+                weighings.add_metric(_labels(state.cell, state.tool), state.weighings.weighings)
+                for code, number in state.weighings.refusals.items():
                     if number:
-                        refusals.add_metric(_labels(one.cell, one.tool, code), number)
+                        refusals.add_metric(_labels(state.cell, state.tool, code), number)
         yield weighings
         yield refusals
         finding = GaugeMetricFamily(FINDING, "1 for each cell of a finding.", labels=("kind", "cell"))
-        for kind, cell in sorted({(one.kind, cell) for one in fleet.findings for cell in one.cells}):
+        for kind, cell in sorted({(state.kind, cell) for state in fleet.findings for cell in state.cells}):
             finding.add_metric(_labels(kind, cell), 1)
         yield finding

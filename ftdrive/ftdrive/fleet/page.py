@@ -1,4 +1,4 @@
-"""The state of a fleet as one HTML page without a link to anything outside it."""
+"""The state of a fleet as a self-contained HTML page."""
 
 from datetime import datetime
 
@@ -10,12 +10,12 @@ from ftdrive.fleet.state import Fleet, attention, summary, times_in_words
 from ftdrive.report.page import templates, with_code
 
 WIDTH, HEIGHT, MARGIN = 220, 44, 3
-# Half the height of a plot, unless the bias has changed by more.
+# Smallest range of a plot, in sigmas to each side.
 LEAST_SIGMAS = 4.0
 
 
 def fleet_page(fleet: Fleet, observed: Observed, store: str) -> str:
-    """Write the page; `store` is the name of the store. Raises `ConfigError` without the extra `fleet`."""
+    """Return the page; `store` is the name of the store. Raises `ConfigError` without the extra `fleet`."""
     environment = templates("ftdrive.fleet", "the page of a fleet", "fleet", "--json")
     from markupsafe import Markup
 
@@ -40,11 +40,11 @@ def fleet_page(fleet: Fleet, observed: Observed, store: str) -> str:
 
 
 def _bias_plot(changes: Changes, start: datetime, now: datetime) -> str:
-    """Draw the changes of the six biases over the last 90 days as SVG, in sigmas of each verification.
+    """Return a plot of the six changes of the bias in the last 90 days as SVG, in sigmas of each verification.
 
-    Force is drawn in one colour, torque in another; the gray band is two sigmas to both sides.
+    Force and torque have different colours; the grey band is ±2 sigmas.
     """
-    # Lines in SVG: matplotlib is too slow for 200 plots.
+    # Plain SVG, because matplotlib is too slow for 200 plots.
     first = (now - WINDOW - start).total_seconds() / 86400
     x = MARGIN + (changes["t_days"] - first) / WINDOW.days * (WIDTH - 2 * MARGIN)
     sigmas = changes["change"] / changes["sigma"]

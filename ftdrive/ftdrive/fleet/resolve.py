@@ -1,6 +1,6 @@
-"""Solve runs again with this version, and compare each result with the run's own calibration.
+"""Solve runs again with this version, and compare each result with the calibration of the run.
 
-solved-<version>.json   ftdrive.calibration/2, in the run folder: the result of that version. It never replaces the
+solved-<version>.json   ftdrive.calibration/2, in the run folder: the result of that version, which never replaces the
                         calibration of the run.
 """
 
@@ -39,17 +39,17 @@ from ftdrive.runs.run import IN_MOTION, Run
 from ftdrive.runs.source import circumstances_of, solve_in_motion
 
 CHANGED_SIGMAS: Final = 3.0
-# Files of a run from which its result is made.
+# Files of a run that are needed to solve it.
 _FILES: Final = ("run.json", "events.ndjson", "dataset*.json", "calibration*.json", "motion*.npz", "motion/*.npz")
 
 
 def solved_path(folder: Path) -> Path:
-    """Return where the result of this version is kept in a run folder."""
+    """Return the path of the result of this version in a run folder."""
     return folder / f"solved-{__version__}.json"
 
 
 def is_calibration(folder: Path, since: datetime | None) -> bool:
-    """Return whether a run is a calibration since that time; True for a damaged one too, so that it is reported."""
+    """Return whether a run is a calibration made since a time; also True for a damaged run, so that it is reported."""
     try:
         header = Run(folder).header()
         recent = since is None or datetime.fromisoformat(header["created_utc"]) >= since
@@ -58,16 +58,16 @@ def is_calibration(folder: Path, since: datetime | None) -> bool:
     return recent and header.get("command") != "verify"
 
 
-def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[str], object]) -> list[Path]:
+def runs_to_solve(folders: Iterable[Path], since: datetime | None, say: Callable[[str], object]) -> list[Path]:
     """Return the calibrations among these runs.
 
-    Those without a dataset or a recording in motion are left out; `say` takes how many, and how to finish them.
+    Runs without a dataset or a recording in motion are left out; `say` receives their number, and how to finish them.
     """
     runs, unfinished = list[Path](), Counter[str]()
-    for run in found:
+    for run in folders:
         if is_calibration(run, since):
             if run.is_dir() and not (Run(run).dataset_path.exists() or Run(run).in_motion):
-                finish = "`ftdrive calibrate --resume RUN` finishes one"
+                finish = "finish each with `ftdrive calibrate --resume RUN`"
                 with suppress(BadDataset, OSError):
                     if (mode := Run(run).mode) in IN_MOTION:
                         finish = f"start again with `ftdrive calibrate --{mode}`"
@@ -75,35 +75,35 @@ def runs_to_solve(found: Iterable[Path], since: datetime | None, say: Callable[[
             else:
                 runs.append(run)
     for words, count in unfinished.items():
-        say(f"Left out, because they have no data to solve: {count} runs; {words}.")
+        say(f"Runs left out because they have no data to solve: {count}; {words}.")
     return runs
 
 
 def solve_run(folder: Path, version: str = __version__) -> bytes:
-    """Return the calibration file of a run: a pure function of its files and of the installed versions.
+    """Return the calibration file of a run, which depends only on the files of the run and the installed versions.
 
-    Raises `OtherVersion` in a worker of another version, `BadDataset`, `BadCalibration` or `OSError` for a file of the
-    run that is damaged or missing, and `NotObservable`.
+    Raises `OtherVersion` in a worker with another version; `BadDataset`, `BadCalibration` or `OSError` for a damaged or
+    missing file of the run; and `NotObservable`.
     """
     require_version(version)
     run = Run(folder)
-    same = {name: found for name, found in versions().items() if name in SAME}
+    same = {name: version for name, version in versions().items() if name in SAME}
     if run.in_motion:
         result, created_utc = solve_in_motion(run), run.header().get("created_utc")
-        kept = {name: value for name, value in result.provenance.items() if name != "argv"}
-        result = replace(result, provenance={**kept, "created_utc": created_utc, "versions": same})
+        origin = {name: value for name, value in result.provenance.items() if name != "argv"}
+        result = replace(result, provenance={**origin, "created_utc": created_utc, "versions": same})
     else:
-        found, own = circumstances_of(run), run.header()
+        known, own = circumstances_of(run), run.header()
         if run.calibration_path.is_file():
             own = CalibrationResult.load(run.calibration_path).provenance
-        provenance = {"created_utc": own.get("created_utc"), **found.origin, "versions": same}
+        provenance = {"created_utc": own.get("created_utc"), **known.origin, "versions": same}
         poses = CalibrationDataset.from_dict(read_object(run.dataset_path, BadDataset))
-        result = solve(poses, run.method, g_m_s2=found.g_m_s2, setup=found.setup, provenance=provenance)
+        result = solve(poses, run.method, g_m_s2=known.g_m_s2, setup=known.setup, provenance=provenance)
     return (json.dumps(result.to_dict(), allow_nan=False, indent=1) + "\n").encode()
 
 
 def _solve_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
-    """Solve a run on another computer, as `solve_run`."""
+    """Solve a run from the contents of its files, on another computer; otherwise as `solve_run`."""
     with TemporaryDirectory(prefix="ftdrive-solve-", dir=folder_of_worker()) as place:
         for path, content in files.items():
             file = Path(place, name, path)
@@ -114,17 +114,17 @@ def _solve_files(name: str, files: Mapping[str, bytes], version: str) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The result of this version beside the calibration of the run."""
+    """Comparison of the result of this version with the calibration of the run."""
 
     verdict_before: str | None
-    """None: the run has no calibration of these poses, because it was rejected or not observable."""
+    """Verdict of the calibration of the run; None if it was rejected or not observable, and so not saved."""
     verdict: str
     finding: Finding | None
-    """The first one of the new verdict; None for a good one."""
+    """First finding of the new result; None if its verdict is good."""
     parameter: str
-    """The one of `ftcalib.model.PARAMETER_NAMES` that changed most."""
+    """Parameter of `ftcalib.model.PARAMETER_NAMES` with the largest change."""
     sigmas: float
-    """Its change in sigmas of both results; infinite for a value that both take as known."""
+    """Change of this parameter in sigmas of both results; infinite for a value that both results take as known."""
 
     @property
     def has_changed(self) -> bool:
@@ -133,16 +133,15 @@ class Comparison:
 
     @property
     def has_other_verdict(self) -> bool:
-        """Whether the verdict differs; no calibration counts as rejected."""
+        """Whether the verdict differs; a missing calibration is treated as rejected."""
         return self.verdict != (self.verdict_before or "rejected")
 
 
 def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Path, Comparison | str]]:
-    """Solve runs and write their results as they come; yield each folder with the comparison, or why it failed.
+    """Solve runs and save each result when it is ready; yield each folder with the comparison, or the error text.
 
-    A run that has the result of this version is only compared, and comes first. A file is written whole or not at all,
-    so everything that was yielded remains when the caller stops. Raises `OtherVersion` if a worker has another
-    version.
+    Runs that already have a result of this version come first and are only compared. All yielded results are saved,
+    even if the caller stops. Raises `OtherVersion` if a worker has another version.
     """
     rest = list[Path]()
     for folder in folders:
@@ -154,9 +153,9 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
     def call_of(folder: Path) -> Call:
         if workers.share_files:
             return solve_run, folder, __version__
-        circumstances_of(Run(folder))  # damage is reported here, because the worker has another path
-        found = {file for pattern in _FILES for file in folder.glob(pattern)}
-        files = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(found)}
+        circumstances_of(Run(folder))  # report damage here, because the paths of the worker mean nothing to the user
+        paths = {file for pattern in _FILES for file in folder.glob(pattern)}
+        files = {file.relative_to(folder).as_posix(): file.read_bytes() for file in sorted(paths)}
         return _solve_files, folder.name, files, __version__
 
     for folder, answer in answers(call_of, rest, workers):
@@ -166,7 +165,7 @@ def solve_again(folders: Iterable[Path], workers: Workers) -> Iterator[tuple[Pat
 
 
 def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
-    """Write the result if it is new; compare it with the newest calibration of the run, if the poses are the same."""
+    """Save a new result, and compare it with the newest calibration of the run if that has the same data."""
     try:
         if document is not None:
             write_new(solved_path(folder), document)
@@ -183,13 +182,13 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
 
 
 def _data_hash(result: CalibrationResult) -> object:
-    """Return the hash of the poses, or of the recording in motion, from which a result was made."""
+    """Return the hash of the poses, or of the recording in motion, of a result."""
     return result.provenance.get("dataset_sha256") or result.provenance.get("recording_sha256")
 
 
 @dataclass(slots=True)
 class SolvedAgain:
-    """What solving again has shown, by run."""
+    """Summary of solving runs again."""
 
     runs: int
     solved_before: int
@@ -198,27 +197,27 @@ class SolvedAgain:
     other_verdict: list[dict[str, Any]] = field(default_factory=list)
     failed: list[dict[str, Any]] = field(default_factory=list)
 
-    def add(self, run: Path, found: Comparison | str) -> None:
-        """Add what `solve_again` yields."""
+    def add(self, run: Path, outcome: Comparison | str) -> None:
+        """Add an outcome of `solve_again`."""
         here = {"run": str(run)}
-        if isinstance(found, str):
-            self.failed.append({**here, "reason": found})
+        if isinstance(outcome, str):
+            self.failed.append({**here, "reason": outcome})
             return
-        if found.has_changed:
-            sigmas = found.sigmas if isfinite(found.sigmas) else None
-            self.changed.append({**here, "parameter": found.parameter, "sigmas": sigmas})
-        if found.has_other_verdict:
-            finding = None if found.finding is None else found.finding.to_dict()
-            verdicts = {"before": found.verdict_before, "now": found.verdict, "finding": finding}
+        if outcome.has_changed:
+            sigmas = outcome.sigmas if isfinite(outcome.sigmas) else None
+            self.changed.append({**here, "parameter": outcome.parameter, "sigmas": sigmas})
+        if outcome.has_other_verdict:
+            finding = None if outcome.finding is None else outcome.finding.to_dict()
+            verdicts = {"before": outcome.verdict_before, "now": outcome.verdict, "finding": finding}
             self.other_verdict.append({**here, **verdicts})
-        self.unchanged += not (found.has_changed or found.has_other_verdict)
+        self.unchanged += not (outcome.has_changed or outcome.has_other_verdict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return it as JSON."""
+        """Return the summary as JSON."""
         return {"schema_version": 1, "version": __version__, **asdict(self)}
 
     def lines(self) -> Iterator[str]:
-        """Yield the counts, and a line for each run that changed, has another verdict, or failed."""
+        """Yield the counts, and one line per run that changed, has another verdict, or failed."""
         now = self.runs - self.solved_before - len(self.failed)
         yield (
             f"{counted(self.runs, 'run')} with ftdrive {__version__}: {now} solved now, {self.solved_before} before, "
@@ -228,11 +227,11 @@ class SolvedAgain:
             f"{self.unchanged} unchanged, {len(self.changed)} changed by more than 3 sigmas, "
             f"{len(self.other_verdict)} with another verdict."
         )
-        for one in self.changed:
-            how = "was known and differs" if one["sigmas"] is None else f"changed by {one['sigmas']:+.1f} sigmas"
-            yield f"changed: {one['run']}: {one['parameter']} {how}"
-        for one in self.other_verdict:
-            why = f" ({one['finding']['words']})" if one["finding"] else ""
-            yield f"verdict: {one['run']}: {one['before'] or 'no result'} before, now {one['now']}{why}"
-        for one in self.failed:
-            yield f"failed: {one['run']}: {one['reason']}"
+        for entry in self.changed:
+            how = "was known and differs" if entry["sigmas"] is None else f"changed by {entry['sigmas']:+.1f} sigmas"
+            yield f"changed: {entry['run']}: {entry['parameter']} {how}"
+        for entry in self.other_verdict:
+            why = f" ({entry['finding']['words']})" if entry["finding"] else ""
+            yield f"verdict: {entry['run']}: {entry['before'] or 'no result'} before, now {entry['now']}{why}"
+        for entry in self.failed:
+            yield f"failed: {entry['run']}: {entry['reason']}"

@@ -1,8 +1,8 @@
-"""The state of each cell, from its newest calibrations and their verifications, and what several cells show together.
+"""The state of each cell from its newest calibrations and verifications, and findings across cells.
 
-Together they show wrong payloads, moved bases, late verifications, and biases that follow the temperature. Within the
-verifications of one calibration, a component of the bias is d = a + b t + c T + e, with the time t, so that seasons and
-drift do not count, and the temperature T of the sensor. The calibrations of one sensor share c.
+The findings are wrong payloads, moved bases, late verifications, refused weighings, and biases that depend on the
+temperature. In the verifications of one calibration, the model of a bias component is d = a + b t + c T + e, with
+sensor temperature T; the time t absorbs seasons and drift. All calibrations of one sensor have the same c.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -23,18 +23,18 @@ from ftdrive.runs.verification import VerificationRecord
 from ftdrive.store.records import StoredCell, StoredResult
 from ftdrive.store.store import Store
 
-# The level of a drift is the mean of the verifications of the last week.
+# The level of a drift is the mean over the verifications of the last week.
 LEVEL_DAYS: Final = 7.0
 COMPONENTS: Final = tuple(f"{name} bias {axis}" for name in ("force", "torque") for axis in "xyz")
 
 
 def fleet_state(store: Store, now: datetime) -> Fleet:
-    """Return the state of all cells of a store, and what they show together; raises `BadStore`."""
+    """Return the states of all cells of a store, and the findings across them; raises `BadStore`."""
     return fleet_of(Observed.read(store, now), store)
 
 
 def fleet_of(observed: Observed, store: Store) -> Fleet:
-    """Return the state of what was read; the store is asked for verifications older than that."""
+    """Return states and findings of the contents of a store, which is queried again for older verifications."""
     states = list[CellState]()
     for cell in observed.cells:
         found = [_cell_state(cell, one, observed, store) for one in observed.newest(cell)]
@@ -45,7 +45,7 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
 
 
 def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
-    """Return the drift of a bias since its calibration at `start`; None with too few verifications."""
+    """Return the drift of the bias since its calibration at `start`; None with too few verifications."""
     if changes is None:
         return None
     t_days, change, sigma = changes["t_days"], changes["change"], changes["sigma"]
@@ -62,14 +62,14 @@ def _drift_of(changes: Changes | None, start: datetime) -> BiasDrift | None:
     others = int(onset.found.sum()) - 1
     more = f", and {others} more {'component' if others == 1 else 'components'}" if others else ""
     size = to_place_of(rate, abs(rate))
-    words = f"{COMPONENTS[k]} drifts by {size} {unit} a week since {since:%Y-%m-%d}{more}"
+    words = f"{COMPONENTS[k]} drifts by {size} {unit} per week since {since:%Y-%m-%d}{more}"
     return BiasDrift(level, found=True, words=words)
 
 
 def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, store: Store) -> CellState:
     calibrated = when(result)
     check: VerificationRecord | None = next(reversed(observed.checks.get(result.id, ())), None)
-    if check is None and calibrated < observed.now - WINDOW:  # its verifications may be too old to be read with it
+    if check is None and calibrated < observed.now - WINDOW:  # its verifications may be older than those read
         check = store.last_verification(result.id)
     verified = None if check is None or check.created_utc is None else when(check)
     temperatures = (None if check is None else check.temperature_C, result.temperature_C)
@@ -95,23 +95,23 @@ def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, stor
 
 
 SIGMAS: Final = 4.0
-# Centres of mass of one tool are alike within the first, that of a payload is wrong from the second on; or 4 sigma,
-# if that is more.
+# Centres of mass of one tool agree within the first distance, and that of a payload is wrong beyond the second one; or
+# within and beyond 4 sigma, if that is larger.
 ALIKE_M, WRONG_M = 0.003, 0.005
-# Likewise masses. A mass is wrong by the larger of share and kg.
+# The corresponding limits of the masses; a mass is wrong beyond the larger one of share and kg.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
-# Mass of sensor and adapter, which a payload includes and the identified mass does not.
+# Largest mass of sensor and adapter, which the payload includes but the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
 TILTED_RAD: Final = np.deg2rad(0.1)
-# Added to the sigma of a tilt: postures of an arm bend it differently.
+# Added to the sigma of a tilt, because the arm bends differently in each posture.
 TILT_FLOOR_RAD: Final = np.deg2rad(0.02)
-# Largest p-value of a turned base: one in 50 fleets of 200 cells shows one by chance.
+# Significance level of a turned base: a false finding in one of 50 fleets of 200 cells.
 SURE: Final = 1e-4
-# A verification that is due today is not late yet.
+# Tolerance after the due time of a verification.
 LATE: Final = timedelta(days=1)
-# With fewer on a day no share of refusals is worth a word.
+# Smallest number of weighings per day for a finding about refusals.
 MANY_WEIGHINGS: Final = 10
-# Refusals of earlier days are past.
+# Age of the oldest refusals that are reported.
 RECENT: Final = timedelta(days=3)
 
 
@@ -135,9 +135,9 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
         due, worst = min(late)
         cells = tuple(sorted({cell for _, cell in late}))
         days = (observed.now - due).days
-        what = f"The verification of {worst} is late by {days} d"
+        what = f"The verification of {worst} is {days} d late"
         if len(cells) > 1:
-            what = f"The verifications of {join_names(cells)} are late, that of {worst} by {days} d"
+            what = f"The verifications of {join_names(cells)} are late, the one of {worst} by {days} d"
         yield FleetFinding("overdue", cells, f"{what}: run `ftdrive fleet verify --due`")
 
 
@@ -145,7 +145,7 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
 
 
 def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
-    """Yield the cells that could not weigh most parts of their last day."""
+    """Yield findings about cells that refused most weighings of their last day."""
     first = (observed.now - RECENT).date().isoformat()
     for one in states:
         if one.weighings is None or one.weighings.day < first:
@@ -153,12 +153,12 @@ def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Itera
         refused = sum(one.weighings.refusals.values())
         tried = refused + one.weighings.weighings
         if tried >= MANY_WEIGHINGS and 2 * refused > tried:
-            code = max(one.weighings.refusals.items(), key=lambda found: found[1])[0]
+            code = max(one.weighings.refusals.items(), key=lambda item: item[1])[0]
             yield FleetFinding(
                 "weighing",
                 (one.cell,),
                 f"{one.cell}: {refused} of {tried} weighings with {one.tool or 'its tool'} were refused on "
-                f"{one.weighings.day}, mostly as '{code}': run `ftdrive weigh` there to see why",
+                f"{one.weighings.day}, mostly because of '{code}': run `ftdrive weigh` at this cell to see why",
             )
 
 
@@ -166,9 +166,9 @@ def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Itera
 
 
 def _bases(observed: Observed) -> Iterator[FleetFinding]:
-    """Yield the cells whose base has turned between the newest calibration and the one before.
+    """Yield findings about bases that have turned between the last two calibrations.
 
-    An update that copies the direction of gravity shows nothing.
+    Updates, which copy the direction of gravity, are skipped.
     """
     for name, results in observed.results.items():
         seen = list[StoredResult]()
@@ -183,13 +183,13 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
                         (name,),
                         f"{name}: gravity has turned by {np.rad2deg(angle):.2f}° in the base between the calibrations "
                         f"of {when(one):%Y-%m-%d} and {when(seen[0]):%Y-%m-%d}: check the bolts and the frame under "
-                        "the base, then calibrate its other tools again",
+                        "the base, then calibrate the other tools of the cell again",
                     )
                 break
 
 
 def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
-    """Return the angle in rad between two directions of gravity, and its p-value if the base has not moved."""
+    """Return the angle between the gravity directions of two results, rad, and its p-value for a fixed base."""
     weights = [one.parameters.weight_N for one in (before, after)]
     if not min(weights) > 0:
         return 0.0, 1.0
@@ -210,21 +210,21 @@ def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Load:
-    """A tool as one cell has identified it, and as its controller has it."""
+    """A tool as identified in one cell, with the payload of its controller."""
 
     cell: str
     mass_kg: float
     mass_sigma_kg: float
-    # (2,) identified centre of mass of the tool, flange axes.
+    # (2,) identified centre of mass of the tool off the flange axis, flange axes.
     off_axis_m: Array
     off_axis_sigma_m: Array
     payload_kg: float
-    # (2,) the centre that the payload amounts to, if sensor and adapter are centred on the axis of the flange.
+    # (2,) centre of mass of the tool that the payload implies, if sensor and adapter are centred on the flange axis.
     configured_off_axis_m: Array | None
 
 
 def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFinding]:
-    """Yield the tools that several cells identify alike, and whose controllers have another mass or centre."""
+    """Yield findings about tools on which several cells agree, but whose payloads have another mass or centre."""
     tools = dict[str, list[_Load]]()
     for cell, one in newest:
         if one.tool is not None and one.payload_kg is not None and one.mass_kg > 0:
@@ -236,10 +236,10 @@ def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFindi
 
 
 def _tool_load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
-    """Sensor and adapter drop out of the moment about the axis, whatever their mass and height."""
+    """Return a tool with its payload; centred sensors and adapters do not change the moment about the flange axis."""
     R, covariance = one.parameters.R_flange_sensor, one.covariance
     arm_m = R @ one.parameters.p_sensor_com_m
-    J = np.concatenate([-skew(arm_m), R], axis=1)  # by the rotation about the flange axes, and by the centre
+    J = np.concatenate([-skew(arm_m), R], axis=1)  # derivative by rotation about the flange axes, and by the centre
     rows = np.r_[0:3, 9:12]
     sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))
     com = one.payload_com_m
@@ -259,8 +259,8 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     yield from _wrong_payloads(
         wrong,
         lambda first, cells: (
-            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis in {cells} alike. "
-            f"The payloads of their controllers amount to others, such as {_mm(first.configured_off_axis_m)} mm"
+            f"The tool {tool} has its centre of mass {_mm(centre)} mm off the flange axis, according to {cells}. "
+            f"The payloads of their controllers imply other centres, such as {_mm(first.configured_off_axis_m)} mm"
         ),
     )
 
@@ -277,19 +277,19 @@ def _mass_findings(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
     yield from _wrong_payloads(
         wrong,
         lambda first, cells: (
-            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter in {cells} alike. "
-            f"The payloads of their controllers do not agree, such as {first.payload_kg:.2f} kg"
+            f"The tool {tool} weighs {mass_kg:.2f} kg without sensor and adapter, according to {cells}. "
+            f"The payloads of their controllers disagree, such as {first.payload_kg:.2f} kg"
         ),
     )
 
 
 def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[FleetFinding]:
-    """Yield a finding of several loads; `words` takes the first of them and the names of all cells."""
-    # One wrong payload is a finding of its own calibration, so this needs two cells or a reference.
+    """Yield a finding about two or more loads; `words` describes the first one and the names of all cells."""
+    # A single wrong payload is a finding of its own calibration.
     loads = sorted(wrong, key=lambda one: one.cell)
     if len(loads) > 1:
         cells, first = tuple(one.cell for one in loads), loads[0]
-        fix = "set them with `ftdrive push`"
+        fix = "set the payloads with `ftdrive push`"
         yield FleetFinding("payload", cells, f"{words(first, join_names(cells))} in {first.cell}: {fix}")
 
 
@@ -301,16 +301,16 @@ def _mm(point_m: Array | None) -> str:
     return "-" if point_m is None else "(" + ", ".join(f"{1e3 * value + 0.0:.0f}" for value in point_m) + ")"
 
 
-# Largest p-value of one component of one sensor: in one of 80 fleets of 200 sensors one follows by chance, and two are
-# needed.
+# Significance level per component and sensor: in one of 80 fleets of 200 sensors, one sensor exceeds it by chance, and
+# a finding needs two sensors.
 SURE_OF_TEMPERATURE: Final = 1e-5
-# Verifications of a calibration.
+# Smallest number of verifications of a calibration.
 FEWEST: Final = 8
 
 
 @dataclass(slots=True, eq=False)
 class _SensorSums:
-    """Sums over the calibrations of one sensor, (6,) each, and its cells."""
+    """Sums (6,) over the calibrations of one sensor, and the cells of the sensor."""
 
     cells: set[str]
     xx: Array
@@ -320,7 +320,7 @@ class _SensorSums:
 
 
 def _temperature_findings(observed: Observed) -> Iterator[FleetFinding]:
-    """Yield the models of which two sensors or more follow their temperature."""
+    """Yield findings about sensor models with two or more sensors whose bias depends on temperature."""
     models = dict[str, dict[str, _SensorSums]]()
     for cell in observed.cells:
         for result in observed.results[cell.name]:
@@ -336,18 +336,18 @@ def _add(sensors: dict[str, _SensorSums], serial: str, cell: str, changes: Chang
     T = changes["temperature_C"]
     if not spans_temperature(T, FEWEST):
         return
-    found = sensors.setdefault(serial, _SensorSums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
-    found.cells.add(cell)
-    found.dof += len(T) - 3
+    sums = sensors.setdefault(serial, _SensorSums(set(), np.zeros(6), np.zeros(6), np.zeros(6)))
+    sums.cells.add(cell)
+    sums.dof += len(T) - 3
     weight = 1 / changes["sigma"].T  # (6, n)
     base = np.stack([np.ones_like(T), changes["t_days"] - changes["t_days"].mean()], axis=1)
     Q, _ = np.linalg.qr(weight[..., None] * base)  # (6, n, 2)
     x, y = (
         part - (Q @ (Q.swapaxes(1, 2) @ part[..., None]))[..., 0] for part in (weight * T, weight * changes["change"].T)
     )
-    found.xx += np.sum(x * x, axis=1)
-    found.xy += np.sum(x * y, axis=1)
-    found.yy += np.sum(y * y, axis=1)
+    sums.xx += np.sum(x * x, axis=1)
+    sums.xy += np.sum(x * y, axis=1)
+    sums.yy += np.sum(y * y, axis=1)
 
 
 def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFinding]:
@@ -366,14 +366,14 @@ def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFi
     yield FleetFinding(
         "temperature",
         cells,
-        f"The bias of {len(following)} of {len(sensors)} sensors {model} follows their temperature, by up to "
-        f"{size} a kelvin (in {join_names(cells)}): let them warm up before a calibration, and tare them at "
-        "the temperature of the work",
+        f"The bias of {len(following)} of {len(sensors)} sensors {model} depends on their temperature, by up to "
+        f"{size} per kelvin (in {join_names(cells)}): let them warm up before a calibration, and tare them at "
+        "their working temperature",
     )
 
 
 def _p_values(sums: _SensorSums) -> Array:
-    """Return p of each component (6,): the larger of those against the stated sigmas and against the scatter."""
+    """Return the p-value (6,) of each component: the larger one of a chi-squared test and an F-test."""
     usable = sums.xx > 0
     chi2 = np.where(usable, sums.xy**2 / np.where(usable, sums.xx, 1.0), 0.0)
     rest = np.maximum(sums.yy - chi2, 1e-12) / sums.dof

@@ -1,4 +1,4 @@
-"""Processes of this computer, or the workers of a Dask cluster: both take calls and give futures."""
+"""Workers that run calls: processes of this computer, or the workers of a Dask cluster."""
 
 import logging
 import os
@@ -21,39 +21,38 @@ from ftdrive.errors import ConfigError
 from ftdrivers.errors import StreamBroken, Unreachable
 from ftdrivers.installation import missing_extra
 
-# For a scheduler to answer, and for its first worker.
+# Time-out for the answer of a scheduler, and for its first worker, s.
 CONNECT_S: Final = 10.0
-# Without an answer, before the workers are counted again.
+# Time without an answer after which the workers are counted again, s.
 CHECK_S: Final = 5.0
-# Packages whose versions a cluster must share, because the last digits depend on them.
+# Packages whose versions must be equal in a cluster, because the last digits depend on them.
 SAME: Final = ("ftdrive", "numpy", "scipy")
 
-# More threads than cores are slow, and their number can change the last digits.
-# One BLAS thread also for one worker, so that all bytes are equal.
+# One BLAS thread per worker: more threads than cores are slow, and their number can change the last digits.
 _ONE_THREAD: Final = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "OPENBLAS", "MKL")}
 _LOGS: Final = ("distributed", "distributed.client", "tornado.application")
-# Messages that a client keeps for developers of Dask: 1000 by default, with their datasets 130 MB.
+# Length of the client's log for developers of Dask; the default of 1000 messages with datasets needs 130 MB.
 _SHORT_LOG: Final = {"distributed.admin.low-level-log-length": 10}
-# A recording of 40 s at 1 kHz exceeds the default, and its warning means nothing to a user.
+# A recording of 40 s at 1 kHz exceeds the default threshold of a warning that does not help users.
 _LARGE_CALLS: Final = {"distributed.admin.large-graph-warning-threshold": "1TB"}
-_DIED: Final = "each worker that was given it died: `ftdrive solve` may show the cause"
+_DIED: Final = "every worker that solved this run died: run `ftdrive solve` on it to see the cause"
 
-# What a call returned or raised.
+# Return value or exception of a call.
 Answer = bytes | BaseException
 # A function and its arguments.
 Call = tuple[Callable[..., bytes], *tuple[Any, ...]]
 
 
 class WorkerDied(FtdriveError):
-    """Each worker that was given this call ended without an answer."""
+    """Raised if every worker that received a call ended without an answer."""
 
 
 class OtherVersion(ConfigError):
-    """A worker has another version of ftdrive than the computer that calls it."""
+    """Raised if a worker has another version of ftdrive than the calling computer."""
 
 
 def require_version(version: str) -> None:
-    """Raise `OtherVersion`, in a worker, unless it has this version of ftdrive."""
+    """Raise `OtherVersion` in a worker without this version of ftdrive."""
     if version != __version__:
         raise OtherVersion(
             f"a worker has ftdrive {__version__}, but this computer has ftdrive {version}: install the same version on "
@@ -62,7 +61,7 @@ def require_version(version: str) -> None:
 
 
 def folder_of_worker() -> str | None:
-    """Return the folder of a Dask worker, which Dask removes also if the worker was killed; None elsewhere."""
+    """Return the folder of a Dask worker, which Dask removes even if the worker is killed; None in other processes."""
     try:
         from distributed import get_worker
 
@@ -72,32 +71,32 @@ def folder_of_worker() -> str | None:
 
 
 def describe_error(error: BaseException) -> str:
-    """Return why a call failed."""
+    """Describe the error of a call."""
     expected = isinstance(error, FtdriveError | OSError)
     return str(error) if expected else f"unexpected {type(error).__name__}: {error}"
 
 
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """Where calls run at once."""
+    """Workers that run several calls at a time."""
 
     count: int
     submit: Callable[..., "Future[bytes]"]
-    """Takes a function and its arguments."""
+    """Starts a call; its arguments are a function and the arguments of the function."""
     death: type[Exception]
-    """Exception of a future whose worker ended without an answer."""
+    """Exception of a future whose worker has died."""
     share_files: bool = False
-    """Whether a path means the same file to each worker."""
+    """Whether all workers have the same file system."""
     require_one: Callable[[], None] = lambda: None
-    """Raises `StreamBroken` if none is left, so that no call would ever be answered."""
+    """Raises `StreamBroken` if no worker is left."""
 
 
 @contextmanager
 def local_workers(count: int | None = None) -> Iterator[Workers]:
-    """Start processes, by default one for each core that this program may use; they end with the context, at once."""
+    """Yield worker processes, by default one per usable core; they end at once with the context."""
     if count is None:
         count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    context = get_context("spawn")  # a fork would copy threads, and numpy with its threads
+    context = get_context("spawn")  # a fork would copy the state of running threads
     lifeline, ours = context.Pipe(duplex=False)
     new_pool = partial(ProcessPoolExecutor, count, context, _begin_worker, (lifeline,))
     pool = new_pool()
@@ -119,13 +118,13 @@ def local_workers(count: int | None = None) -> Iterator[Workers]:
 
 
 def _begin_worker(lifeline: Connection) -> None:
-    """Prepare a process: one thread of BLAS, Ctrl-C is left to the parent, and the end of the parent ends it too."""
+    """Initialize a worker process: one BLAS thread, no reaction to Ctrl-C, and end with the parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.environ |= _ONE_THREAD  # numpy is not imported yet
 
     def end() -> None:
         try:
-            lifeline.poll(None)  # until the parent closes its end, or was killed
+            lifeline.poll(None)  # until the parent closes its end or is killed
         finally:
             os._exit(1)
 
@@ -134,13 +133,13 @@ def _begin_worker(lifeline: Connection) -> None:
 
 @contextmanager
 def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[Workers]:
-    """Connect to the Dask cluster of a scheduler, dask://HOST:PORT.
+    """Yield the workers of the Dask cluster at a scheduler address dask://HOST:PORT.
 
-    Raises `ConfigError` for another form, or a worker with another version of ftdrive, numpy or scipy; `Unreachable`
-    if no scheduler answers there, or it has no worker; `StreamBroken` if it was lost while calls were running.
+    Raises `ConfigError` for another form of address, or a worker with another version of ftdrive, numpy or scipy;
+    `Unreachable` if no scheduler answers or it has no worker; `StreamBroken` if the cluster is lost during calls.
     """
-    found = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
-    if found is None:
+    match = re.fullmatch(r"dask://([^/:@]+|\[[0-9a-fA-F:]+\]):(\d{1,5})/?", address)
+    if match is None:
         raise ConfigError(f"--cluster is '{address}': give the address of a Dask scheduler, such as dask://host:8786")
     try:
         import distributed
@@ -148,26 +147,28 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
     except ModuleNotFoundError as error:
         raise ConfigError(missing_extra("`fleet`", error.name or "", "fleet")) from None
     for name in _LOGS:
-        # A lost cluster is one sentence, not several tracebacks.
+        # A lost cluster is reported in one sentence, not by several tracebacks.
         logging.getLogger(name).setLevel(logging.CRITICAL)
-    dask: Any = distributed  # most of it has no types
+    dask: Any = distributed  # mostly without type annotations
     try:
         with config.set(_SHORT_LOG):
-            client = dask.Client(f"tcp://{found[1]}:{found[2]}", timeout=timeout_s, set_as_default=False)
-    # The answer of another server may look like a huge length.
+            client = dask.Client(f"tcp://{match[1]}:{match[2]}", timeout=timeout_s, set_as_default=False)
+    # The answer of another kind of server may be read as a huge length.
     except (OSError, ValueError, MemoryError) as error:
         raise Unreachable(
-            f"no Dask scheduler answers at {address} ({error})", "start it, or correct --cluster"
+            f"no Dask scheduler answers at {address} ({error})", "start the scheduler, or correct --cluster"
         ) from error
     with config.set(_LARGE_CALLS), client:
-        start = f"start one: dask worker tcp://{found[1]}:{found[2]} --nthreads 1"
+        start = f"start one: dask worker tcp://{match[1]}:{match[2]} --nthreads 1"
 
-        # `dask worker` starts another one in place of one that died.
+        # `dask worker` replaces a worker that died.
         def require_one() -> None:
             try:
                 client.wait_for_workers(1, timeout=timeout_s)
             except OSError as error:
-                raise StreamBroken(f"the cluster {address} has no worker any more", f"{start}, and repeat") from error
+                raise StreamBroken(
+                    f"the cluster {address} has no worker left", f"{start}, and repeat the command"
+                ) from error
 
         try:
             require_one()
@@ -178,26 +179,29 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
             submit = client.get_executor(pure=False).submit
             yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, require_one=require_one)
         except CancelledError as error:
-            raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
+            raise StreamBroken(
+                f"the cluster {address} was lost", "start the cluster, and repeat the command"
+            ) from error
 
 
-def _require_same_versions(found: Any, address: str) -> None:
-    """Raise `ConfigError` for a worker of another version; `found` is as `distributed.Client.get_versions` has it."""
-    ours = found["client"]["packages"]
-    for worker, theirs in found["workers"].items():
+def _require_same_versions(versions: Any, address: str) -> None:
+    """Raise `ConfigError` for a worker with another version; `versions` is from `distributed.Client.get_versions`."""
+    ours = versions["client"]["packages"]
+    for worker, theirs in versions["workers"].items():
         for name in SAME:
             if (other := theirs["packages"].get(name)) != ours[name]:
                 raise ConfigError(
-                    f"the worker {worker} of the cluster {address} has {name} {other or '(none)'}, this computer has "
+                    f"the worker {worker} of the cluster {address} has {name} {other or '(none)'}, but this computer "
+                    "has "
                     f"{ours[name]}: install {name} {ours[name]} there"
                 )
 
 
 def answers(call_of: Callable[[Path], Call], items: Iterable[Path], workers: Workers) -> Iterator[tuple[Path, Answer]]:
-    """Make a call for each item, when it is its turn so that few are in memory; yield item and answer as they come.
+    """Make one call per item, a few at a time to limit memory; yield item and answer when an answer arrives.
 
-    A call whose worker died is repeated alone, because the death of a process also breaks the calls that run beside it.
-    The cause of a second death is then the call itself.
+    A call whose worker died is repeated alone, because the death of a process also breaks other running calls. A second
+    death is then due to the call itself.
     """
     died = yield from _round(call_of, items, workers, 2 * workers.count)
     died = yield from _round(call_of, died, workers, 1)
@@ -208,7 +212,7 @@ def answers(call_of: Callable[[Path], Call], items: Iterable[Path], workers: Wor
 def _round(
     call_of: Callable[[Path], Call], items: Iterable[Path], workers: Workers, at_once: int
 ) -> Generator[tuple[Path, Answer], None, list[Path]]:
-    """Make each call once, some at a time; return the items whose worker died."""
+    """Make each call once, `at_once` calls at a time; yield the answers, and return the items whose worker died."""
     waiting, running, died = iter(items), dict["Future[bytes]", Path](), list[Path]()
     while True:
         while len(running) < at_once and (item := next(waiting, None)) is not None:

@@ -52,7 +52,7 @@ def warnings(
             change_K = last.temperature_C - newest.temperature_C
             if abs(change_K) > OTHER_TEMPERATURE_K:
                 words = f"{abs(change_K):.0f} K {'warmer' if change_K > 0 else 'colder'}"
-                yield f"{what} was made at {newest.temperature_C:.0f} °C, but {last.run} was {words}: verify it when warm"
+                yield f"{what} was made at {newest.temperature_C:.0f} °C, {last.run} was {words}: verify it when warm"
 
 
 def _series(results: Sequence[StoredResult]) -> Iterator[list[StoredResult]]:

@@ -98,7 +98,7 @@ def _load_result(result: StoredResult, *, accept_edited: bool = False) -> Calibr
 def _of_sensor(
     store: Store, result: StoredResult, results: Iterable[StoredResult]
 ) -> tuple[BiasTemperature | None, Array | None]:
-    """Return the temperature dependence of the sensor's bias, and its change in one hour, from all runs of the sensor."""
+    """Return the temperature dependence of the sensor's bias, and its change in one hour, from all its runs."""
     key = (result.sensor_serial, result.arm_serial, result.mount)
     of_sensor = [other for other in results if (other.sensor_serial, other.arm_serial, other.mount) == key]
     try:

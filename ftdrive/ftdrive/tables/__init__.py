@@ -1,1 +1,1 @@
-"""Tables of other programs: which text, which columns, which units."""
+"""Reading of tables of other programs: text formats, columns and units."""

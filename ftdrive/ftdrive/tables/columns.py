@@ -1,4 +1,4 @@
-"""Which columns of a table hold which signal, and in which units."""
+"""Recognition of the signals in the columns of a table, and of their units."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,7 +12,7 @@ from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftcalib.model import STANDARD_GRAVITY_M_S2
 
 _DEG = 0.017453292519943295
-# Factors to SI by what they measure, without spaces, dots, `·`, `*`, `-` and `^`.
+# Factors to SI units by quantity; the names of units are without spaces, dots, `·`, `*`, `-` and `^`.
 UNITS: Final[Mapping[str, Mapping[str, float]]] = {
     "time": {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9},
     "force": {**FORCE_UNITS_N, "kg": FORCE_UNITS_N["kgf"], "lb": FORCE_UNITS_N["lbf"]},
@@ -29,7 +29,7 @@ UNITS: Final[Mapping[str, Mapping[str, float]]] = {
 }
 COUNTS: Final = ("counts", "count", "cts", "digits")
 _BEHIND = re.compile(r"(?P<name>.+?)(?:\s*[\[(](?P<bracket>[^\])]*)[\])]|_(?P<suffix>[^\W_]+))\s*")
-# A longer name has no unit: the time to look for it grows with the square of the length.
+# Longest name that is searched for a unit, because the search time grows with the square of the length.
 _LONGEST_NAME = 200
 _SUFFIXES: Final = frozenset(
     {*UNITS["time"], *UNITS["torque"], *COUNTS, "N", "mN", "kgf", "lbf", "mm", "cm", "m", "deg", "rad"}
@@ -37,19 +37,19 @@ _SUFFIXES: Final = frozenset(
 
 
 class Layout(NamedTuple):
-    """How one program names its columns."""
+    """Names of the columns in one program."""
 
     program: str
     signals: Mapping[str, str]
-    """Ways to name a signal, with `|` between them; the first one that is complete counts.
+    """Alternative lists of column names by signal, separated by `|`; the first complete list is used.
 
-    Names are in lower case with `_` for all that is no letter or digit. `?` stands for x, y, z, `#` for 0 to 5, and `*`
-    for anything in front, the same in all names of a way.
+    Names are in lower case, with `_` for all other characters than letters and digits. `?` means x, y, z; `#` means 0
+    to 5; `*` is any prefix that is the same in all names of a list.
     """
 
 
 _UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-# One row a program. Where two rows serve a file, the one that names more of its columns counts first.
+# One entry per program. If several entries match a file, the one with the most matching columns has priority.
 LAYOUTS: Final = (
     Layout(
         "ftdrive",
@@ -103,9 +103,9 @@ LAYOUTS: Final = (
             "wrench": "*force_? *torque_?",
             "quaternion": "*orientation_? *orientation_w | *rotation_? *rotation_w",
             "position": "*position_? | *translation_?",
-            "joints": " ".join(f"*{one}_joint_position" for one in _UR_JOINTS)
+            "joints": " ".join(f"*{joint}_joint_position" for joint in _UR_JOINTS)
             + " | "
-            + " ".join(f"*{one}_joint" for one in _UR_JOINTS),
+            + " ".join(f"*{joint}_joint" for joint in _UR_JOINTS),
             "acceleration": "*linear_acceleration_?",
         },
     ),
@@ -140,13 +140,13 @@ LAYOUTS: Final = (
 
 
 class Signal(NamedTuple):
-    """Columns that hold one signal."""
+    """The columns of one signal."""
 
     form: str
     program: str
     columns: Sequence[int]
     units: Sequence[str]
-    """Of each column, as the header writes it; empty where it writes none."""
+    """Unit of each column as in the header; empty without a unit."""
 
 
 class SignalColumns:
@@ -155,11 +155,11 @@ class SignalColumns:
     Parameters
     ----------
     names, units : sequence of str
-        Of the header; an empty unit may stand in the name.
+        Names and units of the header; if a unit is empty, it may be part of the name.
     given : mapping, optional
-        Column of the file, by the names of ftdrive's own layout: ``{"fx": "Force X [N]", "t": "1"}``.
+        Columns of the file by the names of ftdrive: ``{"fx": "Force X [N]", "t": "1"}``.
     in_memory : bool
-        Whether a program has the table, and a message shows its line instead of the option of a command.
+        Whether the table is in memory; messages then show Python code instead of a command option.
 
     Raises
     ------
@@ -193,7 +193,7 @@ class SignalColumns:
         self._layouts = [layout for *_, layout in sorted(ranked, reverse=True, key=lambda one: one[:2])]
 
     def find(self, *signals: str) -> Signal | None:
-        """Return the first of some signals that the table has. Raises `BadDataset` for two candidates."""
+        """Return the first available one of some signals; None without any. Raises `BadDataset` for two candidates."""
         two, line = list[str](), ""
         for layout, signal in product(self._layouts, signals):
             for way in layout.signals.get(signal, "").split("|"):
@@ -204,16 +204,16 @@ class SignalColumns:
                 if found and not two:
                     two = [self.names[one[0][0]] for one in found]
                     line = self.line(signal)
-        if two and signals != ("time",):  # stamps of two topics stand beside the clock of the file
+        if two and signals != ("time",):  # two topics have time stamps besides the clock of the file
             raise BadDataset(f"two candidates, {' and '.join(two[:2])}. Name the columns: {line}")
         return None
 
     def begins(self, signal: str) -> bool:
-        """Whether a part of the columns of a signal is there."""
+        """Return whether the table has at least one column of a signal."""
         return any(self._nearest(layout, signal)[0] for layout in LAYOUTS if signal in layout.signals)
 
     def missing(self, what: str, *signals: str) -> str:
-        """Return the words for a signal that the table lacks: what it has, the nearest layout and the line to type."""
+        """Return an error message about a missing signal: existing columns, nearest layout, and the line to type."""
         near = (self._nearest(layout, one) for layout in LAYOUTS for one in signals if one in layout.signals)
         share, program, missing, signal = max(near, key=lambda one: one[0])
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
@@ -223,7 +223,7 @@ class SignalColumns:
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
 
     def line(self, signal: str) -> str:
-        """Return the option or argument that names the columns of a signal, those filled in that are found."""
+        """Return the option or argument that names the columns of a signal, with the recognised ones filled in."""
         parts = {}
         for key in OWN_NAMES[signal].split():
             found = self._keys.get(key) or self._keys.get(_OTHER_NAMES.get(key, key))
@@ -235,7 +235,7 @@ class SignalColumns:
         return f'--columns "{",".join(f"{key}={name}" for key, name in parts.items())}"'
 
     def _find(self, key: str, column: str) -> tuple[int, str]:
-        """Return the index of a given column and the unit behind it."""
+        """Return index and unit of a column that was given by name or number."""
         column, unit = column.strip(), ""
         if column not in self.names and (match := re.fullmatch(r"(.+?)\s*\[([^\]]*)\]", column)):
             column, unit = match[1], match[2]
@@ -244,12 +244,12 @@ class SignalColumns:
         if not same and column.isdecimal() and 1 <= int(column) <= len(self.names):
             same = [int(column) - 1]
         if len(same) != 1:
-            found = "two columns have this name" if same else f"the columns are {list_names(self.names)}"
-            raise BadDataset(f"--columns {key}={column}: {found}: name a column, or its number from 1")
+            why = "two columns have this name" if same else f"the columns are {list_names(self.names)}"
+            raise BadDataset(f"--columns {key}={column}: {why}: give the name of a column, or its number from 1")
         return same[0], unit or [unit for _, unit in _keys_of(self.names[same[0]])][-1]
 
     def _complete(self, way: str) -> list[list[tuple[int, str]]]:
-        """Return the columns of each prefix for which a way is complete; two columns of one name are two candidates."""
+        """Return the columns for each prefix with a complete list of names; equal names give several candidates."""
         if not (patterns := _written_out(way)):
             return []
         first = patterns[0].removeprefix("*")
@@ -269,7 +269,7 @@ class SignalColumns:
         return complete
 
     def _of_one_case(self, columns: Sequence[list[tuple[int, str]]]) -> list[list[tuple[int, str]]]:
-        """Leave out columns whose name differs in its case from the others: T is an angle beside O and A, t a time."""
+        """Return the columns without those in another letter case: with O and A, T is an angle and t is a time."""
         upper = [self.names[one[0][0]].isupper() for one in columns if len(one) == 1] or [False]
         chosen = [[each for each in one if self.names[each[0]].isupper() == all(upper)] for one in columns]
         return [one if len(every) > 1 and one else list(every) for one, every in zip(chosen, columns, strict=True)]
@@ -296,7 +296,7 @@ class SignalColumns:
         return nearest
 
 
-# What `--columns` calls them.
+# Names of the columns of each signal in `--columns`.
 OWN_NAMES: Final = {
     "time": "t",
     "wrench": "fx fy fz tx ty tz",
@@ -323,14 +323,14 @@ _OTHER_NAMES: Final = {"tx": "mx", "ty": "my", "tz": "mz", "t": "time"}
 
 
 def _normalized(name: str) -> str:
-    """Return a name in lower case, with `_` for all that is no letter or digit."""
+    """Return a name in lower case, with `_` for all other characters than letters and digits."""
     return re.sub(r"[\W_]+", "_", name.lower()).strip("_")
 
 
 def factor(unit: str, kind: str, column: str) -> float | None:
-    """Return the factor of a unit to SI; None for none. Raises `BadDataset` for a unit of another kind.
+    """Return the factor of a unit to SI; None without a unit. Raises `BadDataset` for a unit of another quantity.
 
-    A number before the unit counts: `.82 N` is the unit of a sensor whose scale a known mass has shown.
+    The unit may have a numerical factor: `.82 N` corrects the scale of a sensor that was checked with a known mass.
     """
     if size := re.fullmatch(r"(\d*\.?\d+(?:e[+-]?\d+)?)\s+(\S.*)", unit.strip()):
         return float(size[1]) * (factor(size[2], kind, column) or 1.0)
@@ -339,18 +339,18 @@ def factor(unit: str, kind: str, column: str) -> float | None:
         return None if not text else 1.0
     of_kind = UNITS[kind]
     lower = {name.lower(): value for name, value in of_kind.items() if name != "mN"}
-    found = of_kind.get(text, lower.get(text.lower()))
-    if found is None:
+    size_SI = of_kind.get(text, lower.get(text.lower()))
+    if size_SI is None:
         known = ", ".join(of_kind)
         raise BadDataset(
-            f"column '{column}' has the unit {unit}, which is none of {kind} ({known}). Name it with its unit: "
+            f"column '{column}' has the unit {unit}, which is not a unit of {kind} ({known}). Give the right unit: "
             f'--columns "…={column} [{next(iter(of_kind))}]"'
         )
-    return found
+    return size_SI
 
 
 def _keys_of(name: str) -> Iterator[tuple[str, str]]:
-    """Give the keys of a name with the unit that each leaves: `fx [N]`, `t_ms`, `x (mm)`."""
+    """Yield the possible keys of a name, each with the unit in the name, such as `fx [N]`, `t_ms`, `x (mm)`."""
     match = _BEHIND.fullmatch(name) if len(name) <= _LONGEST_NAME else None
     if match and match["bracket"] is not None and re.search(r"[^\W\d]|°|^$", match["bracket"]):
         yield _normalized(match["name"]), match["bracket"].strip()
@@ -361,7 +361,7 @@ def _keys_of(name: str) -> Iterator[tuple[str, str]]:
 
 
 def _written_out(way: str) -> list[str]:
-    """Write out `?` and `#` of a way."""
+    """Return the names of a list with `?` and `#` expanded."""
     marks = {"?": "xyz", "#": "012345"}
     return [
         word.replace(mark, letter) if mark else word

@@ -1,4 +1,4 @@
-"""Tables of wrenches and poses, from text or from memory, as numbers in the units and frames of the project."""
+"""Tables of wrenches and poses, from text or memory, converted to the units and frames of ftdrive."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,15 +23,15 @@ from ftdrive.tables.columns import COUNTS, UNITS, Signal, SignalColumns, factor
 from ftdrive.tables.text import TextTable, seconds_of
 
 WrenchAxes = Literal["sensor", "flange", "tcp", "base"]
-# Sequences of scipy: capitals turn about axes of the tool, small letters about those of the base.
+# Axis sequences as in scipy: upper case for rotations about tool axes, lower case about base axes.
 _MAKERS: Final = {"rpy": "xyz", "abc": "ZYX", "wpr": "xyz", "oat": "ZYZ"}
-# Axis about which each column turns.
+# Rotation axis of each column.
 _AXES: Final = {"rpy": "xyz", "abc": "zyx", "wpr": "xyz", "oat": "zyz", "vector": "xyz", "angles": "xyz"}
 _ORIENTATIONS: Final = (
     *("matrix", "quaternion", "quaternion_w_first", "transform", "tcp_pose", "vector", "rpy", "abc", "wpr", "oat"),
     *("angles", "joints", "gravity", "acceleration"),
 )
-# Layouts of the orientation that a message may suggest, the likeliest first.
+# Forms of the orientation that a message may suggest, the most likely first.
 _NEAREST: Final = ("quaternion", "matrix", "vector", "rpy", "abc", "tcp_pose")
 _KIND: Final = {
     "time": "time",
@@ -40,34 +40,34 @@ _KIND: Final = {
     **dict.fromkeys((*_AXES, "joints"), "angle"),
 }
 _LONGEST_VECTOR_RAD = 2 * np.pi + 0.01
-# A quaternion rounded to two decimals differs from length 1 by no more.
+# Largest deviation from length 1 of a quaternion with two decimals.
 _ROUNDED_LENGTH = 0.01
-# More than two turns in rad, or than any arm reaches in m: the numbers are degrees and mm.
+# Beyond two turns, or beyond the reach of any arm, the units must be degrees and mm.
 _MOST_RAD, _MOST_M = 4 * np.pi, 10.0
 _UNITS_OF_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-# 1990 to 2100, since 1970.
+# Range of Unix times, from 1990 to 2100.
 _EPOCH_S: Final = (6.3e8, 4.1e9)
-# Recordings have steps between these, 50 kHz to 5 Hz, and so many rows.
+# Range of the time steps of a recording, 50 kHz to 5 Hz, and its smallest number of rows.
 _STEPS_S: Final = (2e-5, 0.2)
 _RECORDING_ROWS = 200
-# From pose to pose; longer ones are in another unit.
+# Range of the time from pose to pose, s; other values are in another unit.
 _POSE_STEPS_S: Final = (0.5, 1e3)
-# Rows at rest in one orientation differ by no more, with encoder noise and rounded angles.
+# Largest rotation between rows at rest, due to encoder noise and rounding.
 _AT_REST_RAD: Final = float(np.radians(0.2))
-# Rows at rest become poses if they are at least this share of the table: the others are rows between two poses.
+# Rows at rest become poses if they are at least this share of the table; the others are motion between poses.
 _MOSTLY: Final = 0.9
-# Nearer to it, any horizontal axis turns a vector upright.
+# Below this distance from upside down, any horizontal axis may turn a vector upright.
 _UPSIDE_DOWN = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TableOptions:
-    """What a table does not say of itself.
+    """Facts that a table itself lacks.
 
     Raises
     ------
     ConfigError
-        An order of angles or a rate that cannot be.
+        The order of angles, the text format or the rate is invalid.
 
     Examples
     --------
@@ -78,58 +78,58 @@ class TableOptions:
     """
 
     columns: Mapping[str, str] = field(default_factory=dict)
-    """Columns of the table by our names, with a unit where theirs have none: ``{"fx": "Force X [kgf]"}``."""
+    """Columns of the table by the names of ftdrive, if needed with a unit: ``{"fx": "Force X [kgf]"}``."""
     separator: Literal["", ",", ";", "\t", " "] = ""
-    """Of the text; it is recognised if it is empty."""
+    """Separator of the text; recognised if empty."""
     decimal: Literal["", ".", ","] = ""
-    """Sign of the text; it is recognised if it is empty."""
+    """Decimal mark of the text; recognised if empty."""
     rate_Hz: float | None = None
-    """Of a table without times."""
+    """Sample rate of a table without times."""
     euler: str = ""
-    """rpy, ABC, WPR, OAT, or three axes: ZYX turns about those of the tool, xyz about those of the base."""
+    """Order of three angles: rpy, ABC, WPR, OAT, or three axes, such as ZYX (tool axes) or xyz (base axes)."""
     wrench_axes: WrenchAxes | None = None
-    """Axes and reference point of the wrench; None is what the program of the table means, mostly the sensor."""
+    """Axes and reference point of the wrench; None means those of the program, usually the sensor."""
     R_flange_tcp: Array = field(default_factory=lambda: np.eye(3))
-    """(3, 3) of the TCP, if the poses are its poses."""
+    """(3, 3) orientation of the TCP, if the table has poses of the TCP."""
     p_flange_tcp_m: Array = field(default_factory=lambda: np.zeros(3))
-    """(3,) of the TCP, if the poses are its poses."""
+    """(3,) position of the TCP, if the table has poses of the TCP."""
     sign: Literal[1, -1] = 1
-    """-1 for a sensor that reports the reaction."""
+    """Sign of the wrench: -1 for a sensor that reports the reaction."""
     forward: Callable[[Array], tuple[Array, Array]] | None = None
-    """Returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of joint angles (n, 6) in rad."""
+    """Forward kinematics: returns R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of joint angles (n, 6), rad."""
 
     def __post_init__(self) -> None:
         if self.euler and self.euler.lower() not in _MAKERS and not re.fullmatch("[xyz]{3}|[XYZ]{3}", self.euler):
             makers = ", ".join(name if name == "rpy" else name.upper() for name in _MAKERS)
             raise ConfigError(
-                f"--euler {self.euler}: give {makers}, or three axes, such as ZYX (of the tool) or xyz (of the base)"
+                f"--euler {self.euler}: give {makers}, or three axes such as ZYX (tool axes) or xyz (base axes)"
             )
         if self.separator not in ("", ",", ";", "\t", " ") or self.decimal not in ("", ".", ","):
             given = f"separator {self.separator!r}, decimal {self.decimal!r}"
             raise ConfigError(f"[text]: {given}: give a comma, semicolon, tab or space, and a point or comma")
         if self.rate_Hz is not None and not self.rate_Hz > 0:
-            raise ConfigError(f"--rate {self.rate_Hz:g}: give the samples a second")
+            raise ConfigError(f"--rate {self.rate_Hz:g}: give the number of samples per second")
 
 
-_JOINTS_ONLY = "it has joint angles and no orientation: add --model, such as UR5e, or --urdf FILE"
-_ANGLES_ONLY = "it has three angles: add --euler, such as ZYX (axes of the tool) or xyz (axes of the base)"
+_JOINTS_ONLY = "the table has joint angles but no orientation: add --model, such as UR5e, or --urdf FILE"
+_ANGLES_ONLY = "the order of the three angles is unknown: add --euler, such as ZYX (tool axes) or xyz (base axes)"
 
 
 class ColumnSource(Protocol):
-    """Columns that are read in blocks."""
+    """Source of columns that are read in blocks."""
 
     names: Sequence[str]
     units: Sequence[str]
     words: str
     comments: int
-    """Lines between the rows that `blocks` has left out as comments."""
+    """Number of commented lines between the rows, which `blocks` has skipped."""
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Give some columns (n, k) of consecutive rows, and the share of the source before the next ones."""
+        """Yield columns (n, k) of consecutive rows, with the share of the source that is read."""
 
 
 class FrameSource:
-    """A DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
+    """Columns of a DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
 
     words, comments = "", 0
 
@@ -140,42 +140,44 @@ class FrameSource:
         self.units: Sequence[str] = [""] * len(self.names)
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Give all rows. Raises `BadDataset`."""
+        """Yield all rows at once. Raises `BadDataset`."""
         try:
             columns = [np.asarray(self._frame[self.names[i]]) for i in use] or [np.empty((0, 0))]
-            numbers = [seconds_of(one) if one.dtype.kind == "M" else one.astype(np.float64) for one in columns]
+            numbers = [
+                seconds_of(column) if column.dtype.kind == "M" else column.astype(np.float64) for column in columns
+            ]
             yield np.column_stack(numbers), 1.0
         except (TypeError, ValueError) as error:
-            raise BadDataset(f"{error}: give a number in each cell") from error
+            raise BadDataset(f"{error}: put a number into each cell") from error
 
 
 class SignalRows(NamedTuple):
     """Consecutive rows of a signal."""
 
     t_s: Array
-    """(n,)"""
+    """(n,) times."""
     values: Array
-    """(n, k)"""
+    """(n, k) values in SI units."""
     place: float
-    """Share of the source before the next rows."""
+    """Share of the source that is read."""
 
 
 class Table:
-    """A table whose signals were found.
+    """A table with recognised signals.
 
     Parameters
     ----------
     source : Path, DataFrame or mapping
     options : TableOptions, optional
     name : str
-        For messages; the name of the file or of the type of the source otherwise.
+        Name in messages; by default that of the file, or of the type of the source.
 
     Raises
     ------
     BadDataset
-        It is no table, or a column contradicts its name. A signal that is missing raises where it is needed.
+        The source is not a table, or a column contradicts its name. A missing signal raises only when it is needed.
     OSError
-        It cannot be read.
+        The source cannot be read.
     """
 
     def __init__(self, source: Path | Any, options: TableOptions | None = None, name: str = "") -> None:
@@ -194,7 +196,7 @@ class Table:
             self._find()
 
     def _find(self) -> None:
-        """Find the signals, and the factors of their units; the first rows show what no name says."""
+        """Recognise the signals, and the factors of their units from names and first rows."""
         find, options = self._columns.find, self.options
         orientation = find(*(_AXES if options.euler else _ORIENTATIONS))
         self._found = {
@@ -206,41 +208,41 @@ class Table:
             else find("position"),
             "sigma": find("sigma"),
         }
-        signals = [one for one in self._found.values() if one is not None]
-        use = sorted({column for one in signals for column in one.columns})
+        signals = [signal for signal in self._found.values() if signal is not None]
+        use = sorted({column for signal in signals for column in signal.columns})
         rows, _ = next(self.source.blocks(use), (np.empty((0, len(use))), 1.0))
-        first = {one.form: rows[:, [use.index(column) for column in one.columns]] for one in signals}
-        self._factors = {one.form: self._factors_of(one, first[one.form]) for one in signals}
-        self._first = {name: first[one.form] * self._factors[one.form] for name, one in self._found.items() if one}
+        first = {signal.form: rows[:, [use.index(column) for column in signal.columns]] for signal in signals}
+        self._factors = {signal.form: self._factors_of(signal, first[signal.form]) for signal in signals}
+        self._first = {key: first[item.form] * self._factors[item.form] for key, item in self._found.items() if item}
 
     @property
     def words(self) -> str:
-        """What was recognised, in one line; empty for a table with the names and units of the project."""
-        programs = {one.program for one in self._found.values() if one} - {"ftdrive", "own program"}
-        named = [f"columns of {one}" for one in sorted(programs)]
-        if self.options.rate_Hz:  # nothing else shows a wrong one
-            named.append(f"{self.options.rate_Hz:g} Hz as given, on whose square the inertia depends")
+        """Description of the recognised format in one line; empty for the names and units of ftdrive."""
+        programs = {signal.program for signal in self._found.values() if signal} - {"ftdrive", "own program"}
+        named = [f"columns of {program}" for program in sorted(programs)]
+        if self.options.rate_Hz:  # nothing else reveals a wrong rate
+            named.append(f"{self.options.rate_Hz:g} Hz as given (the inertia depends on its square)")
         return "; ".join(filter(None, [self.source.words, *named, *self._guesses]))
 
     @property
     def has_nominal_kinematics(self) -> bool:
-        """Whether orientations follow from joint angles with the nominal kinematics of a model."""
+        """Whether the orientations are computed from joint angles with nominal kinematics."""
         orientation = self._found["orientation"]
         return orientation is not None and orientation.form == "joints"
 
     @property
     def gravity_is_measured(self) -> bool:
-        """Whether the orientation is a direction of gravity, so that nothing turns about the vertical."""
+        """Whether the orientation is only a direction of gravity, without a rotation about the vertical."""
         orientation = self._found["orientation"]
         return orientation is not None and orientation.form in ("gravity", "acceleration")
 
     def has(self, signal: Literal["wrench", "orientation"]) -> bool:
-        """Whether the table has a signal."""
+        """Return whether the table has a signal."""
         return self._found[signal] is not None
 
     @cached_property
     def in_motion(self) -> bool:
-        """Whether its rows follow one another too quickly for poses at rest, or come from two streams."""
+        """Whether the rows are a recording in motion: too fast for poses at rest, or from two streams."""
         if self.gravity_is_measured or not (self.has("wrench") and self.has("orientation")):
             return False
         wrench, orientation = (np.isfinite(self._first[one]).all(axis=1) for one in ("wrench", "orientation"))
@@ -254,20 +256,20 @@ class Table:
         return bool(np.median(np.diff(self._first["time"].sum(axis=1)[both])) <= _STEPS_S[1])
 
     def rate_Hz(self, signal: Literal["wrench", "orientation"]) -> float:
-        """Return the mean rate of a signal in the first rows. Raises `BadDataset` for fewer than two."""
+        """Return the mean rate of a signal in the first rows, Hz. Raises `BadDataset` for fewer than two rows."""
         if self.options.rate_Hz:
             return self.options.rate_Hz
         self._require_time()
         self._require(signal)
         t_s = self._first["time"].sum(axis=1)[np.isfinite(self._first[signal]).all(axis=1)]
         if len(t_s) < 2:
-            raise BadDataset(f"{self.name}: it has {len(t_s)} rows of the {signal}: at least 2 are needed")
+            raise BadDataset(f"{self.name}: the table has {len(t_s)} rows of the {signal}: at least 2 are needed")
         return (len(t_s) - 1) / max(float(t_s[-1] - t_s[0]), 1e-9)
 
     def wrenches(self) -> Iterator[SignalRows]:
-        """Give wrenches (n, 6) in N and N·m, in axes of the sensor or the flange.
+        """Yield wrenches (n, 6), N and N·m, in sensor or flange axes.
 
-        Raises `BadDataset` behind the last valid rows.
+        Raises `BadDataset` after the last valid rows.
         """
         signals = [self._require("wrench")]
         if self._axes == "base":
@@ -279,10 +281,12 @@ class Table:
             yield SignalRows(t_s, wrench, place)
 
     def poses(self) -> Iterator[SignalRows]:
-        """Give R_base_flange row by row, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
+        """Yield R_base_flange, row-major, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
-            raise BadDataset(f"{self.name}: gravity does not show how the arm turns about it: give the orientation too")
+            raise BadDataset(
+                f"{self.name}: gravity does not determine the rotation about the vertical: give the orientation too"
+            )
         self._require_time()
         for t_s, values, place in self._in_order(signals):
             with self._named():
@@ -290,7 +294,7 @@ class Table:
             yield SignalRows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-        """Return the rows as poses at rest: each row is one, or the rows of each dwell in a long table.
+        """Return the table as poses at rest: one per row, or in a long table one per dwell.
 
         Raises `BadDataset`.
         """
@@ -304,24 +308,22 @@ class Table:
             *([one] if (one := self._found["sigma"]) else []),
         ]
         if len(signals) > 2 and self._axes in ("tcp", "base"):
-            raise BadDataset(
-                f"{self.name}: standard errors are those of the sensor's axes: leave them out, or rotate them"
-            )
+            raise BadDataset(f"{self.name}: standard errors must be in sensor axes: leave them out, or rotate them")
         times, parts, _ = zip(*self._rows(signals), strict=True)
         t_s = np.concatenate(times)
         pose, wrench, *sigma = (np.concatenate(each) for each in zip(*parts, strict=True))
         if not len(wrench):
             raise BadDataset(
-                f"{self.name}: no row has an orientation and a wrench: give one row a pose, or a recording"
+                f"{self.name}: no row has both an orientation and a wrench: give one row per pose, or a recording"
             )
         if missing := self._count - len(wrench):
-            self._guesses.append(f"{missing} of {self._count} rows left out, which lack the wrench or the orientation")
+            self._guesses.append(f"{missing} of {self._count} rows without wrench or orientation left out")
         if comments := self.source.comments:
             self._guesses.append(f"{comments} commented lines between the rows left out")
         if sigma and (sigma[0] <= 0).any():
             row = int(np.argmax((sigma[0] <= 0).any(axis=1)))
             raise BadDataset(
-                f"{self.name}: " + _wrong_row(row, f"{sigma[0][row].min():g} is no standard error, which is above 0")
+                f"{self.name}: " + _wrong_row(row, f"the standard error {sigma[0][row].min():g} is not above 0")
             )
         with self._named():
             R, _ = self._flange([pose])
@@ -336,26 +338,26 @@ class Table:
         return rows if sigma or len(rows) < _RECORDING_ROWS else self._of_dwells(rows)
 
     def _of_dwells(self, rows: CalibrationDataset) -> CalibrationDataset:
-        """Return one pose per dwell; the rows themselves if they are not mostly dwells."""
+        """Return one pose per dwell; the rows unchanged if less than 90 % of them are at rest."""
         dwells = _dwells(rows.R_base_flange, rows.wrench)
-        n_samples = np.array([len(range(*one.indices(len(rows)))) for one in dwells], np.int64)
+        n_samples = np.array([len(range(*dwell.indices(len(rows)))) for dwell in dwells], np.int64)
         if n_samples.sum() < _MOSTLY * len(rows):
             return rows
         self._guesses.append(f"{n_samples.sum():,} rows at rest are {counted(len(dwells), 'pose')}")
         if between := len(rows) - n_samples.sum():
             self._guesses.append(f"{counted(between, 'row')} between them left out")
-        means = [mean_and_covariance(rows.wrench[one]) for one in dwells]
+        means = [mean_and_covariance(rows.wrench[dwell]) for dwell in dwells]
         return replace(
             rows,
-            R_base_flange=nearest_rotation(np.array([rows.R_base_flange[one].mean(axis=0) for one in dwells])),
-            wrench=np.array([one.mean for one in means]),
-            wrench_cov=np.array([one.covariance for one in means]),
+            R_base_flange=nearest_rotation(np.array([rows.R_base_flange[dwell].mean(axis=0) for dwell in dwells])),
+            wrench=np.array([estimate.mean for estimate in means]),
+            wrench_cov=np.array([estimate.covariance for estimate in means]),
             n_samples=n_samples,
-            t_s=np.array([rows.t_s[one].mean() for one in dwells]),
+            t_s=np.array([rows.t_s[dwell].mean() for dwell in dwells]),
         )
 
     def _form(self, form: str) -> dict[str, JSON]:
-        """Return what the orientations were read from, which limits what a mistake in them can be."""
+        """Return the form of the orientations, which limits the possible mistakes in them."""
         if form in _AXES and (self.options.euler or form in _MAKERS):
             euler = self.options.euler or form
             return {"form": "euler", "euler": _MAKERS.get(euler.lower(), euler)}
@@ -370,14 +372,16 @@ class Table:
             raise BadDataset(f"{self.name}: {words}, or add {rate} if the samples are evenly spaced")
 
     def _require(self, signal: str) -> Signal:
-        """Return a signal. Raises `BadDataset` with the line to type."""
-        if (found := self._found[signal]) is not None:
-            return found
+        """Return a signal. Raises `BadDataset`, whose message has the line to type, if it is missing."""
+        if (columns := self._found[signal]) is not None:
+            return columns
         with self._named():
             words = self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST))
-            # A recording in motion is often a file for each device.
+            # A recording in motion often has one file per device.
             alone = signal == "orientation" and self.has("wrench") and self._found["time"] is not None
-            raise BadDataset(f"{words}, or give poses of their own: --wrench, --orientation-file" if alone else words)
+            raise BadDataset(
+                f"{words}, or give wrench and poses as two files: --wrench, --orientation-file" if alone else words
+            )
 
     @contextmanager
     def _named(self) -> Iterator[None]:
@@ -387,7 +391,7 @@ class Table:
             raise BadDataset(f"{self.name}: {error}") from error
 
     def _factors_of(self, signal: Signal, first: Array) -> Array:
-        """Return the factor to SI of each column, guessed where no unit is named and the numbers leave no doubt."""
+        """Return the factor of each column to SI units; a missing unit is guessed if the numbers are clear."""
         names = [self.source.names[column] for column in signal.columns]
         kinds = {"tcp_pose": ["length"] * 3 + ["angle"] * 3}.get(signal.form, [_KIND.get(signal.form, "")] * len(names))
         if "wrench" in signal.form or signal.form == "sigma":
@@ -415,20 +419,20 @@ class Table:
         return np.array([guess if one is None else one for one in found])
 
     def _in_order(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
-        """Give `_rows` that exist. Raises `BadDataset` if their time goes back."""
+        """Yield the non-empty blocks of `_rows`. Raises `BadDataset` if the time decreases."""
         last_s = -np.inf
         for t_s, values, place in self._rows(signals):
             if (back := np.diff(t_s, prepend=last_s) < 0).any():
                 at_s = t_s[int(np.argmax(back))]
-                raise BadDataset(f"{self.name}: the time goes back to {at_s:.9g} s: give the samples in their order")
+                raise BadDataset(f"{self.name}: the time goes back to {at_s:.9g} s: sort the samples by time")
             if len(t_s):
                 last_s = float(t_s[-1])
                 yield t_s, values, place
 
     def _rows(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
-        """Give times, numbers in SI and place of the rows that have all of some signals.
+        """Yield times, values in SI units and position of the rows that have all of some signals.
 
-        Times are NaN without a column and a rate. Raises `BadDataset` for a row that has a part of a signal.
+        Times are NaN without a time column and a rate. Raises `BadDataset` for a row with an incomplete signal.
         """
         with self._named():
             yield from self._complete_rows(signals)
@@ -447,7 +451,7 @@ class Table:
                 if (partly := known.any(axis=1) & ~known.all(axis=1)).any():
                     row = int(np.argmax(partly))
                     name = self.source.names[one.columns[int(np.argmin(known[row]))]]
-                    raise BadDataset(_wrong_row(count + row, f"{name} is missing or no finite number"))
+                    raise BadDataset(_wrong_row(count + row, f"{name} is missing or not a finite number"))
                 if (huge := np.argwhere(known & (np.abs(numbers) > LARGEST))).size:
                     row, column = huge[0]
                     name, value = self.source.names[one.columns[column]], numbers[row, column]
@@ -470,7 +474,7 @@ class Table:
         return "base" if form == "base_wrench" else "sensor"
 
     def _in_flange(self, wrench: Array, pose: Sequence[Array]) -> Array:
-        """Return wrenches (n, 6) in axes of the flange and about its origin, if they are not those of the sensor."""
+        """Return wrenches (n, 6) in flange axes about the flange origin; wrenches in sensor axes are not changed."""
         force, torque = np.hsplit(self.options.sign * wrench, 2)
         if self._axes in ("sensor", "flange"):
             return np.hstack([force, torque])
@@ -479,11 +483,11 @@ class Table:
             force, torque = force @ R_flange.T, torque @ R_flange.T
         else:
             R, _ = self._flange(pose[:1])
-            force, torque = (np.einsum("nji,nj->ni", R, one) for one in (force, torque))
+            force, torque = (np.einsum("nji,nj->ni", R, vector) for vector in (force, torque))
         return np.hstack([force, torque + np.cross(self.options.p_flange_tcp_m, force)])
 
     def _flange(self, values: Sequence[Array]) -> tuple[Array, Array | None]:
-        """Return R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) of orientations and perhaps positions."""
+        """Return R_base_flange (n, 3, 3), and p_base_flange_m (n, 3) or None, from orientation and position."""
         orientation = self._found["orientation"]
         numbers, p = values[0], values[1] if len(values) > 1 else None
         form = "" if orientation is None else orientation.form
@@ -511,7 +515,7 @@ class Table:
 
 
 def _dwells(R: Array, wrench: Array) -> list[slice]:
-    """Return the rows of each dwell: 20 or more in one orientation (n, 3, 3), without a step of the wrench (n, 6)."""
+    """Return the row range of each dwell: 20 or more rows in one orientation without a step of the wrench (n, 6)."""
     dwells: list[slice] = []
     first = 0
     for end in (*(np.flatnonzero(angle_between(R[1:], R[:-1]) > _AT_REST_RAD) + 1), len(R)):
@@ -530,7 +534,7 @@ def _dwells(R: Array, wrench: Array) -> list[slice]:
 
 
 def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
-    """Split the rows of a dwell at steps of the wrench (n, 6), such as a tare; each part has 20 rows or more."""
+    """Return the rows of a dwell split at steps of the wrench (n, 6), such as a tare, into parts of 20 rows or more."""
     parts, waiting = list[slice](), [(first, last)]
     while waiting:
         first, last = waiting.pop()
@@ -543,7 +547,7 @@ def _without_steps(wrench: Array, first: int, last: int) -> list[slice]:
 
 
 def _largest_step(wrench: Array) -> int | None:
-    """Return the row (n, 6) from which on the mean differs most, None if it is within the noise."""
+    """Return the row at which the mean of the wrench (n, 6) changes most; None if the change is within the noise."""
     n = len(wrench)
     before = np.arange(LEAST_SAMPLES, n - LEAST_SAMPLES + 1)
     path = np.cumsum(wrench - wrench.mean(axis=0), axis=0)[before - 1] / np.maximum(wrench.std(axis=0), 1e-300)
@@ -558,7 +562,7 @@ def _wrong_row(row: int, words: str) -> str:
 
 
 def _of_angles(angles: Array, euler: str, axes: str) -> Array:
-    """Return the rotations (n, 3, 3) of three angles (n, 3) about these axes, turned in the order of `euler`."""
+    """Return the rotations (n, 3, 3) of angles (n, 3) about `axes`, applied in the order of `euler`."""
     sequence = _MAKERS.get(euler.lower(), euler)
     if sequence.lower() != axes and sorted(sequence.lower()) == sorted(axes):
         angles = angles[:, [axes.index(axis) for axis in sequence.lower()]]
@@ -566,7 +570,7 @@ def _of_angles(angles: Array, euler: str, axes: str) -> Array:
 
 
 def _rotations(form: str, numbers: Array) -> Array:
-    """Return the rotations (n, 3, 3) in these numbers (n, k). Raises `BadDataset`."""
+    """Return the rotations (n, 3, 3) of the values (n, k) in this form. Raises `BadDataset`."""
     if form == "matrix":
         return proper_rotations(numbers.reshape(-1, 3, 3))
     length = np.linalg.norm(numbers, axis=1)
@@ -576,8 +580,8 @@ def _rotations(form: str, numbers: Array) -> Array:
         return Rotation.from_quat(numbers).as_matrix()
     if (largest := float(length.max(initial=0.0))) > _MOST_RAD:
         raise BadDataset(
-            f"a rotation vector of {largest:.0f} rad has degrees, or is three angles: name its unit, --columns "
-            f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (axes of the base) or XYZ (axes of the tool)'
+            f"a rotation vector of {largest:.0f} rad is in degrees, or is three angles: give its unit, --columns "
+            f'"rx=… [deg],ry=… [deg],rz=… [deg]", or add --euler xyz (base axes) or XYZ (tool axes)'
         )
     if largest > _LONGEST_VECTOR_RAD:
         raise BadDataset(
@@ -588,7 +592,7 @@ def _rotations(form: str, numbers: Array) -> Array:
 
 
 def _upright(gravity: Array) -> Array:
-    """Return the least rotations (n, 3, 3) that turn a direction of gravity (n, 3) straight down."""
+    """Return the smallest rotations (n, 3, 3) that turn directions of gravity (n, 3) straight down."""
     up = -gravity / np.linalg.norm(gravity, axis=1, keepdims=True)
     halfway = np.column_stack([np.cross(up, [0.0, 0.0, 1.0]), 1 + up[:, 2]])
     halfway[halfway[:, 3] < _UPSIDE_DOWN] = [1.0, 0.0, 0.0, 0.0]
@@ -596,7 +600,7 @@ def _upright(gravity: Array) -> Array:
 
 
 def _unit_of_time(t: Array, name: str) -> str:
-    """Return the unit of times (n,), s unless the numbers leave no doubt. Raises `BadDataset` if two others fit."""
+    """Return the unit of times (n,): s unless the numbers exclude it. Raises `BadDataset` if two other units fit."""
     t = t[np.isfinite(t)]
     steps = np.diff(t)
     steps = steps[steps > 0]
@@ -609,7 +613,7 @@ def _unit_of_time(t: Array, name: str) -> str:
     is_recording = len(t) >= _RECORDING_ROWS
     least, most = _STEPS_S if is_recording else _POSE_STEPS_S
     fitting = [unit for unit, size in _UNITS_OF_TIME.items() if least <= step * size <= most]
-    if "s" in fitting or not fitting or step < 1:  # slow samples in s, or fast ones in ms
+    if "s" in fitting or not fitting or step < 1:  # slow samples in s, or fast samples in ms
         return "s"
     if len(fitting) > 1 and is_recording:
         raise BadDataset(

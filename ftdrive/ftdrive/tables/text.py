@@ -1,4 +1,4 @@
-"""Text tables as other programs write them: how one is written is found from its first lines."""
+"""Text tables of other programs; the format is recognised from the first lines."""
 
 import csv
 import gzip
@@ -18,7 +18,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.files import open_file
 from ftcalib.model import Array
 
-# Characters: of a block, of the first part that is looked at, of the longest head, and of the longest line.
+# Sizes in characters: block, first part that is examined, longest header, longest line.
 _BLOCK, _FIRST, _HEAD, _LINE = 1 << 22, 1 << 16, 1 << 20, 1 << 18
 _SEPARATORS: Final = {";": "semicolons", "\t": "tabs", ",": "commas", " ": "spaces"}
 _COMMENT = re.compile(r"\s*(#+|%+|//)\s*")
@@ -26,7 +26,7 @@ _NUMBER: Final = {
     ".": re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
     ",": re.compile(r"[+-]?(\d+(,\d*)?|,\d+)(e[+-]?\d+)?|[+-]?(nan|inf)", re.IGNORECASE),
 }
-# Rows at the end of the first lines decide on separator and decimal sign.
+# Number of rows from which separator and decimal mark are recognised.
 _DECIDE = 30
 _DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?\s*(Z|[+-]\d\d:?\d\d)?")
 _UNIT = re.compile(r"[\[(]?\s*[-%°a-zA-Zµμ·*./^²0-9 ]{0,8}\s*[\])]?")
@@ -34,24 +34,24 @@ _UNIT_LENGTH = 20
 
 
 class _TextFormat(NamedTuple):
-    """How a table is written."""
+    """Format of a text table."""
 
     separator: str
     decimal: str
     names: Sequence[str]
-    """One a column, as in the file; "1", "2", … without a header."""
+    """Names of the columns as in the file; "1", "2", … without a header."""
     units: Sequence[str]
-    """Of a second row of the header; empty cells without one."""
+    """Units from a second row of the header; empty strings without one."""
     dates: Sequence[int]
-    """Columns with dates as in ISO 8601, such as 2026-11-28 12:00:00.25."""
+    """Indices of columns with ISO 8601 dates, such as 2026-11-28 12:00:00.25."""
     first_line: int
     """Number of the first row of numbers, from 1."""
     words: str
-    """What differs from commas and a decimal point below one row of names; empty if nothing does."""
+    """Differences from a table with commas, decimal points and one row of names; empty without any."""
 
 
 class TextTable:
-    """A text table on disk; what is not given of how it is written is recognised. Raises `BadDataset` or `OSError`."""
+    """A text table on disk; separator and decimal mark are recognised if not given. Raises `BadDataset`, `OSError`."""
 
     def __init__(self, path: Path, separator: str = "", decimal: str = "") -> None:
         self.path, self.comments = path, 0
@@ -64,25 +64,25 @@ class TextTable:
 
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, IO[bytes]]]:
-        r"""Give the text, whose lines end with `\n` whatever ends them on disk, and the file on disk.
+        r"""Yield the text with `\n` as line end, and the file on disk.
 
-        A line ends with `\n`, `\r\n` or `\r`; other characters that Unicode calls line breaks belong to a cell.
+        A line on disk ends with `\n`, `\r\n` or `\r`; other line breaks of Unicode belong to a cell.
         """
         with open_file(self.path) as raw:
             packed = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
             file = io.BufferedReader(gzip.GzipFile(fileobj=raw)) if packed else raw
             try:
-                is_utf16 = file.peek(2)[:2] in (b"\xff\xfe", b"\xfe\xff")  # Excel calls it Unicode text
+                is_utf16 = file.peek(2)[:2] in (b"\xff\xfe", b"\xfe\xff")  # "Unicode text" of Excel
                 text = io.TextIOWrapper(file, "utf-16" if is_utf16 else "utf-8-sig", "replace", newline=None)
                 yield text, raw
             except (gzip.BadGzipFile, EOFError, zlib.error) as error:
-                raise BadDataset("the compressed file is damaged or cut: unpack what is left") from error
+                raise BadDataset("the compressed file is damaged or incomplete: unpack the readable part") from error
 
     def blocks(self, use: Sequence[int]) -> Iterator[tuple[Array, float]]:
-        """Give some columns (n, k) of consecutive rows, and the share of the file before the next ones.
+        """Yield columns (n, k) of consecutive rows, with the share of the file that is read.
 
-        A blank cell is NaN, a date the seconds since 1970. Raises `BadDataset` behind the last valid block.
+        A blank cell is NaN, and a date is the time since 1970, s. Raises `BadDataset` after the last valid block.
         """
         size = self.path.stat().st_size
         with self._open() as (file, raw):
@@ -93,7 +93,7 @@ class TextTable:
                 text += file.readline(_LINE)
                 if len(text) >= _BLOCK + _LINE and not text.endswith("\n"):
                     cut = line + text.count("\n")
-                    raise BadDataset(f"line {cut} is longer than {_LINE} characters: give one row a sample")
+                    raise BadDataset(f"line {cut} is longer than {_LINE} characters: write one row per sample")
                 yield self._parsed(text, use, line), raw.tell() / size
                 line += text.count("\n")
 
@@ -110,7 +110,7 @@ class TextTable:
         found = self._numbers(rows, separator, use)
         if found is None:
             plain = "\n".join(["", *rows, ""])
-            # The first two overlap where three cells in a row are blank.
+            # The first replacement is needed twice, because three consecutive blank cells overlap.
             for edge in (separator * 2, separator * 2, f"\n{separator}", f"{separator}\n"):
                 plain = plain.replace(edge, f"{edge[0]}nan{edge[1]}")
             found = self._numbers(plain.split("\n"), separator, use)
@@ -120,7 +120,7 @@ class TextTable:
         return found
 
     def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
-        """Return some columns of lines as numpy reads them; None if it refuses a cell, as a blank one, or a row."""
+        """Return columns of lines as read by numpy; None if numpy rejects a cell, such as a blank one, or a row."""
         if not (rows := list(filter(None, lines))):
             return None
         kinds = dict.fromkeys(range(len(self.names)), "U1") | dict.fromkeys(use, "f8")
@@ -129,19 +129,19 @@ class TextTable:
         try:
             found = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
             columns = [found[str(i)] if kinds[i] == "f8" else self._dates(found[str(i)], self.names[i]) for i in use]
-            # An open quote takes the rows below into its cell.
+            # An unclosed quote would include the rows below in its cell.
             return np.column_stack(columns) if len(found) == len(rows) else None
         except (BadDataset, ValueError):
             return None
 
     def _dates(self, cells: NDArray[np.str_], name: str) -> Array:
-        """Return the seconds since 1970 of dates (n,). Raises `BadDataset` or `ValueError`."""
+        """Return the times since 1970 of dates (n,), s. Raises `BadDataset` or `ValueError`."""
         if all((match := _DATE.fullmatch(cell)) and not match[3] for cell in cells.tolist()):
             return seconds_of(cells.astype("datetime64[ns]"))
         return np.array([self._number(cell.strip(), name, 0) for cell in cells.tolist()])
 
     def _slowly_parsed(self, text: str, use: Sequence[int], first: int) -> Array:
-        """Parse what numpy refuses, such as a separator in a quoted cell. Raises `BadDataset` with the line."""
+        """Return columns of a text that numpy rejects, such as with quoted separators. Raises `BadDataset`."""
         count, rows = len(self.names), []
         for line, one in enumerate(text.split("\n"), first):
             row = _split(one, self.format.separator)
@@ -153,7 +153,9 @@ class TextTable:
             if len(row) == count + 1 and not row[-1].strip():
                 row.pop()
             if len(row) != count:
-                raise BadDataset(f"line {line} has {len(row)} values, other lines have {count}: correct or delete it")
+                raise BadDataset(
+                    f"line {line} has {len(row)} values, but other lines have {count}: correct or delete this line"
+                )
             rows.append([self._number(row[i].strip(), self.names[i], line) for i in use])
         return np.array(rows, float).reshape(len(rows), len(use))
 
@@ -164,23 +166,23 @@ class TextTable:
             return float(cell.replace(",", "."))
         if match := _DATE.fullmatch(cell):
             zone = match[3] or ""
-            with suppress(ValueError):  # a 13th month
+            with suppress(ValueError):  # such as a 13th month
                 date = datetime.fromisoformat(cell.removesuffix(zone).rstrip().replace(",", ".") + zone)
                 return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
         other = ",."[self.format.decimal == ","]
         point = {",": "comma", ".": "point"}[other]
-        why = f"has a decimal {point}, unlike others" if _NUMBER[other].fullmatch(cell) else "is no number"
+        why = f"has a decimal {point}, unlike others" if _NUMBER[other].fullmatch(cell) else "is not a number"
         raise BadDataset(f"line {line}: {name} is '{cell[:40]}', which {why}: correct or delete this line")
 
 
 def seconds_of(dates: NDArray[Any]) -> Array:
-    """Return the seconds since 1970 of dates (n,)."""
+    """Return the times since 1970 of dates (n,), s."""
     known = dates.astype("datetime64[ns]")
     return np.where(np.isnat(known), np.nan, known.astype(np.int64) * 1e-9)
 
 
 def _format_in(text: IO[str], separator: str, decimal: str) -> _TextFormat:
-    """Recognise the format of a text from its first lines, of which a long header needs more. Raises `BadDataset`."""
+    """Return the format of a text, recognised from as many first lines as needed. Raises `BadDataset`."""
     head = text.read(_FIRST)
     while True:
         more = text.read(len(head))
@@ -193,25 +195,25 @@ def _format_in(text: IO[str], separator: str, decimal: str) -> _TextFormat:
 
 
 class _NoNumbers(BadDataset):
-    """The lines so far have no row of numbers."""
+    """Raised if the examined lines have no row of numbers."""
 
 
 def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextFormat:
     if "\0" in head:
-        raise BadDataset("it is no text table: give a CSV file")
+        raise BadDataset("the file is not a text table: give a CSV file")
     lines = head.split("\n")
     lines = lines[: -1 if more and len(lines) > 1 else None]
     separator, decimal, count, numeric = _decided(lines, separator, decimal)
     if not numeric:
-        found = "the file is empty" if not head.strip() else "no row has two numbers or more"
-        raise _NoNumbers(f"{found}: give a table with one row a sample")
+        why = "the file is empty" if not head.strip() else "no row has two numbers or more"
+        raise _NoNumbers(f"{why}: give a table with one row per sample")
     rows = [_split(line, separator) for line in lines]
     first = next(i for i, row in enumerate(rows) if _is_data(lines[i], row, decimal, numeric))
     above = [i for i in range(first) if lines[i].strip()]
     _require_no_data(lines, above, numeric, separator, decimal)
-    # A separator at the end of each line makes one more column.
+    # A separator at the end of each line adds an empty column.
     ended = all(not row[-1] for row in rows[first:] if len(row) == count)
-    # Programs write their settings above the names, one a line.
+    # Programs may write settings above the names, one per line.
     header = [(i, cells) for i in above if (cells := _header(lines[i], separator, count, ended))]
     units: Sequence[str] = ()
     if len(header) > 1 and header[-1][0] == above[-1] and all(map(_is_unit, header[-1][1])):
@@ -227,7 +229,7 @@ def _format_of(head: str, more: bool, separator: str, decimal: str) -> _TextForm
 
 
 def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, str, int, int]:
-    """Return separator, decimal sign, columns and numbers a row: those by which most cells are numbers."""
+    """Return separator, decimal mark, and numbers of columns and of numbers per row, for the most numbers in cells."""
     last = [line for line in lines if line.strip() and not _COMMENT.match(line)][-_DECIDE:]
     best = (",", ".", 0, 0)
     most = 0.0
@@ -238,7 +240,7 @@ def _decided(lines: Sequence[str], separator: str, decimal: str) -> tuple[str, s
         rows = [row for row in rows if len(row) == count]
         for point in decimal or ("." if between == "," else ".,"):
             numbers = [_count_numbers(row, point) for row in rows]
-            # A cell that is not a number counts against it: `1,5;2,5` has numbers between commas too.
+            # Other cells reduce the score, because `1,5;2,5` has numbers between commas too.
             score = sum(2 * n - sum(map(bool, row)) for n, row in zip(numbers, rows, strict=True) if n)
             if numbers and min(count, max(numbers)) > 1 and score > most:
                 best, most = (between, point, count, max(numbers)), score
@@ -259,12 +261,12 @@ def _count_numbers(row: Sequence[str], decimal: str) -> int:
 
 
 def _is_data(line: str, row: Sequence[str], decimal: str, numeric: int) -> bool:
-    # Two topics on one clock leave half of the cells blank.
+    # In a table of two topics, half of the cells are blank.
     return not _COMMENT.match(line) and _count_numbers(row, decimal) > max(1, numeric // 4)
 
 
 def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, separator: str, decimal: str) -> None:
-    """Raise `BadDataset` if a line above the first row is a row of numbers that is written in another way."""
+    """Raise `BadDataset` if a line above the first row is a row of numbers in another format."""
     for i in above:
         for between, point in ((one, other) for one in _SEPARATORS for other in ".,"):
             cells = [cell for cell in _split(lines[i], between) if cell]
@@ -273,7 +275,9 @@ def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, s
                     f"{_SEPARATORS[a]} and a decimal {'comma' if b == ',' else 'point'}"
                     for a, b in ((between, point), (separator, decimal))
                 )
-                raise BadDataset(f"line {i + 1} is a row with {ours}, rows below have {theirs}: write all in one way")
+                raise BadDataset(
+                    f"line {i + 1} is a row with {ours}, but the rows below have {theirs}: write all rows in one format"
+                )
 
 
 def _is_unit(cell: str) -> bool:
@@ -281,7 +285,7 @@ def _is_unit(cell: str) -> bool:
 
 
 def _header(line: str, separator: str, count: int, ended: bool) -> list[str]:
-    """Return the names in a line above the numbers; behind `#` or `%`, and perhaps with separators of its own."""
+    """Return the names in a header line, which may be commented and may have other separators."""
     line = line[found.end() :] if (found := _COMMENT.match(line)) else line
     for other in (separator, *_SEPARATORS):
         cells = _split(line, other)
