@@ -196,7 +196,7 @@ TCP: Final = ask(do="set-tcp", tcp=[0, 0, 0.1, 0, 0, 0]), ask(do="set-tcp", tcp=
 PROTECTIVE_STOP: Final = ask(do="protective-stop"), unlock
 RTDE_SILENT: Final = ask(do="silent", what="rtde"), ask(do="silent", what="rtde", on=False)
 SLIDER: Final = ask(do="slider", fraction=0.0), ask(do="slider", fraction=1.0)
-ONE_MOVE: Final = "it ends the one move it was given"
+ONE_MOVE: Final = "it completes the current move it was given"
 
 # fmt: off
 FAULTS: Final[Sequence[Fault]] = (

@@ -227,7 +227,7 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
         "3 or 5 numbers",
         "'0:x:33'",
         "not a cylinder",
-        "are these mm",
+        "in mm",
         "ends 20 mm from the flange",
         "wrong side of the plane [1, 0, 0, 800]",
         "the plane [-1, 0, 0, -20] (+x 20 mm) is 0 mm from the arm's shoulder",
@@ -259,7 +259,7 @@ def test_the_operator_may_keep_addresses_that_do_not_answer() -> None:
     assert outcome.exit_code == 0, (outcome.output, outcome.exception)
     cell = load()
     assert (cell.robot.host, cell.robot.model, cell.sensor.url) == ("127.99.99.9", "ur10e", silent)
-    assert Path("ftdrive.toml").read_text().count("not read when this was written") == 2
+    assert Path("ftdrive.toml").read_text().count("not read when this file was written") == 2
 
 
 @pytest.mark.slow

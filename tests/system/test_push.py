@@ -88,7 +88,7 @@ def test_what_cannot_be_pushed_is_refused_with_the_reason(station: Station, run:
     station.control(do="remote-control", on=True)
     station.control(do="foreign-program", seconds=600)
     code, words = refused(run)
-    assert (code, "another program is on the controller" in words) == (7, True)
+    assert (code, "another program is active on the controller" in words) == (7, True)
     station.control(do="dashboard-stop")
     described = ftdrive.folder / "cell.toml"
     described.write_text(described.read_text().replace(f"mass_kg = {SENSOR_KG}\n", ""))

@@ -78,7 +78,7 @@ def test_an_arm_is_timed_only_when_its_reader_follows_the_clock(monkeypatch: pyt
 
 def test_a_clock_that_has_no_place_left_ends_the_start() -> None:
     clock = SlowToClaim()
-    clock.refusal = ConnectError("too many threads follow one emulated cell")
+    clock.refusal = ConnectError("too many threads use one emulated cell")
     with pytest.raises(ConnectError, match="too many"), Sensor("fake", clock=clock):
         pass
     follower = Follower(clock, lambda: pytest.fail("it works without a place"), "late")

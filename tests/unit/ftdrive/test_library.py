@@ -86,11 +86,11 @@ def test_a_path_a_table_arrays_and_a_dataset_give_the_same_result() -> None:
 @pytest.mark.parametrize(
     ("source", "error", "words"),
     [
-        ([[1.0] * 13] * 24, TypeError, "list has no names of columns: give a path, a DataFrame"),
-        ([{"fx": 1.0}] * 2, TypeError, "list has no names of columns"),
-        (np.zeros((24, 13)), TypeError, r"an array of shape \(24, 13\) has no names of columns"),
+        ([[1.0] * 13] * 24, TypeError, "list has no column names: give a path, a DataFrame"),
+        ([{"fx": 1.0}] * 2, TypeError, "list has no column names"),
+        (np.zeros((24, 13)), TypeError, r"an array of shape \(24, 13\) has no column names"),
         (None, TypeError, r"NoneType .* or a pair \(R_base_flange, wrench\)"),
-        (info().calibration, TypeError, "this is a result, which is solved already"),
+        (info().calibration, TypeError, "this is a result, which is already solved"),
         ((np.zeros((4, 6)), np.zeros((4, 3, 3))), ftdrive.DataError, r"Give \(R_base_flange, wrench\), of shapes"),
         ({}, ftdrive.DataError, "no orientation among the columns"),
         ({"fx": [1.0]}, ftdrive.DataError, r"table=ftdrive.TableOptions\(columns=\{'qx': '…'"),

@@ -78,7 +78,7 @@ def test_the_model_is_asked_for_where_no_robot_reports_it(
         assert (described.model, BY_KEY[MODEL] in described.questions) == (model, False)
     # The second arm is not expected to be the first one.
     assert given == ["ur5e", None]
-    assert described.found() == {"robot": "UR10e, serial 1", "sensor": "not read when this was written"}
+    assert described.found() == {"robot": "UR10e, serial 1", "sensor": "not read when this file was written"}
     described.keep(ROBOT, "10.0.0.4")
     assert BY_KEY[MODEL] in described.questions
     assert MODEL not in described.answered

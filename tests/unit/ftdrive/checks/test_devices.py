@@ -153,7 +153,7 @@ def test_a_remote_control_that_cannot_be_queried_fails(lab: Lab, monkeypatch: py
 @pytest.mark.parametrize(
     ("info", "state", "words"),
     [
-        (DeviceInfo("UR5e", "A1", "5.15"), "warning", "no kinematics reported: plans use those of a nominal UR5e"),
+        (DeviceInfo("UR5e", "A1", "5.15"), "warning", "no kinematics reported: plans use nominal UR5e"),
         (DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(MODELS["UR5e"].numbers, "device")}), "ok", "0.0 mm"),
         (
             DeviceInfo("UR5e", "A1", "5.15", {"kinematics": Fact(drawn("UR5e").numbers, "device")}),
@@ -280,7 +280,7 @@ def test_what_comes_twice_or_too_late_is_reported(counted: dict[str, Any], state
 def test_a_rate_that_is_too_high(rate_Hz: float, state: str) -> None:
     rate = stream(rate_Hz)["sensor.rate"]
     assert rate.state == state
-    assert ("records come twice" in str(rate.fix)) == (state != "ok")
+    assert ("samples are duplicated" in str(rate.fix)) == (state != "ok")
 
 
 @pytest.mark.parametrize(
@@ -347,7 +347,7 @@ def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size
     ("payload_kg", "sensor_kg", "state", "words"),
     [
         (None, 0.3, "skipped", "does not report"),
-        (1.72, 0.3, "ok", "robot 1.72 kg; weighed 1.44 kg + 0.30 kg sensor"),
+        (1.72, 0.3, "ok", "controller 1.72 kg; identified 1.44 kg + 0.30 kg sensor"),
         (1.72, None, "ok", "weighed 1.44 kg + sensor"),
         (3.0, 0.3, "warning", "payload of 3.00 kg, but 1.44 kg hang"),
     ],

@@ -79,7 +79,7 @@ def test_an_adapter_whose_name_is_written_like_in_any_address(asked: list[Any], 
 def test_a_port_without_more_is_a_serial_sensor(asked: list[Any], tmp_path: Path) -> None:
     assert probe_place("/dev/null") == []
     assert asked == [("/dev/null", REAL)]
-    with pytest.raises(ConnectError, match=f"{tmp_path}/ttyUSB0 does not exist; plug it in"):
+    with pytest.raises(ConnectError, match=f"{tmp_path}/ttyUSB0 does not exist; plug the adapter in"):
         probe_place(f"{tmp_path}/ttyUSB0")
     assert not is_place("ati-serial:///dev/ttyUSB0")
 

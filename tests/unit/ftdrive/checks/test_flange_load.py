@@ -88,7 +88,7 @@ def test_the_gain_of_the_sensor_is_part_of_the_sigma() -> None:
 
 def test_the_margin_names_rated_payload_and_model() -> None:
     assert margin_in_words(1.442, "UR5e").startswith("3.56 kg below the rated payload of a UR5e, 5 kg;")
-    assert margin_in_words(3.5, "UR3").startswith("0.50 kg over the rated payload of a UR3, 3 kg:")
+    assert margin_in_words(3.5, "UR3").startswith("0.50 kg above the rated payload of a UR3, 3 kg:")
     assert "Acme" in margin_in_words(1.0, "Acme")
 
 

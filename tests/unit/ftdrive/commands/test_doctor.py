@@ -66,7 +66,7 @@ def test_the_clock_of_the_arm_is_compared_over_a_second(pace: float, until: int,
 def test_the_pose_is_read_in_millimetres() -> None:
     arm, silent = (cast("Any", Arm(FakeClock(), until=until)) for until in (10**6, 0))
     read, unknown = (cast("Any", SimpleNamespace(tcp_offset=one)) for one in (np.zeros(6), None))
-    assert check_flange(arm, read).found == "TCP offset read; flange at (100, -200, 346) mm in base"
+    assert check_flange(arm, read).found == "TCP offset reported; flange at (100, -200, 346) mm in base"
     failed = check_flange(silent, read)
     assert (failed.state, failed.fix) == ("failed", "look at the cable")
     assert check_flange(arm, unknown).state == "skipped"

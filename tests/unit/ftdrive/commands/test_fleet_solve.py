@@ -83,7 +83,7 @@ def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[.
     assert code == 0
     assert out.startswith("0 runs")
     words = " ".join(err.split())
-    assert "they have no data to solve: 1 runs; `ftdrive calibrate --resume RUN` finishes one" in words
+    assert "they have no data to solve: 1 runs; finish each with `ftdrive calibrate --resume RUN`" in words
     assert "they have no data to solve: 1 runs; start again with `ftdrive calibrate --sweep`" in words
     assert "No runs: " in run()[2]
 
@@ -96,7 +96,7 @@ def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[.
         (["--since", "soon"], 2, "--since is 'soon': give an age such as 90d or 12h, or a date such as 2026-08-31"),
         (["--since", "999999999d"], 2, "--since is '999999999d': give an age"),
         (["--cluster", "host"], 2, "--cluster is 'host': give the address of a Dask scheduler"),
-        (["--store", "nowhere"], 2, "is no address of a database"),
+        (["--store", "nowhere"], 2, "is not a database address"),
         (["--workers", "0"], 2, "0 is not in the range"),
     ],
 )

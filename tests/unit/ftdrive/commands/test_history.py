@@ -224,7 +224,7 @@ def test_a_calibration_never_fails_for_the_store_and_is_caught_up(
     calibrate_with(monkeypatch, runs / "gripper-1")
     code, out, err = run("calibrate")
     assert (code, out.endswith("calibration.json\n")) == (0, True)
-    assert "The run is saved but not in the history yet, because the store s.sqlite cannot be" in err
+    assert "The run is saved, but not yet in the history, because the store s.sqlite cannot be" in err
     assert "(database is locked)" in err
     other.close()
     calibrate_with(monkeypatch, runs / "gripper-2")
@@ -239,7 +239,7 @@ def test_a_bad_address_is_a_warning_after_a_calibration(url: str, runs: Path, mo
     monkeypatch.setenv("FTDRIVE_STORE_URL", url)
     said = list[str]()
     index_run(runs / "gripper-0", said.append)
-    assert said[0].startswith(" The run is saved but not in the history yet, because ")
+    assert said[0].startswith(" The run is saved, but not yet in the history, because ")
 
 
 def test_a_result_that_solve_saves_in_its_run_is_indexed(

@@ -108,9 +108,9 @@ def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--columns", "fx"], "--columns fx: give NAME=COLUMN with commas between"),
+        (["--columns", "fx"], "--columns fx: give NAME=COLUMN separated by commas between"),
         (["--columns", "none.toml"], "none.toml"),
-        (["--columns", "empty.toml"], "empty.toml names no columns"),
+        (["--columns", "empty.toml"], "empty.toml has no columns"),
         (["--columns", "fx=Force"], "the columns are t, fx, fy"),
         (["--tcp", "1,2"], "--tcp is '1,2': give 3 or 6 numbers"),
         (["--euler", "xy"], "--euler xy: give rpy, ABC"),

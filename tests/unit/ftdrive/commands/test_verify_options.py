@@ -32,7 +32,7 @@ def begun(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--quick", "--poses", "3", "--simulate"), "--quick and --poses exclude one another"),
+        (("--quick", "--poses", "3", "--simulate"), "--quick and --poses exclude each other"),
         ((), "no calibration: give --calibration PATH, or --simulate"),
         (("--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("--resume", "RUN", "--quick"), "leave out --quick"),

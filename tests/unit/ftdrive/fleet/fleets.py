@@ -7,7 +7,7 @@ from ftdrive.fleet.state import BiasDrift, CellState, Fleet, FleetFinding
 
 NOW = datetime(2026, 11, 22, 12, tzinfo=UTC)
 CALM = BiasDrift(0.8, found=False, words="")
-DRIFTING = BiasDrift(6.5, found=True, words="force bias x drifts by 0.12 N a week since 2026-11-01")
+DRIFTING = BiasDrift(6.5, found=True, words="force bias x drifts by 0.12 N per week since 2026-11-01")
 
 
 def cell(name: str, tool: str | None = "gripper", **more: Any) -> CellState:

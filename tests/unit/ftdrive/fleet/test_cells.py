@@ -64,9 +64,9 @@ _CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
         (f"schedule = 3\n{_CELL}", "the key schedule is unknown"),
         (f"{_CELL}verify_every = 7\n", r"\[cells\.a\]: the key verify_every is unknown: the keys are config"),
         ("[cells]\na = 3\n", "is 3: write a table"),
-        ('[cells."a/b"]\nconfig = "b.toml"\nverify_every_days = 7\n', "is no name of a cell"),
+        ('[cells."a/b"]\nconfig = "b.toml"\nverify_every_days = 7\n', "is not a valid cell name"),
         ("[cells.a]\nverify_every_days = 7\n", "config is None: give the path"),
-        ('[cells.a]\nconfig = "c.toml"\nverify_every_days = 7\n', r"c\.toml does not exist: `ftdrive init` writes one"),
+        ('[cells.a]\nconfig = "c.toml"\nverify_every_days = 7\n', r"c\.toml does not exist: correct the path"),
         ('[cells.a]\nconfig = "empty.toml"\nverify_every_days = 7\n', r"has no \[robot\] host"),
         ('[cells.a]\nconfig = "b.toml"\n', "verify_every_days is None: give the days"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = 0\n', "verify_every_days is 0: give"),
@@ -87,7 +87,7 @@ def test_the_format_must_be_known(folder: Path, head: str) -> None:
 
 
 def test_cells_whose_runs_cannot_be_separated_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"a and b have the same \[robot\] host host-a.*give each its arm_serial"):
+    with pytest.raises(ConfigError, match=r"a and b have the same \[robot\] host host-a.*set arm_serial in each cell"):
         refuse_ambiguous([cell("a"), cell("b", robot_host="host-a")])
     with pytest.raises(ConfigError, match="a and b have the same arm_serial 1"):
         refuse_ambiguous([cell("a", arm_serial="1"), cell("b", arm_serial="1")])

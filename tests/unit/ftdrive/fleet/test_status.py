@@ -113,7 +113,7 @@ def test_a_drift_is_found_and_put_in_words() -> None:
     assert c is None
     assert a.found
     assert a.words.startswith("force bias x drifts by 0.02")  # 2 sigmas of 0.01 N
-    assert " N a week since 2026-" in a.words
+    assert " N per week since 2026-" in a.words
     assert 4 < a.level_sigmas < 7
     assert (b.found, b.words) == (False, "")
     assert b.level_sigmas < 2

@@ -108,7 +108,7 @@ def test_no_proven_move_brings_anything_nearer_than_its_clearance(hook_m: tuple[
 @pytest.mark.slow
 def test_a_load_has_no_room_under_a_low_ceiling() -> None:
     low = CellConfig(CELL.robot, CELL.sensor, CELL.tool, WorkcellConfig(planes_mm=((0, 0, -1, -450),)))
-    with pytest.raises(PlanRefused, match="jog the arm to where the load has room"):
+    with pytest.raises(PlanRefused, match="jog the arm to where there is room"):
         plan_for(low, certifier_for(low, "UR3e", MODELS["UR3e"], HOOK_M), USUAL_POSTURE_RAD)
 
 

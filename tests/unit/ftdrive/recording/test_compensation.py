@@ -203,7 +203,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
         (
             "wrench",
             "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n2,1,2,3,4,5,6\n",
-            "row 2: fy is missing or no finite number",
+            "row 2: fy is missing or not a finite number",
         ),
         ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "has degrees, or is three angles"),
         ("poses", "t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,2\n", "row 2: the quaternion has length 2"),

@@ -80,7 +80,7 @@ OTHER = {
     "emulated": (origin(OURS, emulated=True), origin(OURS), "its emulated is True"),
     "no serial number": (origin(changed(serial=None)), origin(changed(serial=None)), "reports no serial number"),
     "not reported": (origin(changed(serial=NOT_REPORTED)), origin(changed(serial=NOT_REPORTED)), "serial=NAME"),
-    "empty": (origin(changed(serial="")), origin(changed(serial="")), "number: name it by serial=NAME"),
+    "empty": (origin(changed(serial="")), origin(changed(serial="")), "number: add serial=NAME"),
     "ours not reported": (origin(OURS), origin(changed(serial=NOT_REPORTED)), "the sensor of this calibration reports"),
     "theirs not reported": (origin(changed(serial=NOT_REPORTED)), origin(OURS), "the sensor of that file reports no"),
     "no devices": (origin(OURS), {}, "the sensor of this calibration reports no serial number"),

@@ -49,7 +49,7 @@ def test_a_run_with_a_load_is_not_that_of_its_tool(lab: Lab) -> None:
     assert run is not None
     solve_and_save(run)
     assert Load.of_header(read_source(run.folder, SolveOptions()).dataset.meta) == load
-    with pytest.raises(BadCalibration, match=r"a load of 0\.5 kg in the gripper: use it with `ftdrive loads solve`"):
+    with pytest.raises(BadCalibration, match=r"a load of 0\.5 kg in the gripper: use it in `ftdrive loads solve`"):
         read_calibration(run.folder)
     found = circumstances_of(Run(run.folder))
     assert found.origin["setup"]["tool"] != lab.cell.tool.name

@@ -50,7 +50,7 @@ def run(tmp_path: Path) -> Run:
         (lambda header: header.update(mode=5), r"'mode' is 5 and not one of auto, step.*from a copy"),
         (lambda header: header.update(mode=["auto"]), r"'mode' is \['auto'\].*from a copy"),
         (lambda header: header.update(said=5), r"'said' is 5 and not an object.*from a copy"),
-        (lambda header: header.update(said={"robot": 5}), r"'said\.robot' is 5 and not a text or null.*from a copy"),
+        (lambda header: header.update(said={"robot": 5}), r"'said\.robot' is 5 and not a string or null.*from a copy"),
         (lambda header: header.update(said={"config": ["a"]}), r"'said\.config' is \['a'\].*from a copy"),
         (
             lambda header: header.update(said={"tool": "0:60:90"}),

@@ -174,7 +174,7 @@ def test_an_arm_out_of_sight_may_be_ending_its_move() -> None:
     under_way, standing = arm_lost(lost, moving=True), arm_lost(lost, moving=False)
     assert (under_way.hazard, standing.hazard) == (16, 16)
     assert isinstance(under_way.error, DeviceTimeout)
-    assert "may not have heard" in str(under_way)
+    assert "may not have received" in str(under_way)
     assert under_way.error.fix == "check the robot"
     assert str(standing) == str(lost)
 

@@ -371,7 +371,7 @@ def test_keep_ends_it_when_the_poses_are_enough_and_not_before() -> None:
     move_on = "move on to another orientation"
     assert moves[:5] == [move_on] * 5
     assert "press k" in moves[5]  # the screen says so all the time
-    assert outcome.person.shown[-1].to_dict()["words"] == "Finished: 6 poses are kept."
+    assert outcome.person.shown[-1].to_dict()["words"] == "Finished: 6 poses are saved."
     assert outcome.cell.now_s == pytest.approx(32.0, abs=0.2)
 
 
@@ -380,7 +380,7 @@ def test_stop_ends_it_at_any_time_and_says_what_is_missing() -> None:
     last = outcome.person.shown[-1]
     assert isinstance(last, Noted)
     assert last.warning
-    assert last.words.startswith("Stopped by the operator: 1 pose is kept")
+    assert last.words.startswith("Stopped by the operator: 1 pose is saved")
     assert "amber" in last.words
 
 
@@ -390,8 +390,8 @@ TILTED = [Rotation.from_euler("xyz", angles, degrees=True) for angles in ((45, 0
 def test_without_keys_it_ends_by_itself_when_the_poses_are_enough() -> None:
     outcome = Outcome(dwells(*AROUND, *TILTED), has_keys=False)
     assert outcome.stops == [1, 2, 3, 4, 5, 6]
-    assert "once the coverage is green" in outcome.person.words()
-    assert "6 poses are kept." in outcome.person.words()
+    assert "when the coverage is green" in outcome.person.words()
+    assert "6 poses are saved." in outcome.person.words()
     assert "press" not in outcome.person.words()
 
 
@@ -403,7 +403,7 @@ def test_without_keys_it_does_not_end_with_a_pose_that_is_in_doubt() -> None:
     poses[5] = Dwell(AROUND[5], 12.0, wrench=shaken)
     outcome = Outcome(poses, has_keys=False)
     assert [record.steady for record in outcome.kept] == [True] * 5 + [False, True]
-    assert "It is kept and marked." in outcome.person.words()
+    assert "The pose is saved and marked as not quiet." in outcome.person.words()
     assert "press" not in outcome.person.words()
 
 
@@ -481,7 +481,7 @@ def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
 def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen: bool) -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), silent_s=(since_s, since_s + 1.0), listen=listen)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, -1.0, 0.0]
-    words = "Nothing is measured until the arm answers again: its clock has stood still."
+    words = "The measurement waits until the arm answers again: its clock has stood still."
     assert outcome.person.words().count(words) == 1
 
 
@@ -540,7 +540,7 @@ def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
 
     outcome = Outcome(dwells(UP, DOWN, LEFT), says=says)
     assert [r.before.R_base_flange[2, 2].round(3) for r in outcome.kept] == [1.0, 0.0]
-    assert outcome.person.words().count("Nothing is measured: protective stop") == 1
+    assert outcome.person.words().count("No measurement now: protective stop") == 1
 
 
 def test_a_run_is_continued_where_it_was() -> None:
@@ -564,7 +564,7 @@ def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
     assert drift.elapsed_s == pytest.approx(6 * (4.0 + MOVE_S), abs=0.5)
     assert len(dataset_from(outcome.kept, {})) == 6
     words = outcome.person.words()
-    assert "dwell 3.3 s" in words
+    assert "dwell for 3.3 s" in words
     assert "first pose: 7 poses" in words
     assert not any(hint in words for hint in ("press k", "Turn the tool"))
     assert {event.hint for event in outcome.person.shown if isinstance(event, Estimated)} == {""}

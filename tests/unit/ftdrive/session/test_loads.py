@@ -24,7 +24,7 @@ def weigh(lab: Lab, tool_kg: float | None, payload_kg: float) -> None:
     [
         (1.0, 1.0, "set the payload to 3.00 kg"),
         (None, 1.0, "the mass of sensor, tool and load, above 2.00 kg"),
-        (4.0, 6.0, "6.00 kg or more, the arm carries 5 kg: take a lighter load"),
+        (4.0, 6.0, "at least 6.00 kg, but the arm carries 5 kg: take a lighter load"),
     ],
 )
 def test_the_payload_must_be_the_total(tool_kg: float | None, payload_kg: float, words: str, lab: Lab) -> None:
@@ -52,7 +52,7 @@ def test_a_load_is_hung_when_the_arm_stands_at_the_first_pose(lab: Lab) -> None:
     assert "nothing and no one below" in asked[1]
     assert sum("hang a load of 2 kg at tip now" in text for text in asked) == 1
     assert all(record.swings for record in lab.run().records())
-    assert any("repeated while it swings" in event.words for event in lab.operator.of(Noted))
+    assert any("repeated while the load swings" in event.words for event in lab.operator.of(Noted))
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_wrist_3_at_the_end_of_its_range_may_be_outside_it_by_its_joint_noise(ou
 
 def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
-    refuse(lab, "payload 1.50 kg .* sensor and tool are 3.00 kg")
+    refuse(lab, "payload 1.50 kg .* sensor and tool weigh 3.00 kg")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
         assert lab.take_poses(dry_run=True) is None
         assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
     else:
-        refuse(lab, f"{words}: take a larger sensor")
+        refuse(lab, f"{words}: use a sensor with a larger range")
 
 
 def test_a_sensor_with_an_arbitrary_zero_is_calibrated_within_its_range(
@@ -160,7 +160,7 @@ def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="A1"))
     assert lab.take_poses(dry_run=True) is None
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
-    refuse(lab, r"the arm at fake has serial A1, \[robot\] serial is B2")
+    refuse(lab, r"the arm at fake has serial A1, but \[robot\] serial is B2")
 
 
 def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
@@ -240,7 +240,7 @@ def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhi
 def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
-    assert "limits are not checked" in lab.said()
+    assert "are not checked in a dry run" in lab.said()
 
 
 def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:

@@ -71,7 +71,7 @@ def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> Non
     assert [question for question in lab.operator.asked if "Approach to pose 5" in question.text]
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
     assert State.HOLD not in lab.operator.states()
-    assert "skipped: pose 4, the arm" in lab.said()
+    assert "skipped: pose 4; the arm" in lab.said()
 
 
 def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
@@ -156,7 +156,7 @@ def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
     lab.take_poses()
     assert lab.taken() == [1, 2, 2, 3, 4, 5, 6, 7]
     assert "no pose yet" in lab.said()
-    assert "pose 2 is being taken" in lab.said()
+    assert "pose 2 is already being taken" in lab.said()
 
 
 def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
@@ -170,7 +170,7 @@ def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> Non
     lab.press((Key.REDO, PoseTaken, 3))
     outcome = lab.calibrate()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert "pose 3 stays" in lab.said()
+    assert "pose 3 keeps" in lab.said()
     assert outcome is not None
     assert outcome.result.n_poses == 6
     assert [event.poses for event in lab.operator.of(Estimated)][:5] == [1, 2, 3, 3, 4]
@@ -181,7 +181,7 @@ def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_r
     lab.operator.answers["Pose 1 of 7"] = ["", "s"]
     outcome = lab.calibrate(mode="step")
     assert lab.taken() == [1, 2, 3, 4, 5, 6]
-    assert "pose 1 stays" in lab.said()
+    assert "pose 1 keeps" in lab.said()
     assert "skipped: the return to pose 1" in lab.said()
     assert outcome is not None
     assert outcome.result.n_poses == 6
@@ -199,7 +199,7 @@ def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> N
     lab.operator.answers["Pose 3 of 7"] = ["s"]
     outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
     assert lab.taken() == []
-    assert "pose 3 stays" in lab.said()
+    assert "pose 3 keeps" in lab.said()
     assert "skipped" not in lab.said()
     assert [event.poses for event in lab.operator.of(Estimated)][-1] == 6
     assert outcome is not None
@@ -351,7 +351,7 @@ def reports(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, 
     ("then", "now", "cure"),
     [
         (("Robotiq FT 300", NOT_REPORTED), ("UR wrist", NOT_REPORTED), "serial=… in its address"),
-        (("Robotiq FT 300", "1"), ("UR wrist", "1"), "connect that of the run"),
+        (("Robotiq FT 300", "1"), ("UR wrist", "1"), "connect the sensor of the run"),
         (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", "1"), "serial=… in its address"),
         (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", NOT_REPORTED), ""),
     ],
@@ -385,7 +385,7 @@ def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab)
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     folder = broken_off(lab)
     lab.arm.identify = lambda: DeviceInfo("UR7e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
-    with pytest.raises(PlanRefused, match="not reported, connected is UR7e"):
+    with pytest.raises(PlanRefused, match="not reported, but UR7e"):
         lab.take_poses(resume=folder)
     lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
     assert lab.take_poses(resume=folder) is not None

@@ -203,7 +203,7 @@ def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
 @pytest.mark.parametrize(
     ("arm", "says"),
     [
-        ({"program": "playing"}, "another program is on the controller"),
+        ({"program": "playing"}, "another program is active on the controller"),
         ({"remote": False}, "local control"),
         (
             {"_status": replace(FakeArm(FakeClock())._status, fault=DeviceFault("protective stop", "clear it"))},
@@ -264,14 +264,14 @@ def test_nothing_more_is_sent_once_the_supervisor_is_gone(sent: int, cell: Cell)
 
 def test_values_that_change_during_the_question_are_not_overwritten(cell: Cell) -> None:
     cell.at_question = lambda: setattr(cell.arm, "settings", replace(OLD, mass_kg=0.7))
-    with pytest.raises(NotAccepted, match="changed meanwhile"):
+    with pytest.raises(NotAccepted, match="changed since they were shown"):
         cell.send(cell.propose())
     assert (cell.arm.sent, cell.receipts()) == ([], [])
 
 
 def test_a_controller_that_keeps_other_values_is_an_error_with_a_receipt(cell: Cell) -> None:
     cell.arm.ignores = True
-    with pytest.raises(NotAccepted, match="another mass and centre of mass than was sent"):
+    with pytest.raises(NotAccepted, match="mass and centre of mass that was sent"):
         cell.send(cell.propose())
     (receipt,) = cell.receipts()
     assert receipt["read_back"]["mass_kg"] == 0.6

@@ -151,7 +151,7 @@ def test_a_controller_that_does_not_hear_the_stop_may_end_its_move(lab: Lab) -> 
     with pytest.raises(DeviceTimeout):
         lab.take_poses()
     holds = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
-    assert "ends the one move" in holds[0].words
+    assert "completes the current move" in holds[0].words
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -213,7 +213,7 @@ def test_after_a_contact_the_arm_goes_back_or_round_it_where_a_person_says_so(la
     reasons = [event.words for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
     assert reasons[2].startswith("back at pose 3")
     assert lab.taken() == [1, 2, 3, 5, 6, 7]
-    assert "skipped: pose 4, the arm" in lab.said()
+    assert "skipped: pose 4; the arm" in lab.said()
 
 
 def test_the_way_back_is_confirmed_by_a_person_though_the_plan_is_known(lab: Lab) -> None:
@@ -334,7 +334,7 @@ def test_an_arm_that_was_moved_between_two_poses_is_noticed(lab: Lab) -> None:
             lab.arm.q = lab.arm.q + np.radians([0, 0, 0, 0, 0, 2.0])
 
     lab.operator.on_event = on_event
-    with pytest.raises(DeviceFault, match=r"joint 6 is 2\.0° from"):
+    with pytest.raises(DeviceFault, match=r"joint 6 is 2\.0° off"):
         lab.take_poses()
     assert lab.operator.of(GuardTripped)[0].hazard == 21
 

@@ -107,7 +107,7 @@ def test_a_push_that_the_weight_of_a_heavy_tool_would_hide_is_seen_once_the_tool
 
 def test_a_joint_off_the_curve_stops_the_arm(lab: Lab) -> None:
     lab.arm.at_sweep_s[1] = 1.0, lambda: setattr(lab.arm, "push_rad", np.radians([0, 0, 0, 0, 3.0, 0]))
-    with pytest.raises(Exception, match="from where it should be"):
+    with pytest.raises(Exception, match="off its planned position"):
         lab.sweep(real=False)
     assert lab.operator.of(GuardTripped)[0].hazard == 2
 

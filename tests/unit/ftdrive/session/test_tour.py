@@ -255,7 +255,7 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     (shown,) = lab.operator.of(Planned)
     assert lab.operator.shown.index(shown) < lab.operator.shown.index(lab.operator.of(Checked)[0])
     words = in_words(shown)
-    for figure in ("wrist 3", "Least clearance", "within 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
+    for figure in ("wrist 3", "Smallest clearance", "within 0.3", "Predicted", "1 move (wrist 1 ", "proven clear by"):
         assert figure in words
     assert "whole arm" not in words
     written = json.loads(json.dumps(shown.to_dict(), allow_nan=False))
@@ -373,7 +373,7 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
         joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))
         assert f"joint{'s' if ',' in joints else ''} {joints}, largest turn {turn_deg.max():.0f}°" in text
         assert "at 30 °/s" in text  # slow, as in any first run
-    assert "Enter measures" in asked[3]  # pose 2 again, where the arm is
+    assert "Enter starts the measurement" in asked[3]  # pose 2 again, where the arm is
     assert "moves" not in asked[3]
 
 
@@ -381,7 +381,7 @@ def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: La
     beside = lab.arm.q
     for yes, words in (
         (True, "shows it, joint"),
-        (True, "shows it, and drives it where --yes may confirm it"),
+        (True, "shows it, and moves along it if --yes may confirm it"),
         (False, "shows it, joint"),
     ):
         lab.operator.asked.clear()

@@ -248,7 +248,7 @@ def end(lab: Lab) -> None:
 def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: end(lab)
     lab.operator.answers["resume:"] = ["resume", "quit"]
-    with pytest.raises(DeviceFault, match="thread has ended"):
+    with pytest.raises(DeviceFault, match="thread of the guards has ended"):
         lab.take_poses()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
     assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guards'")]) == 1
@@ -265,7 +265,7 @@ def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
     if stop == 0:
         lab.operator.at_question.append(("Is the tool free", lambda: setattr(lab.watchers[-1], "ended", True)))
     lab.operator.on_event = on_event
-    with pytest.raises(DeviceFault, match="nothing is watched"):
+    with pytest.raises(DeviceFault, match="the arm is not watched"):
         lab.take_poses()
     assert len(lab.arm.moves) == stop
 

@@ -98,7 +98,7 @@ def test_a_calibration_does_not_fail_for_a_server_that_is_down(
     monkeypatch.setenv("FTDRIVE_STORE_URL", url)
     said = list[str]()
     index_run(runs / "2026-03-01-calibrate", said.append)
-    assert "The run is saved but not in the history yet, because the store postgresql" in " ".join(said)
+    assert "The run is saved, but not yet in the history, because the store postgresql" in " ".join(said)
 
 
 @pytest.mark.slow

@@ -108,7 +108,7 @@ def test_a_store_that_cannot_be_written_is_reported_once_and_caught_up(tmp_path:
         log.keep(part(mass))
     log.close()
     assert len(down.said) == 1
-    assert down.said[0].startswith(" Weighings are kept but not in the history yet, because the store")
+    assert down.said[0].startswith(" Weighings are saved, but not yet in the history, because the store")
     up = Logs(down.folder, f"sqlite:///{tmp_path}/store.sqlite")
     up.write("cable", times=iter([NOON + timedelta(days=1)]))
     assert [one.weighings for one in Store(up.url).weighings(9)] == [5, 0]
@@ -128,7 +128,7 @@ def test_lines_wait_for_a_disk_that_fails(tmp_path: Path, monkeypatch: pytest.Mo
     for mass in (0.1, 0.2, 0.3):  # closed each time, so that the lines come one by one
         logs.write(mass)
     assert [one.weighings for one in Store(logs.url).weighings(9)] == [1]
-    assert logs.said == [" Weighings are not kept, because [Errno 28] No space left on device."] * 2
+    assert logs.said == [" Weighings are not saved, because [Errno 28] No space left on device."] * 2
 
     failures = iter([True, False])
     shutil.rmtree(logs.folder)

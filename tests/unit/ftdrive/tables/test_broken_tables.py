@@ -144,23 +144,23 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
         r"line 6: fx is '1\.5', which has a decimal point, unlike others",
         named(),
     ),
-    "decimal comma between commas": (replaced(5, "fx", "1,5"), r"line 6 has 12 values, other lines have 11", named()),
-    "a blank cell": (replaced(5, "fx", ""), r"row 5: fx is missing or no finite number", named()),
-    "nan": (replaced(5, "ty", "nan"), r"row 5: ty is missing or no finite number", named()),
-    "inf": (replaced(5, "ty", "inf"), r"row 5: ty is missing or no finite number", named()),
+    "decimal comma between commas": (replaced(5, "fx", "1,5"), r"line 6 has 12 values, but other lines have 11", named()),
+    "a blank cell": (replaced(5, "fx", ""), r"row 5: fx is missing or not a finite number", named()),
+    "nan": (replaced(5, "ty", "nan"), r"row 5: ty is missing or not a finite number", named()),
+    "inf": (replaced(5, "ty", "inf"), r"row 5: ty is missing or not a finite number", named()),
     "a value too many": (
         "\n".join([*lines()[:5], lines()[5] + ",7", *lines()[6:]]),
-        r"line 6 has 12 values, other lines have 11",
+        r"line 6 has 12 values, but other lines have 11",
         named(),
     ),
     "half a line": (
         "\n".join([*lines()[:5], lines()[5][:40], *lines()[6:]]),
-        r"line 6 has \d+ values, other lines have 11",
+        r"line 6 has \d+ values, but other lines have 11",
         named(),
     ),
     "half a file": (
         text(PLAIN)[: len(text(PLAIN)) // 2].rpartition(",")[0],
-        r"line \d+ has \d+ values, other lines have 11",
+        r"line \d+ has \d+ values, but other lines have 11",
         named(),
     ),
     "zero sigma": (
@@ -180,7 +180,7 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     ),
     "rotation vector in degrees": (
         text(t(POSES) | wrench(POSES) | columns("rx ry rz", np.degrees(POSES.R.as_rotvec()))),
-        r"rotation vector of \d+ rad has degrees, or is three angles: .*\[deg\].*--euler",
+        r"rotation vector of \d+ rad is in degrees, or is three angles: .*\[deg\].*--euler",
         named(),
     ),
     "no row": (lines()[0], r"no row has two numbers or more", named()),
@@ -197,7 +197,7 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     "empty": ("", r"the file is empty", named()),
     "blank lines": ("\n\n \n", r"the file is empty", named()),
     "prose": ("this is a text\nwithout numbers, as it seems\n", r"no row has two numbers or more", named()),
-    "binary": (bytes(range(256)) * 9, r"it is no text table", named()),
+    "binary": (bytes(range(256)) * 9, r"the file is not a text table", named()),
     "damaged gzip": (
         gzip.compress(text(PLAIN).encode())[:300] + b"\0" * 300,
         r"compressed file is damaged or cut",
@@ -208,26 +208,26 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
     # units
     "force in mm": (
         text(renamed(fx="fx [mm]")),
-        r"column 'fx \[mm\]' has the unit mm, which is none of force .*--columns",
+        r"column 'fx \[mm\]' has the unit mm, which is not a unit of force .*--columns",
         named(),
     ),
-    "torque in N": (text(renamed(tx="tx (N)")), r"column 'tx \(N\)' has the unit N, which is none of torque", named()),
-    "time in N": (text(renamed(t="t [N]")), r"has the unit N, which is none of time", named()),
-    "force in parsec": (text(renamed(fx="fx [pc]")), r"has the unit pc, which is none of force", named()),
+    "torque in N": (text(renamed(tx="tx (N)")), r"column 'tx \(N\)' has the unit N, which is not a unit of torque", named()),
+    "time in N": (text(renamed(t="t [N]")), r"has the unit N, which is not a unit of time", named()),
+    "force in parsec": (text(renamed(fx="fx [pc]")), r"has the unit pc, which is not a unit of force", named()),
     "position in deg": (
         text(PLAIN | columns("x|[deg] y|[deg] z|[deg]".replace("|", "_"), POSES.p_m)),
-        r"has the unit deg, which is none of length",
+        r"has the unit deg, which is not a unit of length",
         named(),
     ),
     "units below the names": (
         text(PLAIN, units=["s", *["V"] * 6, *[""] * 4]),
-        r"has the unit V, which is none of force",
+        r"has the unit V, which is not a unit of force",
         named(),
     ),
     # options
     "a column that is not there": (
         text(PLAIN),
-        r"--columns fx=Force X: the columns are t, fx, .*name a column, or its number",
+        r"--columns fx=Force X: the columns are t, fx, .*give the name of a column, or its number",
         named(fx="Force X"),
     ),
     "a number beyond the last": (text(PLAIN), r"--columns fx=99: the columns are", named(fx="99")),

@@ -103,9 +103,9 @@ def test_a_table_in_memory_is_read_by_its_names() -> None:
     plain = t(POSES) | wrench(POSES) | quaternion(POSES)
     expected = Table(plain).dataset().sha256()
     assert Table(pyarrow.table(plain), name="dict").dataset().sha256() == expected
-    with pytest.raises(BadDataset, match=r"^dict: .*give a number in each cell"):
+    with pytest.raises(BadDataset, match=r"^dict: .*put a number into each cell"):
         Table({**plain, "fx": np.array(["a"] * 24)}).dataset()
-    with pytest.raises(BadDataset, match=r"^dict: .*give a number in each cell"):
+    with pytest.raises(BadDataset, match=r"^dict: .*put a number into each cell"):
         Table({**plain, "fx": np.zeros(7)}).dataset()
 
 
@@ -132,7 +132,7 @@ def test_standard_errors_are_those_of_the_axes_of_the_sensor() -> None:
     sigma = columns("sigma_fx sigma_fy sigma_fz sigma_tx sigma_ty sigma_tz", np.full((24, 6), 0.1))
     plain = wrench(POSES) | quaternion(POSES) | sigma
     assert Table(plain).dataset().wrench_cov is not None
-    with pytest.raises(BadDataset, match="standard errors are those of the sensor's axes"):
+    with pytest.raises(BadDataset, match="standard errors must be in sensor axes"):
         Table(plain, TableOptions(wrench_axes="tcp")).dataset()
 
 

@@ -195,7 +195,7 @@ def test_lines_of_the_report_go_on_under_their_text(
         ("--level-deg", "-1", "-1.0 is not in the range 0<=x<=180"),
         ("--mounting-deg", "nan,0,0", "--mounting-deg is 'nan,0,0': give 3 numbers"),
         ("--mass-kg", "0", "0.0 is not in the range x>0"),
-        ("--up", "0,0,0", "--up is 0,0,0, which is no direction: give 0,0,1"),
+        ("--up", "0,0,0", "--up is 0,0,0, which is not a direction: give 0,0,1"),
     ],
 )
 def test_an_impossible_known_value_is_reported_as_it_was_given(

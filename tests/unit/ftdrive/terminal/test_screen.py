@@ -59,7 +59,7 @@ SIGMA: dict[str, Any] = {
     "tilt_alpha_rad": np.radians(0.06),
     "tilt_beta_rad": np.radians(0.05),
 }
-HINT = "point the middle of the tool's -x, -y and -z axes down: tilt it about its own x axis by -45°"
+HINT = "point the middle between the tool's -x, -y and -z axes down: tilt it about its own x axis by -45°"
 
 
 def pose(stop: int, number: int, **changes: Any) -> PoseTaken:
@@ -484,7 +484,7 @@ def test_a_terminal_that_knows_only_ascii_gets_ascii() -> None:
 
 
 def test_ascii_is_longer_and_nothing_is_cut_off_for_it() -> None:
-    hint = "point the middle of the tool's -x, -y and -z axes down: tilt it about y by -45°"
+    hint = "point the middle between the tool's -x, -y and -z axes down: tilt it about y by -45°"
     found = view(
         *MIDDLE, estimated(hint=hint), Noted(words="turned by 45° 45° 45° 45° 45° 45° 45° 45° 45° 45°", warning=True)
     )
