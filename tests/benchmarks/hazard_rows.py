@@ -283,7 +283,7 @@ BEFOREHAND: Final[Sequence[Beforehand]] = (
     Beforehand("2, 3", "a tool longer than its cage", 7, "proven clear", change=_caged),
     Beforehand("3", "not measured", 7, "measured", change=_of_workcell(measured=False)),
     Beforehand("3", "a safety plane in the way", 7, "safety limits", ("--plane", "0,0,1,1.0")),
-    Beforehand("5", "the arm stands in a box", 7, "0 mm from contact", change=_of_workcell(boxes_mm=(BOX_MM,))),
+    Beforehand("5", "the arm stands in a box", 7, "the clearance is 0 mm", change=_of_workcell(boxes_mm=(BOX_MM,))),
     Beforehand("7", "payload 0 in the controller", 7, "payload", ("--payload", "0")),
     Beforehand("8", "a turned TCP, not reported", 0, options=("--tcp", "0,0,0.2,0.3,0,0", "--no-tcp-offset")),
     Beforehand("9", "another model", 3, "UR10e", change=_of_model("UR10e")),

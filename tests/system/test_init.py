@@ -232,7 +232,7 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
         "wrong side of the plane [1, 0, 0, 800]",
         "the plane [-1, 0, 0, -20] (+x 20 mm) is 0 mm from the arm's shoulder",
         "write 1200 or 1.200",
-        "give side and distance",
+        "give a side and a distance",
         "the box [-50, -50, 0, 50, 50, 400]",
     ):
         assert words in outcome.stderr

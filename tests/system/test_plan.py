@@ -97,7 +97,7 @@ def test_the_table_fits_into_80_columns() -> None:
         (["--tool", "200:100:50"], "[200.0, 100.0, 50.0] is not"),
         (["--quick", "--minimal"], "not both"),
         (["--mounting", "sideways"], "mounting"),
-        (["--plane", "0:0:0:1"], "no direction"),
+        (["--plane", "0:0:0:1"], "normal is zero"),
         (["--tip-speed-limit", "-1"], "1 to 250"),
         (["--tip-speed-limit", "fast"], "'fast': give mm/s, such as 250, or none"),
         (["--posture", "45,-100"], "3 numbers"),

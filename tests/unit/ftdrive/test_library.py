@@ -20,7 +20,7 @@ from tests.unit.ftdrive.recorded import block, info
     ("arguments", "words"),
     [
         ({"model": "ur6e"}, "ur6e"),
-        ({"tool_mm": []}, "what is mounted"),
+        ({"tool_mm": []}, "the tool is not described"),
         ({"tool_mm": [(0, 200)]}, "tool_mm"),
         ({"poses": 7}, "choose 24, 12, 6"),
         ({"mounting": "shelf"}, "shelf"),

@@ -164,7 +164,7 @@ def test_degrees_of_the_mounting_are_a_number_too() -> None:
     [
         ("[site]\ng_m_s2 = '9.81'", "a number: give one such as"),
         ("[sampling]\nattempts = 1.5", "a whole number: give one such as 1,"),
-        ("[workcell]\nmounting = true", "a text: put it in quotes"),
+        ("[workcell]\nmounting = true", "a string: put it in quotes"),
         ("[workcell]\nmeasured = 1", "true or false: give one of them"),
         ("[tool]\ncylinders_mm = [0, 60, 90]", r"such as \[\[0, 60, 90\]\]"),
     ],
@@ -210,7 +210,7 @@ def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch
         (GOOD + "sign = 0\n", "sign = 0.*-1 for"),
         (GOOD + "height_mm = 3300\n", "0 to 500"),
         (GOOD + "height_mm = 0.033\n", "the unit is mm"),
-        (GOOD.replace("10.0.0.2", "http://10.0.0.2/"), "name or IPv4 address alone"),
+        (GOOD.replace("10.0.0.2", "http://10.0.0.2/"), "only a name or an IPv4 address"),
         (GOOD + "[robot", "TOML"),
         (GOOD + "[tool]\ncylinders_mm = " + "[" * 50_000, "TOML file: its brackets are nested too deeply"),
         (GOOD + '[site]\ng_m_s2 = "9.8"\n', "g_m_s2"),

@@ -30,7 +30,7 @@ def test_what_is_no_length(text: str) -> None:
 
 @pytest.mark.parametrize(("units", "text"), [(MM, "1,200"), (KG, "-1,200 g"), (DEG_S, "12,000")])
 def test_a_comma_that_may_separate_thousands_is_not_guessed(units: dict[str, str], text: str) -> None:
-    with pytest.raises(ConfigError, match="two meanings"):
+    with pytest.raises(ConfigError, match="ambiguous"):
         parse_quantity("--x", text, units)
 
 

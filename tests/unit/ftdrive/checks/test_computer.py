@@ -43,7 +43,7 @@ def test_the_workcell_is_counted_and_what_cannot_be_is_named() -> None:
     found = checks.check_workcell(wrong, "UR5e")
     assert (found.name, found.state) == ("workcell.measured", "failed")
     assert "[1, 0, 0, 800]" in found.found
-    assert "give [-1, 0, 0, -800]" in found.found
+    assert "Give [-1, 0, 0, -800]" in found.found
 
 
 def test_a_slow_adapter_with_a_short_name(computer: Path) -> None:

@@ -129,7 +129,7 @@ def test_an_interface_that_cannot_be_asked(can0: Path, asked: list[Any]) -> None
     [
         ([], "answers on can0: check its power"),
         ([REFUSED], "a Robotous was not asked"),
-        ([FOUND, Answer("robotous-can://can0", "R")], "choose one, ati-can.* or robotous"),
+        ([FOUND, Answer("robotous-can://can0", "R")], "give the address of one, ati-can.* or robotous"),
     ],
 )
 def test_only_one_sensor_is_the_sensor(answers: list[Answer], words: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ def test_ports_and_interfaces_are_listed_with_what_is_wrong(capsys: pytest.Captu
 def test_places_are_probed_and_an_error_is_an_answer(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(devices, "ask", ask)
+    monkeypatch.setattr(devices, "probe_place", ask)
     places = ["--probe", "can0", "--probe", "silent", "--probe", "busy"]
     assert cli.run(["devices", *places]) == 4
     lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith(" probed")]

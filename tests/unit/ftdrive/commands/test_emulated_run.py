@@ -37,7 +37,7 @@ def test_the_place_of_a_run_that_is_not_kept_is_not_printed(
         operator.show(Noted(words=f"3 poses are kept in {folder}"))
         return SimpleNamespace()
 
-    monkeypatch.setattr(rehearsal, "calibrate", calibrate)
+    monkeypatch.setattr(rehearsal, "run_calibration", calibrate)
     rehearsal.rehearse(STATION, tmp_path, "simulated", person, kept=kept)  # type: ignore[arg-type]
     assert [type(event) for event in person.events] == expected
 

@@ -108,7 +108,7 @@ def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--columns", "fx"], "--columns fx: give NAME=COLUMN separated by commas between"),
+        (["--columns", "fx"], "--columns fx: give NAME=COLUMN separated by commas"),
         (["--columns", "none.toml"], "none.toml"),
         (["--columns", "empty.toml"], "empty.toml has no columns"),
         (["--columns", "fx=Force"], "the columns are t, fx, fy"),
@@ -120,7 +120,7 @@ def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
         (["--model", "ur5e", "--urdf", "a.urdf"], "--model and --urdf both describe the arm"),
         (["--urdf", "none.urdf"], "--urdf none.urdf: none.urdf is not a URDF"),
         (["--urdf", "arm.urdf?flange=tip"], "has no link 'tip'"),
-        (["--urdf", "arm.urdf"], "7 joints move, 6 are read"),
+        (["--urdf", "arm.urdf"], "7 moving joints, not 6"),
         (["--wrench-topic", "/ft"], "go with a bag of ROS"),
     ],
 )

@@ -43,9 +43,9 @@ def test_a_centre_of_mass_that_is_wrong_in_several_controllers_is_named() -> Non
     assert (one.kind, one.cells) == ("payload", ("b", "c", "d"))
     x, y = 1e3 * OFF_AXIS_M
     assert one.words.startswith(
-        f"The tool gripper has its centre of mass ({x:.0f}, {y:.0f}) mm off the flange axis in b, c and d"
+        f"The tool gripper has its centre of mass ({x:.0f}, {y:.0f}) mm off the flange axis, according to b, c and d"
     )
-    assert "amount to others, such as (0, 0) mm in b: set them with `ftdrive push`" in one.words
+    assert "imply other centres, such as (0, 0) mm in b: set the payloads with `ftdrive push`" in one.words
 
 
 def test_one_wrong_controller_is_no_finding_of_the_fleet() -> None:
@@ -65,7 +65,7 @@ def test_a_mass_that_is_wrong_in_several_controllers_is_named(kg: float, wrong: 
     assert [(each.kind, each.cells) for each in one] == ([("payload", ("a", "b", "c"))] if wrong else [])
     if wrong:
         assert (
-            f"The tool gripper weighs {MASS_KG:.2f} kg without sensor and adapter in a, b and c alike" in one[0].words
+            f"The tool gripper weighs {MASS_KG:.2f} kg without sensor and adapter, according to a, b and c" in one[0].words
         )
         assert f"such as {kg:.2f} kg in a" in one[0].words
 
@@ -108,7 +108,7 @@ def test_sensors_that_follow_their_temperature_are_named_by_model() -> None:
         checks += [check_at(each, T) for each, T in zip(days, warm, strict=True)]
     (finding,) = found("abcde", results, checks)
     assert (finding.kind, finding.cells) == ("temperature", ("a", "b"))
-    assert "The bias of 2 of 3 sensors Rokubi follows their temperature, by up to 0.0099 N a kelvin" in finding.words
+    assert "The bias of 2 of 3 sensors Rokubi depends on their temperature, by up to 0.0099 N per kelvin" in finding.words
 
 
 def check_at(one: Any, T: float) -> Any:
@@ -132,9 +132,9 @@ def test_late_verifications_are_one_finding() -> None:
     names = [cell(name) for name in "abcde"]  # e was never calibrated; c is due since half a day
     (one,) = fleet(names, results, [check(results[1], 19)]).findings
     assert (one.kind, one.cells) == ("overdue", ("a", "b"))
-    assert one.words == "The verifications of a and b are late, that of a by 23 d: run `ftdrive fleet verify --due`"
+    assert one.words == "The verifications of a and b are late, the one of a by 23 d: run `ftdrive fleet verify --due`"
     (alone,) = fleet([cell("a")], results).findings
-    assert alone.words.startswith("The verification of a is late by 23 d")
+    assert alone.words.startswith("The verification of a is 23 d late")
 
 
 @pytest.mark.parametrize(
@@ -155,4 +155,4 @@ def test_a_cell_that_cannot_weigh_most_parts_is_named(
     findings = fleet(cells, [result("a", 9), result("b", 9)], (), [last, weighed("b", 0.0)]).findings
     assert [(one.kind, one.cells) for one in findings] == ([("weighing", ("a",))] if named else [])
     if named:
-        assert "11 of 21 weighings with gripper were refused on 2026-11-21, mostly as 'cable'" in findings[0].words
+        assert "11 of 21 weighings with gripper were refused on 2026-11-21, mostly because of 'cable'" in findings[0].words

@@ -61,7 +61,7 @@ def test_an_outage_keeps_the_last_state_with_its_age_and_is_said_once() -> None:
     ages = [NOW + timedelta(seconds=t_s) - then for t_s, then in zip(times, read, strict=True)]
     assert [age / timedelta(seconds=EVERY_S) for age in ages] == [0, 1, 2, 3, 0]
     assert served.said == [
-        "the store db cannot be read (gone). The last state is served meanwhile. It is 1 min old.",
+        "the store db cannot be read (gone). The server shows the last state, which is 1 min old.",
         "The store can be read again.",
     ]
 

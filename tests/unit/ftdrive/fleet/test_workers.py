@@ -75,7 +75,7 @@ def test_a_call_that_no_worker_is_left_for_ends(monkeypatch: pytest.MonkeyPatch)
             raise StreamBroken("the cluster has no worker left", "start one")
 
     endless = Workers(1, lambda *_: Future[bytes](), BrokenExecutor, require_one=require_one)
-    with pytest.raises(StreamBroken, match="no worker any more"):
+    with pytest.raises(StreamBroken, match="no worker left"):
         list(answers(lambda item: (name_of, item), ITEMS, endless))
 
 

@@ -124,9 +124,9 @@ def test_a_cell_in_millimetres_becomes_what_judges_moves() -> None:
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        (cell(tool=()), "what is mounted"),
+        (cell(tool=()), "the tool is not described"),
         (cell(tool=((0, 200),)), "3 or 5 numbers"),
-        (cell(workcell=WorkcellConfig(planes_mm=((0, 0, 0, 5),))), "no direction"),
+        (cell(workcell=WorkcellConfig(planes_mm=((0, 0, 0, 5),))), "normal is zero"),
         (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, float("nan"), 1, 1),))), "6 numbers"),
         (cell(workcell=WorkcellConfig(boxes_mm=((0, 0, 0, 0, 1, 1),))), "is empty"),
         (cell(workcell=WorkcellConfig("journal")), "mounting is 'journal'"),

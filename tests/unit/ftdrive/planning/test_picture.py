@@ -35,9 +35,9 @@ def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
     first, second, *others = plan.steps
     moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
     title = _title_of(plan, certifier_of(), on_its_way=False)
-    assert "stays in this sphere" in title
+    assert "stay in this sphere" in title
     assert "WHOLE ARM" not in title
-    assert "grey: arm, orange: tool" in title
+    assert "grey: arm at every pose" in title
     title = _title_of(moving, certifier_of(), on_its_way=True)
     assert "all that moves" not in title
     assert "WHOLE ARM moves" in title

@@ -205,7 +205,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
             "t,fx,fy,fz,tx,ty,tz\n0,1,2,3,4,5,6\n1,1,nan,3,4,5,6\n2,1,2,3,4,5,6\n",
             "row 2: fy is missing or not a finite number",
         ),
-        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "has degrees, or is three angles"),
+        ("poses", "t,rx,ry,rz\n0,0,90,0\n1,0,90,0\n", "is in degrees, or is three angles"),
         ("poses", "t,qx,qy,qz,qw\n0,0,0,0,1\n1,0,0,0,2\n", "row 2: the quaternion has length 2"),
         ("poses", "t,r11,r12,r13,r21,r22,r23,r31,r32,r33\n" + "0,1,0,0,0,1,0,0,0,-1\n" * 2, "reflection"),
         ("poses", "t,rx,ry,rz\n900,0,0,0\n901,0,0,0\n", "no time in common"),

@@ -57,7 +57,7 @@ def test_arrays_that_unpack_to_too_much_are_refused(tmp_path: Path, monkeypatch:
     path = tmp_path / "motion.npz"
     recording().save(path)
     monkeypatch.setattr(numbers, "MOST_BYTES", 10_000)
-    with pytest.raises(BadDataset, match=r"not a recording in motion \(its unpacked size is 0 MB, more than"):
+    with pytest.raises(BadDataset, match=r"not a recording in motion \(its unpacked size is 0 MB, above"):
         MotionRecording.load(path)
 
 

@@ -70,5 +70,5 @@ def test_a_run_in_motion_is_solved_with_the_earlier_result_that_it_keeps(
     MotionRecording(samples, states, 250.0).save(run.new_path("motion", ".npz"))
     monkeypatch.setattr(source, "circumstances_of", lambda _: source.Circumstances(9.80665, Setup(), of("FT1", "A1")))
     assert source.solve_in_motion(run).provenance["parent"] == {"id": before.id}
-    with pytest.raises(ConfigError, match="of sensor FT2"):
+    with pytest.raises(ConfigError, match="of the sensor FT2"):
         source.solve_in_motion(run, earlier=replace(before, provenance=of("FT2", "A1")))

@@ -47,7 +47,7 @@ def run(tmp_path: Path) -> Run:
         (lambda header: header["devices"].pop("arm"), r"has no 'arm'.*from a copy"),
         (lambda header: header["devices"]["arm"].clear(), r"has no 'serial'.*from a copy"),
         (lambda header: header["devices"]["arm"].update(serial=5), r"'devices\.arm\.serial' is 5.*from a copy"),
-        (lambda header: header.update(mode=5), r"'mode' is 5 and not one of auto, step.*from a copy"),
+        (lambda header: header.update(mode=5), r"'mode' is 5, not one of auto, step.*from a copy"),
         (lambda header: header.update(mode=["auto"]), r"'mode' is \['auto'\].*from a copy"),
         (lambda header: header.update(said=5), r"'said' is 5 and not an object.*from a copy"),
         (lambda header: header.update(said={"robot": 5}), r"'said\.robot' is 5 and not a string or null.*from a copy"),

@@ -346,14 +346,14 @@ def test_a_repeat_is_reported_once_and_left_out(turn_deg: float) -> None:
     nudged = near * Rotation.from_euler("x", 0.5, degrees=True)
     outcome = Outcome(dwells(UP, DOWN, near, nudged, LEFT))
     assert outcome.stops == [1, 2, 3]
-    assert outcome.person.words().count(f"This is pose 1 again, {turn_deg:.0f}° from it") == 1
+    assert outcome.person.words().count(f"This orientation is {turn_deg:.0f}° from pose 1") == 1
 
 
 def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> None:
     near = Rotation.from_euler("y", 5.0, degrees=True)
     outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
-    repeats = [words for words in outcome.person.words().splitlines() if words.startswith("This is pose 1 again")]
-    left_out = "This is pose 1 again, 5° from it: it is left out."
+    repeats = [words for words in outcome.person.words().splitlines() if words.startswith("This orientation is")]
+    left_out = "This orientation is 5° from pose 1 and is left out."
     assert [words.startswith(left_out) for words in repeats] == [True, True]
     assert ["Press k" in words for words in repeats] == [False, True]
 
@@ -507,7 +507,7 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     assert outcome.stops == [1, 2, 3]
     assert all(record.steady for record in outcome.kept)
     words = outcome.person.words()
-    assert re.search(r"fy scatters by 1\.\d N, .* 0\.0[45]", words)
+    assert re.search(r"sigma of fy is 1\.\d N, and 0\.0[45]", words)
     assert "Let go of" in words
     assert [event.attempts for event in outcome.person.shown if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
@@ -530,8 +530,8 @@ def test_a_mean_that_changes_is_seen_at_the_first_pose_too() -> None:
 )
 def test_a_pose_that_the_others_contradict_is_asked_about(residual: tuple[float, float] | None, asked: bool) -> None:
     words = Outcome(dwells(*AROUND), fit=Fit(residual=residual)).person.words()
-    assert ("Pose 6 is 3.2 N" in words) == asked
-    assert "Pose 5 is" not in words  # too few to judge
+    assert ("Pose 6 differs by 3.2 N" in words) == asked
+    assert "Pose 5 differs" not in words  # too few to judge
 
 
 def test_nothing_is_measured_while_the_controller_reports_a_fault() -> None:
@@ -547,7 +547,7 @@ def test_a_run_is_continued_where_it_was() -> None:
     first = Outcome(dwells(*AROUND[:3]))
     second = Outcome(dwells(DOWN, *AROUND[3:]), earlier=first.kept)
     assert second.stops == [4, 5, 6]
-    assert "This is pose 2 again" in second.person.words()
+    assert "from pose 2 and is left out" in second.person.words()
     assert "These poses are enough" in second.person.words()
     assert len(dataset_from([*first.kept, *second.kept], {})) == 6
 
@@ -597,7 +597,7 @@ def test_a_program_that_ends_where_it_has_been_ends_it() -> None:
     outcome = Outcome(dwells(UP, DOWN, UP), listen=True, says=lambda t: status("playing" if t < 10 else "stopped"))
     assert outcome.stops == [1, 2]
     *_, left_out, ended = outcome.person.words().splitlines()
-    assert "pose 1 again, 0°" in left_out
+    assert "0° from pose 1" in left_out
     assert ended.startswith("The program has ended")
     assert outcome.cell.now_s < 13
 

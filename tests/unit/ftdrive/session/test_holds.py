@@ -200,7 +200,7 @@ def test_an_arm_that_was_out_of_sight_is_resumed_after_a_new_question(lab: Lab) 
     when_asked(lab, "resume:", once(out_of_sight))
     assert lab.take_poses() is not None
     assert questions(lab) == 2
-    assert [event for event in lab.operator.of(Noted) if "out of sight" in event.words]
+    assert [event for event in lab.operator.of(Noted) if "no status of the arm" in event.words]
     assert lab.operator.of(GuardTripped) == []
 
 

@@ -207,7 +207,7 @@ def test_a_program_of_another_client_is_refused_before_anything_is_done(
 ) -> None:
     monkeypatch.setattr(lab.arm, "reported_program", lambda: "PLAYING pick.urp")
     lab.arm.program = program
-    words = r"program is on the controller \(PLAYING pick\.urp\): stop it at the pendant, then start again"
+    words = r"program is active on the controller \(PLAYING pick\.urp\): stop it at the pendant, then start again"
     with pytest.raises(NotAccepted, match=words):
         lab.take_poses(dry_run=dry_run)
     assert (lab.arm.opened, lab.arm.moves, lab.operator.asked) == (1, [], [])

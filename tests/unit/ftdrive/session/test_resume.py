@@ -99,7 +99,7 @@ def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
     lab.press((Key.KEEP, PoseTaken, 3))
     lab.take_poses()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert lab.said().count("r to take it again") == 1
+    assert lab.said().count("press r to take the last one again") == 1
 
 
 def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
@@ -366,7 +366,7 @@ def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
     if not cure:
         assert lab.take_poses(resume=folder) is not None
         return
-    with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, connected is {now[0]}.*{cure}"):
+    with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, but {now[0]}.*{cure}"):
         lab.take_poses(resume=folder)
     assert lab.arm.moves == []
 

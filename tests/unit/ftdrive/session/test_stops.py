@@ -373,7 +373,7 @@ def test_each_part_of_a_way_begins_where_the_one_before_should_have_ended(
 
     monkeypatch.setattr(drive, "plan_approach", in_two)
     monkeypatch.setattr(lab.arm, "move_to", past_it)
-    with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° from"):
+    with pytest.raises(DeviceFault, match=r"joint 5 is 1\.0° off"):
         lab.take_poses()
     assert len(lab.arm.moves) == 1
 

@@ -142,7 +142,7 @@ def test_q_ends_a_sweep(lab: Lab) -> None:
     with pytest.raises(Declined, match="stopped by the operator"):
         lab.sweep(real=False)
     assert lab.arm.halted.is_set()
-    assert "was not completed" in lab.said()
+    assert "sweep not completed" in lab.said()
 
 
 def test_a_sweep_has_no_pose_to_skip_so_s_stops_it_and_it_starts_again(lab: Lab) -> None:

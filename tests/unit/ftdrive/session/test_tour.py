@@ -127,7 +127,7 @@ def test_what_is_predicted_before_it_moves_comes_true(sampling: Sampling, lab: L
     outcome = lab.calibrate()
     assert outcome is not None
     (words,) = [
-        note.words for note in lab.operator.of(Noted) if "predicted for 1.2 kg, a sensor whose gain" in note.words
+        note.words for note in lab.operator.of(Noted) if "predicted for 1.2 kg, a sensor gain error" in note.words
     ]
     told_g = float(words.split("mass ")[1].split(" g")[0])
     assert told_g == pytest.approx(1e3 * float(outcome.result.sigma["mass_kg"]), rel=0.7)

@@ -251,7 +251,7 @@ def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
     with pytest.raises(DeviceFault, match="thread of the guards has ended"):
         lab.take_poses()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
-    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guards'")]) == 1
+    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the thread of the guards")]) == 1
     assert len(lab.arm.moves) == 3
 
 

@@ -78,7 +78,7 @@ def test_the_rows_that_were_left_out_are_counted(tmp_path: Path) -> None:
     path.write_text("\n".join(blank))
     table = Table(path)
     assert table.dataset().wrench.shape == (23, 6)
-    assert table.words == "1 of 24 rows left out, which lack the wrench or the orientation"
+    assert table.words == "1 of 24 rows without wrench or orientation left out"
     path.write_text(PLAIN.replace("\n32.0,", "\n# 32.0,"))
     table = Table(path)
     assert len(table.dataset().wrench) == 23
@@ -141,7 +141,7 @@ def test_an_impossible_date_is_named_and_a_blank_may_stand_before_its_zone(tmp_p
     assert values.tolist() == [[1_767_268_800, 1]] * 40
     for date in ("2026-13-01 12:00:00", "2026-01-01 25:00:00 Z"):
         path.write_text("t,fx\n2026-01-01 12:00:00,1\n" + f"{date},1\n")
-        with pytest.raises(BadDataset, match=f"line 3: t is '{date}', which is no number: correct or delete"):
+        with pytest.raises(BadDataset, match=f"line 3: t is '{date}', which is not a number: correct or delete"):
             list(TextTable(path).blocks([0, 1]))
 
 

@@ -125,7 +125,7 @@ def test_rows_without_a_wrench_are_left_out_and_counted() -> None:
     gaps = {name: np.where(np.arange(24) < 2, np.nan, values) for name, values in wrench(POSES).items()}
     table = Table(t(POSES) | gaps | quaternion(POSES))
     assert len(table.dataset()) == 22
-    assert table.words == "2 of 24 rows left out, which lack the wrench or the orientation"
+    assert table.words == "2 of 24 rows without wrench or orientation left out"
 
 
 def test_standard_errors_are_those_of_the_axes_of_the_sensor() -> None:

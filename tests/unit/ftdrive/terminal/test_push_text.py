@@ -29,8 +29,8 @@ def test_old_and_new_values_stand_beside_one_another() -> None:
         "centre, mm  (0.0, 0.0, 30.0)  (9.5, 4.8, 80.9)  (+9.5, +4.8, +50.9)",
         "The centre is in flange axes. One sigma is 0.0011 kg and 0.20, 0.30, 0.40 mm. The inertia stays that of a "
         "point mass: gravity does not reveal it.",
-        "The load is 3.56 kg below the rated payload of a UR5e, 5 kg; compare with the payload curve in its user "
-        "manual, too.",
+        "The load is 3.56 kg below the rated payload of a UR5e, 5 kg; also compare with the payload curve in its "
+        "user manual.",
         "Included are sensor and adapter, 0.25 kg; their centre is taken half way up the sensor's height of 33 mm.",
     ]
 

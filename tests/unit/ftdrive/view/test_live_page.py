@@ -437,4 +437,4 @@ def test_a_recording_brings_its_arm_and_tool(tmp_path: Path) -> None:
     assert not said
     stream.cell = replace(CELL, tool=ToolConfig())
     assert certifier_of(stream, None, said.append) is None
-    assert "what is mounted?" in said[0]
+    assert "the tool is not described" in said[0]
