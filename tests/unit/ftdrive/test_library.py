@@ -22,7 +22,7 @@ from tests.unit.ftdrive.recorded import block, info
         ({"model": "ur6e"}, "ur6e"),
         ({"tool_mm": []}, "the tool is not described"),
         ({"tool_mm": [(0, 200)]}, "tool_mm"),
-        ({"poses": 7}, "choose 24, 12, 6"),
+        ({"poses": 7}, "choose one of 24, 12, 6"),
         ({"mounting": "shelf"}, "shelf"),
         ({"boxes_mm": [(0, 0, 0, 100, 100)]}, "boxes_mm"),
         ({"posture_deg": (0, -90)}, "posture_deg has 2 angles"),

@@ -78,7 +78,7 @@ OTHER = {
     "range not known": (origin(OURS), origin(changed(range=None)), "but unknown in this calibration"),
     "sign": (origin(OURS), origin(changed(sign=-1)), "its sign is 1, but -1 in this calibration"),
     "emulated": (origin(OURS, emulated=True), origin(OURS), "its emulated is True"),
-    "no serial number": (origin(changed(serial=None)), origin(changed(serial=None)), "reports no serial number"),
+    "no serial number": (origin(changed(serial=None)), origin(changed(serial=None)), "has no serial number"),
     "not reported": (origin(changed(serial=NOT_REPORTED)), origin(changed(serial=NOT_REPORTED)), "serial=NAME"),
     "empty": (origin(changed(serial="")), origin(changed(serial="")), "number: add serial=NAME"),
     "ours not reported": (origin(OURS), origin(changed(serial=NOT_REPORTED)), "the sensor of this calibration has"),

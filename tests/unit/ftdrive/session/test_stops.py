@@ -351,7 +351,7 @@ def test_an_arm_that_was_moved_while_a_way_waits_for_its_word_does_not_begin_it(
     lab.push_on_the_way(4)
     lab.operator.answers["resume:"] = answers
     lab.operator.at_question.append((f"Approach {way}", move))
-    with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° from"):
+    with pytest.raises(DeviceFault, match=r"joint 1 is 25\.0° off"):
         lab.take_poses()
     assert lab.operator.of(GuardTripped)[-1].hazard == 21
     assert len(lab.arm.moves) == moves

@@ -53,7 +53,7 @@ def test_a_long_table_is_read_in_parts_up_to_its_fault(tmp_path: Path) -> None:
     assert parts[-1].place == 1.0
     assert Table(path).rate_Hz("wrench") == pytest.approx(1000)
     content = path.read_text()
-    for line, words in (("1,4,1,2,3,4,5,6.7.8", r"tz is '6\.7\.8', which is no number"), ("1,4", "has 2 values")):
+    for line, words in (("1,4,1,2,3,4,5,6.7.8", r"tz is '6\.7\.8', which is not a number"), ("1,4", "has 2 values")):
         path.write_text(f"{content}{line}\n")
         valid: list[SignalRows] = []
         with pytest.raises(BadDataset, match=rf"w\.csv: line 60002.*{words}.*correct or delete"):

@@ -99,7 +99,7 @@ def test_what_is_wrong_is_red_below_its_field(form: Form) -> None:
     height = form.controls()["sensor.height_mm"]
     assert (height["tone"], "'high', which is not a number" in height["words"]) == ("bad", True)
     form.enter("sensor.height_mm", "33")
-    form.wait(lambda: "off its axis" in str(form.parts()["form/words"]))
+    form.wait(lambda: "off the flange axis" in str(form.parts()["form/words"]))
     assert form.controls()["write"]["disabled"]
 
 
