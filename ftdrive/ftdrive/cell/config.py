@@ -84,13 +84,10 @@ class RobotConfig:
         reject=rules.reject_control,
     )
     api_port: int = entry("port of the Robot API of PolyScope X", 80, between=(1, 65535))
-    serial: str | None = entry(
-        "serial number of the arm; if it is set, no other arm is moved", None, reject=rules.reject_empty
-    )
+    serial: str | None = entry("serial number; if set, no other arm is moved", None, reject=rules.reject_empty)
     simulate: bool = entry(
         "true for an emulated cell: commands with --simulate use its tool, masses, surroundings and speed; other "
-        "commands "
-        "refuse it",
+        "commands refuse it",
         False,
     )
 
@@ -101,9 +98,7 @@ class SensorConfig:
 
     url: str = entry("address, such as ati-can://can0?bitrate=250000", option="--sensor", reject=rules.reject_empty)
     sign: int = entry(
-        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` determines it",
-        1,
-        reject=rules.reject_sign,
+        "1, or -1 for a sensor that reports the reaction; `ftdrive doctor --push` finds it", 1, reject=rules.reject_sign
     )
     height_mm: float | None = entry(
         "height of the sensor's origin above the flange face; gravity does not determine it",
@@ -159,8 +154,7 @@ class ToolConfig:
     )
     mass_kg: float | None = entry(
         "approximate mass below the sensor; compared with the controller's payload and the sensor's range; it limits "
-        "the "
-        "change of the wrench until six poses are taken",
+        "the change of the wrench until six poses are taken",
         None,
         "kg",
         (0.001, 100),
@@ -181,16 +175,14 @@ class WorkcellConfig:
 
     mounting: str | None = entry(
         "floor, wall, ceiling, or the lean of the base towards -x in degrees, 90 is a wall; without it a floor is "
-        "assumed, "
-        "and results with another gravity direction are not accepted as good",
+        "assumed, and results with another gravity direction are not accepted as good",
         None,
         option="--mounting",
         reject=rules.reject_mounting,
     )
     planes_mm: Rows = entry(
         "[nx, ny, nz, offset]: the arm stays where normal · point is at least the offset; [-1, 0, 0, -800] is a wall "
-        "at "
-        "+x 800 mm; the plane under the base is always included",
+        "at +x 800 mm; the plane under the base is always included",
         (),
         "mm",
         option="--plane",
@@ -242,8 +234,7 @@ class _StoreConfig:
     """Store of results and verifications, an index of run folders."""
 
     url: str | None = entry(
-        "address of the database, such as sqlite:////data/store.sqlite; if it is not set, a file in the user's data "
-        "folder",
+        "address of the database, such as sqlite:////data/store.sqlite; without it, a file in the user's data folder",
         None,
         reject=rules.reject_store,
     )

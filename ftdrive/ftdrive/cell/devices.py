@@ -56,7 +56,5 @@ def program_registers(cell: CellConfig, first: int, integers: int, doubles: int)
     another client or a fieldbus owns a register.
     """
     if cell.robot.driver != "ur":
-        raise ConfigError(
-            f"[robot] driver {cell.robot.driver} has no registers: use serve-load with a Universal Robots arm"
-        )
+        raise ConfigError(f"[robot] driver {cell.robot.driver} has no registers: serve-load needs a UR arm")
     return ProgramRegisters(cell.robot.host, first, integers, doubles, clock=cell.clock)

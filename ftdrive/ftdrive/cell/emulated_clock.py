@@ -49,9 +49,7 @@ class EmulatedClock(Clock):
             self._descriptor = os.open(path, os.O_RDWR | os.O_CLOEXEC)
             self._page = memoryview(mmap.mmap(self._descriptor, 0)).cast("q")
         except (OSError, ValueError) as error:
-            raise ConnectError(
-                f"the clock of the emulated cell cannot be read ({error})", "start the emulated cell again"
-            ) from error
+            raise ConnectError(f"the clock of the emulated cell cannot be read ({error})", "start it again") from error
         if self._page[0] != _VERSION:
             raise ConnectError(
                 f"the clock of the emulated cell has version {self._page[0]}, not {_VERSION}",

@@ -104,12 +104,7 @@ def check_program(status: ArmStatus) -> Check:
     if status.program == "stopped":
         return Check("robot.program", "ok", "no program runs; clients that only read cannot be detected")
     found = f"a program is active on the controller ({status.program})"
-    return Check(
-        "robot.program",
-        "warning",
-        found,
-        "stop it at the pendant: calibrate refuses to start while a program is active",
-    )
+    return Check("robot.program", "warning", found, "stop it at the pendant: calibrate refuses to start beside it")
 
 
 def check_speed(status: ArmStatus) -> Check:
@@ -146,9 +141,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
         expected_kg = tool.mass_kg + (sensor_kg or 0.0)
         found += f", sensor and tool weigh {expected_kg:.2f} kg"
         if abs(payload_kg - expected_kg) > max(described_cell.PAYLOAD_KG, described_cell.PAYLOAD_SHARE * expected_kg):
-            return Check(
-                name, "failed", found, "correct the payload at the pendant, or the masses in [tool] and [sensor]"
-            )
+            return Check(name, "failed", found, "correct the payload at the pendant, or the masses in [tool], [sensor]")
     if p_m is not None and not any(p_m):
         fix = "set the centre of gravity at the pendant: Installation, Payload"
         return Check(name, "warning", f"{found}; no real payload has its centre in the flange face", fix)
@@ -156,10 +149,7 @@ def check_payload(status: ArmStatus, tool: ToolConfig, sensor_kg: float | None) 
 
 
 def check_weighed_payload(payload_kg: float | None, result: CalibrationResult, sensor_kg: float | None) -> Check:
-    """Compare the payload that the controller reports with the mass identified by a calibration.
-
-    `sensor_kg` is the mass of sensor and adapter, which the sensor does not measure.
-    """
+    """Compare the controller's payload with the mass of a calibration plus `sensor_kg`, of sensor and adapter."""
     name = "robot.payload"
     if payload_kg is None:
         return Check(name, "skipped", "the controller does not report its payload")
@@ -177,10 +167,7 @@ def _at_tool(p_flange_m: Sequence[float], tool: ToolConfig) -> bool:
 
 
 def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> Check:
-    """Check the response time of the arm, in one of three periods of 0.5 s.
-
-    The median must be below `usual_s`, and the 90 % quantile below `gap_s`.
-    """
+    """Check the response times of the arm in 0.5 s: median below `usual_s`, 90 % below `gap_s`; best of three."""
     name, found = "robot.link", ""
     # Try again, because a briefly busy computer is not a bad link.
     for _ in range(_LINK_TRIES):
@@ -222,9 +209,7 @@ def check_clock(arm: RobotArm, clock: Clock) -> Check:
     found = f"rate of the controller's clock relative to this computer: {pace:.4f}, over {host_s[-1]:.1f} s"
     if abs(pace - 1) < 0.02:
         return Check("clock.pace", "ok", found)
-    return Check(
-        "clock.pace", "warning", found, "close other programs on this computer, and check the load of the network"
-    )
+    return Check("clock.pace", "warning", found, "close other programs on this computer, and check the network")
 
 
 def _silent(name: str, error: DeviceError) -> Check:

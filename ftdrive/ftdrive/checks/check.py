@@ -108,6 +108,4 @@ def check_calibration(
     if belongs.unknown:
         fix = "add serial=… (from its label) to the sensor's address, then calibrate again"
         return Check(name, "warning", f"{made}; {'; '.join(belongs.unknown)}", fix)
-    return Check(
-        name, "ok", f"{made}, with these devices" if connected else f"{made}; no connected device to compare with"
-    )
+    return Check(name, "ok", f"{made}, with these devices" if connected else f"{made}; no device is connected")

@@ -102,9 +102,7 @@ def _check_settings(bias: Fact | None, transformation: Fact | None) -> list[Chec
     checks = []
     if bias is not None and isinstance(bias.value, tuple) and any(bias.value):
         numbers = ", ".join(f"{value:g}" for value in bias.value)
-        found = (
-            f"the sensor subtracts its software bias ({numbers}): a calibration is valid only until this bias changes"
-        )
+        found = f"the sensor subtracts its software bias ({numbers}): a change of it invalidates a calibration"
         checks.append(Check("sensor.bias", "ok", found))
     if transformation is not None:
         found = f"the driver undoes the tool transformation of the sensor: {transformation.value}"
@@ -122,9 +120,7 @@ def check_tool_weight(limits: ArrayLike | None, cell: CellConfig) -> Check:
     weight_N, length_m = mass_kg * cell.site.g_m_s2, max((row[1] for row in cell.tool.cylinders_mm), default=0.0) / 1e3
     share = max(2 * weight_N / range_N.min(), 2 * weight_N * length_m / range_Nm.min())
     found = f"twice the tool's weight is {100 * share:.0f} % of the sensor's range"
-    return (
-        Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "use a sensor with a larger range")
-    )
+    return Check(name, "ok", found) if share <= _LOAD else Check(name, "failed", found, "use a larger sensor")
 
 
 def check_rest(wrench: Array, limits: ArrayLike | None, cell: CellConfig, *, zero_is_arbitrary: bool) -> Check:
@@ -312,9 +308,7 @@ def check_level(wrench: Array) -> Check:
     force, torque = ", ".join(f"{s:.4f}" for s in sigma[:3]), ", ".join(f"{s:.5f}" for s in sigma[3:])
     found = f"σ ({force}) N, ({torque}) N·m"
     if not is_stationary(wrench):
-        return Check(
-            name, "warning", f"{found}, but not steady", "keep hands and cables off the sensor, and let it warm up"
-        )
+        return Check(name, "warning", f"{found}, but not steady", "keep hands and cables off it, and let it warm up")
     return Check(name, "ok", found)
 
 
@@ -405,9 +399,7 @@ def check_push(
     if size_N < _PUSH_N:
         return Check("push.sign", "failed", found, f"push again with more than {_PUSH_N:g} N, and hold"), moved
     if base is None:
-        return Check(
-            "push.sign", "skipped", found, "give --calibration FILE, because the mounting must be known"
-        ), moved
+        return Check("push.sign", "skipped", found, "give --calibration FILE, for the mounting"), moved
     if abs(base[0]) < 0.8 * size_N:
         fix = "push along +X of the base; if you did, the sensor is mounted differently: ftdrive calibrate"
         return Check("push.sign", "failed", found, fix), moved

@@ -105,18 +105,12 @@ def _parse_cell(path: Path, name: str, table: Any) -> StoredCell:
     if not isinstance(config, str) or not config:
         raise ConfigError(f'{place} config is {config!r}: give the path of its ftdrive.toml, such as "{name}.toml"')
     if isinstance(days, bool) or not isinstance(days, int | float) or not 0 < days <= MOST_DAYS:  # false for nan
-        raise ConfigError(
-            f"{place} verify_every_days is {days!r}: give the number of days between two verifications, such as 7"
-        )
+        raise ConfigError(f"{place} verify_every_days is {days!r}: give a number of days, such as 7")
     if serial is not None and not (isinstance(serial, str) and serial):
-        raise ConfigError(
-            f'{place} arm_serial is {serial!r}: give the serial number as a string, such as "20225500001"'
-        )
+        raise ConfigError(f'{place} arm_serial is {serial!r}: give it as a string, such as "20225500001"')
     file = (path.parent / config).resolve()
     if not file.is_file():
-        raise ConfigError(
-            f"{place} config: {file} does not exist: correct the path, or write the file with `ftdrive init`"
-        )
+        raise ConfigError(f"{place} config: {file} does not exist: correct the path, or write it with `ftdrive init`")
     found = settings(file)
     host = found["robot.host"].value
     if host is None:

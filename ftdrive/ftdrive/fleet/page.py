@@ -40,10 +40,7 @@ def fleet_page(fleet: Fleet, observed: Observed, store: str) -> str:
 
 
 def _bias_plot(changes: Changes, start: datetime, now: datetime) -> str:
-    """Return a plot of the six changes of the bias in the last 90 days as SVG, in sigmas of each verification.
-
-    Force and torque have different colours; the grey band is ±2 sigmas.
-    """
+    """Return the changes of the bias in the last 90 days as SVG, in sigmas; the grey band is ±2 sigmas."""
     # Plain SVG, because matplotlib is too slow for 200 plots.
     first = (now - WINDOW - start).total_seconds() / 86400
     x = MARGIN + (changes["t_days"] - first) / WINDOW.days * (WIDTH - 2 * MARGIN)

@@ -59,10 +59,7 @@ def is_calibration(folder: Path, since: datetime | None) -> bool:
 
 
 def runs_to_solve(folders: Iterable[Path], since: datetime | None, say: Callable[[str], object]) -> list[Path]:
-    """Return the calibrations among these runs.
-
-    Runs without a dataset or a recording in motion are left out; `say` receives their number, and how to finish them.
-    """
+    """Return the calibrations among runs; `say` receives how many have no data yet, and how to finish them."""
     runs, unfinished = list[Path](), Counter[str]()
     for run in folders:
         if is_calibration(run, since):

@@ -175,9 +175,7 @@ def attention(fleet: Fleet, now: datetime) -> list[str]:
                     f"{failed}, and no change explains it: verify again with a free tool, or calibrate again"
                 )
         if state.drift is not None and state.drift.found:
-            sentences.append(
-                f"{name}: {state.drift.words}: calibrate again, and check the sensor if the drift continues"
-            )
+            sentences.append(f"{name}: {state.drift.words}: calibrate again, and check the sensor if it continues")
     return sentences + [state.words for state in fleet.findings]
 
 

@@ -166,10 +166,7 @@ def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Itera
 
 
 def _bases(observed: Observed) -> Iterator[FleetFinding]:
-    """Yield findings about bases that have turned between the last two calibrations.
-
-    Updates, which copy the direction of gravity, are skipped.
-    """
+    """Yield findings about bases turned between the last two calibrations; updates copy gravity and are skipped."""
     for name, results in observed.results.items():
         seen = list[StoredResult]()
         for one in reversed(results):

@@ -179,9 +179,7 @@ def cluster_workers(address: str, *, timeout_s: float = CONNECT_S) -> Iterator[W
             submit = client.get_executor(pure=False).submit
             yield Workers(sum(client.ncores().values()), submit, dask.KilledWorker, require_one=require_one)
         except CancelledError as error:
-            raise StreamBroken(
-                f"the cluster {address} was lost", "start the cluster, and repeat the command"
-            ) from error
+            raise StreamBroken(f"the cluster {address} was lost", "start it, and repeat the command") from error
 
 
 def _require_same_versions(versions: Any, address: str) -> None:
@@ -192,8 +190,7 @@ def _require_same_versions(versions: Any, address: str) -> None:
             if (other := theirs["packages"].get(name)) != ours[name]:
                 raise ConfigError(
                     f"the worker {worker} of the cluster {address} has {name} {other or '(none)'}, but this computer "
-                    "has "
-                    f"{ours[name]}: install {name} {ours[name]} there"
+                    f"has {ours[name]}: install {name} {ours[name]} there"
                 )
 
 

@@ -102,8 +102,7 @@ def plan_tour(
             return make_plan(kind, why, certifier, *found, speeds, guess)
     raise PlanRefused(
         f"{_reason(poses)}. Nor is a tour at another posture, with the flange in a box, or of other poses proven clear "
-        "and informative enough to estimate all parameters. Describe the tool more closely, or clear the "
-        "surroundings"
+        "and informative enough to estimate all parameters. Describe the tool more closely, or clear the surroundings"
     )
 
 
@@ -192,8 +191,7 @@ def _plan_cone(
     if not (0 < half_angle_rad <= np.pi and poses >= FEWEST_CHOSEN):
         raise ConfigError(
             f"a cone of {np.degrees(half_angle_rad):g} degrees with {poses} poses cannot be planned: give above 0 and "
-            "up "
-            f"to 180 degrees, and {FEWEST_CHOSEN} poses or more"
+            f"up to 180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
     cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
     found = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
@@ -218,8 +216,7 @@ def _plan_box(
 ) -> Plan:
     """Plan a tour of the special orientations with the flange inside a box. Base, shoulder and elbow move too.
 
-    The edges of the box, twice `half_size_m` long, are along the base axes. Its centre in base is by default the
-    present position of the flange.
+    The edges of the box, twice `half_size_m` long, are along the base axes. Its centre is by default at the flange.
     """
     q_now = checked_joints(q_rad)
     if not 0 <= half_size_m <= 1:
@@ -229,17 +226,13 @@ def _plan_box(
     if found is None:
         raise PlanRefused(
             f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} "
-            "orientations "
-            "are reachable, or no tour of them is proven clear: give a larger box, or another centre"
+            "orientations are reachable, or no tour of them is proven clear: give a larger box, or another centre"
         )
     return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
 
 
 def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
-    """Plan one tour through one or more sets of orientations of Yu's Fig. 6, such as A+E; `COUNTS` has their names.
-
-    Random orientations that are out of reach are replaced by others of the same set.
-    """
+    """Plan one tour through sets of orientations of Yu's Fig. 6, such as A+E; `COUNTS` has their names."""
     q_now = checked_joints(q_rad)
     try:
         names = names_of(sets)
@@ -265,10 +258,7 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
 def plan_verification(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, *, speeds: Speeds, guess: Guess
 ) -> Plan:
-    """Plan a tour of at least two poses far from `R_fitted` (k, 3, 3), the orientations of a calibration.
-
-    The other parameters and the errors are those of `plan_tour`.
-    """
+    """Plan a tour far from the orientations `R_fitted` (k, 3, 3) of a calibration; otherwise as `plan_tour`."""
     q_now = checked_joints(q_rad)
     if poses < FEWEST_TO_VERIFY:
         raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
@@ -371,8 +361,7 @@ def plan_for(
 ) -> Plan:
     """Plan a tour for a cell and its certifier, starting near joint angles `q_rad` (6,).
 
-    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, and `ConfigError` for wrong
-    values.
+    Raises `PlanRefused` if too few poses are reachable by moves that are proven clear, `ConfigError` for wrong values.
     """
     speeds, guess = speeds_of(cell), guess_of(certifier, cell)
     if tip_unlimited:
@@ -439,7 +428,7 @@ def certifier_for(
         raise ConfigError("the model of the arm is unknown: give --model, or set [robot] model in ftdrive.toml")
     if not cell.tool.cylinders_mm:
         raise ConfigError(
-            "the tool is not described: give --tool FROM:TO:DIAMETER, or set [tool] cylinders_mm in ftdrive.toml"
+            "the tool is not described: give --tool FROM:TO:DIAMETER, or [tool] cylinders_mm in ftdrive.toml"
         )
     planes = (BASE_PLANE, *map(plane_from_mm, cell.workcell.planes_mm))
     scene = Scene(planes, tuple(map(box_from_mm, cell.workcell.boxes_mm)), lean_of(cell.workcell.mounting))

@@ -1,10 +1,9 @@
 """A bundle: a run folder as one zip file without addresses and names, which `replay` and `solve` read.
 
 bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
-environment.json    versions of all packages, and checks of the computer without devices
-sensor.json         the sensor matrices in the current folder, redacted
-<run>/...           the files of the run folder; text files are redacted, poses are copied byte by byte
-transcripts/...     the files of `ftdrive transcript record`, redacted
+environment.json    versions of all packages, and checks of the computer without devices sensor.json         the sensor
+matrices in the current folder, redacted <run>/...           the files of the run folder; text files are redacted, poses
+are copied byte by byte transcripts/...     the files of `ftdrive transcript record`, redacted
 """
 
 import getpass
@@ -295,9 +294,7 @@ def unpack(source: Path) -> Iterator[Path]:
 
 def _extract(source: Path, folder: Path) -> Path:
     if (size := source.stat().st_size) > MOST_BYTES:
-        raise BadBundle(
-            f"{source} has {size / 1e9:.0f} GB, but a bundle has at most {MOST_BYTES / 1e9:g} GB: check the name"
-        )
+        raise BadBundle(f"{source} has {size / 1e9:.0f} GB, a bundle at most {MOST_BYTES / 1e9:g} GB: check the name")
     try:
         with open_file(source) as file, zipfile.ZipFile(file) as archive:
             _require_harmless(archive.infolist())

@@ -57,8 +57,8 @@ class Load(KnownLoad):
         return (
             f"A weight of {self.mass_kg:g} kg at {self.name} moves with the arm in the tour, which is a hazard. Is the "
             f"space below and beside it free of people and objects, is its string at most {1e3 * STRING_M:.0f} mm "
-            "long, "
-            f"and is the weight at most {2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm high?",
+            f"long, and is the weight at most {2e3 * WEIGHT_RADIUS_M:.0f} mm wide and {1e3 * WEIGHT_HEIGHT_M:.0f} mm "
+            "high?",
         )
 
     def __str__(self) -> str:
@@ -69,9 +69,7 @@ class Load(KnownLoad):
         """Return the load of the options `--load`, `--at` and `--gripped`; raises `ConfigError`."""
         mass_kg, sigma_kg = mass_of(mass)
         if (place is None) != gripped:
-            raise ConfigError(
-                "--load needs the position of the load: give either its hook, such as --at tip=0,0,200, or --gripped"
-            )
+            raise ConfigError("--load needs a position: give its hook, such as --at tip=0,0,200, or --gripped")
         if place is None:
             return cls("gripper", mass_kg, sigma_kg)
         name, p_flange_m = place_of(place)
@@ -120,9 +118,7 @@ def place_of(text: str) -> tuple[str, tuple[float, float, float]]:
     if not re.fullmatch(r"[\w-]+", name):
         raise ConfigError(f"the place '{text}' has no name: give one such as tip=0,0,200")
     if not given:
-        raise ConfigError(
-            f"--at {name} has no position: give it in mm from the flange face, such as --at {name}=0,0,200"
-        )
+        raise ConfigError(f"--at {name} has no position: give mm from the flange face, such as --at {name}=0,0,200")
     try:
         place_mm = [float(number) for number in numbers.split(",")]
     except ValueError:

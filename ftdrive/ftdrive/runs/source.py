@@ -133,8 +133,7 @@ class SolveOptions:
         if cases and (method != "ml" or drift != "auto" or joined or any(option is not None for option in others)):
             raise ConfigError(
                 "--table-iii defines its methods and test sets: leave out --method, --test, other data, --drift and "
-                "known "
-                "values"
+                "known values"
             )
         if test is not None and method != "all":
             raise ConfigError("--test compares methods: add --method all")
@@ -330,10 +329,7 @@ class RecordedData:
 
 
 def read_source(source: Path, options: SolveOptions) -> RecordedData:
-    """Read poses at rest from a run folder, a dataset.json or a table.
-
-    Raises `BadDataset`, `ConfigError` or `OSError`.
-    """
+    """Read poses from a run folder, dataset.json or table. Raises `BadDataset`, `ConfigError` or `OSError`."""
     known = options.known
     if source.is_dir():
         run = Run(source)
@@ -352,9 +348,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         if table.gravity_is_measured:  # so that its direction defines the base
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
-        raise ConfigError(
-            f"{source.name} is not a table: leave out the options that describe a table, such as --columns"
-        )
+        raise ConfigError(f"{source.name} is not a table: leave out options for tables, such as --columns")
     up_in_base = options.up_in_base
     if up_in_base is not None:
         provenance = {**found.provenance, "up_in_base": list(up_in_base)}

@@ -128,10 +128,7 @@ class WeighingDay:
 
 
 def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:
-    """Return the sum of the last day of each tool and arm with its last weighing, the oldest first.
-
-    A tool has several files on a day if it was calibrated on that day.
-    """
+    """Return the sum of the last day of each tool and arm, with its last weighing, the oldest first."""
     last = dict[tuple[object, ...], WeighingDay]()
     for part in sorted(days, key=lambda part: (part.day, part.last_utc or "", part.id)):
         key = (part.tool, part.arm_serial, part.robot_host, part.emulated)

@@ -35,10 +35,7 @@ _COMPLETED = "completed.ndjson"
 
 
 def has_completed(arm_serial: str, plan_sha256: str) -> bool:
-    """Return whether this arm has completed this plan before; unreadable lines are ignored.
-
-    False without a serial number, because the arm may be another one.
-    """
+    """Return whether this arm completed this plan before; False without a serial number, which identifies the arm."""
     path = user_folder("state") / _COMPLETED
     if arm_serial == NOT_REPORTED or not path.is_file():
         return False
@@ -128,10 +125,7 @@ class AlongPlan:
         if plan is None:
             plan = planned(certifier, np.round(cell.arm.state().q_rad / _GRID_RAD) * _GRID_RAD)
         elif plan is not (own := plan.of_arm(certifier)):
-            cell.note(
-                "the plan was made with other kinematics: its moves are now proven clear with the kinematics of this "
-                "arm"
-            )
+            cell.note("the plan was made with other kinematics: its moves are now proven with those of this arm")
             plan = own
         records = [] if session.resumed is None else session.resumed.records()
         kept = {record.stop: record for record in records if record.stop not in self.options.redo}
@@ -146,10 +140,7 @@ class AlongPlan:
         """Everything known before the first motion, with the plan at its own speeds."""
         run_checks(self.before, CHECKS)
         if self.options.dry_run:
-            cell.note(
-                "the safety limits of the controller are not checked in a dry run: only a program on the controller "
-                "can do that"
-            )
+            cell.note("the controller's safety limits are not checked: only a program on the controller can do that")
             return
         # Take control of the arm only when all other checks have passed.
         cell.arm.open(control=True)
@@ -240,9 +231,7 @@ class AlongPlan:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? You hang it when the arm stands at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(
-                    way, assumed=before.known and not arm_moves(way)
-                )  # an approach that moves base or elbow is new
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # else the approach is new
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)
@@ -279,10 +268,7 @@ class AlongPlan:
             questions.ask_reduced(assumed=False)
 
     def judge_completed(self, missing: str = "") -> None:
-        """Record that this session completed the plan, or show why it did not.
-
-        `missing` describes the missing poses or moves; empty if there are none.
-        """
+        """Record that this session completed the plan, or show why not; `missing` describes missing poses or moves."""
         if not self.todo or self.before.known:
             return
         if missing:

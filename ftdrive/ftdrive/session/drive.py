@@ -408,9 +408,7 @@ class Drive:
         if trip is not None and (trip is not reported or report_error is not None):
             self.journal.show(GuardTripped(hazard=trip.hazard, words=words))
         if report_error is not None:
-            self.note(
-                f"{reported} (reported late because of {report_error!r}: check screen, pipe and disk)", warning=True
-            )
+            self.note(f"{reported} (reported late, {report_error!r}: check screen, pipe and disk)", warning=True)
         self.show_state(State.STOP, words=words)
         self.guarded.show_new()
         self.show_state(State.HOLD, words=words)

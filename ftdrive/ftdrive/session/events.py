@@ -322,10 +322,7 @@ class Operator(Protocol):
         """Return one of the answers of a question; raises `Declined` or `SupervisorGone` if no operator can answer."""
 
     def absence(self) -> str | None:
-        """Return why no operator follows the session, such as a closed terminal; None if one does.
-
-        Any thread may call this method; it returns at once.
-        """
+        """Return why no operator follows, such as a closed terminal; None if one does. Callable from any thread."""
 
     @property
     def has_keys(self) -> bool:

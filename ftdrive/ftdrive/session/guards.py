@@ -286,9 +286,8 @@ class ModelGuard(Guard):
         if away_m > allowed_m + lag_rad * reach_m or away_rad > allowed_rad + lag_rad:
             raise fault(
                 Hazard.WRONG_TCP,
-                f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° off the pose that the "
-                "kinematics of a "
-                f"{arm.name} give: check the model and the active TCP",
+                f"the flange is {1e3 * away_m:.1f} mm and {np.degrees(away_rad):.2f}° off the pose that the kinematics "
+                f"of a {arm.name} give: check the model and the active TCP",
             )
 
 

@@ -91,9 +91,7 @@ def take_by_hand(session: OpenSession) -> Run:
         run = session.new_run()
         cell.journal.keep_in(run)
     if (load := task.load) is not None:
-        cell.note(
-            f"{load} is on the tool in every pose. Keep clear of the load and of the space below it.", warning=True
-        )
+        cell.note(f"{load} is on the tool in every pose. Keep clear of it and of the space below.", warning=True)
     book = PoseBook(cell, run, task.judge(by_hand=True), down_of(task.cell.workcell.mounting))
     with cell.journal.reporting_early_end(run):
         sampling, swing_N = task.cell.sampling, None
@@ -357,8 +355,7 @@ class HandGuided:
             again = " and press r to take the pose again" if self._operator.has_keys else ""
             self._note(
                 f"Pose {record.stop} differs by {force_N:.1f} N from the fit of the others: if something touched the "
-                "tool, "
-                f"remove the contact{again}.",
+                f"tool, remove the contact{again}.",
                 warning=True,
             )
         return touched
@@ -368,9 +365,7 @@ class HandGuided:
         if self._level is not None:
             for c in np.flatnonzero(restless_channels(wrench, self._level))[:1]:
                 found, unit = wrench[:, c].std(ddof=1), "N" if c < 3 else "N·m"
-                unrest = (
-                    f"the sigma of {CHANNELS[c]} is {found:.2g} {unit}, and {self._level[c]:.2g} in the quietest pose"
-                )
+                unrest = f"sigma of {CHANNELS[c]} is {found:.2g} {unit}, in the quietest pose {self._level[c]:.2g}"
         self._note(f"Pose {stop} is not quiet: {unrest}. {advice}", warning=True)
 
     def _obey_keys(self) -> None:
@@ -416,17 +411,13 @@ class HandGuided:
     def _hold_still(self) -> str:
         seconds = STILL_S + self._sampling.average_s + 3 * LOOK_S
         return (
-            f"let it dwell for {seconds:.1f} s at each pose"
-            if self._listen
-            else f"leave the arm still for {seconds:.1f} s"
+            f"let it dwell {seconds:.1f} s at each pose" if self._listen else f"leave the arm still for {seconds:.1f} s"
         )
 
     def _end(self, why: str) -> None:
         self._over = True
         saved = f"{len(self._taken)} {'pose is' if len(self._taken) == 1 else 'poses are'} saved"
-        enough = (
-            "" if self._light == "green" else f"; the light is {self._light}: the poses may be too few or too similar"
-        )
+        enough = "" if self._light == "green" else f"; the light is {self._light}: poses may be too few or too similar"
         self._note(f"{why}: {saved}{enough}.", warning=bool(enough))
 
     def _show_state(self, state: State, words: str = "") -> None:

@@ -187,10 +187,7 @@ def faces(gravity_flange: Array) -> tuple[int, int, int, int, int, int]:
 
 
 def _hint(R_base_flange: Array, guess: Guess, down_base: Array, most_tilt_rad: float) -> str:
-    """Describe the simple motion from the last of the orientations (n, 3, 3) to the most useful next one.
-
-    If possible, the tool axis stays within `most_tilt_rad` of straight down.
-    """
+    """Describe the simple motion from the last of the orientations (n, 3, 3) to the most useful next one."""
     last = R_base_flange[-1]
     words, candidates = _simple_motions(last, down_base)
     inside = np.flatnonzero(candidates[:, :, 2] @ down_base >= np.cos(most_tilt_rad))
@@ -234,10 +231,7 @@ def _light(coverage: Prediction, *, loaded: bool = False) -> str:
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """Return the residual of a new pose in the fit of the earlier ones: sigmas of the worst channel, and norm in N.
-
-    The noise of the pose is scaled by the noise factor of the fit.
-    """
+    """Return the residual of a new pose in the fit of the earlier ones: sigmas of the worst channel, and norm in N."""
     if result is None:
         return None
     R_base_flange = record.before.R_base_flange

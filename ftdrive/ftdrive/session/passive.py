@@ -50,10 +50,7 @@ def record_passively(
     so far is in the run. Raises `Declined` if the operator ends the recording in the first seconds.
     """
     # Every sample is kept, not sums alone, so that the run can be solved again and contact judged anew.
-    cell.note(
-        f"Recording for at most {seconds:.0f} s; ftdrive does not move the arm. Keep the tool free for part of the "
-        "time."
-    )
+    cell.note(f"Recording for at most {seconds:.0f} s; nothing is commanded. Keep the tool free for part of the time.")
     cell.journal.keep_in(run)
     executor = fits or ThreadPoolExecutor(1)
     recorder = _Recorder(cell, run)

@@ -175,9 +175,7 @@ def _check_approach(before: Before) -> Check:
     if not len(approach.q_rad):
         return Check("approach", "ok", "the arm stands at the first pose")
     nearest_mm = 1e3 * approach.clearance_m
-    return Check(
-        "approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, smallest clearance {nearest_mm:.0f} mm"
-    )
+    return Check("approach", "ok", f"moves: {len(approach.q_rad)}, proven clear, clearance {nearest_mm:.0f} mm")
 
 
 def check_cable(before: Before) -> Check:
@@ -227,8 +225,7 @@ def require_no_program(arm: RobotArm, clock: Clock, limits: Limits) -> None:
         if clock.now_s() > deadline_s:
             raise NotAccepted(
                 f"another program is active on the controller ({arm.reported_program() or program}): stop it at the "
-                "pendant, "
-                "then start again; ftdrive has changed nothing"
+                "pendant, then start again; ftdrive has changed nothing"
             )
         clock.sleep(0.02)
 

@@ -143,8 +143,7 @@ def rehearse_loads(
     for name, hook_mm in _HOOKS_MM.items():
         say(
             f"A load of {_LOAD_KG:.3f} kg hangs on a string at {name}, {hook_mm} mm from the flange. The load swings, "
-            "because "
-            "this quick tour moves its hook; `calibrate --load` turns the tool about the hook instead."
+            "because this quick tour moves its hook; `calibrate --load` turns the tool about the hook instead."
         )
         station.control(do="hang", mass_kg=_LOAD_KG, at_mm=hook_mm, swing_deg=0)
         whole_kg = truth["payload_kg"] + _LOAD_KG

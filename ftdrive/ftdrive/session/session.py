@@ -138,10 +138,9 @@ class Calibrating:
         found = predicted_sigma(np.array([step.R_base_flange for step in plan.steps]), guess)
         assumed = " (assumed: [tool] mass_kg is not set)" if self.options.real and not self.cell.tool.mass_kg else ""
         return (
-            f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor gain error of {100 * guess.gain_sigma:.2g} %; "
-            f"one sigma: mass {1e3 * found.sigma['mass_kg']:.2g} g, "
-            f"force bias {np.max(found.sigma['force_bias_N']):.2g} N, compensation {found.force_rms_N:.2g} N, "
-            f"{to_place_of(found.torque_rms_Nm, found.torque_rms_Nm)} N·m"
+            f"predicted for {guess.mass_kg:g} kg{assumed}, a sensor gain error of {100 * guess.gain_sigma:.2g} %; one "
+            f"sigma: mass {1e3 * found.sigma['mass_kg']:.2g} g, force bias {np.max(found.sigma['force_bias_N']):.2g} "
+            f"N, compensation {found.force_rms_N:.2g} N, {to_place_of(found.torque_rms_Nm, found.torque_rms_Nm)} N·m"
         )
 
 
@@ -258,9 +257,7 @@ def describe_run(task: Task, options: SessionOptions, connected: Mapping[str, De
         "devices": {role: asdict(info) for role, info in connected.items()},
         "mode": options.mode,
         **({} if options.method == "ml" else {"method": options.method}),
-        **(
-            {"station": {}} if task.cell.is_emulated else {}
-        ),  # an emulated cell in another process, whose truth is unknown
+        **({"station": {}} if task.cell.is_emulated else {}),  # a cell of another process: its truth is unknown
         **options.description,
     }
 

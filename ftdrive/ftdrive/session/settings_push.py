@@ -3,8 +3,7 @@
 A push changes the robot's model of its load. It is refused unless the arm is that of the calibration, stands still, and
 no program runs. Every attempt that may have sent something writes a receipt with the old values, which can be restored.
 
-push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; then push-2.json and so
-on
+push.json         ftdrive.push/1: devices, reason, old and new values, values read back, error; then push-2.json …
 """
 
 import re
@@ -85,9 +84,7 @@ class Receipt:
         for _, path in reversed(paths):
             if (receipt := cls.load(path)).restores is None:
                 return receipt
-        raise BadDataset(
-            f"{run} has no receipt of a push: give the run folder or the {_RECEIPT}.json of an earlier push"
-        )
+        raise BadDataset(f"{run} has no receipt of a push: give the run or the {_RECEIPT}.json of an earlier push")
 
 
 def _settings(values: Mapping[str, Any]) -> ControllerSettings:
@@ -278,9 +275,7 @@ def send(
     arm.open(control=True)
     _wait_until_still(arm)
     if arm.controller_settings() != push.old:
-        raise NotAccepted(
-            "the settings of the controller have changed since they were shown: start again; nothing was sent"
-        )
+        raise NotAccepted("the settings of the controller have changed meanwhile: start again; nothing was sent")
     guard()
     read_back, failure = None, ""
     try:
@@ -311,8 +306,8 @@ EFFECTS: Final = {
     ),
     "gravity": (
         "The controller uses the gravity direction to compensate the weight of the whole arm. With a wrong direction "
-        "the "
-        "arm may stop, or sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send gravity"
+        "the arm may stop, or sink in freedrive. Keep the arm free and still, and hands off. Type GRAVITY to send "
+        "gravity"
     ),
 }
 
@@ -354,9 +349,7 @@ def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
     old, changed = receipt.old, receipt.new
     payload = changed.mass_kg is not None
     if payload and (old.mass_kg is None or old.p_flange_com_m is None):
-        raise NotAccepted(
-            f"{receipt.path} has no old payload, because the controller did not report one: set it at the pendant"
-        )
+        raise NotAccepted(f"{receipt.path} has no old payload, the controller did not report it: set it at the pendant")
     back = ControllerSettings(
         old.mass_kg if payload else None,
         old.p_flange_com_m if payload else None,

@@ -206,10 +206,7 @@ def on_script_path(cell: CellConfig) -> CellConfig:
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return the plan and its curve, slowed down by the speed slider, which does not act on a running sweep.
-
-    Raises `NotAccepted` if the slider is too low.
-    """
+    """Return plan and curve, slowed down by the speed slider as it is now. Raises `NotAccepted` if it is too low."""
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(

@@ -205,9 +205,7 @@ class Tour:
                 self._note(f"{names[record.stop]} keeps its earlier measurement", warning=True)
         if left := [name for stop, name in names.items() if stop not in stay]:
             way = f"the arm goes on to pose {self._now.todo[0]}" if self._now.todo else "no pose is left"
-            self._note(
-                f"skipped: {' and '.join(left)}; {way}; a session with --resume takes skipped poses", warning=True
-            )
+            self._note(f"skipped: {' and '.join(left)}; {way}; --resume takes skipped poses", warning=True)
 
     def _take(self, stop: int, index: int) -> None:
         step, sampling, clock = self._plan.steps[index], self._config.sampling, self._drive.watcher.clock
@@ -319,24 +317,16 @@ def moves_s(plan: Plan, todo: Sequence[int], approach: Approach) -> float:
 
 
 def _chosen_sampling(before: Before, todo: Sequence[int]) -> tuple[Sampling, Array]:
-    """Return the sampling of each pose, and the standard deviation (6,) of its average.
-
-    The duration is configured, or chosen from a record of the sensor's noise. It is longer for a new tool or a hanging
-    load.
-    """
+    """Return the sampling of each pose, configured or chosen, and the standard deviation (6,) of its average."""
     sampling, sigma = _usual_sampling(before, todo)
     load = before.task.load
     if load is not None and not load.gripped:
         longer = load.sampling(sampling)
-        before.cell.note(
-            f"hanging load: {longer.average_s:g} s at each tilt, repeated while the load swings by 5° or more"
-        )
+        before.cell.note(f"hanging load: {longer.average_s:g} s at each tilt, repeated while it swings by 5° or more")
         return longer, sigma / np.sqrt(longer.average_s / sampling.average_s)
     if before.plan.kind != "tool":
         return sampling, sigma
-    before.cell.note(
-        f"new tool: {_TOOL_AVERAGES:g} times this averaging time at each of the {len(before.plan.steps)} poses"
-    )
+    before.cell.note(f"new tool: {_TOOL_AVERAGES:g} times this duration at each of the {len(before.plan.steps)} poses")
     return replace(sampling, average_s=_TOOL_AVERAGES * sampling.average_s), sigma / np.sqrt(_TOOL_AVERAGES)
 
 

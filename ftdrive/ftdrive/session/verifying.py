@@ -139,9 +139,7 @@ class Verifying:
             with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
                 plan = Plan.load(path)
                 turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
-                near = (
-                    turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD
-                )  # otherwise the cable would wind up
+                near = turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD  # else the cable winds up
                 if plan.kind == "verification" and len(plan.steps) == poses and near and self._is_mine(path.parent):
                     plan.require(certifier)
                     return plan
@@ -173,11 +171,7 @@ class RunningComparison:
         if angle_between(self._R_fitted, R_base_flange).min(initial=np.inf) >= FRESH_RAD:
             self._fresh.add(record.stop)
         enough = len(self._fresh) >= self._wanted
-        hint = (
-            ""
-            if record.stop in self._fresh
-            else "this pose is too near to one of the calibration: turn the tool further"
-        )
+        hint = "" if record.stop in self._fresh else "too near to a pose of the calibration: turn the tool further"
         compared = Compared(
             stop=record.stop,
             number=record.pose.number,
@@ -196,10 +190,7 @@ class RunningComparison:
         self._fresh.discard(stop)
 
     def predict(self, R_base_flange: Array) -> Array | None:
-        """Return the wrench (6,) of a free tool at this orientation (3, 3); None until poses confirm the calibration.
-
-        Any thread may call this method.
-        """
+        """Return the wrench (6,) of a free tool; None until poses confirm the calibration. Callable from any thread."""
         seen = [compared.residual for compared in list(self._compared.values())]
         norms = ((np.linalg.norm(one[:3]), np.linalg.norm(one[3:])) for one in seen)
         if len(seen) < HOLDS_POSES or any(force_N > HOLDS_N or torque_Nm > HOLDS_NM for force_N, torque_Nm in norms):

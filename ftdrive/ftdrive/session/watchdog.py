@@ -123,9 +123,7 @@ class Watcher:
         if self._tripped is not None:
             raise self._tripped
         if self._has_ended:
-            raise fault(
-                Hazard.UNGUARDED, "the thread of the guards has ended, the arm is not watched", "quit this session"
-            )
+            raise fault(Hazard.UNGUARDED, "the guard thread has ended, the arm is not watched", "quit this session")
         if self._motion is not None and (late_s := self.clock.now_s() - self._looked_s) > self._limits.hung_s:
             raise fault(
                 Hazard.UNGUARDED,

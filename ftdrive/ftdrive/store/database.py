@@ -154,9 +154,7 @@ class Database:
                 self._file.parent.mkdir(parents=True, exist_ok=True)
         with self._connected("written") as connection:
             if self._is_sqlite:
-                connection.exec_driver_sql(
-                    "BEGIN IMMEDIATE"
-                )  # otherwise two writers that have read first would block each other
+                connection.exec_driver_sql("BEGIN IMMEDIATE")  # two writers that read first would block each other
             else:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": _WRITERS})
             if self._version(connection) != SCHEMA:
@@ -176,9 +174,7 @@ class Database:
 
         With `first_by`, only rows with a greater string in this column are replaced.
         """
-        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(
-            table
-        )  # importing the other dialect is slow
+        insert = import_module(f"sqlalchemy.dialects.{self._dialect}").insert(table)  # importing both is slow
         new = {column.name: insert.excluded[column.name] for column in table.columns}
         key = [column.name for column in table.primary_key]
         where = None

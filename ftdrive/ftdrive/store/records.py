@@ -120,10 +120,7 @@ STORED: Final = (
 
 
 def record_paths(folders: Iterable[Path]) -> list[Path]:
-    """Return the files that become records in run folders, or directly in folders of runs, without duplicates.
-
-    A folder of weighings is treated as a run folder.
-    """
+    """Return the files that become records in run folders or folders of runs. Weighings count as a run folder."""
     folders = [folder.resolve() for folder in folders]
     weighings = (path for folder in folders for path in (folder, folder / FOLDER) if path.name == FOLDER)
     names = ("calibration*.json", "verification*.json", FILES)

@@ -57,15 +57,12 @@ def calibration_of_tool(
     unindexed, _ = read_records(path for path in record_paths([RUNS]) if str(path) not in indexed)
     results += [result for result in unindexed if isinstance(result, StoredResult)]
     accepted = sorted(
-        (result for result in results if result.verdict != "rejected"),
-        key=lambda result: result.created_utc or "",
-        reverse=True,
+        (row for row in results if row.verdict != "rejected"), key=lambda row: row.created_utc or "", reverse=True
     )
     ours = [result for result in accepted if _may_belong(result, arm, sensor)]
     for result in (result for result in ours if result.tool == name):
-        if (loaded := _load_result(result)) and not compare_devices(
-            loaded, {"arm": arm, "sensor": sensor}, mount
-        ).others:
+        loaded = _load_result(result)
+        if loaded and not compare_devices(loaded, {"arm": arm, "sensor": sensor}, mount).others:
             return Tool(
                 loaded, Path(result.path), (*warnings, *_failed(store, result)), *_of_sensor(store, result, results)
             )

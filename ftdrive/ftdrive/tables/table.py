@@ -267,10 +267,7 @@ class Table:
         return (len(t_s) - 1) / max(float(t_s[-1] - t_s[0]), 1e-9)
 
     def wrenches(self) -> Iterator[SignalRows]:
-        """Yield wrenches (n, 6), N and N·m, in sensor or flange axes.
-
-        Raises `BadDataset` after the last valid rows.
-        """
+        """Yield wrenches (n, 6), N and N·m, in sensor or flange axes. Raises `BadDataset` after the last valid rows."""
         signals = [self._require("wrench")]
         if self._axes == "base":
             signals.append(self._require("orientation"))
@@ -284,9 +281,7 @@ class Table:
         """Yield R_base_flange, row-major, and p_base_flange_m if it is known: (n, 9 or 12). Raises as `wrenches`."""
         signals = [self._require("orientation"), *([one] if (one := self._found["position"]) else [])]
         if self.gravity_is_measured:
-            raise BadDataset(
-                f"{self.name}: gravity does not determine the rotation about the vertical: give the orientation too"
-            )
+            raise BadDataset(f"{self.name}: gravity does not determine the rotation about it: give the orientation too")
         self._require_time()
         for t_s, values, place in self._in_order(signals):
             with self._named():
@@ -294,10 +289,7 @@ class Table:
             yield SignalRows(t_s, np.hstack([R.reshape(-1, 9), *([] if p is None else [p])]), place)
 
     def dataset(self, orientation: Orientation = "R_base_flange") -> CalibrationDataset:
-        """Return the table as poses at rest: one per row, or in a long table one per dwell.
-
-        Raises `BadDataset`.
-        """
+        """Return the table as poses at rest: one per row, or in a long table one per dwell. Raises `BadDataset`."""
         if orientation not in get_args(Orientation):
             raise ValueError(f"orientation is '{orientation}', expected one of {', '.join(get_args(Orientation))}")
         if self._found["sigma"] is None and self._columns.begins("sigma"):
@@ -379,9 +371,7 @@ class Table:
             words = self._columns.missing(signal, *(("wrench",) if signal == "wrench" else _NEAREST))
             # A recording in motion often has one file per device.
             alone = signal == "orientation" and self.has("wrench") and self._found["time"] is not None
-            raise BadDataset(
-                f"{words}, or give wrench and poses as two files: --wrench, --orientation-file" if alone else words
-            )
+            raise BadDataset(f"{words}, or give poses of their own: --wrench, --orientation-file" if alone else words)
 
     @contextmanager
     def _named(self) -> Iterator[None]:

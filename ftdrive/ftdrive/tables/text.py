@@ -64,10 +64,7 @@ class TextTable:
 
     @contextmanager
     def _open(self) -> Iterator[tuple[Any, IO[bytes]]]:
-        r"""Yield the text with `\n` as line end, and the file on disk.
-
-        A line on disk ends with `\n`, `\r\n` or `\r`; other line breaks of Unicode belong to a cell.
-        """
+        r"""Yield the text with `\n` as line end, and the file on disk. Other line breaks of Unicode belong to cells."""
         with open_file(self.path) as raw:
             packed = raw.read(2) == b"\x1f\x8b"
             raw.seek(0)
@@ -153,9 +150,7 @@ class TextTable:
             if len(row) == count + 1 and not row[-1].strip():
                 row.pop()
             if len(row) != count:
-                raise BadDataset(
-                    f"line {line} has {len(row)} values, but other lines have {count}: correct or delete this line"
-                )
+                raise BadDataset(f"line {line} has {len(row)} values, other lines have {count}: correct or delete it")
             rows.append([self._number(row[i].strip(), self.names[i], line) for i in use])
         return np.array(rows, float).reshape(len(rows), len(use))
 
@@ -275,9 +270,7 @@ def _require_no_data(lines: Sequence[str], above: Sequence[int], numeric: int, s
                     f"{_SEPARATORS[a]} and a decimal {'comma' if b == ',' else 'point'}"
                     for a, b in ((between, point), (separator, decimal))
                 )
-                raise BadDataset(
-                    f"line {i + 1} is a row with {ours}, but the rows below have {theirs}: write all rows in one format"
-                )
+                raise BadDataset(f"line {i + 1} is a row with {ours}, rows below have {theirs}: use one format")
 
 
 def _is_unit(cell: str) -> bool:

@@ -112,10 +112,7 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
 
 
 def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
-    """Return a lower bound (k,) of the distance between each body and a box along the base axes, m.
-
-    A body with a bound of at least `enough_m` (k,) is not refined further.
-    """
+    """Return a lower bound (k,) of the distance of each body to a box, m; those of `enough_m` (k,) are not refined."""
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
     # For a body that intersects the box the bound is -1 m, because the depth is not computed.
@@ -261,12 +258,10 @@ class Cylinder:
                 "flange: give a start of 0 mm or more, and a larger end of at most 2000 mm"
             )
         if not 0 < self.diameter_m <= 1:
-            raise ConfigError(
-                f"a cylinder of the tool has a diameter of {self.diameter_m * 1e3:g} mm: give 1 to 1000 mm"
-            )
+            raise ConfigError(f"a cylinder of the tool has a diameter of {self.diameter_m * 1e3:g} mm: give 1 to 1000")
         if not self.offset_m <= 1:
             raise ConfigError(
-                f"a cylinder of the tool is {self.offset_m * 1e3:g} mm off the flange axis: give at most 1000 mm"
+                f"a cylinder of the tool is {self.offset_m * 1e3:g} mm off the flange axis: give at most 1000"
             )
 
     @property

@@ -50,9 +50,7 @@ def checked_joints(q_rad: ArrayLike) -> Array:
     """Return the joint vector (6,); raises `ConfigError` unless all joints are within one turn of zero."""
     q = np.asarray(q_rad, dtype=np.float64)
     if q.shape != (6,) or not np.all(np.abs(q) <= 2 * np.pi + ALIGNED):
-        raise ConfigError(
-            f"joint angles are {np.degrees(q).round(1).tolist()} degrees: give six within one turn of zero"
-        )
+        raise ConfigError(f"joint angles are {np.degrees(q).round(1).tolist()} degrees: give six within ±360")
     return q
 
 

@@ -161,9 +161,8 @@ def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
                 return
 
 
-# Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees.
-# Every order of 90° moves takes 54 s at 60 °/s. This one has only eight moves of the whole wrist, which the limit of
-# the tip speed slows down.
+# Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees. Every order of 90° moves takes 54 s at
+# 60 °/s. This one has only eight moves of the whole wrist, which the limit of the tip speed slows down.
 _TOUR_DEG = (
     (1, -90, 90, 45),
     (10, -90, 90, -45),
@@ -236,10 +235,7 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
 
 
 def from_usual_wrist(certifier: Certifier, q_rad: Array) -> Array:
-    """Return joint angles (6,) with joints 4 and 5 as at the start of the constant tour, where most tours exist.
-
-    Joint 6 keeps its angle, which shows how the cable is wound.
-    """
+    """Return joint angles (6,) with joints 4 and 5 as at the start of the constant tour; joint 6 keeps its angle."""
     q = q_rad.copy()
     # The planner reports this error with its remedy.
     with suppress(ConfigError):

@@ -68,7 +68,7 @@ _CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
         ("[cells.a]\nverify_every_days = 7\n", "config is None: give the path"),
         ('[cells.a]\nconfig = "c.toml"\nverify_every_days = 7\n', r"c\.toml does not exist: correct the path"),
         ('[cells.a]\nconfig = "empty.toml"\nverify_every_days = 7\n', r"has no \[robot\] host"),
-        ('[cells.a]\nconfig = "b.toml"\n', "verify_every_days is None: give the number of days"),
+        ('[cells.a]\nconfig = "b.toml"\n', "verify_every_days is None: give a number of days"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = 0\n', "verify_every_days is 0: give"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = true\n', "verify_every_days is True"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = nan\n', "verify_every_days is nan"),

@@ -52,7 +52,7 @@ def test_a_load_is_hung_when_the_arm_stands_at_the_first_pose(lab: Lab) -> None:
     assert "nothing and no one below" in asked[1]
     assert sum("hang a load of 2 kg at tip now" in text for text in asked) == 1
     assert all(record.swings for record in lab.run().records())
-    assert any("repeated while the load swings" in event.words for event in lab.operator.of(Noted))
+    assert any("repeated while it swings" in event.words for event in lab.operator.of(Noted))
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,7 @@ def test_a_tool_too_heavy_or_too_long_for_the_sensor_is_refused(
         assert lab.take_poses(dry_run=True) is None
         assert words in next(event.words for event in lab.operator.of(Checked) if event.name == "load")
     else:
-        refuse(lab, f"{words}: use a sensor with a larger range")
+        refuse(lab, f"{words}: use a larger sensor")
 
 
 def test_a_sensor_with_an_arbitrary_zero_is_calibrated_within_its_range(
@@ -240,7 +240,7 @@ def test_a_computer_that_stalls_does_not_refuse_a_program_that_has_ended_meanwhi
 def test_a_dry_run_takes_no_control_and_says_what_it_left_out(lab: Lab) -> None:
     assert lab.take_poses(dry_run=True) is None
     assert (lab.arm.opened, lab.arm.asked_limits) == (1, 0)
-    assert "are not checked in a dry run" in lab.said()
+    assert "safety limits are not checked" in lab.said()
 
 
 def test_control_is_taken_when_all_else_is_well(lab: Lab) -> None:

@@ -264,7 +264,7 @@ def test_nothing_more_is_sent_once_the_supervisor_is_gone(sent: int, cell: Cell)
 
 def test_values_that_change_during_the_question_are_not_overwritten(cell: Cell) -> None:
     cell.at_question = lambda: setattr(cell.arm, "settings", replace(OLD, mass_kg=0.7))
-    with pytest.raises(NotAccepted, match="changed since they were shown"):
+    with pytest.raises(NotAccepted, match="changed meanwhile"):
         cell.send(cell.propose())
     assert (cell.arm.sent, cell.receipts()) == ([], [])
 

@@ -248,10 +248,10 @@ def end(lab: Lab) -> None:
 def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
     lab.arm.at_move[3] = lambda: end(lab)
     lab.operator.answers["resume:"] = ["resume", "quit"]
-    with pytest.raises(DeviceFault, match="thread of the guards has ended"):
+    with pytest.raises(DeviceFault, match="guard thread has ended"):
         lab.take_poses()
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
-    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the thread of the guards")]) == 1
+    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guard thread")]) == 1
     assert len(lab.arm.moves) == 3
 
 

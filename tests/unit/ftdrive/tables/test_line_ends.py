@@ -63,7 +63,7 @@ def test_first_rows_that_are_written_in_another_way_are_named(above: str, decima
     rows[1:3] = text(table, *other[above]).splitlines()[1:3]
     path = tmp_path / "t.csv"
     path.write_text("\n".join(rows) + "\n")
-    with pytest.raises(BadDataset, match=r"^t\.csv: line 2 is a row with .*rows below have .*write all rows in one format$"):
+    with pytest.raises(BadDataset, match=r"^t\.csv: line 2 is a row with .*rows below have .*use one format$"):
         Table(path)
 
 
