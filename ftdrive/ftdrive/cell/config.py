@@ -256,7 +256,7 @@ class CellConfig:
 
     @property
     def is_emulated(self) -> bool:
-        """Whether the cell is emulated and so has its own clock."""
+        """Whether the cell is emulated, and therefore has its own clock."""
         return self.clock is not REAL
 
     def to_dict(self) -> dict[str, Any]:

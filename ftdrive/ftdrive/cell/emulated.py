@@ -29,7 +29,7 @@ EMULATED = "emulated://"
 # Motion of the emulated arm in modes in which the session does not move it: request to the cell, and description.
 MOVED_BY: Mapping[str, tuple[Mapping[str, Any], str]] = {
     "manual": ({"do": "hand-guide"}, "its arm is guided by hand to several orientations"),
-    "passive": ({"do": "production"}, "a production program picks, places and touches"),
+    "passive": ({"do": "production"}, "a production program picks up, places and touches objects"),
     "listen": ({"do": "pendant-program"}, "a program on its pendant turns the wrist"),
 }
 

@@ -440,7 +440,9 @@ def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any])
     ):
         before, now = at(earlier.provenance, *place), at(provenance, *place)
         if before and now and before != now:
-            raise ConfigError(f"--from: result {earlier.id} is of the {what} {before}, but the new data of {now}{fix}")
+            raise ConfigError(
+                f"--from: result {earlier.id} is of the {what} {before}, but the new data are of {now}{fix}"
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -65,9 +65,9 @@ class VerificationRecord(NamedTuple):
     bias_change: Sequence[float] | None = None
     """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
     bias_change_sigma: Sequence[float] | None = None
-    """(6,) standard deviation of that change from the readings of this verification."""
+    """(6,) standard deviation of the change of the bias, from the readings of this verification."""
     calibration_sigma: Sequence[float] | None = None
-    """(6,) standard deviation of that change from the calibration, common to all its verifications."""
+    """(6,) standard deviation of the change of the bias, from the calibration, common to all its verifications."""
 
     @property
     def run(self) -> str:
@@ -76,7 +76,7 @@ class VerificationRecord(NamedTuple):
 
     @property
     def shows_bias(self) -> bool:
-        """Whether the estimated change of the bias is valid, which another change or a contact would spoil."""
+        """Whether the estimated change of the bias is valid; another change or a contact invalidates it."""
         return self.passed or self.change == "bias"
 
     @classmethod

@@ -46,7 +46,7 @@ class Hazard(IntEnum):
     WRONG_PLAN = 25
     DISK_FULL = 26
     SUPERVISOR_GONE = 27
-    """The operator, or the program that supervises the session instead, is gone."""
+    """No operator, and no program that supervises the session instead, follows it any more."""
 
 
 SCHEMA_VERSION = 1

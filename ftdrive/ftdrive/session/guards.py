@@ -429,7 +429,7 @@ class RangeGuard(Guard):
 
 @dataclass
 class ContactGuard(Guard):
-    """Rows 14 and 1: the sensor carries only the tool's weight."""
+    """Rows 14 and 1 of the hazards: the sensor carries only the weight of the tool."""
 
     limits: Limits
     heaviest_kg: float

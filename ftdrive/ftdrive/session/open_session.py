@@ -191,7 +191,7 @@ class Journal:
     def ask(self, question: Question) -> str:
         """Ask, and record the answer and its author. Raises `SupervisorGone`, even if `--yes` would answer."""
         assumed = question.assumed if self._yes else None
-        with self.recording_absence():  # no guard does so, because the arm stands
+        with self.recording_absence():  # the guards do not record it, because the arm stands
             self.require_operator()
             try:
                 answer = self._operator.ask(question) if assumed is None else assumed

@@ -74,9 +74,7 @@ def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: Snapshot
 
 def test_the_way_of_a_stop_follows_from_speed_and_deceleration(plan: Plan) -> None:
     assert max(step.speed_rad_s for step in plan.steps) == pytest.approx(np.radians(60))
-    assert "from 60 °/s brakes with 300 °/s²: the arm rests after 0.20 s and 6.0°" in plan.stop_in_words(
-        RobotConfig("ur")
-    )
+    assert "60 °/s brakes with 300 °/s²: the arm rests after 0.20 s and 6.0°" in plan.stop_in_words(RobotConfig("ur"))
     soft = RobotConfig("ur", stop_deceleration_deg_s2=100.0)
     assert "with 100 °/s²: the arm rests after 0.60 s and 18.0°" in plan.stop_in_words(soft)
     assert not plan.stop_in_words(RobotConfig("ur", driver="another"))

@@ -70,7 +70,7 @@ SAME = {
 }
 OTHER = {
     "serial number": (origin(OURS), origin(changed(serial="FT2")), ""),
-    "model": (origin(OURS), origin(changed(model="ATI Gamma")), "its model is ATI Mini45, but ATI Gamma in this calibration"),
+    "model": (origin(OURS), origin(changed(model="ATI Gamma")), "its model is ATI Mini45, but ATI Gamma in this"),
     "model not known": (origin(changed(model=None)), origin(OURS), "its model is unknown"),
     "slot": (origin(OURS), origin(changed(counts_per_N=500.0)), "its counts per N is 1000, but 500 in this"),
     "slot of torques": (origin(OURS), origin(changed(counts_per_Nm=1.0)), "its counts per N·m is 20000"),

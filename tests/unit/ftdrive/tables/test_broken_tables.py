@@ -211,11 +211,7 @@ BROKEN: dict[str, tuple[str | bytes, str, TableOptions]] = {
         r"column 'fx \[mm\]' has the unit mm, which is not a unit of force .*--columns",
         named(),
     ),
-    "torque in N": (
-        text(renamed(tx="tx (N)")),
-        r"column 'tx \(N\)' has the unit N, which is not a unit of torque",
-        named(),
-    ),
+    "torque in N": (text(renamed(tx="tx (N)")), r"'tx \(N\)' has the unit N, which is not a unit of torque", named()),
     "time in N": (text(renamed(t="t [N]")), r"has the unit N, which is not a unit of time", named()),
     "force in parsec": (text(renamed(fx="fx [pc]")), r"has the unit pc, which is not a unit of force", named()),
     "position in deg": (
