@@ -37,10 +37,10 @@ def fleet_of(observed: Observed, store: Store) -> Fleet:
     """Return states and findings of the contents of a store, which is queried again for older verifications."""
     states = list[CellState]()
     for cell in observed.cells:
-        found = [_cell_state(cell, one, observed, store) for one in observed.newest(cell)]
-        if not found or cell.tool not in {None, *(one.tool for one in found)}:
+        found = [_cell_state(cell, result, observed, store) for result in observed.newest(cell)]
+        if not found or cell.tool not in {None, *(state.tool for state in found)}:
             found.append(CellState(cell.name, cell.tool, cell.arm_serial))
-        states += sorted(found, key=lambda one: one.tool or "")
+        states += sorted(found, key=lambda state: state.tool or "")
     return Fleet(tuple(states), _fleet_findings(observed, states))
 
 
@@ -87,7 +87,7 @@ def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, stor
         change=None if check is None else check.change,
         due=max(calibrated, verified or calibrated) + timedelta(days=cell.verify_every_days),
         mass_kg=result.mass_kg,
-        temperature_C=next((one for one in temperatures if one is not None), None),
+        temperature_C=next((value for value in temperatures if value is not None), None),
         drift=_drift_of(observed.changes.get(result.id), calibrated),
         weighings=observed.weighings.get((cell.name, result.tool, result.emulated)),
         emulated=result.emulated,
@@ -116,7 +116,7 @@ RECENT: Final = timedelta(days=3)
 
 
 def _fleet_findings(observed: Observed, states: Sequence[CellState]) -> tuple[FleetFinding, ...]:
-    newest = [(cell.name, one) for cell in observed.cells for one in observed.newest(cell)]
+    newest = [(cell.name, result) for cell in observed.cells for result in observed.newest(cell)]
     return (
         *_overdue(states, observed),
         *_bases(observed),
@@ -130,7 +130,7 @@ def _fleet_findings(observed: Observed, states: Sequence[CellState]) -> tuple[Fl
 
 
 def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
-    late = [(one.due, one.cell) for one in states if one.due is not None and one.due + LATE < observed.now]
+    late = [(state.due, state.cell) for state in states if state.due is not None and state.due + LATE < observed.now]
     if late:
         due, worst = min(late)
         cells = tuple(sorted({cell for _, cell in late}))
@@ -147,18 +147,18 @@ def _overdue(states: Sequence[CellState], observed: Observed) -> Iterator[FleetF
 def _refused_weighings(states: Sequence[CellState], observed: Observed) -> Iterator[FleetFinding]:
     """Yield findings about cells that refused most weighings of their last day."""
     first = (observed.now - RECENT).date().isoformat()
-    for one in states:
-        if one.weighings is None or one.weighings.day < first:
+    for state in states:
+        if state.weighings is None or state.weighings.day < first:
             continue
-        refused = sum(one.weighings.refusals.values())
-        tried = refused + one.weighings.weighings
+        refused = sum(state.weighings.refusals.values())
+        tried = refused + state.weighings.weighings
         if tried >= MANY_WEIGHINGS and 2 * refused > tried:
-            code = max(one.weighings.refusals.items(), key=lambda item: item[1])[0]
+            code = max(state.weighings.refusals.items(), key=lambda item: item[1])[0]
             yield FleetFinding(
                 "weighing",
-                (one.cell,),
-                f"{one.cell}: {refused} of {tried} weighings with {one.tool or 'its tool'} were refused on "
-                f"{one.weighings.day}, mostly because of '{code}': run `ftdrive weigh` at this cell to see why",
+                (state.cell,),
+                f"{state.cell}: {refused} of {tried} weighings with {state.tool or 'its tool'} were refused on "
+                f"{state.weighings.day}, mostly because of '{code}': run `ftdrive weigh` at this cell to see why",
             )
 
 
@@ -169,9 +169,9 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
     """Yield findings about bases turned between the last two calibrations; updates copy gravity and are skipped."""
     for name, results in observed.results.items():
         seen = list[StoredResult]()
-        for one in reversed(results):
-            if not seen or _turned(one, seen[0])[0] > 1e-9:
-                seen.append(one)
+        for result in reversed(results):
+            if not seen or _turned(result, seen[0])[0] > 1e-9:
+                seen.append(result)
             if len(seen) == 2:
                 angle, p_value = _turned(*reversed(seen))
                 if angle > TILTED_RAD and p_value < SURE:
@@ -179,7 +179,7 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
                         "base",
                         (name,),
                         f"{name}: gravity has turned by {np.rad2deg(angle):.2f}° in the base between the calibrations "
-                        f"of {when(one):%Y-%m-%d} and {when(seen[0]):%Y-%m-%d}: check the bolts and the frame under "
+                        f"of {when(result):%Y-%m-%d} and {when(seen[0]):%Y-%m-%d}: check the bolts and the frame under "
                         "the base, then calibrate the other tools of the cell again",
                     )
                 break
@@ -187,7 +187,7 @@ def _bases(observed: Observed) -> Iterator[FleetFinding]:
 
 def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
     """Return the angle between the gravity directions of two results, rad, and its p-value for a fixed base."""
-    weights = [one.parameters.weight_N for one in (before, after)]
+    weights = [result.parameters.weight_N for result in (before, after)]
     if not min(weights) > 0:
         return 0.0, 1.0
     old, new = before.parameters.down, after.parameters.down
@@ -196,8 +196,8 @@ def _turned(before: StoredResult, after: StoredResult) -> tuple[float, float]:
         return angle, 1.0
     across = np.linalg.svd(skew(old))[0][:, :2]  # (3, 2)
     covariance = TILT_FLOOR_RAD**2 * np.eye(2)
-    for one, weight in zip((before, after), weights, strict=True):
-        covariance += across.T @ one.covariance[3:6, 3:6] @ across / weight**2
+    for result, weight in zip((before, after), weights, strict=True):
+        covariance += across.T @ result.covariance[3:6, 3:6] @ across / weight**2
     change = across.T @ (new - old)
     return angle, float(chi2_sf(2, change @ np.linalg.solve(covariance, change)))
 
@@ -223,35 +223,35 @@ class _Load:
 def _payloads(newest: Sequence[tuple[str, StoredResult]]) -> Iterator[FleetFinding]:
     """Yield findings about tools on which several cells agree, but whose payloads have another mass or centre."""
     tools = dict[str, list[_Load]]()
-    for cell, one in newest:
-        if one.tool is not None and one.payload_kg is not None and one.mass_kg > 0:
-            tools.setdefault(one.tool, []).append(_tool_load(cell, one, one.payload_kg))
+    for cell, result in newest:
+        if result.tool is not None and result.payload_kg is not None and result.mass_kg > 0:
+            tools.setdefault(result.tool, []).append(_tool_load(cell, result, result.payload_kg))
     for tool, loads in tools.items():
         if len(loads) > 1:
             yield from _centre(tool, loads)
             yield from _mass_findings(tool, loads)
 
 
-def _tool_load(cell: str, one: StoredResult, payload_kg: float) -> _Load:
+def _tool_load(cell: str, result: StoredResult, payload_kg: float) -> _Load:
     """Return a tool with its payload; centred sensors and adapters do not change the moment about the flange axis."""
-    R, covariance = one.parameters.R_flange_sensor, one.covariance
-    arm_m = R @ one.parameters.p_sensor_com_m
+    R, covariance = result.parameters.R_flange_sensor, result.covariance
+    arm_m = R @ result.parameters.p_sensor_com_m
     J = np.concatenate([-skew(arm_m), R], axis=1)  # derivative by rotation about the flange axes, and by the centre
     rows = np.r_[0:3, 9:12]
     sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))
-    com = one.payload_com_m
-    configured = None if com is None else np.array(com[:2]) * payload_kg / one.mass_kg
-    return _Load(cell, one.mass_kg, one.mass_sigma_kg, arm_m[:2], sigma[:2], payload_kg, configured)
+    com = result.payload_com_m
+    configured = None if com is None else np.array(com[:2]) * payload_kg / result.mass_kg
+    return _Load(cell, result.mass_kg, result.mass_sigma_kg, arm_m[:2], sigma[:2], payload_kg, configured)
 
 
 def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
-    centre = np.median([one.off_axis_m for one in loads], axis=0)
-    alike = [one for one in loads if (abs(one.off_axis_m - centre) <= _either(ALIKE_M, one.off_axis_sigma_m)).all()]
+    centre = np.median([load.off_axis_m for load in loads], axis=0)
+    alike = [load for load in loads if (abs(load.off_axis_m - centre) <= _either(ALIKE_M, load.off_axis_sigma_m)).all()]
     wrong = [
-        one
-        for one in alike
-        if one.configured_off_axis_m is not None
-        and (abs(one.configured_off_axis_m - one.off_axis_m) > _either(WRONG_M, one.off_axis_sigma_m)).any()
+        load
+        for load in alike
+        if load.configured_off_axis_m is not None
+        and (abs(load.configured_off_axis_m - load.off_axis_m) > _either(WRONG_M, load.off_axis_sigma_m)).any()
     ]
     yield from _wrong_payloads(
         wrong,
@@ -263,14 +263,14 @@ def _centre(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
 
 
 def _mass_findings(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
-    mass_kg = float(np.median([one.mass_kg for one in loads]))
+    mass_kg = float(np.median([load.mass_kg for load in loads]))
     wrong = []
-    for one in loads:
-        margin_kg = max(WRONG_KG, WRONG_SHARE * one.mass_kg, SIGMAS * one.mass_sigma_kg)
-        above_kg = one.payload_kg - one.mass_kg
-        alike = abs(one.mass_kg - mass_kg) <= max(ALIKE_SHARE * mass_kg, SIGMAS * one.mass_sigma_kg)
+    for load in loads:
+        margin_kg = max(WRONG_KG, WRONG_SHARE * load.mass_kg, SIGMAS * load.mass_sigma_kg)
+        above_kg = load.payload_kg - load.mass_kg
+        alike = abs(load.mass_kg - mass_kg) <= max(ALIKE_SHARE * mass_kg, SIGMAS * load.mass_sigma_kg)
         if alike and not -margin_kg <= above_kg <= MOST_SENSOR_KG + margin_kg:
-            wrong.append(one)
+            wrong.append(load)
     yield from _wrong_payloads(
         wrong,
         lambda first, cells: (
@@ -283,9 +283,9 @@ def _mass_findings(tool: str, loads: Sequence[_Load]) -> Iterator[FleetFinding]:
 def _wrong_payloads(wrong: Iterable[_Load], words: Callable[[_Load, str], str]) -> Iterator[FleetFinding]:
     """Yield a finding about two or more loads; `words` describes the first one and the names of all cells."""
     # A single wrong payload is a finding of its own calibration.
-    loads = sorted(wrong, key=lambda one: one.cell)
+    loads = sorted(wrong, key=lambda load: load.cell)
     if len(loads) > 1:
-        cells, first = tuple(one.cell for one in loads), loads[0]
+        cells, first = tuple(load.cell for load in loads), loads[0]
         fix = "set the payloads with `ftdrive push`"
         yield FleetFinding("payload", cells, f"{words(first, join_names(cells))} in {first.cell}: {fix}")
 

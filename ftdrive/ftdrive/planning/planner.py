@@ -97,9 +97,9 @@ def plan_tour(
     """
     q_now = checked_joints(q_rad)
     _pose_numbers(poses)
-    for kind, why, found in _attempts(certifier, q_now, poses, speeds, guess):
-        if found is not None:
-            return make_plan(kind, why, certifier, *found, speeds, guess)
+    for kind, why, tour in _attempts(certifier, q_now, poses, speeds, guess):
+        if tour is not None:
+            return make_plan(kind, why, certifier, *tour, speeds, guess)
     raise PlanRefused(
         f"{_reason(poses)}. Nor is a tour at another posture, with the flange in a box, or of other poses proven clear "
         "and informative enough to estimate all parameters. Describe the tool more closely, or clear the surroundings"
@@ -143,14 +143,14 @@ def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
     The poses determine all parameters, not only weight, centre of mass and bias of the tool. Their error is 3 % above
     that of a tetrahedron of gravity directions.
     """
-    found = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
-    if found is None:
+    tour = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
+    if tour is None:
         raise PlanRefused(
             f"no tour of {TOOL_POSES} poses is reachable, proven clear and informative enough for a new tool: jog the "
             "arm to another posture, or clear the surroundings"
         )
-    why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(found)]
-    plan = make_plan("tool", why, certifier, found.numbers, found.q_rad, speeds, guess)
+    why = [f"{TOOL_POSES} poses for a new tool; mounting and base are known.", *_chosen_words(tour)]
+    plan = make_plan("tool", why, certifier, tour.numbers, tour.q_rad, speeds, guess)
     return replace(plan, why=tuple(why))  # without the predicted error, which ignores the earlier calibration
 
 
@@ -158,14 +158,14 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
     """Plan a tour of tilts with a load on a string; the arm turns about the hook, which stays at one point."""
     speeds = speeds.limited(Speeds.with_hung_load())
     q_now = checked_joints(q_rad)
-    found = hung_tour(certifier, q_now, HUNG_POSES, speeds)
-    if found is None:
+    tour = hung_tour(certifier, q_now, HUNG_POSES, speeds)
+    if tour is None:
         raise PlanRefused(
             f"no tour of {HUNG_POSES} tilts of 45 to 75 degrees is reachable and proven clear with the hanging load: "
             "jog the arm to where there is room around and below the load, or hang it from another point of the tool"
         )
-    hook_m = found[2]
-    numbers, q = _start_nearest(q_now, found[:2])
+    hook_m = tour[2]
+    numbers, q = _start_nearest(q_now, tour[:2])
     share = np.linspace(0, 1, 41)[:, None, None]
     between = ((1 - share) * q + share * np.roll(q, -1, axis=0)).reshape(-1, 6)
     away_mm = 1e3 * np.linalg.norm(certifier.arm.hook_m(certifier.arm.frames(between)) - hook_m, axis=1).max()
@@ -194,14 +194,14 @@ def _plan_cone(
             f"up to 180 degrees, and {FEWEST_CHOSEN} poses or more"
         )
     cone = f"within {np.degrees(half_angle_rad):.0f} degrees of straight down"
-    found = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
-    if found is None:
+    tour = chosen_tour(certifier, q_now, poses, half_angle_rad, speeds, guess)
+    if tour is None:
         raise PlanRefused(
             f"no tour of {poses} poses with the tool {cone} is reachable, proven clear and informative enough to "
             "estimate all parameters: widen the cone, or jog the arm to another posture"
         )
-    why = [f"The tool axis stays {cone}.", *_chosen_words(found)]
-    return make_plan("cone", why, certifier, found.numbers, found.q_rad, speeds, guess)
+    why = [f"The tool axis stays {cone}.", *_chosen_words(tour)]
+    return make_plan("cone", why, certifier, tour.numbers, tour.q_rad, speeds, guess)
 
 
 def _plan_box(
@@ -222,13 +222,13 @@ def _plan_box(
     if not 0 <= half_size_m <= 1:
         raise ConfigError(f"the box is {1e3 * half_size_m:g} mm to each side: give 0 to 1000 mm")
     centre = certifier.arm.frames(q_now).flange_m[0] if centre_m is None else np.asarray(centre_m, dtype=np.float64)
-    found = _box(certifier, q_now, _pose_numbers(poses), centre, half_size_m, speeds)
-    if found is None:
+    tour = _box(certifier, q_now, _pose_numbers(poses), centre, half_size_m, speeds)
+    if tour is None:
         raise PlanRefused(
             f"with the flange within {1e3 * half_size_m:.0f} mm of {_format_point(centre)} not all {poses} "
             "orientations are reachable, or no tour of them is proven clear: give a larger box, or another centre"
         )
-    return make_plan("box", [_box_words(centre, half_size_m)], certifier, *found, speeds, guess)
+    return make_plan("box", [_box_words(centre, half_size_m)], certifier, *tour, speeds, guess)
 
 
 def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Speeds, guess: Guess) -> Plan:
@@ -243,16 +243,16 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
         (_at_pan(q_now, NUMBERS[24]) if name == "A" else paper_set(name, spare=SPARE, down_base=down), COUNTS[name])
         for name in names
     ]
-    found = tour_of_sets(certifier, q_now, kinds, speeds)
-    if found is None:
+    tour = tour_of_sets(certifier, q_now, kinds, speeds)
+    if tour is None:
         raise PlanRefused(
             f"no tour of the sets {sets} is reachable and proven clear: jog the arm to another posture, clear the "
             "surroundings, or choose other sets"
         )
-    numbers = np.concatenate([numbers_of(name) for name in names])[found[0]]
+    numbers = np.concatenate([numbers_of(name) for name in names])[tour[0]]
     why = [f"{len(numbers)} poses: {', '.join(f'{name} {COUNTS[name]}' for name in names)} (Yu et al. 2021, Fig. 6)."]
-    why += [] if np.array_equal(found[1][0, :3], q_now[:3]) else [_elsewhere_words(found[1][0])]
-    return make_plan("sets", why, certifier, numbers.tolist(), found[1], speeds, guess)
+    why += [] if np.array_equal(tour[1][0, :3], q_now[:3]) else [_elsewhere_words(tour[1][0])]
+    return make_plan("sets", why, certifier, numbers.tolist(), tour[1], speeds, guess)
 
 
 def plan_verification(
@@ -262,13 +262,13 @@ def plan_verification(
     q_now = checked_joints(q_rad)
     if poses < FEWEST_TO_VERIFY:
         raise ConfigError(f"{poses} poses cannot verify a calibration: give {FEWEST_TO_VERIFY} or more")
-    found = verification_tour(certifier, q_now, poses, R_fitted, speeds)
-    if found is None:
+    tour = verification_tour(certifier, q_now, poses, R_fitted, speeds)
+    if tour is None:
         raise PlanRefused(
             f"no tour of {poses} new poses is reachable and proven clear: jog the arm to another posture, or clear "
             "the surroundings"
         )
-    numbers, q = _start_nearest(q_now, found)
+    numbers, q = _start_nearest(q_now, tour)
     why = [f"{poses} poses that were not used in the calibration, far from its {len(R_fitted)} poses."]
     why += [] if np.array_equal(q[0, :3], q_now[:3]) else [_elsewhere_words(q[0])]
     plan = make_plan("verification", why, certifier, numbers, q, speeds, guess)

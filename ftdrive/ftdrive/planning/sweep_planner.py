@@ -110,7 +110,7 @@ def _scored_sweeps(
 ) -> list[tuple[float, Sweep]]:
     """Return random curves, and changes of the best one that seems clear, with their scores; the best first."""
     arm = certifier.arm
-    rng, found = np.random.default_rng(0), list[tuple[float, Sweep]]()
+    rng, scored = np.random.default_rng(0), list[tuple[float, Sweep]]()
     best, least = _random_shape(rng), np.inf
     for k in range(RANDOM + CHANGED):
         tried = _random_shape(rng)
@@ -123,10 +123,10 @@ def _scored_sweeps(
         score = _score(arm, sweep, guess)
         seems_free = score < least and _seems_free(certifier, sweep, stop_rad_s2)
         if k < RANDOM or seems_free:
-            found.append((score if seems_free else score + _TOUCHING, sweep))
+            scored.append((score if seems_free else score + _TOUCHING, sweep))
         if seems_free:
             least, best = score, tried
-    return sorted(found, key=lambda one: one[0])
+    return sorted(scored, key=lambda one: one[0])
 
 
 def _seems_free(certifier: Certifier, sweep: Sweep, stop_rad_s2: float) -> bool:

@@ -35,23 +35,23 @@ def hints(result: CalibrationResult, records: Sequence[PoseRecord]) -> tuple[Fin
     records = _in_dataset(records)
     if len(records) != result.n_poses:
         raise ValueError(f"{len(records)} records do not belong to a result of {result.n_poses} poses")
-    names, found = pose_names(records), find_moved(records)
+    names, findings = pose_names(records), find_moved(records)
     if any(finding.code in _CHANGES for finding in result.findings):  # the change explains the outliers
-        return tuple(found)
+        return tuple(findings)
     odd = [row for row in _out_of_line(result) if _steady(records[row])]
     pulled = [row for row in odd if np.abs(result.residuals[row] / _sigma(result))[:3].max() > _SIGNIFICANT]
     for row in odd:
         force_N, torque_Nm = np.linalg.norm(result.residuals[row, :3]), np.linalg.norm(result.residuals[row, 3:])
         code = "load_swings" if row not in pulled else "pose_touched" if len(pulled) == 1 else "pose_off"
-        found.append(Finding.of(code, pose=names[row], force_N=force_N, torque_Nm=torque_Nm))
+        findings.append(Finding.of(code, pose=names[row], force_N=force_N, torque_Nm=torque_Nm))
     if len(pulled) > 1:
-        found.append(Finding.of("cable_pulls", poses=[names[row] for row in pulled]))
+        findings.append(Finding.of("cable_pulls", poses=[names[row] for row in pulled]))
     if again is not None and np.abs(again.change / again.sigma).max() > _SIGNIFICANT:
         if _drifts_alike(result, again):
-            found.append(Finding.of("sensor_drifts"))
+            findings.append(Finding.of("sensor_drifts"))
         elif np.abs(again.change / _sigma(result)).max() > np.sqrt(2) * _SIGNIFICANT:
-            found.append(Finding.of("return_differs", pose=names[0]))
-    return tuple(found)
+            findings.append(Finding.of("return_differs", pose=names[0]))
+    return tuple(findings)
 
 
 def _in_dataset(records: Sequence[PoseRecord]) -> list[PoseRecord]:
@@ -64,14 +64,14 @@ def _steady(record: PoseRecord) -> bool:
 
 def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
     """Return findings about poses that were not steady; each row of the dataset has one record."""
-    found = []
+    findings = []
     for record, name in zip(records, pose_names(records), strict=True):
         turn_rad = turned_rad(record.before, record.after)
         if turn_rad >= MOVED_RAD:
-            found.append(Finding.of("pose_turned", pose=name, turn_deg=np.degrees(turn_rad)))
+            findings.append(Finding.of("pose_turned", pose=name, turn_deg=np.degrees(turn_rad)))
         elif not record.steady:
-            found.append(Finding.of("pose_unsteady", pose=name))
-    return found
+            findings.append(Finding.of("pose_unsteady", pose=name))
+    return findings
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:

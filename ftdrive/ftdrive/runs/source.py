@@ -335,27 +335,27 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         run = Run(source)
         if run.in_motion:
             raise BadDataset(f"{source} is a recording in motion and has no poses: solve it with {run.solve_command}")
-        found = _recorded_data(run, run.records())
+        data = _recorded_data(run, run.records())
     elif source.suffix == ".json":
-        found = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
+        data = RecordedData(CalibrationDataset.load(source), {"source": source.name, "versions": versions()})
     else:
         table = Table(source, options.table)
         dataset = table.dataset(options.orientation)
         recognised = {"table": table.words} if table.words else {}
-        found = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
+        data = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.has_nominal_kinematics:
-            found = replace(found, setup=replace(found.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
+            data = replace(data, setup=replace(data.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
         if table.gravity_is_measured:  # so that its direction defines the base
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
         raise ConfigError(f"{source.name} is not a table: leave out options for tables, such as --columns")
     up_in_base = options.up_in_base
     if up_in_base is not None:
-        provenance = {**found.provenance, "up_in_base": list(up_in_base)}
-        found = replace(found, setup=replace(found.setup, up_in_base=up_in_base), provenance=provenance)
+        provenance = {**data.provenance, "up_in_base": list(up_in_base)}
+        data = replace(data, setup=replace(data.setup, up_in_base=up_in_base), provenance=provenance)
     if known is not None and known.gravity_direction_base is not None:
-        known = replace(known, gravity_direction_base=-found.setup.up)
-    return replace(found, known=known)
+        known = replace(known, gravity_direction_base=-data.setup.up)
+    return replace(data, known=known)
 
 
 _TAKEN: Final = "give a path, a DataFrame, arrays by name, or a pair (R_base_flange, wrench)"
@@ -493,9 +493,9 @@ def solve_in_motion(
     run: Run, known: Known | None = None, *, earlier: CalibrationResult | None = None, point_mass: bool = False
 ) -> CalibrationResult:
     """Return the solution of a run in motion; for a new tool with the given or the recorded earlier result."""
-    found, earlier = circumstances_of(run), earlier or _earlier_of(run)
+    circumstances, earlier = circumstances_of(run), earlier or _earlier_of(run)
     if earlier is not None:
-        require_same_cell(earlier, found.origin)
+        require_same_cell(earlier, circumstances.origin)
     wrench, poses = means_of(run.motion_path)
     digest = hashlib.sha256()
     for file in files_of(run.motion_path):
@@ -508,10 +508,10 @@ def solve_in_motion(
         earlier=earlier,
         point_mass=point_mass,
         guarded=run.mode == "sweep",
-        height_m=found.setup.sensor_height_m,
-        g_m_s2=found.g_m_s2,
-        setup=found.setup,
-        provenance={**found.provenance(), **recording},
+        height_m=circumstances.setup.sensor_height_m,
+        g_m_s2=circumstances.g_m_s2,
+        setup=circumstances.setup,
+        provenance={**circumstances.provenance(), **recording},
     )
 
 
@@ -530,12 +530,14 @@ def _earlier_of(run: Run) -> CalibrationResult | None:
 def _recorded_data(run: Run, records: Sequence[PoseRecord]) -> RecordedData:
     if not records:
         raise NotObservable(f"{run.folder} has no data to solve: {run.how_to_go_on}")
-    found = circumstances_of(run)
-    marks = {"emulated": True} if found.origin["station"] is not None else {}
-    if "load" in found.origin:
-        marks["load"] = found.origin["load"]
-    dataset = dataset_from(records, {"run": run.folder.name, "devices": found.origin["devices"], **marks})
-    return RecordedData(dataset, found.provenance(), found.g_m_s2, found.setup, None, records, _earlier_of(run))
+    circumstances = circumstances_of(run)
+    marks = {"emulated": True} if circumstances.origin["station"] is not None else {}
+    if "load" in circumstances.origin:
+        marks["load"] = circumstances.origin["load"]
+    dataset = dataset_from(records, {"run": run.folder.name, "devices": circumstances.origin["devices"], **marks})
+    return RecordedData(
+        dataset, circumstances.provenance(), circumstances.g_m_s2, circumstances.setup, None, records, _earlier_of(run)
+    )
 
 
 def circumstances_of(run: Run) -> Circumstances:

@@ -98,8 +98,8 @@ class WeighingDay:
         OSError
             The file cannot be read.
         """
-        found = before or cls(id=path.stem, path=str(path), refusals=dict.fromkeys(REFUSALS, 0))
-        size, weighings, refusals, last = found.size, found.weighings, {**found.refusals}, None
+        total = before or cls(id=path.stem, path=str(path), refusals=dict.fromkeys(REFUSALS, 0))
+        size, weighings, refusals, last = total.size, total.weighings, {**total.refusals}, None
         with open_file(path) as file:
             first = 1 + file.read(size).count(b"\n")
             for number, line in enumerate(read_lines(file, BadDataset, first), first):
@@ -112,7 +112,7 @@ class WeighingDay:
                     names = ("tool", "arm_serial", "sensor_serial", "robot_host", "calibration_id")
                     origin: dict[str, Any] = {name: text_at(content, name) for name in names}
                     day, emulated = text_at(content, "day") or "", content.get("emulated") is True
-                    found = replace(found, day=day, emulated=emulated, **origin)
+                    total = replace(total, day=day, emulated=emulated, **origin)
                 elif (code := content.get("refused")) is not None:
                     refusals[code if code in refusals else "other"] += 1
                 elif content.get("is_something"):
@@ -123,8 +123,8 @@ class WeighingDay:
             raise BadDataset("the file has no weighings: delete it")
         if last is not None:
             mass_kg, sigma_kg = number_at(last, "mass_kg"), number_at(last, "mass_sigma_kg")
-            found = replace(found, last_utc=time_at(last, "t_utc"), mass_kg=mass_kg, mass_sigma_kg=sigma_kg)
-        return replace(found, size=size, weighings=weighings, refusals=refusals)
+            total = replace(total, last_utc=time_at(last, "t_utc"), mass_kg=mass_kg, mass_sigma_kg=sigma_kg)
+        return replace(total, size=size, weighings=weighings, refusals=refusals)
 
 
 def sum_up(days: Iterable[WeighingDay]) -> list[WeighingDay]:

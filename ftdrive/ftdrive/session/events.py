@@ -278,9 +278,9 @@ def _to_json(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _to_json(value.tolist())
     if isinstance(value, Mapping):
-        return {key: _to_json(one) for key, one in value.items()}
+        return {key: _to_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_to_json(one) for one in value]
+        return [_to_json(item) for item in value]
     if isinstance(value, np.generic):
         return _to_json(value.item())
     if isinstance(value, float) and not np.isfinite(value):

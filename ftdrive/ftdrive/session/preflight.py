@@ -271,7 +271,7 @@ def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
     for row in rows:
         found.append(row(before))
         before.cell.journal.show(found[-1])
-    if failed := [f"{one.name}: {one.words}" for one in found if not one.passed]:
+    if failed := [f"{result.name}: {result.words}" for result in found if not result.passed]:
         raise NotAccepted("nothing moves: " + "; ".join(failed))
 
 

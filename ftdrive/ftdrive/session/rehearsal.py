@@ -155,7 +155,11 @@ def rehearse_loads(
         load = KnownLoad(name, _LOAD_KG, _LOAD_SIGMA_KG, (x, y, z), _PLACE_SIGMA_MM / 1e3)
         taken.append((outcome, load))
     station.control(do="unhang")
-    sets = [LoadRun(one.run.folder.name, one.dataset, load) for one, load in taken if one.dataset is not None]
+    sets = [
+        LoadRun(calibrated.run.folder.name, calibrated.dataset, load)
+        for calibrated, load in taken
+        if calibrated.dataset is not None
+    ]
     return solve_loads(sets, p_flange_sensor_m=np.array(truth["p_flange_sensor_m"]), g_m_s2=truth["g_m_s2"])
 
 

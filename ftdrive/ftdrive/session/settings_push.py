@@ -376,7 +376,7 @@ def _write_receipt(
         **made_now(),
         "devices": {role: asdict(info) for role, info in devices.items()},
         **reason,
-        **{name: None if one is None else asdict(one) for name, one in values.items()},
+        **{name: None if value is None else asdict(value) for name, value in values.items()},
         "error": error or None,
     }
     path = Run(folder).new_path(_RECEIPT)

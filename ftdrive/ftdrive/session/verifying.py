@@ -192,7 +192,7 @@ class RunningComparison:
     def predict(self, R_base_flange: Array) -> Array | None:
         """Return the wrench (6,) of a free tool; None until poses confirm the calibration. Callable from any thread."""
         seen = [compared.residual for compared in list(self._compared.values())]
-        norms = ((np.linalg.norm(one[:3]), np.linalg.norm(one[3:])) for one in seen)
+        norms = ((np.linalg.norm(residual[:3]), np.linalg.norm(residual[3:])) for residual in seen)
         if len(seen) < HOLDS_POSES or any(force_N > HOLDS_N or torque_Nm > HOLDS_NM for force_N, torque_Nm in norms):
             return None
         return free_wrench(self._calibration, R_base_flange)

@@ -197,12 +197,12 @@ class SignalColumns:
         two, line = list[str](), ""
         for layout, signal in product(self._layouts, signals):
             for way in layout.signals.get(signal, "").split("|"):
-                found = self._complete(way)
-                if len(found) == 1:
-                    columns, units = zip(*found[0], strict=True)
+                candidates = self._complete(way)
+                if len(candidates) == 1:
+                    columns, units = zip(*candidates[0], strict=True)
                     return Signal(signal, layout.program, columns, units)
-                if found and not two:
-                    two = [self.names[one[0][0]] for one in found]
+                if candidates and not two:
+                    two = [self.names[one[0][0]] for one in candidates]
                     line = self.line(signal)
         if two and signals != ("time",):  # two topics have time stamps besides the clock of the file
             raise BadDataset(f"two candidates, {' and '.join(two[:2])}. Name the columns: {line}")

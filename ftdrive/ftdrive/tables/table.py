@@ -388,7 +388,7 @@ class Table:
             kinds = ["force"] * 3 + ["torque"] * 3
         if signal.form == "time" and len(names) == 2:
             return np.array([1.0, 1e-9])
-        found = [
+        factors = [
             factor(unit, kind, name) if kind else None
             for unit, kind, name in zip(signal.units, kinds, names, strict=True)
         ]
@@ -396,17 +396,17 @@ class Table:
             self._guesses.append("wrench in counts")
         largest = float(np.nanmax(np.abs(first), initial=0.0))
         guess = 1.0
-        if signal.form == "time" and None in found:
+        if signal.form == "time" and None in factors:
             unit = _unit_of_time(first[:, 0], names[0])
             guess = _UNITS_OF_TIME[unit]
             self._guesses += [f"time in {unit}"] if unit != "s" else []
-        elif kinds[0] == "angle" and None in found and largest > _MOST_RAD and signal.form != "vector":
+        elif kinds[0] == "angle" and None in factors and largest > _MOST_RAD and signal.form != "vector":
             guess = UNITS["angle"]["deg"]
             self._guesses.append("angles in degrees")
-        elif kinds[0] == "length" and signal.form == "position" and None in found and largest > _MOST_M:
+        elif kinds[0] == "length" and signal.form == "position" and None in factors and largest > _MOST_M:
             guess = 1e-3
             self._guesses.append("positions in mm")
-        return np.array([guess if one is None else one for one in found])
+        return np.array([guess if one is None else one for one in factors])
 
     def _in_order(self, signals: Sequence[Signal]) -> Iterator[tuple[Array, list[Array], float]]:
         """Yield the non-empty blocks of `_rows`. Raises `BadDataset` if the time decreases."""

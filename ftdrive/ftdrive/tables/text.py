@@ -104,17 +104,17 @@ class TextTable:
             separator, rows = "\t", ["\t".join(row.split()) for row in rows]
         if self.format.decimal == ",":
             rows = [row.replace(",", ".") for row in rows] if "." not in text else []
-        found = self._numbers(rows, separator, use)
-        if found is None:
+        numbers = self._numbers(rows, separator, use)
+        if numbers is None:
             plain = "\n".join(["", *rows, ""])
             # The first replacement is needed twice, because three consecutive blank cells overlap.
             for edge in (separator * 2, separator * 2, f"\n{separator}", f"{separator}\n"):
                 plain = plain.replace(edge, f"{edge[0]}nan{edge[1]}")
-            found = self._numbers(plain.split("\n"), separator, use)
-        if found is None:
+            numbers = self._numbers(plain.split("\n"), separator, use)
+        if numbers is None:
             return self._slowly_parsed(text, use, first)
         self.comments += comments
-        return found
+        return numbers
 
     def _numbers(self, lines: Sequence[str], separator: str, use: Sequence[int]) -> Array | None:
         """Return columns of lines as read by numpy; None if numpy rejects a cell, such as a blank one, or a row."""
@@ -124,10 +124,10 @@ class TextTable:
         kinds |= {i: "U40" for i in self.format.dates if i in use}
         of_columns = [(str(i), kind) for i, kind in kinds.items()]
         try:
-            found = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
-            columns = [found[str(i)] if kinds[i] == "f8" else self._dates(found[str(i)], self.names[i]) for i in use]
+            table = np.loadtxt(rows, of_columns, comments=None, delimiter=separator, ndmin=1, quotechar='"')
+            columns = [table[str(i)] if kinds[i] == "f8" else self._dates(table[str(i)], self.names[i]) for i in use]
             # An unclosed quote would include the rows below in its cell.
-            return np.column_stack(columns) if len(found) == len(rows) else None
+            return np.column_stack(columns) if len(table) == len(rows) else None
         except (BadDataset, ValueError):
             return None
 

@@ -82,11 +82,11 @@ def chosen_tour(
     best = _clear_candidates(certifier, q_now, candidates, spins, poses, speeds, guess, ideal)
     if best is None or best.force_rms_N > NEARLY * ideal:
         for posture in _others(certifier, q_now, candidates):
-            found = _clear_candidates(
+            candidate = _clear_candidates(
                 certifier, np.array([*posture, *q_now[3:]]), candidates, spins, poses, speeds, guess, ideal
             )
-            if found is not None and (best is None or found.force_rms_N * NEARLY < best.force_rms_N):
-                best = Chosen(found.numbers, found.q_rad, found.force_rms_N, ideal, elsewhere=True)
+            if candidate is not None and (best is None or candidate.force_rms_N * NEARLY < best.force_rms_N):
+                best = Chosen(candidate.numbers, candidate.q_rad, candidate.force_rms_N, ideal, elsewhere=True)
     return best
 
 
@@ -150,8 +150,8 @@ def tour_of_sets(
 
     candidates = np.concatenate([R for R, _ in kinds])
     q_now = np.asarray(q_rad, dtype=np.float64)
-    found = _first_tour(certifier, q_now, candidates, 1, sum(wanted), first_of_each, speeds)
-    return None if found is None else (np.array(found[0]) - FIRST_NUMBER, found[1])
+    tour = _first_tour(certifier, q_now, candidates, 1, sum(wanted), first_of_each, speeds)
+    return None if tour is None else (np.array(tour[0]) - FIRST_NUMBER, tour[1])
 
 
 def hung_tour(
