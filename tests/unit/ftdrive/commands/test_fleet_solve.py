@@ -83,8 +83,8 @@ def test_runs_without_a_dataset_and_an_empty_store_are_mentioned(run: Callable[.
     assert code == 0
     assert out.startswith("0 runs")
     words = " ".join(err.split())
-    assert "they have no data to solve: 1 runs; finish each with `ftdrive calibrate --resume RUN`" in words
-    assert "they have no data to solve: 1 runs; start again with `ftdrive calibrate --sweep`" in words
+    assert "they have no data to solve: 1; finish each with `ftdrive calibrate --resume RUN`" in words
+    assert "they have no data to solve: 1; start again with `ftdrive calibrate --sweep`" in words
     assert "No runs: " in run()[2]
 
 

@@ -133,7 +133,7 @@ def test_a_store_that_cannot_be_used_is_one_sentence(
     for arguments in (["history"], ["history", "--index", runs], ["diff", "abcd", "abcd"]):
         code, out, err = run(*arguments)
         assert (code, out) == (6, "")
-        assert f"has version {SCHEMA + 1}, this ftdrive uses version {SCHEMA}: install a newer ftdrive" in err
+        assert f"has version {SCHEMA + 1}, but this ftdrive uses version {SCHEMA}: install a newer ftdrive" in err
     monkeypatch.setenv("FTDRIVE_STORE_URL", "mysql://host/db")
     code, _, err = run("history")
     assert (code, "begins with mysql" in err) == (2, True)

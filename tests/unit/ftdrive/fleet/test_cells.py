@@ -72,7 +72,7 @@ _CELL = '[cells.a]\nconfig = "b.toml"\nverify_every_days = 7\n'
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = 0\n', "verify_every_days is 0: give"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = true\n', "verify_every_days is True"),
         ('[cells.a]\nconfig = "b.toml"\nverify_every_days = nan\n', "verify_every_days is nan"),
-        (f"{_CELL}arm_serial = 222\n", "arm_serial is 222: give the serial number as a string"),
+        (f"{_CELL}arm_serial = 222\n", "arm_serial is 222: give it as a string"),
     ],
 )
 def test_each_mistake_is_one_sentence(folder: Path, text: str, words: str) -> None:

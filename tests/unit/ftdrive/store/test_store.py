@@ -137,9 +137,9 @@ def test_a_damaged_file_is_named_and_costs_only_itself(runs: Path, store_url: st
 @pytest.mark.parametrize(
     ("url", "words"),
     [
-        ("store.sqlite", "no address of a database"),
-        ("sqlite+none:////data/store", "no address of a database"),
-        ("postgresql+psycopg://lab:secret@host:port/db", "no address of a database"),
+        ("store.sqlite", "is not a database address"),
+        ("sqlite+none:////data/store", "is not a database address"),
+        ("postgresql+psycopg://lab:secret@host:port/db", "is not a database address"),
         ("mysql://lab:secret@host/db", "begins with mysql: give sqlite"),
         ("postgresql+psycopg://lab:secret@host/db", "needs psycopg"),
     ],

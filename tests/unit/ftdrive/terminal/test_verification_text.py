@@ -82,7 +82,7 @@ def test_a_failure_has_its_reason_and_what_helps(printed: Any) -> None:
     lines = printed(verified(changed, passed=False))
     assert lines[6].startswith("FAILED largest difference")
     assert lines[7] == "the difference has a reason"
-    assert lines[-2] == "No update compensates the change: calibrate again."
+    assert lines[-2] == "No update makes up for the change: calibrate again."
     helped = replace(changed, update=cast("Any", "bias"))
     assert printed(verified(helped, passed=False))[-2] == "? R03 was not steady"
     noisy = printed(verified(FOUND, passed=False))
