@@ -507,7 +507,7 @@ def test_a_hand_on_the_tool_is_named_and_the_pose_taken_again() -> None:
     assert outcome.stops == [1, 2, 3]
     assert all(record.steady for record in outcome.kept)
     words = outcome.person.words()
-    assert re.search(r"sigma of fy is 1\.\d N, and 0\.0[45]", words)
+    assert re.search(r"sigma of fy is 1\.\d N, in the quietest pose 0\.0[45]", words)
     assert "Let go of" in words
     assert [event.attempts for event in outcome.person.shown if isinstance(event, PoseTaken)] == [1, 2, 1]
     assert np.abs(outcome.kept[1].mean.mean[1] - BIAS[1]) < 0.05  # without the hand
@@ -564,7 +564,7 @@ def test_listening_ends_when_the_program_is_back_at_its_first_pose() -> None:
     assert drift.elapsed_s == pytest.approx(6 * (4.0 + MOVE_S), abs=0.5)
     assert len(dataset_from(outcome.kept, {})) == 6
     words = outcome.person.words()
-    assert "dwell for 3.3 s" in words
+    assert "dwell 3.3 s" in words
     assert "first pose: 7 poses" in words
     assert not any(hint in words for hint in ("press k", "Turn the tool"))
     assert {event.hint for event in outcome.person.shown if isinstance(event, Estimated)} == {""}
