@@ -46,7 +46,7 @@ class UsageError(FtdriveError):
     ...     ftdrive.plan_tour("ur5e", [(0, 200, 100)], poses=7)
     ... except ftdrive.UsageError as error:
     ...     print(error)
-    a plan of 7 poses does not exist: choose 24, 12, 6
+    there is no plan of 7 poses: choose one of 24, 12, 6
     """
 
 
