@@ -98,9 +98,7 @@ class Halves:
             self._set_clock(self._doubtful)
             if self._complete():
                 return self._accept()
-            self._set_clock(
-                len(self._waiting), by_period=False
-            )  # two deficits in a row: the sensor's clock shifted
+            self._set_clock(len(self._waiting), by_period=False)  # two deficits in a row: the sensor's clock shifted
         return []
 
     def _complete(self) -> bool:
