@@ -74,8 +74,7 @@ class _LazyGroup(click.Group):
         if cmd_name in self.commands or cmd_name not in self._modules:
             return self.commands.get(cmd_name)
         module = import_module(f"ftdrive.commands.{self._modules[cmd_name][0]}")
-        command: click.Command = getattr(module, cmd_name.replace("-", "_"))
-        return command
+        return next(one for one in vars(module).values() if isinstance(one, click.Command) and one.name == cmd_name)
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -216,7 +215,7 @@ def _run(arguments: Sequence[str]) -> int:
     try:
         return int(cli.main(list(arguments), prog_name="ftdrive", standalone_mode=False) or 0)
     except click.ClickException as error:
-        _explain(error, arguments)
+        _explain_click_error(error, arguments)
         return error.exit_code
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted")
@@ -232,7 +231,7 @@ def _run(arguments: Sequence[str]) -> int:
         return code
 
 
-def _explain(error: click.ClickException, arguments: Sequence[str]) -> None:
+def _explain_click_error(error: click.ClickException, arguments: Sequence[str]) -> None:
     """Print an error of the line itself, and what to type."""
     from ftdrive.mistakes import existing, missing, of_subcommand, without_value
 

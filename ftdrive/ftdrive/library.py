@@ -27,9 +27,9 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 from ftdrive.recording.files import RecordingReader
-from ftdrive.recording.files import read_recording as read_ours
+from ftdrive.recording.files import load_recording as read_ours
 from ftdrive.recording.foreign import TablePair, is_recording, moving_source, tables_of
-from ftdrive.recording.recording import ROW, Recording, rows_of
+from ftdrive.recording.recording import ROW, Recording, to_records
 from ftdrive.recording.replay import is_run_folder
 from ftdrive.recording.solve import solve_recording
 from ftdrive.runs.calibration import identity_mismatch, read_calibration, sensor_files, sensor_identity
@@ -168,7 +168,7 @@ def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableO
     if tables is None:
         raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
     pair = TablePair(*tables, calibration, "", None)
-    return Recording(pair.header, np.concatenate([rows_of(block.samples) for block in pair.blocks()]), [])
+    return Recording(pair.header, np.concatenate([to_records(block.samples) for block in pair.blocks()]), [])
 
 
 _NOT_CONFIGURED = CellConfig(RobotConfig(""), SensorConfig(""))
@@ -313,7 +313,7 @@ def open_stream(
         cell, chosen = station_of(given), given
     else:
         chosen = _only_one(given, tool)
-        cell = config if isinstance(config, Station) else _cell(config, sensor, arm)
+        cell = config if isinstance(config, Station) else _cell_config(config, sensor, arm)
     source = CellSource(cell, chosen, name=name, force=force, devices=(sensor, arm))
     return Stream(source, frame=frame, stages=stages, track=track, on_contact=on_contact)
 
@@ -329,7 +329,9 @@ def _only_one(calibration: CalibrationResult | None, tool: str | None) -> Calibr
     )
 
 
-def _cell(config: str | Path | CellConfig | None, sensor: ForceTorqueSensor | None, arm: RobotArm | None) -> CellConfig:
+def _cell_config(
+    config: str | Path | CellConfig | None, sensor: ForceTorqueSensor | None, arm: RobotArm | None
+) -> CellConfig:
     if isinstance(config, CellConfig):
         return config
     if config is None and sensor is not None and arm is not None:
@@ -387,11 +389,11 @@ def plan_tour(
     """
     options = {
         "robot.model": ("model", model),
-        "tool.cylinders_mm": ("tool_mm", _rows(tool_mm)),
+        "tool.cylinders_mm": ("tool_mm", _float_rows(tool_mm)),
         "tool.mass_kg": ("mass_kg", mass_kg),
         "workcell.mounting": ("mounting", mounting),
-        "workcell.planes_mm": ("planes_mm", _rows(planes_mm)),
-        "workcell.boxes_mm": ("boxes_mm", _rows(boxes_mm)),
+        "workcell.planes_mm": ("planes_mm", _float_rows(planes_mm)),
+        "workcell.boxes_mm": ("boxes_mm", _float_rows(boxes_mm)),
         "workcell.measured": ("measured", True),
     }
     cell = cell_of(settings(flags=options, cell=_NOT_CONFIGURED), devices=False)
@@ -422,7 +424,7 @@ def certifier_of(stream: Stream, replayed: Path | None, say: Callable[[str], obj
         return None
 
 
-def _rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
+def _float_rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(map(float, row)) for row in rows)
 
 

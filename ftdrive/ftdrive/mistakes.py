@@ -119,7 +119,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
 
     Where the error is `about` something, only a file that it names counts.
     """
-    for number, place, name, command in _named(group, arguments):
+    for number, place, name, command in _unmatched_arguments(group, arguments):
         path, kind = Path(name), kind_of(Path(name))
         if kind is None or not name.isprintable() or (about and name not in about):
             continue
@@ -143,7 +143,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
     return ""
 
 
-def _named(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
+def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
     """Yield number, place, name and command of each argument that is an existing file, or that no command has."""
     command: click.Command = group
     words, option, number_of_place = list[str](), "", 0
@@ -177,7 +177,7 @@ def _is_read(parameter: click.Parameter) -> bool:
 
 def existing(group: click.Group, arguments: Sequence[str]) -> str:
     """Return a path like the one that does not exist, or where to find one, as a sentence."""
-    for _, _, name, _ in _named(group, arguments):
+    for _, _, name, _ in _unmatched_arguments(group, arguments):
         path = Path(name)
         if path.exists():
             continue

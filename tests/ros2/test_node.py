@@ -18,7 +18,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftdrive.errors import ConfigError
-from ftdrive.exports.registry import Settings, export
+from ftdrive.exports.registry import Settings, export_calibration
 from ftdrive.stream.processing import Processor
 from ftdrive.stream.samples import EventKind, Stages, StreamEvent, WrenchFrame
 from ftdrivers.errors import NoRos2
@@ -301,7 +301,7 @@ def test_the_exported_broadcaster_computes_the_wrench_of_the_node(stack: ExitSta
     stamps = set((processed.t_host_ns + served.stream.info.utc_offset_ns).tolist())
     until(lambda: all(len(of_stamps(messages, stamps)) == len(R) for messages in received.values()))
     raw, compensated = (of_stamps(received[topic], stamps) for topic in ("wrench_raw", "wrench"))
-    made = export(calibration, "ros2-control", Settings(), max_force_error_N=np.inf)
+    made = export_calibration(calibration, "ros2-control", Settings(), max_force_error_N=np.inf)
     context = {"R_flange_sensor": calibration.R_flange_sensor, "p_flange_sensor_m": np.zeros(3)}
     assert np.allclose(evaluate("ros2-control", made.text, R, raw, context), compensated, atol=1e-9)
 

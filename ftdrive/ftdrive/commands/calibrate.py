@@ -29,7 +29,7 @@ from ftdrive.commands.options import (
     Number,
     ViewOptions,
     declined_aborts,
-    runs,
+    runs_option,
     simulate,
     view_options,
     write_json,
@@ -135,10 +135,10 @@ HEADINGS = {
 )
 @click.option("--redo", type=int, multiple=True, metavar="N", help="With --resume: repeat pose N. Repeatable.")
 @YES
-@runs()
+@runs_option()
 @ALL
 @JSON_LINES
-def calibrate(
+def calibrate_command(
     described: CellOptions,
     tool: tuple[str, ...],
     control: str | None,
@@ -191,11 +191,11 @@ def calibrate(
                 conclude(page, words)
             return
         index_run(outcome.run.folder, messages.print, None if simulate else cell)
-        _report(outcome, page, simulate=simulate, every=every, as_json=as_json)
+        _report_calibration(outcome, page, simulate=simulate, every=every, as_json=as_json)
     require_accepted(outcome.result, to_be_saved=True)
 
 
-def _report(outcome: Outcome, page: Page | None, *, simulate: bool, every: bool, as_json: bool) -> None:
+def _report_calibration(outcome: Outcome, page: Page | None, *, simulate: bool, every: bool, as_json: bool) -> None:
     """Print the result and what to do next, and show both on the page."""
     result, run, folder = outcome.result, outcome.run, quote(str(outcome.run.folder))
     is_saved = result.verdict != "rejected"

@@ -91,7 +91,7 @@ def compensate(
     if as_json:
         write_json({"schema_version": 1, **result})
     else:
-        echo("\n".join(_words(result, str(frame))))
+        echo("\n".join(_result_lines(result, str(frame))))
     if output is not None:
         short = "" if failure is None else f": the first {result['samples']} samples"
         beside(as_json).print(f" Saved {output}{short}")
@@ -113,7 +113,7 @@ def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Pa
     return f"missing: {missing}. Type\nftdrive compensate {line}"
 
 
-def _words(result: dict[str, Any], frame: str) -> Iterator[str]:
+def _result_lines(result: dict[str, Any], frame: str) -> Iterator[str]:
     yield from (f" {MARKS[mark]}" for mark in result["marks"])
     yield f" {result['samples']} samples, {result['duration_s']:.2f} s, gaps: {result['gaps']}"
     if delay := result["delay_s"]:

@@ -19,13 +19,13 @@ def config() -> None:
     """Show the configuration. `ftdrive init` writes one; any key may be set by a variable, FTDRIVE_ROBOT_HOST."""
 
 
-@config.command()
+@config.command("show")
 @click.option("--config", "path", type=FILE, help="TOML file to show, instead of ./ftdrive.toml.")
 @click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
 @simulate("Show the configuration of an emulated cell. Its addresses are valid until this command ends.")
 @EMULATED_SENSOR
 @JSON
-def show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
+def config_show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
     """Print the configuration in force, as a file that could be used in its place; a password is left out.
 
     An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the

@@ -13,7 +13,7 @@ from ftcalib.accuracy import CONTACT_N, compensation_error, errors_in_sigma
 from ftcalib.loads.solve import LoadSolution
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import REAL_PACE, SENSORS, Station
-from ftdrive.commands.options import ALL, CONTROL, JSON, METHOD, SETS, runs, write_json
+from ftdrive.commands.options import ALL, CONTROL, JSON, METHOD, SETS, runs_option, write_json
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.planning.drawing import draw_plan
 from ftdrive.planning.plan import Plan
@@ -57,7 +57,7 @@ from ftdrive.terminal.screen import open_operator
 @click.option(
     "--simulate", is_flag=True, expose_value=False, help="Emulate the cell: always on here, accepted by every command."
 )
-@runs()
+@runs_option()
 @ALL
 @JSON
 def demo(

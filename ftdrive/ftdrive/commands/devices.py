@@ -29,7 +29,7 @@ A PLACE is
 @click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors at PLACE. Repeatable.")
 @simulate("Show and probe the two ports of an emulated cell instead.")
 @JSON
-def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
+def devices_command(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces; with --probe, the known sensors that answer there.
 
     Nothing is opened and no byte is sent, except at each PLACE: the command listens there, and then sends read requests
@@ -42,7 +42,7 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     check_simulate(simulate, real={"--probe": places})
     failures: list[Exception] = []
     found = (
-        _emulated(failures)
+        _emulated_devices(failures)
         if simulate
         else {
             "serial": [_serial_port(port) for port in sorted(list_ports.comports())],
@@ -55,7 +55,7 @@ def devices(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
-        _print(found)
+        _print_devices(found)
     if failures:
         raise failures[0]
 
@@ -84,7 +84,7 @@ def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[s
     return answers or [nothing]
 
 
-def _emulated(failures: list[Exception]) -> dict[str, Any]:
+def _emulated_devices(failures: list[Exception]) -> dict[str, Any]:
     with Station("both") as station:
         serial, can = station.endpoints["sensors"]["serial"], station.endpoints["sensors"]["can"]
         places = (serial["port"], f"slcan://{can['channel']}?bitrate={can['bitrate']}")
@@ -95,7 +95,7 @@ def _emulated(failures: list[Exception]) -> dict[str, Any]:
         }
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print_devices(found: dict[str, Any]) -> None:
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
         answer.print(hanging(" serial  ", "   ".join(word for word in words if word), answer))

@@ -68,8 +68,8 @@ def diff(first: str, second: str, as_json: bool) -> None:
                     {"name": name, "change": change, "sigma": sigma, "in_sigmas": ratio if isfinite(ratio) else None}
                     for name, change, sigma, ratio in values
                 ],
-                "groups": {name: _as_json(test) for name, test in found.groups.items()},
-                "joint": _as_json(found.joint),
+                "groups": {name: _chi_square_json(test) for name, test in found.groups.items()},
+                "joint": _chi_square_json(found.joint),
                 "significant": found.joint.p_value < _SIGNIFICANT,
                 "sensors": sensors,
             }
@@ -81,11 +81,11 @@ def diff(first: str, second: str, as_json: bool) -> None:
     if sensors is not None:
         echo(f"One contact reads differently: errors of the sensor are {sensors[0]} in A, {sensors[1]} in B.")
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
-    echo(_line("mass, kg", mass_change_kg, sigma_kg))
+    echo(_change_line("mass, kg", mass_change_kg, sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
         for k, axis in enumerate("xyz"):
             row = 3 * i + k
-            echo(_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
+            echo(_change_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
     if found.joint.dof:
         echo("Sigma from noise: what gain and cross-talk of one sensor hide in these values is the same in A and B.")
     echo(_describe_difference(found, sensors))
@@ -124,7 +124,7 @@ def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
     return sensor_in_words(first), sensor_in_words(second)
 
 
-def _line(label: str, change: float, sigma: float) -> str:
+def _change_line(label: str, change: float, sigma: float) -> str:
     if change == 0:
         return f"{label:22}{'same':>12}"
     spread, ratio = (to_place_of(sigma, sigma), f"{change / sigma:+11.1f}") if sigma > 0 else ("known", "")
@@ -143,5 +143,5 @@ def _describe_difference(found: Difference, sensors: tuple[str, str] | None) -> 
     return f"They differ significantly ({test}): {', '.join(changed) or 'several parameters together'}."
 
 
-def _as_json(test: ChiSquare) -> dict[str, Any]:
+def _chi_square_json(test: ChiSquare) -> dict[str, Any]:
     return asdict(test) | ({} if isfinite(test.chi2) else {"chi2": None})

@@ -19,7 +19,17 @@ from ftdrive.checks.arm import examine_arm
 from ftdrive.checks.check import Check, check_calibration, verdict
 from ftdrive.checks.computer import SensorAddress
 from ftdrive.checks.sensor import PUSH_S, check_sensor_error, examine_push, examine_sensor
-from ftdrive.commands.options import CELL, JSON, MODEL, CellOptions, Number, check_simulate, runs, simulate, write_json
+from ftdrive.commands.options import (
+    CELL,
+    JSON,
+    MODEL,
+    CellOptions,
+    Number,
+    check_simulate,
+    runs_option,
+    simulate,
+    write_json,
+)
 from ftdrive.errors import NotAccepted
 from ftdrive.planning.planner import guess_of_devices
 from ftdrive.runs.calibration import read_calibration
@@ -47,7 +57,7 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
     "--mass-kg", type=Number(0, min_open=True), help="Expected mass of the tool.  [default: [tool] mass_kg, else 1]"
 )
 @click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
-@runs("Folder of the runs, whose disk is checked.")
+@runs_option("Folder of the runs, whose disk is checked.")
 @click.option("--all", "every", is_flag=True, help="Print the checks that passed or do not apply too, a line each.")
 @JSON
 def doctor(
@@ -104,7 +114,7 @@ def doctor(
         answer = {"schema_version": 1, "checks": [asdict(check) for check in found], "verdict": verdict(found)}
         write_json({**answer, "push": pushed} if push else answer)
     else:
-        _print(found, every=every)
+        _print_checks(found, every=every)
         again = " --simulate" if simulate else ""
         if failed:
             messages.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
@@ -122,10 +132,10 @@ def _is_pushing() -> bool:
     return bool(sys.stdin.readline())
 
 
-def _print(found: list[Check], *, every: bool) -> None:
+def _print_checks(found: list[Check], *, every: bool) -> None:
     for subject, group in groupby(found, lambda check: check.name.partition(".")[0]):
         checks = list(group)
-        for i, check in enumerate(checks if every else _in_brief(checks)):
+        for i, check in enumerate(checks if every else _attention_only(checks)):
             head = Text.assemble(f" {'' if i else subject:<12}", _MARK[check.state], " ")
             answer.print(hanging(head, check.found, answer))
             if check.fix is not None and check.state in {"warning", "failed"}:
@@ -136,7 +146,7 @@ def _print(found: list[Check], *, every: bool) -> None:
     answer.print(f" {words[verdict(found)]}{count}.")
 
 
-def _in_brief(checks: list[Check]) -> list[Check]:
+def _attention_only(checks: list[Check]) -> list[Check]:
     """Return what needs attention, behind the one check that names the subject, with the number of the others."""
     passed = [check for check in checks if check.state == "ok"]
     first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]

@@ -93,7 +93,7 @@ def history(
         rows = [one.to_dict(age_days(one.created_utc, now), last.get(one.id)) for one in results]
         about = {
             "trends": [one.to_dict() for one in found],
-            "temperature": [mounted | _as_json(fit) for mounted, fit in warmth],
+            "temperature": [mounted | _fit_json(fit) for mounted, fit in warmth],
             "hour_changes": moved,
             "warnings": advice,
             "last_weighings": [asdict(one) for one in weighed],
@@ -116,7 +116,7 @@ def history(
         answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-def _as_json(fit: Any) -> dict[str, Any]:
+def _fit_json(fit: Any) -> dict[str, Any]:
     """Return the fields of a `ftcalib.after.series.BiasTemperature`."""
     return {
         "slope_per_K": fit.slope.tolist(),

@@ -22,7 +22,7 @@ from ftdrive.commands.options import (
     STAGES,
     TRACK,
     Headed,
-    Source,
+    SourceOptions,
     ViewOptions,
     check_simulate,
     view_options,
@@ -41,7 +41,7 @@ from ftdrive.terminal.live_screen import run_live
 from ftdrive.terminal.text import echo
 from ftdrive.view.live_page import LivePage
 from ftdrive.view.page import drawing
-from ftdrive.words.stream import Summary
+from ftdrive.words.stream import StreamSummary
 
 HEADINGS = {
     "The cell": "--config --robot --sensor --simulate --raw",
@@ -75,7 +75,7 @@ HEADINGS = {
 @view_options
 @JSON
 def live(
-    source: Source,
+    source: SourceOptions,
     track: Tracking,
     raw: bool,
     replay: Path | None,
@@ -135,7 +135,7 @@ def live(
         if full_screen:
             run_live(feed, checks, "" if page is None else page.url)
         elif not prints:
-            show_table(Summary(feed, checks).views())
+            show_table(StreamSummary(feed, checks).views())
         else:
-            for line in Summary(feed).lines(once=once, as_json=as_json):
+            for line in StreamSummary(feed).lines(once=once, as_json=as_json):
                 (click.echo if as_json else echo)(line)

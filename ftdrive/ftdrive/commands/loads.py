@@ -9,7 +9,7 @@ import click
 
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.emulated import TOOL_MM
-from ftdrive.commands.options import JSON, PATH, SOURCE, Number, Source, write_json
+from ftdrive.commands.options import JSON, PATH, SOURCE, Number, SourceOptions, write_json
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.library import check_known_load, solve_load_runs
 from ftdrive.recording.replay import replayed
@@ -27,7 +27,7 @@ def loads() -> None:
     """Check a sensor by a known weight, and correct its matrix by several: so that 10 N are 10 N."""
 
 
-@loads.command()
+@loads.command("check")
 @click.argument("mass", metavar="MASS")
 @click.option("--at", metavar="NAME=X,Y,Z", help="Where it hangs, mm from the flange face along the flange axes.")
 @SOURCE
@@ -36,10 +36,10 @@ def loads() -> None:
 @click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests to join.")
 @click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, seconds.")
 @JSON
-def check(
+def loads_check(
     mass: str,
     at: str | None,
-    source: Source,
+    source: SourceOptions,
     replay: Path | None,
     zero: bool,
     poses: int,
@@ -79,7 +79,7 @@ def check(
         raise NotAccepted("the load reads otherwise than the sensor promises")
 
 
-@loads.command()
+@loads.command("solve")
 @click.argument("runs", nargs=-1, required=True, type=PATH)
 @click.option(
     "--tool-mass",
@@ -88,7 +88,7 @@ def check(
 )
 @click.option("--accept", is_flag=True, help="Save a matrix that differs much from the one known before.")
 @JSON
-def solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: bool) -> None:
+def loads_solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: bool) -> None:
     """Fit the matrix of the sensor to RUNS: the tool alone, and runs of `calibrate --load`.
 
     It is saved as sensor.json in this folder, only if the runs agree. Every command here then decodes contacts of this

@@ -81,7 +81,7 @@ CONTROL = click.option(
 )
 
 
-def runs(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
+def runs_option(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
     """Make the option --runs."""
     folder = click.Path(file_okay=False, path_type=Path)
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
@@ -294,9 +294,9 @@ class ViewOptions:
             return
         self.require()
         from ftdrive.terminal.console import print_page
-        from ftdrive.view.site import announced, serve
+        from ftdrive.view.site import announced, serve_page
 
-        with serve(title, address) as page, announced(page, address, print_page):
+        with serve_page(title, address) as page, announced(page, address, print_page):
             yield page
 
 
@@ -363,7 +363,7 @@ def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated:
         raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
 
 
-class Source(NamedTuple):
+class SourceOptions(NamedTuple):
     """The cell and the calibration of a compensated stream, as the options of `SOURCE` name them."""
 
     path: Path | None
@@ -461,11 +461,11 @@ class Source(NamedTuple):
 
 
 def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that name cell and calibration, and pass them to the command as one `Source`."""
+    """Add the options that name cell and calibration, and pass them to the command as one `SourceOptions`."""
 
     @wraps(command)
     def with_source(**options: Any) -> None:
-        source = Source(*(options.pop(name) for name in Source._fields))
+        source = SourceOptions(*(options.pop(name) for name in SourceOptions._fields))
         described = source.described
         real = {"--tool": source.tool, "--config": described.config, "--robot": described.robot}
         check_simulate(source.simulate, real=real)
@@ -500,14 +500,14 @@ def frame_options(axes: "Axes", about: str) -> Callable[[F], F]:
         @click.option("--about", default=about, show_default=True, metavar="POINT", help=point)
         @wraps(command)
         def with_frame(axes: "Axes", about: str, **options: Any) -> None:
-            command(frame=_frame(axes, about), **options)
+            command(frame=_wrench_frame(axes, about), **options)
 
         return cast("F", with_frame)
 
     return added
 
 
-def _frame(axes: "Axes", about: str) -> "WrenchFrame":
+def _wrench_frame(axes: "Axes", about: str) -> "WrenchFrame":
     from ftdrive.stream.samples import Point, WrenchFrame
 
     if about in get_args(Point):
@@ -625,7 +625,7 @@ REPORTED = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_
 """Names of the options of `solve` that `report` takes too."""
 
 
-def typed(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
+def typed_options(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
     """Return the options that were given, as words for a shell; with `names` only these."""
     words = list[str]()
     for one in context.command.params:

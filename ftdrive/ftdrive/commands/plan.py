@@ -102,7 +102,7 @@ def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str |
 @view_options
 @simulate("Use arm and tool of an emulated cell instead of the configuration.")
 @JSON
-def plan(
+def plan_command(
     config: Path | None,
     model: str | None,
     tool: tuple[str, ...],

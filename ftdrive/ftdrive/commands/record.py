@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.options import FRAME, JSON, SOURCE, STAGES, TRACK, NewFile, Source, write_json
+from ftdrive.commands.options import FRAME, JSON, SOURCE, STAGES, TRACK, NewFile, SourceOptions, write_json
 from ftdrive.errors import RecordingHasGaps
 from ftdrive.recording import Recorder
 from ftdrive.recording.files import require_new_recordings
@@ -59,7 +59,7 @@ def record(
     paths: Sequence[Path],
     duration_s: float | None,
     count: int | None,
-    source: Source,
+    source: SourceOptions,
     track: Tracking,
     frame: WrenchFrame,
     stages: dict[str, Any],
@@ -81,7 +81,7 @@ def record(
                     pass
         finally:
             if recorder.samples:
-                _report(recorder, frame, stream.info.calibration_name, as_json=as_json)
+                _report_recording(recorder, frame, stream.info.calibration_name, as_json=as_json)
     if recorder.gaps:
         raise RecordingHasGaps(
             f"gaps: {recorder.gaps}, samples lost: {recorder.lost}; check cable, supply and load of the computer, then "
@@ -89,7 +89,7 @@ def record(
         )
 
 
-def _report(recorder: Recorder, frame: WrenchFrame, name: str, *, as_json: bool) -> None:
+def _report_recording(recorder: Recorder, frame: WrenchFrame, name: str, *, as_json: bool) -> None:
     # of all samples: that of the first half second may differ much
     rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:

@@ -23,12 +23,12 @@ from ftdrive.commands.options import (
     check_simulate,
     require_extra,
     simulate,
-    typed,
+    typed_options,
     write_json,
 )
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
-from ftdrive.report.page import page
+from ftdrive.report.page import render_page
 from ftdrive.report.subject import MAY_BE_MISSING, read_subject, trust
 from ftdrive.runs import is_run
 from ftdrive.runs.bundle import unpack
@@ -101,9 +101,9 @@ def report(
         require_extra("report", "a report in HTML (not --format json)", "jinja2", "matplotlib")
     orientation, drift, *known, up = (shared[name] for name in REPORTED[1:7])
     given = SolveOptions(method, orientation, drift, known_values(*known), up_direction(up), table=table)
-    options = replace(given, words=typed(click.get_current_context(), REPORTED))
+    options = replace(given, words=typed_options(click.get_current_context(), REPORTED))
     gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
-    with unpack(source) if source is not None else _rehearsed(sensor) as found:
+    with unpack(source) if source is not None else _report_folder(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
         trusted = trust(subject.result, found, store_url, datetime.now(UTC))
@@ -114,7 +114,7 @@ def report(
             subject = replace(subject, source=source, reproduce=command)
         with working("Comparing methods and drawing"):
             facts = facts_of(subject, trusted)
-            text = page(facts) if form == "html" else json.dumps(facts, allow_nan=False) + "\n"
+            text = render_page(facts) if form == "html" else json.dumps(facts, allow_nan=False) + "\n"
     if output is not None:
         write_new(output, text)
     elif form == "html":
@@ -137,7 +137,7 @@ def _saved(text: str, folder: Path) -> Path:
             return path
 
 
-def _rehearsed(sensor: str | None) -> AbstractContextManager[Path]:
+def _report_folder(sensor: str | None) -> AbstractContextManager[Path]:
     from ftdrive.session.rehearsal import rehearsed_run  # with the drivers and the screen of a session
     from ftdrive.terminal.screen import open_operator
 

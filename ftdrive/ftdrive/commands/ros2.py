@@ -5,7 +5,7 @@ from contextlib import closing
 
 import click
 
-from ftdrive.commands.options import FRAME, SOURCE, Source
+from ftdrive.commands.options import FRAME, SOURCE, SourceOptions
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.terminal.console import messages
 from ftdrivers.ros2.middleware import ros2_module
@@ -32,7 +32,7 @@ class _RosCommand(click.Command):
     metavar="...",
     help="Arguments of ROS until the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
 )
-def ros2(source: Source, frame: WrenchFrame, ros_args: Sequence[str]) -> None:
+def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> None:
     """Publish the raw and the compensated wrench as topics of ROS 2.
 
     The node has ~/wrench_raw, ~/wrench, ~/contact, ~/status, /diagnostics and the services ~/tare and ~/undo_tare.

@@ -6,7 +6,7 @@ from functools import partial
 import click
 
 from ftdrive.cell.devices import program_registers
-from ftdrive.commands.options import SOURCE, TRACK, Source, frame_options
+from ftdrive.commands.options import SOURCE, TRACK, SourceOptions, frame_options
 from ftdrive.errors import ConfigError
 from ftdrive.servers.program import INTEGERS, ProgramService, doubles_of
 from ftdrive.stream.samples import Tracking, WrenchFrame
@@ -19,7 +19,7 @@ from ftdrivers.ur.rtde import FIRST_REGISTER, LAST_REGISTER
 @frame_options("base", "tcp")
 @TRACK
 @click.option("--first", type=int, default=FIRST_REGISTER, show_default=True, help="First register of each kind.")
-def serve_load(source: Source, frame: WrenchFrame, track: Tracking, first: int) -> None:
+def serve_load(source: SourceOptions, frame: WrenchFrame, track: Tracking, first: int) -> None:
     """Answer the program on the controller: weigh a part, zero, and the contact wrench all the time.
 
     Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive

@@ -34,7 +34,7 @@ from ftdrive.commands.options import (
     NewFile,
     check_simulate,
     simulate,
-    typed,
+    typed_options,
     write_json,
 )
 from ftdrive.errors import ConfigError, NotAccepted, exit_code
@@ -109,7 +109,7 @@ HEADINGS = {
 @EMULATED_SENSOR
 @ALL
 @JSON
-def solve(
+def solve_command(
     sources: Sequence[Path],
     test: Path | None,
     cases: bool,
@@ -143,7 +143,7 @@ def solve(
         show = _show_cases
     elif options.method == "all":
         show = partial(_show_all, test, None if test is None else _poses_of(test, options))
-    with _rehearsed(sensor, options.method, cases=cases) if simulate else nullcontext() as run:
+    with _rehearsed_folder(sensor, options.method, cases=cases) if simulate else nullcontext() as run:
         _solve_each(sources if run is None else [run], options, show, as_json)
     if output is not None and sources and sources[0].is_dir():
         index_run(sources[0], messages.print)  # the result, if it was saved in the run
@@ -154,7 +154,7 @@ def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
         return read_source(place, SolveOptions(orientation=options.orientation)).dataset
 
 
-def _rehearsed(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
+def _rehearsed_folder(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
     """Make a run of an emulated cell with the poses that method or cases need."""
     from ftdrive.session.rehearsal import rehearsed_run  # with the drivers and the screen of a session
     from ftdrive.terminal.screen import open_operator
@@ -204,16 +204,19 @@ def _show_result(
     else:
         print_result(result, drift=drift_check(records) if records else None, records=records, every=every)
         if not click.get_current_context().params["simulate"]:  # which has a temporary run
-            messages.print_next(*_following(result, source, output))
+            messages.print_next(*_next_commands(result, source, output))
     _save(result, output, force, as_json)
 
 
-def _following(result: CalibrationResult, source: Path, output: Path | None) -> list[str]:
+def _next_commands(result: CalibrationResult, source: Path, output: Path | None) -> list[str]:
     """Return the commands to type after a result; `report` takes fewer options, and in motion only a run."""
     why, context = "   (how good it is, and why)", click.get_current_context()
     if output is not None and (result.verdict != "rejected" or context.params["force"]):
         return [f"ftdrive report {quote(str(output))}{why}", f"ftdrive live --calibration {quote(str(output))}"]
-    every, reported = typed(context, [name for name in context.params if name not in _SAVING]), typed(context, REPORTED)
+    every, reported = (
+        typed_options(context, [name for name in context.params if name not in _SAVING]),
+        typed_options(context, REPORTED),
+    )
     commands = []
     if every == reported and (source.is_dir() or result.motion is None):
         commands.append(f"ftdrive report {' '.join([quote(str(source)), *reported])}{why}")

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from ftdrive.commands.options import FRAME, SOURCE, STAGES, TRACK, Source
+from ftdrive.commands.options import FRAME, SOURCE, STAGES, TRACK, SourceOptions
 from ftdrive.servers.foxglove import FoxgloveServer
 from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
 from ftdrive.servers.udp import UdpSender
@@ -33,7 +33,7 @@ from ftdrive.terminal.console import messages, print_address
 @click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
 @click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
 def stream(
-    source: Source,
+    source: SourceOptions,
     track: Tracking,
     frame: WrenchFrame,
     stages: dict[str, Any],

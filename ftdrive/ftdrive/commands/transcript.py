@@ -29,7 +29,7 @@ def transcript() -> None:
     """
 
 
-@transcript.command()
+@transcript.command("record")
 @click.option("--sensor", metavar="URL", help="Address of the sensor, such as ati-serial:///dev/serial/by-id/NAME.")
 @simulate("Use an emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
 @click.option("-o", "--output", "path", required=True, type=NewFile(), help="Save the transcript as this new file.")
@@ -42,27 +42,27 @@ def transcript() -> None:
     help="Duration of the recording, s.",
 )
 @JSON
-def record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
+def transcript_record(sensor: str | None, simulate: bool, path: Path, duration_s: float, as_json: bool) -> None:
     """Record all bytes between the driver and its sensor, from opening to closing.
 
     Only the driver's own requests are sent. If the sensor fails, the transcript of the failure is kept.
     """
     if simulate:
-        sensor = _emulated(sensor)
+        sensor = _emulated_address(sensor)
     if sensor is None:
         raise ConfigError("no sensor is given: add --sensor URL or --simulate")
-    url, seen = _record(sensor, path, duration_s)
+    url, seen = _record_bytes(sensor, path, duration_s)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "url": url, "recorded": seen})
     else:
-        answer.print(_words(seen))
+        answer.print(_describe_bytes(seen))
 
 
-def _emulated(sensor: str | None) -> str:
+def _emulated_address(sensor: str | None) -> str:
     return EMULATED + sensor_name(sensor or f"{EMULATED}serial")
 
 
-def _record(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
+def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
     """Record; return the address of the driver, and what it received. A file that is `kept` is named on the screen."""
     # Rejected before an emulated one starts.
     if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":
@@ -110,7 +110,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if simulate:
         with TemporaryDirectory(prefix="ftdrive-") as folder:
             path = Path(folder) / "sensor.jsonl"
-            _record(_emulated(sensor), path, 1.0, kept=False)
+            _record_bytes(_emulated_address(sensor), path, 1.0, kept=False)
             loaded = Transcript.load(path)
     elif file is not None:
         open_file(file).close()  # raises for what has no end
@@ -123,13 +123,13 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if as_json:
         write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
-        answer.print(hanging(" recorded  ", _words(recorded), answer))
-        answer.print(hanging(" played    ", _words(played), answer))
+        answer.print(hanging(" recorded  ", _describe_bytes(recorded), answer))
+        answer.print(hanging(" played    ", _describe_bytes(played), answer))
     if (played_s := played["duration_s"]) < (whole_s := loaded.header["duration_s"]):
         messages.print(f" The recording was interrupted: {played_s:.3g} s of {whole_s:g} s were played.")
 
 
-def _words(seen: dict[str, Any]) -> str:
+def _describe_bytes(seen: dict[str, Any]) -> str:
     if "identity" not in seen:
         return str(seen.get("error", "interrupted"))
     force, torque = (

@@ -19,7 +19,7 @@ from ftdrive.commands.options import (
     ViewOptions,
     check_simulate,
     declined_aborts,
-    runs,
+    runs_option,
     simulate,
     view_options,
     write_json,
@@ -65,9 +65,9 @@ from ftdrive.view.session_page import asked
 @click.option("--resume", type=FOLDER, help="Continue an interrupted verification in its mode.")
 @view_options
 @YES
-@runs()
+@runs_option()
 @JSON_LINES
-def verify(
+def verify_command(
     path: Path | None,
     described: CellOptions,
     simulate: bool,
@@ -117,18 +117,20 @@ def verify(
                 on_page(page, operator, options, task.command) as (shown, options),
             ):
                 verified = task.take(shown, limits, options)
-            _report(verified, update, page, again="" if station is None else " --simulate", as_json=as_json)
+            _report_verification(
+                verified, update, page, again="" if station is None else " --simulate", as_json=as_json
+            )
             index_run(verified.run.folder, messages.print, cell if station is None else None)
     if not verified.passed:
         raise NotAccepted(f"the verification failed: {verified.failure}")
 
 
-def _report(verified: Verified, update: Answer, page: Page | None, *, again: str, as_json: bool) -> None:
+def _report_verification(verified: Verified, update: Answer, page: Page | None, *, again: str, as_json: bool) -> None:
     """Print the outcome and what to do next, and show both on the page; save the update if it is wanted."""
     if not as_json:
         print_verification(verified)
     conclude_verification(page, verified)
-    saved = save_wanted_update(verified, update, partial(_ask, page, as_json))
+    saved = save_wanted_update(verified, update, partial(_ask_on_page, page, as_json))
     following = verified.next_command(saved, again)
     conclude_verification(page, verified, following)
     if as_json:
@@ -139,7 +141,7 @@ def _report(verified: Verified, update: Answer, page: Page | None, *, again: str
     messages.print_next(following)
 
 
-def _ask(page: Page | None, as_json: bool, question: Question) -> str:
+def _ask_on_page(page: Page | None, as_json: bool, question: Question) -> str:
     """Ask in the terminal; the page shows the question while it waits."""
     show = (lambda _: None) if page is None else page.put
     show({"question": asked(question)})

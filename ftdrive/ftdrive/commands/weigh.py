@@ -7,12 +7,21 @@ from pathlib import Path
 
 import click
 
-from ftdrive.commands.options import JSON, POSITIVE, SOURCE, NewFile, Source, ViewOptions, view_options, write_json
+from ftdrive.commands.options import (
+    JSON,
+    POSITIVE,
+    SOURCE,
+    NewFile,
+    SourceOptions,
+    ViewOptions,
+    view_options,
+    write_json,
+)
 from ftdrive.errors import ConfigError
 from ftdrive.recording import Recorder
 from ftdrive.stream.processing import SENSOR_FRAME
 from ftdrive.stream.stream import RECOVER_S, Sink, pump
-from ftdrive.stream.weighing import PATIENCE_S, Weighing, line_of, load_values
+from ftdrive.stream.weighing import PATIENCE_S, Weighing, format_scale, load_values
 from ftdrive.terminal.console import has_screen, messages
 from ftdrive.terminal.text import echo
 from ftdrive.terminal.weigh_screen import WeighScreen
@@ -33,8 +42,8 @@ from ftdrive.view.page import drawing
 @click.option("--allow-control", is_flag=True, help="With --view: the page may tare the empty gripper.")
 @view_options
 @JSON
-def weigh(
-    source: Source,
+def weigh_command(
+    source: SourceOptions,
     zero: bool,
     poses: int,
     moving: bool,
@@ -80,10 +89,14 @@ def weigh(
         if on_screen:
             WeighScreen(weighing, turns, "" if page is None else page.url).run()
         else:
-            _print(weighing, turns, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json)
+            _print_weights(
+                weighing, turns, once=once, waits=zero or moving, poses=0 if moving else poses, as_json=as_json
+            )
 
 
-def _print(weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bool, poses: int, as_json: bool) -> None:
+def _print_weights(
+    weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bool, poses: int, as_json: bool
+) -> None:
     """Print each new weight or fault as a line; with `once` end with the first weight."""
     clock, info = weighing.stream.clock, weighing.stream.info
     head = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
@@ -101,6 +114,6 @@ def _print(weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bo
             values = {} if weight is None else load_values(weight, info)
             write_json({**head, **values, "count": shown.count, "refused": shown.refusal})
         else:
-            echo(line_of(shown))
+            echo(format_scale(shown))
         if once:
             return

@@ -19,13 +19,13 @@ MC_RTC_G_M_S2: Final = 9.80665
 _SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
 
 
-def plain(text: str) -> str:
+def plain_ascii(text: str) -> str:
     """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
     return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
 
 
 @dataclass(frozen=True, slots=True)
-class Format:
+class ExportFormat:
     """One target."""
 
     description: str
@@ -94,12 +94,12 @@ _WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: turn it if tho
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
 # By name, as `--format` takes it; above each row project, file and version of its reader, and the reader's formula.
-FORMATS: Mapping[str, Format] = {
+FORMATS: Mapping[str, ExportFormat] = {
     # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
     # gravity_compensation.cpp, master since pull request 18 (2021-05). With a the acceleration that its IMU reports,
     # turned into the sensor frame, which points up at rest:
     #     force = raw - bias[:3] + gripper_mass a        torque = raw - bias[3:] + gripper_com x (gripper_mass a)
-    "kth": Format(
+    "kth": ExportFormat(
         "ROS 1 node gravity_compensation of kth-ros-pkg/force_torque_tools",
         "ft_calib.yaml",
         content={
@@ -119,7 +119,7 @@ FORMATS: Mapping[str, Format] = {
     # ICube-Robotics/ft_tools_ros2, ft_tools/src/ft_parameters.cpp and ft_estimation.cpp, main. Signs are those of the
     # code, which differ from its README. With g the parameter `gravity_in_reference_frame` in the sensor frame:
     #     force = raw - mass g - force_offset            torque = raw - com x (mass g) - torque_offset
-    "ft-tools": Format(
+    "ft-tools": ExportFormat(
         "ROS 2 node ft_estimation of ICube-Robotics/ft_tools_ros2",
         "calibration_parameters.yaml",
         content={
@@ -133,7 +133,7 @@ FORMATS: Mapping[str, Format] = {
     ),
     # As ft-tools: ft_msgs/msg/FtCalibration.msg, as `ros2 service call` and `ros2 topic pub` take it; the only field
     # of a request of ft_msgs/srv/SetCalibration.
-    "ros2-message": Format(
+    "ros2-message": ExportFormat(
         "ROS 2 message ft_msgs/FtCalibration, for the service set_calibration",
         "calibration.yaml",
         content={
@@ -153,7 +153,7 @@ FORMATS: Mapping[str, Format] = {
     # and .cpp, master (control_filters.md has older names). With g the vector `gravity_field`, turned from world_frame
     # into sensor_frame:
     #     force = raw + offset.force - mass g            torque = raw + offset.torque - CoG x (mass g)
-    "ros2-control": Format(
+    "ros2-control": ExportFormat(
         "ros2_controllers force_torque_sensor_broadcaster with the gravity filter of control_toolbox",
         "ft.yaml",
         content=_BROADCASTER,
@@ -162,7 +162,7 @@ FORMATS: Mapping[str, Format] = {
     # ros-controls/ros2_controllers, admittance_controller/admittance_rule_impl.hpp, Humble to Kilted. In the axes of
     # fixed_world_frame, with the weight CoG.force in N, positive; the controller subtracts no bias:
     #     force_z = reading + CoG.force                  torque = reading - CoG.pos x [0, 0, -CoG.force]
-    "admittance": Format(
+    "admittance": ExportFormat(
         "ros2_controllers admittance_controller",
         "admittance.yaml",
         subtracts=("weight",),
@@ -193,7 +193,7 @@ FORMATS: Mapping[str, Format] = {
     # end_effector_link (force) or compliance_ref_link, R turns it into the axes of robot_base_link, and the arm moves
     # along the net force:
     #     net = R X (raw + offset - weight) + target     with the broadcaster of ros2-control before it
-    "cartesian-controllers": Format(
+    "cartesian-controllers": ExportFormat(
         "FZI cartesian_controllers of ROS 2 for force and compliance, with the broadcaster of ros2-control",
         "controllers.yaml",
         content={
@@ -224,7 +224,7 @@ FORMATS: Mapping[str, Format] = {
     #     force = raw - offset[3:] - mass g
     #     couple = raw - offset[:3] - (com - p) x (mass g), in sensor axes
     # White space must follow the last number. The reader stops there.
-    "mc-rtc": Format(
+    "mc-rtc": ExportFormat(
         "mc_rtc, calib_data.NAME of a force sensor",
         "calib_data.ft_sensor",
         expresses=("rotation",),
@@ -246,7 +246,7 @@ FORMATS: Mapping[str, Format] = {
     # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is taken to be, with g of the
     # calibration, and a sensor that has the axes of the flange:
     #     force = raw - offset[:3] - mass g              torque = raw - offset[3:] - com x (mass g)
-    "xarm": Format(
+    "xarm": ExportFormat(
         "UFACTORY xArm, the ten numbers of ft_sensor_cali_load",
         "load.yaml",
         expresses=("tilt",),
@@ -263,7 +263,7 @@ FORMATS: Mapping[str, Format] = {
     # them. The load is all that the flange carries. Neither formula nor g of the firmware are public; g is along -z of
     # the base, which cannot be changed:
     #     force on the flange = mass g                   torque about the flange = F_x_Cload x (mass g)
-    "franka": Format(
+    "franka": ExportFormat(
         "Franka libfranka setLoad, with the mass of the sensor",
         "load.yaml",
         subtracts=("weight",),
@@ -281,7 +281,7 @@ FORMATS: Mapping[str, Format] = {
     # flange axes from the flange, no exponents. The payload is all that the flange carries. The statement zeroes the
     # sensor of an e-Series arm. The formula of the controller is not public, and taken to be, with g of `set_gravity`:
     #     force on the flange = m g                      torque about the flange = cog x (m g)
-    "ur-payload": Format(
+    "ur-payload": ExportFormat(
         "Universal Robots URScript set_target_payload, with the mass of the sensor",
         "payload.script",
         subtracts=("weight",),
@@ -302,7 +302,7 @@ FORMATS: Mapping[str, Format] = {
     # that `origin` of `inertial` is the centre of mass in the sensor frame. `rpy` is R = Rz(yaw) Ry(pitch) Rx(roll).
     # With g the gravity of the simulation, in sensor axes:
     #     force on the sensor = mass g                   torque about its origin = origin x (mass g)
-    "urdf": Format(
+    "urdf": ExportFormat(
         "URDF links and fixed joints of sensor and tool",
         "tool.urdf",
         subtracts=("weight",),
@@ -348,7 +348,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
     #     force = mass g                                 torque = pos x (mass g)
     # and the plugin gives, with the reading as the hardware interface has it, which is minus that of MuJoCo:
     #     force = reading - CoG.mass g                   torque = reading - CoG.pos x (CoG.mass g)
-    "mujoco": Format(
+    "mujoco": ExportFormat(
         "MuJoCo body of tool and sensor, with parameters for mujoco_ros2_control",
         "tool.xml",
         subtracts=("weight",),
@@ -393,7 +393,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
     ),
     # ros2/geometry2, tf2_ros static_transform_publisher, Humble or newer. Position (m) and quaternion map sensor
     # coordinates to those of the frame-id: p = R(q) p_sensor + (x, y, z).
-    "static-transform": Format(
+    "static-transform": ExportFormat(
         "ROS 2 static_transform_publisher, flange to sensor",
         "transform.sh",
         subtracts=(),
@@ -403,6 +403,8 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
         "--frame-id {flange_frame} --child-frame-id {sensor_frame}\n",
         notes=("It has the place of the sensor only, no bias and no weight.",),
     ),
-    "json": Format("JSON with everything that compensation needs", "ft.json", expresses=_OWN_READING, comment="none"),
-    "yaml": Format("YAML with everything that compensation needs", "ft.yaml", expresses=_OWN_READING),
+    "json": ExportFormat(
+        "JSON with everything that compensation needs", "ft.json", expresses=_OWN_READING, comment="none"
+    ),
+    "yaml": ExportFormat("YAML with everything that compensation needs", "ft.yaml", expresses=_OWN_READING),
 }

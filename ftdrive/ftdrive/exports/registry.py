@@ -21,7 +21,7 @@ from ftcalib.model import Array, angle_between, angle_between_vectors, nearest_r
 from ftdrive import __version__
 from ftdrive.checks.arm import FlangeLoad, flange_load
 from ftdrive.errors import ConfigError, NotAccepted
-from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, Format, plain
+from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N, MC_RTC_G_M_S2, Comment, ExportFormat, plain_ascii
 from ftdrive.runs import is_run
 from ftdrive.runs.calibration import MARKS, marks_of
 from ftdrive.runs.run import Run
@@ -288,7 +288,7 @@ class Exported:
     max_torque_error_Nm: float
 
 
-def _document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
+def _compensation_document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
     """Return all that compensation needs, for a program of the user.
 
     With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros where
@@ -327,7 +327,7 @@ _STEPS = 500
 _CONVERGED = 1e-12
 
 
-def _compensations(calibration: CalibrationResult, target: Format) -> tuple[Compensator, Compensator]:
+def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tuple[Compensator, Compensator]:
     """Return our compensation of a free tool, and that of a target that expresses all but what its `expresses` lacks.
 
     Without tilt, gravity points along -z of the base. Without rotation, the sensor's axes are those of the flange.
@@ -360,7 +360,7 @@ def _largest_norm(matrix: Array, offset: Array) -> float:
     return float(norms.max())
 
 
-def export(
+def export_calibration(
     calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
 ) -> Exported:
     """Write a calibration for the target of this name in `FORMATS`.
@@ -376,9 +376,9 @@ def export(
     if isinstance(target.content, str):
         text = target.content.format_map(values)
     elif name == "json":
-        text = json.dumps(_document(calibration, settings), indent=1, allow_nan=False) + "\n"
+        text = json.dumps(_compensation_document(calibration, settings), indent=1, allow_nan=False) + "\n"
     else:
-        text = _yaml(values.filled(target.content) or _document(calibration, settings))
+        text = _yaml(values.filled(target.content) or _compensation_document(calibration, settings))
     notes = [MARKS[mark] for mark in marks_of(calibration)]
     force_N, torque_Nm = 0.0, 0.0
     if target.subtracts:
@@ -415,7 +415,7 @@ def _above(value: float) -> str:
     return f"{np.ceil(value / step) * step:.2g}"
 
 
-def _lost(calibration: CalibrationResult, target: Format) -> Iterator[str]:
+def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
     """Name what the calibration has and the target cannot express, beyond rounding."""
     tilt_rad = angle_between_vectors(np.array([0.0, 0.0, -1.0]), calibration.gravity_force_base_N)
     turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
@@ -440,7 +440,7 @@ def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
     )
 
 
-def _lossless(calibration: CalibrationResult, target: Format) -> Iterator[str]:
+def _lossless(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
     """Name the formats that lose nothing, subtract as much, and read our sensor if the target does."""
     for name, other in FORMATS.items():
         as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
@@ -470,7 +470,7 @@ def _made_by(calibration: CalibrationResult, verification: VerificationRecord | 
 
 def _with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
     """Add comment lines, reduced to printable ASCII."""
-    clean = [plain(line) for line in lines]
+    clean = [plain_ascii(line) for line in lines]
     if comment == "none":
         return text
     if comment == "<!-- -->":

@@ -10,11 +10,11 @@ from math import degrees, pi, radians
 from typing import Any, Final
 
 from ftdrive.errors import PlanRefused
-from ftdrive.exports.formats import plain
+from ftdrive.exports.formats import plain_ascii
 from ftdrive.planning.approach import NEAR_RAD
 from ftdrive.planning.geometry.scene import MOUNTINGS
 from ftdrive.planning.plan import Plan
-from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, TRACKED, Command, Condition, State
+from ftdrive.servers.program import CODES, DOUBLES, INTEGERS, TRACKED, Condition, ServiceCommand, ServiceState
 from ftdrivers.ur.rtde import LAST_REGISTER
 
 FORMAT = "ftdrive.targets/1"
@@ -22,14 +22,14 @@ COLUMNS = "pose,orientation,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,speed_rad_
 _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 
 
-def table(plan: Plan) -> str:
+def plan_table(plan: Plan) -> str:
     """Write one line per pose, with speed, acceleration and clearance of the move to the next (last: first).
 
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
-    _require_usable(plan)
+    _require_exportable(plan)
     emulated = ", EMULATED cell: no real arm may follow this plan" if plan.emulated else ""
-    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain(plan.description['model'])}{emulated}", COLUMNS]
+    lines = [f"# {FORMAT} plan {plan.to_dict()['sha256']} {plain_ascii(plan.description['model'])}{emulated}", COLUMNS]
     for i, step in enumerate(plan.steps, start=1):
         numbers = (*step.q_rad, step.speed_rad_s, plan.acceleration_rad_s2, step.clearance_m)
         lines.append(",".join([str(i), str(step.number), *(f"{number:.9g}" for number in numbers)]))
@@ -44,7 +44,7 @@ def program(plan: Plan, *, dwell_s: float) -> str:
 
     Raises `PlanRefused` if a move is not proven clear, or no arm can follow a value in the plan.
     """
-    _require_usable(plan)
+    _require_exportable(plan)
     return "".join(
         f"{line}\n"
         for line in ("def ftdrive_tour():", *(f"  {line}" if line else "" for line in _body(plan, dwell_s)), "end")
@@ -53,19 +53,19 @@ def program(plan: Plan, *, dwell_s: float) -> str:
 
 def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     sha256 = plan.sha256
-    steps, model = plan.steps, plain(plan.description["model"])
+    steps, model = plan.steps, plain_ascii(plan.description["model"])
     name = f"ftdrive plan {sha256[:12]}"
-    first = _joints(steps[0].q_rad)
+    first = _joint_row(steps[0].q_rad)
     emulated = "EMULATED CELL: no real arm may follow this plan. " if plan.emulated else ""
     yield f"# ftdrive plan {sha256}"
     yield f"# for a {model} with this tool, mm from the flange face:"
     for part in plan.description["tool"]:
         yield f"#   {_cylinder(part)}"
     yield "# proven clear, all along its moves, of itself and of these surroundings, mm, base axes:"
-    yield from (f"#   {plain(line)}" for line in _scene(plan.description["scene"]))
-    yield f"# {plain(plan.room_in_words())}"
+    yield from (f"#   {plain_ascii(line)}" for line in _scene(plan.description["scene"]))
+    yield f"# {plain_ascii(plan.room_in_words())}"
     yield f"# Speed: {_speeds(plan)}."
-    yield from (f"# {plain(sentence)}" for sentence in plan.why)
+    yield from (f"# {plain_ascii(sentence)}" for sentence in plan.why)
     yield "#"
     yield "# In PolyScope: a Script node of type File with this file, then one of type Line with ftdrive_tour()"
     yield "#"
@@ -101,7 +101,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield f"movej({first}, a={APPROACH_RAD_S2:.6f}, v={APPROACH_RAD_S:.6f})"
     for i, step in enumerate((*steps, steps[0]), start=1):
         if i > 1:
-            yield f"movej({_joints(step.q_rad)}, a={plan.acceleration_rad_s2:.6f}, v={steps[i - 2].speed_rad_s:.6f})"
+            yield f"movej({_joint_row(step.q_rad)}, a={plan.acceleration_rad_s2:.6f}, v={steps[i - 2].speed_rad_s:.6f})"
         where = f"pose {i} of {len(steps)}" if i <= len(steps) else "pose 1 again"
         yield f'textmsg("{name}: {where}, orientation R{step.number:02d}")'
         yield f"sleep({dwell_s:.3f})"
@@ -130,7 +130,7 @@ def _speeds(plan: Plan) -> str:
     return f"joints up to {fastest_deg_s:.0f} deg/s, the tips of the tool {limit}"
 
 
-def _joints(q_rad: tuple[float, ...]) -> str:
+def _joint_row(q_rad: tuple[float, ...]) -> str:
     return f"[{', '.join(f'{round(q, 6) + 0.0:.6f}' for q in q_rad)}]"
 
 
@@ -156,7 +156,7 @@ def _cylinder(part: dict[str, Any]) -> str:
     return f"from {mm['from_m']} to {mm['to_m']}, diameter {mm['diameter_m']}{aside}"
 
 
-def _require_usable(plan: Plan) -> None:
+def _require_exportable(plan: Plan) -> None:
     """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
     # The text of an export carries no verdict, so a rejected calibration is not exported.
     if plan.sweep is not None:
@@ -208,7 +208,7 @@ def functions(first: int, *, example: bool = False) -> str:
         "AGE": doubles["bias_age"],
         "UNSEEN": str(UNSEEN),
         "ZEROS": ", ".join(["0.0"] * len(DOUBLES[6:])),
-        **{one.name: str(int(one)) for one in (*Command, *State)},
+        **{one.name: str(int(one)) for one in (*ServiceCommand, *ServiceState)},
     }
     tracks = first + len(DOUBLES + TRACKED) <= LAST_REGISTER + 1
     text = _TEXT + (_BIAS if tracks else "") + (_EXAMPLE if example else "")

@@ -19,11 +19,10 @@ from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.recording.files import RecordingReader
 from ftdrive.recording.foreign import TablePair, table_words, tables_of
 from ftdrive.recording.recorder import Recorder
-from ftdrive.recording.recording import NEEDED, ROW, Header, Measured, Source, read_ahead, with_calibration
+from ftdrive.recording.recording import NEEDED, ROW, AnyRecording, Header, Measured, read_ahead, with_calibration
 from ftdrive.runs.source import SolveOptions
 from ftdrive.stream.samples import Block, Paired, StreamEvent, StreamInfo, WrenchFrame
-from ftdrive.stream.sources import Read
-from ftdrive.stream.sources import Source as SampleSource
+from ftdrive.stream.sources import Read, SampleSource
 from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
@@ -46,7 +45,7 @@ def source_to_compensate(
     *,
     everything: bool,
     say: Callable[[str], object],
-) -> tuple[Source, dict[str, float] | None]:
+) -> tuple[AnyRecording, dict[str, float] | None]:
     """Return the recording with the calibration, and the delay of one of another program with one sigma.
 
     `name` is that of the calibration, `delay_s` a number or "auto" or None. With `everything`, all columns are read.
@@ -77,7 +76,7 @@ def source_to_compensate(
 
 
 def compensate_recording(
-    source: Source,
+    source: AnyRecording,
     frame: WrenchFrame,
     output: Path | None = None,
     *,
@@ -104,7 +103,7 @@ def compensate_recording(
     if estimate_bias:
         header, change = estimated_bias(source, show=show)
     info = header.info
-    blocks, found = _Blocks(source, info, show), _Sums()
+    blocks, found = _Blocks(source, info, show), _RunningSums()
     failure: BaseException | None = None
     stream = Stream(blocks, frame=frame)
     sinks: list[Sink] = [found]
@@ -137,7 +136,7 @@ def compensate_recording(
 class _Blocks(SampleSource):
     """A recording of any length, as fast as it is read, with those of its events that still hold."""
 
-    def __init__(self, recording: Source, info: StreamInfo, show: Callable[[str], object]) -> None:
+    def __init__(self, recording: AnyRecording, info: StreamInfo, show: Callable[[str], object]) -> None:
         self.info, self._recording, self._show = info, recording, show
         self._newest: Paired | None = None
         self.failure: Exception | None = None
@@ -185,7 +184,7 @@ class _Blocks(SampleSource):
         return Read(samples)
 
 
-class _Sums(Sink):
+class _RunningSums(Sink):
     """What is known of a result, block after block."""
 
     def __init__(self) -> None:
@@ -229,7 +228,7 @@ class _Sums(Sink):
 
 
 def estimated_bias(
-    source: Source, *, show: Callable[[str], object] = lambda _: None
+    source: AnyRecording, *, show: Callable[[str], object] = lambda _: None
 ) -> tuple[Header, dict[str, list[float]]]:
     """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
 
@@ -262,7 +261,7 @@ def estimated_bias(
     # that means of R are as good as rotations.
     free_tool = Compensator(calibration.parameters, response=calibration.response)
     left = np.asarray(free_tool.batch(reading, R), np.float64)
-    free = _free(left)
+    free = _near_median(left)
     scatter = left[free] - left[free].mean(axis=0)
     correlation = np.clip((scatter[1:] * scatter[:-1]).sum(axis=0) / (scatter**2).sum(axis=0), 0.0, 0.95)
     noise = scatter.T @ scatter / (len(scatter) - 1) * ((1 + correlation) / (1 - correlation)).max() / len(scatter)
@@ -276,7 +275,7 @@ def estimated_bias(
     return header, {"value": change.tolist(), "sigma": sigma.tolist()}
 
 
-def _free(reading: Array) -> NDArray[np.bool_]:
+def _near_median(reading: Array) -> NDArray[np.bool_]:
     """Return which readings (n, 6) are near the median of those that are, in units of their own spread."""
     free = np.ones(len(reading), bool)
     for _ in range(20):

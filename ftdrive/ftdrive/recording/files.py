@@ -20,7 +20,7 @@ RecordingFile = McapFile | CsvFile | ParquetFile
 """A new file of one format. Whatever happens, `samples` of those that were appended remain in the file."""
 
 
-class Format(NamedTuple):
+class RecordingFormat(NamedTuple):
     """A file format."""
 
     new: type[RecordingFile]
@@ -31,14 +31,14 @@ class Format(NamedTuple):
 
 
 _FORMATS = {
-    ".mcap": Format(McapFile, read_mcap, "mcap"),
-    ".csv": Format(CsvFile, read_csv, "csv"),
-    ".parquet": Format(ParquetFile, read_parquet, "pyarrow"),
+    ".mcap": RecordingFormat(McapFile, read_mcap, "mcap"),
+    ".csv": RecordingFormat(CsvFile, read_csv, "csv"),
+    ".parquet": RecordingFormat(ParquetFile, read_parquet, "pyarrow"),
 }
 ENDINGS = tuple(_FORMATS)
 
 
-def format_of(path: Path) -> Format:
+def format_of(path: Path) -> RecordingFormat:
     """Return the format of a recording, complete or not; raises `ConfigError` if it is unknown or lacks its package."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending not in _FORMATS:
@@ -120,7 +120,7 @@ class RecordingReader:
             raise BadRecording(error.problem, self.path) from error
 
 
-def read_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
+def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording of `RecordingReader` into memory.
 
     It raises for a damaged file or one without a sample. A file that was cut is read up to there; `cut` says so.

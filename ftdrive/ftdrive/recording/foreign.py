@@ -145,9 +145,9 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")
             named = _pose_reader(reader, pose_topic)
-            messages = _messages(reader, [wrenches, *named.topics])
-            wrench = _numbers(reader, wrenches, messages[wrenches], 6)
-            poses = _poses(reader, named, messages)
+            messages = _read_topics(reader, [wrenches, *named.topics])
+            wrench = _number_column(reader, wrenches, messages[wrenches], 6)
+            poses = _pose_column(reader, named, messages)
     except (UsageError, BadDataset):
         raise
     except ProtocolError as error:
@@ -156,12 +156,12 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged, or of another version") from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
     return (
-        _table(path.name, wrench, origin_ns, CHANNELS),
-        _table(path.name, poses, origin_ns, ("qx", "qy", "qz", "qw", "x", "y", "z")),
+        _time_ordered_table(path.name, wrench, origin_ns, CHANNELS),
+        _time_ordered_table(path.name, poses, origin_ns, ("qx", "qy", "qz", "qw", "x", "y", "z")),
     )
 
 
-def _table(name: str, column: _Column, origin_ns: int, names: Sequence[str]) -> Table:
+def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Sequence[str]) -> Table:
     """Return times and numbers as a table, in the order of the times."""
     t_ns, values = column
     order = np.argsort(t_ns, kind="stable")
@@ -183,7 +183,7 @@ def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> s
     return topic or of_kind[0]
 
 
-def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_Message]]:
+def _read_topics(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_Message]]:
     chosen = [one for one in reader.connections if one.topic in topics]
     found: dict[str, list[_Message]] = {topic: [] for topic in topics}
     for connection, received_ns, data in reader.messages(connections=chosen):
@@ -191,7 +191,7 @@ def _messages(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_Mes
     return found
 
 
-def _numbers(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
+def _number_column(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
     """Return times (n,) in ns, of receipt if no message has a stamp, and numbers (n, count) behind the header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
@@ -210,10 +210,10 @@ def _numbers(reader: "AnyReader", topic: str, messages: Sequence[_Message], coun
     seconds, nanoseconds = (rows[:, i : i + 4].copy().view("<u4")[:, 0] for i in (4, 8))
     t_ns = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds
     numbers = rows[:, start : start + 8 * count].copy().view("<f8")
-    return _checked(topic, t_ns if t_ns.any() else received_ns, numbers)
+    return _checked_column(topic, t_ns if t_ns.any() else received_ns, numbers)
 
 
-def _checked(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Column:
+def _checked_column(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Column:
     if (t_ns <= 0).any():
         raise BadDataset(f"{topic}: some messages have the stamp 0: set header.stamp in its driver and record again")
     if not np.isfinite(numbers).all():
@@ -235,11 +235,11 @@ def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
     return named
 
 
-def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_Message]]) -> _Column:
+def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_Message]]) -> _Column:
     """Return times (m,) in ns, and quaternions x, y, z, w and positions (m, 7)."""
     if isinstance(named, Poses):
         (topic,) = named.topics
-        t_ns, numbers = _numbers(reader, topic, messages[topic], 7)
+        t_ns, numbers = _number_column(reader, topic, messages[topic], 7)
         position, quaternion = numbers[:, :3], numbers[:, 3:]
         lengths = np.linalg.norm(quaternion, axis=1)
         if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
@@ -269,7 +269,7 @@ def _poses(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_
         t_ns = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in times])
         R, p = named.chain.poses(dict(zip(named.chain.names, map(np.array, columns), strict=True)))
         (topic,) = named.topics
-        return _checked(topic, t_ns, np.hstack([Rotation.from_matrix(R).as_quat(), p]))
+        return _checked_column(topic, t_ns, np.hstack([Rotation.from_matrix(R).as_quat(), p]))
     R, p = map(np.array, columns)
     return np.array(times), np.hstack([Rotation.from_matrix(R).as_quat(), p])
 
@@ -311,7 +311,7 @@ class TablePair:
         share = [0.0]
 
         def samples() -> Iterator[FtSamples]:
-            for block, share[0] in _numbered(self._wrench):
+            for block, share[0] in _numbered_samples(self._wrench):
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         paired = pair_blocks(samples(), _states_of(self._orientation), self.delay_s)
@@ -322,7 +322,7 @@ class TablePair:
         """Return the delay and its sigma, from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
-        means = list(_before_a_fault(_means(self._wrench, size)))
+        means = list(_before_a_fault(_mean_samples(self._wrench, size)))
         estimator = DelayEstimator(info.calibration, info.p_flange_sensor_m, window=_WHOLE)
         estimator.learn(means, lambda: _before_a_fault(_states_of(self._orientation)))
         return estimator.delay_s, estimator.sigma_s
@@ -340,7 +340,7 @@ def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
             raise
 
 
-def _means(table: Table, size: int) -> Iterator[FtSamples]:
+def _mean_samples(table: Table, size: int) -> Iterator[FtSamples]:
     """Yield the mean wrench of each so many samples, numbered, at their mean time."""
     t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
     for rows in table.wrenches():
@@ -352,8 +352,8 @@ def _means(table: Table, size: int) -> Iterator[FtSamples]:
         t_s, wrench, count = t_s[n * size :], wrench[n * size :], count + n
 
 
-def _numbered(table: Table) -> Iterator[tuple[FtSamples, float]]:
-    """Give the samples, numbered by their times as in `numbers_of`, and the share of the table before the next ones."""
+def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
+    """Yield the samples, numbered by their times, and the share of the table that is read."""
     known, number = 0, 0
     t_s, wrench, place = np.empty(0), np.empty((0, 6)), 0.0
     for rows in chain(table.wrenches(), [None]):
@@ -361,7 +361,7 @@ def _numbered(table: Table) -> Iterator[tuple[FtSamples, float]]:
             t_s, wrench, place = np.concatenate([t_s, rows.t_s]), np.concatenate([wrench, rows.values]), rows.place
             if len(t_s) <= known + 2 * _NEAR:
                 continue
-        numbers = numbers_of(t_s)
+        numbers = sample_numbers(t_s)
         numbers += number - numbers[max(known - 1, 0)]
         # what follows shows whether a step is a gap
         end = len(t_s) if rows is None else len(t_s) - _NEAR
@@ -372,7 +372,7 @@ def _numbered(table: Table) -> Iterator[tuple[FtSamples, float]]:
         t_s, wrench, known = t_s[start:], wrench[start:], end - start
 
 
-def numbers_of(t_s: Array) -> NDArray[np.int64]:
+def sample_numbers(t_s: Array) -> NDArray[np.int64]:
     """Number samples by their times (n,), so that a sample that is missing is a gap and a late one is not.
 
     Where each time is near a multiple of the period, a longer step is a gap. Elsewhere, as with times of receipt or of

@@ -160,7 +160,7 @@ class McapFile(GrowingFile):
             some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
             yield t_ns[some], 0, {ros2.TRANSFORMS: self._transforms(rows[some], t_ns[some])}
         log = partial(_log, offset_ns=offset_ns)
-        for topic, kind, pack in ((EVENTS, "", log), (LOAD, "load", _load), (TRACKED, "tracked", _tracked)):
+        for topic, kind, pack in ((EVENTS, "", log), (LOAD, "load", _pack_load), (TRACKED, "tracked", _tracked)):
             for event in events:
                 if kind in ("", event.kind):
                     packed = ros2.ENCODING + pack(event)
@@ -240,7 +240,7 @@ def _log(event: StreamEvent, offset_ns: int) -> bytes:
     return packed + struct.pack("<I", 0)
 
 
-def _load(event: StreamEvent) -> bytes:
+def _pack_load(event: StreamEvent) -> bytes:
     """Pack a weighing, which the events have too; what is not known is NaN."""
     values, nowhere = event.values, [np.nan] * 3
     com_m, sigma_m = values["p_sensor_com_m"] or nowhere, values["p_sensor_com_sigma_m"] or nowhere
@@ -255,7 +255,7 @@ def _tracked(event: StreamEvent) -> bytes:
     return struct.pack("<15d?", *values["bias"], *values["sigma"], *part)
 
 
-def _event(body: bytes, t_host_ns: int) -> StreamEvent:
+def _unpack_event(body: bytes, t_host_ns: int) -> StreamEvent:
     texts, place = [], 16
     for _ in range(4):
         (length,) = struct.unpack_from("<I", body, place)
@@ -291,7 +291,7 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
                 if opcode not in (_CHUNK, _INDEX, _DATA_END, _CUT):
                     continue
                 if content is None:
-                    content = _Content(_header(documents), columns)
+                    content = _Content(_mcap_header(documents), columns)
                     yield content.piece(0.0)
                 if opcode == _INDEX:
                     content.indexes.append(data)
@@ -322,7 +322,7 @@ def _add_document(data: bytes, documents: dict[str, Any]) -> None:
     documents[attachment.name] = parsed_json(attachment.data)
 
 
-def _header(documents: Mapping[str, Any]) -> Header:
+def _mcap_header(documents: Mapping[str, Any]) -> Header:
     if not {"calibration.json", "recording.json"} <= documents.keys():
         raise BadRecording("the header is missing: the file was cut within it, or another program wrote it")
     return Header.from_dict(documents["recording.json"] | {"calibration": documents["calibration.json"]})
@@ -396,10 +396,10 @@ class _Content:
         for channel, t_ns, places, ends in found:
             if channel == _CHANNELS[EVENTS]:
                 for t, place, end in zip((t_ns - offset_ns).tolist(), places.tolist(), ends.tolist(), strict=True):
-                    self._events.append(_event(messages[place + _HEAD.itemsize : end], t))
+                    self._events.append(_unpack_event(messages[place + _HEAD.itemsize : end], t))
             elif channel in _COLUMNS:
                 kind, behind = _COLUMNS[channel]
-                values = _at(messages, ends - behind - kind.itemsize, kind)
+                values = _gather(messages, ends - behind - kind.itemsize, kind)
                 for name in self._columns.keys() & set(kind.names):
                     self._columns[name].append(values[name])
                 if channel == _CHANNELS[SAMPLE]:
@@ -422,7 +422,7 @@ def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDA
     """Return the channel of an index, and times, begins and ends (n,) of its messages; checks them against these."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
-    heads = _at(messages, places, _HEAD)
+    heads = _gather(messages, places, _HEAD)
     if (heads["opcode"] != _MESSAGE).any() or (heads["channel"] != channel).any() or (heads["log"] != t_ns).any():
         raise ValueError("an index differs from its chunk")
     return channel, t_ns, places, places + 9 + heads["length"].astype(np.int64)
@@ -444,7 +444,7 @@ def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[
             raise ValueError("a chunk has a message that no index names")
 
 
-def _at(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
+def _gather(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
     """Return the values at these places; without a copy if they are equally far apart."""
     if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
         raise ValueError("an index points out of its chunk")

@@ -22,7 +22,7 @@ from ftdrive.recording.files import (
     write_recording,
 )
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, rows_of
+from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, to_records
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
@@ -250,7 +250,7 @@ class Recorder(Sink):
         blocks, self._blocks = self._blocks, []
         events, self._events = self._events, []
         if self._files and (blocks or events):
-            self._files.append(rows_of(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW), events)
+            self._files.append(to_records(Block.concatenate(blocks)) if blocks else np.zeros(0, ROW), events)
 
 
 _RAW_ROW: Final = "{:.6f}," + ",".join(["{:.7g}"] * 6) + "\n"

@@ -67,12 +67,12 @@ NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()
 """The columns of the table formats, by the field of `ROW` that holds them."""
 
 
-def numbers_in(kind: np.dtype[Any]) -> np.dtype[Any]:
+def flat_layout(kind: np.dtype[Any]) -> np.dtype[Any]:
     """Return the layout of the bytes of `ROW`, or of some of its fields, with one field a number."""
     return np.dtype([(one, kind[name].base) for name in kind.names or () for one in NUMBERS[name]])
 
 
-COLUMNS: Final = numbers_in(ROW)
+COLUMNS: Final = flat_layout(ROW)
 """The columns of the table formats."""
 
 
@@ -81,7 +81,7 @@ def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray
 
     `start_ns` is `t_host_ns` of the first sample of the recording.
     """
-    t_ns, numbers = rows["t_host_ns"], rows.view(numbers_in(rows.dtype))
+    t_ns, numbers = rows["t_host_ns"], rows.view(flat_layout(rows.dtype))
     times = {"t_s": (t_ns - start_ns) * 1e-9, "t_utc_s": (t_ns + utc_offset_ns) * 1e-9}
     return times | {name: numbers[name] for name in numbers.dtype.names or ()}
 
@@ -95,7 +95,7 @@ def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
     return list(accumulate(np.searchsorted(rows["t_host_ns"], after_ns).tolist(), max))
 
 
-def rows_of(samples: Block | Paired) -> Rows:
+def to_records(samples: Block | Paired) -> Rows:
     """Return samples as records; what paired samples do not have is 0."""
     rows = np.zeros(len(samples), ROW)
     for name in _GROUPS:
@@ -162,11 +162,11 @@ class Header:
             known = {**newer, "result": None, **document}
             values = {item.name: known[item.name] for item in fields(StreamInfo)}
             values |= {name: np.array(values[name], np.float64) for name in _ARRAYS if values[name] is not None}
-            values |= {"arm": _device(values["arm"]), "sensor": _device(values["sensor"])}
+            values |= {"arm": _device_info(values["arm"]), "sensor": _device_info(values["sensor"])}
             values["result"] = CalibrationResult.from_dict(document["calibration"])
             if values["verification"] is not None:
                 values["verification"] = VerificationRecord.from_dict(values["verification"])
-            frame, stages = frame_of(document["frame"]), _stages_of(document["stages"])
+            frame, stages = frame_from_dict(document["frame"]), _stages_of(document["stages"])
             return cls(StreamInfo(**values), frame, stages, document["configuration"])
         except KeyError as error:
             raise BadRecording(f"the header lacks the field {error.args[0]}: the file is damaged") from error
@@ -177,7 +177,7 @@ class Header:
 _ARRAYS = ("p_flange_sensor_m", "R_flange_tcp", "p_flange_tcp_m", "hour_change")
 
 
-def _device(document: Mapping[str, Any]) -> DeviceInfo:
+def _device_info(document: Mapping[str, Any]) -> DeviceInfo:
     facts = {
         name: Fact(tuple(fact["value"]) if isinstance(fact["value"], list) else fact["value"], fact["source"])
         for name, fact in document["facts"].items()
@@ -185,7 +185,7 @@ def _device(document: Mapping[str, Any]) -> DeviceInfo:
     return DeviceInfo(document["model"], document["serial"], document["firmware"], facts)
 
 
-def frame_of(values: Mapping[str, Any]) -> WrenchFrame:
+def frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
     """Build a frame from `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
@@ -239,7 +239,7 @@ class Measured(NamedTuple):
     """As in `Piece`."""
 
 
-class Source(Protocol):
+class AnyRecording(Protocol):
     """A recording of any length."""
 
     @property
@@ -278,7 +278,7 @@ class Recording(Displayed):
     @property
     def table(self) -> NDArray[np.void]:
         """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
-        return self.rows.view(numbers_in(self.rows.dtype))
+        return self.rows.view(flat_layout(self.rows.dtype))
 
     def to_frame(self) -> Any:
         """Return the samples as a DataFrame of pandas, else of Polars.
@@ -343,7 +343,7 @@ class Recording(Displayed):
 def changed(header: Header, event: StreamEvent) -> Header:
     """Return the header that holds after an event. Raises `BadRecording` for a stage of a newer version."""
     if event.kind == "frame":
-        return replace(header, frame=frame_of(event.values))
+        return replace(header, frame=frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 

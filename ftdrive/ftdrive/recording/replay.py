@@ -11,7 +11,7 @@ import numpy as np
 from ftcalib import CalibrationResult
 from ftcalib.errors import BadDataset
 from ftdrive.errors import ConfigError
-from ftdrive.recording.files import read_recording
+from ftdrive.recording.files import load_recording
 from ftdrive.recording.foreign import TablePair, tables_of
 from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.calibration import read_calibration
@@ -31,7 +31,7 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
     is_run = is_run_folder(path)
     tables = None if is_run else tables_of(path)
     if tables is None and not is_run:
-        recording = read_recording(path)
+        recording = load_recording(path)
         header = recording.header
         if loaded is not None:
             header = with_calibration(header, loaded, str(calibration))
@@ -89,8 +89,8 @@ def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> R
     info = StreamInfo(
         result=calibration,
         calibration_name=name,
-        arm=_device(header, "arm"),
-        sensor=_device(header, "sensor"),
+        arm=_replayed_device(header, "arm"),
+        sensor=_replayed_device(header, "sensor"),
         tool=config["tool"].get("name", ""),
         utc_offset_ns=records[0].clock_offset_ns,
         sensor_rate_Hz=rate_Hz,
@@ -104,6 +104,6 @@ def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> R
     return RecordingSource(info, rows)
 
 
-def _device(header: Mapping[str, Any], role: str) -> DeviceInfo:
+def _replayed_device(header: Mapping[str, Any], role: str) -> DeviceInfo:
     found = header.get("devices", {}).get(role, {})
     return DeviceInfo(*(found.get(name, NOT_REPORTED) for name in ("model", "serial", "firmware")))

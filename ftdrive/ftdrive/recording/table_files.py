@@ -46,7 +46,7 @@ from ftdrive.recording.recording import (
     Rows,
     event_of,
     event_text,
-    numbers_in,
+    flat_layout,
     places_of,
     table_of,
 )
@@ -118,16 +118,16 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
         if not file.readline(100).startswith(FIRST_BYTES):
             raise BadRecording(f"the first line is not '# {FORMAT}'")
         file.seek(0)
-        parts = _checked(file)
+        parts = _checked_lines(file)
         first = next(parts, [])
         if len(first) < 3 or not first[1].startswith(_HEADER):
             raise BadRecording("the header is missing: the file was cut within its first lines")
-        header = Header.from_dict(_parsed(first[1].removeprefix(_HEADER)))
+        header = Header.from_dict(_parse_document(first[1].removeprefix(_HEADER)))
         names = first[2].rstrip("\n").split(",")
         if missing := [name for name in COLUMNS.names or () if name not in names]:
             raise BadRecording(f"the column {missing[0]} is missing")
         kind = np.dtype([(name, ROW[name]) for name in ROW.names or () if name in columns])
-        numbers = numbers_in(kind)
+        numbers = flat_layout(kind)
         order = [names.index(name) for name in numbers.names or ()]
         lines, events, ended, failure = list[str](), list[StreamEvent](), False, None
 
@@ -157,7 +157,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
         return "" if ended else "the last line is not '# end'"
 
 
-def _checked(file: BufferedReader) -> Iterator[list[str]]:
+def _checked_lines(file: BufferedReader) -> Iterator[list[str]]:
     """Give the lines of each checksum that fits them, and the end."""
     crc, waiting, begin = 0, list[str](), 0
     for number, line in enumerate(read_lines(file, BadRecording), 1):
@@ -183,7 +183,7 @@ def _crc_line(crc: int) -> bytes:
     return f"{_CRC}{crc:08x}\n".encode()
 
 
-def _parsed(text: str) -> dict[str, object]:
+def _parse_document(text: str) -> dict[str, object]:
     try:
         return dict(parsed_json(text))
     except (TypeError, ValueError) as error:
@@ -205,7 +205,7 @@ class ParquetFile(_TableFile):
         self._events: list[str] = []
         self._writer = parquet.ParquetWriter(
             PythonFile(self, "w"),
-            _schema(),
+            _arrow_schema(),
             compression="zstd",
             compression_level=ZSTD_LEVEL,
             use_dictionary=False,
@@ -230,7 +230,7 @@ class ParquetFile(_TableFile):
         if self._waiting:
             self._write_group()
         texts = {"header": json.dumps(self._header.to_dict()), "events": f"[{','.join(self._events)}]"}
-        crc = _crc({name.encode(): text.encode() for name, text in texts.items()})
+        crc = _text_crc({name.encode(): text.encode() for name, text in texts.items()})
         self._writer.add_key_value_metadata({**texts, "crc32": crc})
         self._writer.close()
 
@@ -239,15 +239,15 @@ class ParquetFile(_TableFile):
 
         rows, self._waiting = np.concatenate(self._waiting), []
         arrays, columns = [], self._columns(rows)
-        for field in _schema():
+        for field in _arrow_schema():
             column = columns[field.name]
             plain = np.packbits(column, bitorder="little") if column.dtype == bool else np.ascontiguousarray(column)
             # To take an array of numpy, pyarrow would import pandas, for a second.
             arrays.append(Array.from_buffers(field.type, len(rows), [None, py_buffer(plain)]))
-        self._writer.write_table(table(arrays, schema=_schema()))
+        self._writer.write_table(table(arrays, schema=_arrow_schema()))
 
 
-def _schema() -> Any:
+def _arrow_schema() -> Any:
     import pyarrow as pa
 
     columns = table_of(np.zeros(0, ROW), 0, 0)
@@ -255,7 +255,7 @@ def _schema() -> Any:
     return pa.schema(fields)
 
 
-def _crc(texts: Mapping[bytes, bytes]) -> str:
+def _text_crc(texts: Mapping[bytes, bytes]) -> str:
     return f"{zlib.crc32(texts[b'header'] + texts[b'events']):08x}"
 
 
@@ -277,14 +277,14 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
             if not {b"header", b"events"} <= texts.keys():
                 raise BadRecording("it has no header of ftdrive: another program wrote it")
             # Files of earlier versions have no checksum here.
-            if texts.get(b"crc32", b"").decode() not in ("", _crc(texts)):
+            if texts.get(b"crc32", b"").decode() not in ("", _text_crc(texts)):
                 raise BadRecording("its header differs from its checksum: the file is damaged")
-            if not file.schema_arrow.remove_metadata().equals(_schema()):
+            if not file.schema_arrow.remove_metadata().equals(_arrow_schema()):
                 raise BadRecording("its columns are not those of a recording: the file is damaged")
             header = Header.from_dict(parsed_json(texts[b"header"]))
             events = [event_of(json.dumps(one)) for one in parsed_json(texts[b"events"])]
             kind = np.dtype([(name, ROW[name]) for name in ROW.names or () if name in columns])
-            numbers = numbers_in(kind)
+            numbers = flat_layout(kind)
             yield Piece(header, np.zeros(0, kind), [], 0.0)
             names, count = {*(numbers.names or ()), "t_host_ns"}, 0
             for number in range(file.num_row_groups):  # one by one, because a reader of all keeps what it has read

@@ -178,15 +178,15 @@ def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[s
         },
         "error_map": _error_map(result),
         "contact": contact_error(result),
-        "correlation": _correlation(result.covariance),
+        "correlation": _correlation_facts(result.covariance),
         "cross_validation": _cross_validation(subject),
-        "poses": _poses(subject),
+        "poses": _pose_facts(subject),
         "residuals": residuals_in_words(result),
         "mass": mass_in_words(result),
-        "drift": _drift(subject),
-        "noise": _noise(subject),
-        "coverage": None if R_base_flange is None else _coverage(subject, R_base_flange),
-        "motion": None if result.motion is None else _motion(result.motion, sweep),
+        "drift": _drift_facts(subject),
+        "noise": _noise_facts(subject),
+        "coverage": None if R_base_flange is None else _coverage_facts(subject, R_base_flange),
+        "motion": None if result.motion is None else _motion_facts(result.motion, sweep),
         "tour": None if subject.run is None else _tour(subject.run, len(subject.records)),
         "comparison": None if subject.parent is None else compared(result, subject.parent),
         "compared_with": subject.parent_name,
@@ -209,7 +209,7 @@ def _about_of(result: CalibrationResult) -> str:
     return ", ".join([*named, *tool, *([made[:16].replace("T", " ") + " UTC"] if isinstance(made, str) else [])])
 
 
-def _correlation(covariance: Array) -> dict[str, Any]:
+def _correlation_facts(covariance: Array) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(covariance))
     sigma[sigma == 0] = np.inf  # known exactly: correlated with nothing
     return {
@@ -236,7 +236,7 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
     }
 
 
-def _poses(subject: Subject) -> list[dict[str, Any]]:
+def _pose_facts(subject: Subject) -> list[dict[str, Any]]:
     """List the poses: residual (6,), its size in sigma as the other poses predict it, and whether the pose was used."""
     result, dataset = subject.result, subject.dataset
     names = pose_names(subject.records) or [str(row + 1) for row in range(result.n_poses)]
@@ -257,7 +257,7 @@ def _poses(subject: Subject) -> list[dict[str, Any]]:
     ]
 
 
-def _drift(subject: Subject) -> dict[str, Any]:
+def _drift_facts(subject: Subject) -> dict[str, Any]:
     result, again = subject.result, drift_check(subject.records)
     return {
         "in_fit": result.to_dict()["drift"],
@@ -268,7 +268,7 @@ def _drift(subject: Subject) -> dict[str, Any]:
     }
 
 
-def _noise(subject: Subject) -> dict[str, Any] | None:
+def _noise_facts(subject: Subject) -> dict[str, Any] | None:
     """Standard error of the mean of one axis at each pose; None if it was not measured."""
     if subject.dataset is None or subject.dataset.wrench_cov is None:
         return None
@@ -281,7 +281,7 @@ def _noise(subject: Subject) -> dict[str, Any] | None:
     }
 
 
-def _coverage(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
+def _coverage_facts(subject: Subject, R_base_flange: Array) -> dict[str, Any]:
     parameters = subject.result.parameters
     seen = assess(R_base_flange, parameters, advise=False)
     gravity, tool = parameters.down @ R_base_flange, R_base_flange[:, :, 2]
@@ -304,7 +304,7 @@ def _planned_sweep(run: Run | None) -> Plan | None:
     return Plan.load(run.plan_path) if run is not None and run.in_motion and run.plan_path.is_file() else None
 
 
-def _motion(motion: MotionResult, planned: Plan | None) -> dict[str, Any]:
+def _motion_facts(motion: MotionResult, planned: Plan | None) -> dict[str, Any]:
     """Return what a recording in motion gives beside the static model, and the planned sweep."""
     return {
         "inertia_kg_m2": motion.inertia_kg_m2.tolist(),

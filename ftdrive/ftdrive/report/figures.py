@@ -64,7 +64,7 @@ _STYLE: Mapping[Any, Any] = {
 }
 
 
-def draw(name: str, facts: Facts) -> str:
+def draw_figure(name: str, facts: Facts) -> str:
     """Draw the figure of this name as an SVG element without links, scripts or fixed ink."""
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
@@ -109,7 +109,7 @@ def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
     bar.set_label(f"predicted {kind.partition('_')[0]} error, {unit}, 1 sigma")
 
 
-def _coverage(figure: Any, facts: Facts) -> None:
+def _draw_coverage(figure: Any, facts: Facts) -> None:
     axes, found = figure.add_subplot(), facts["coverage"]
     with _globe(axes):
         _dots(axes, found["gravity_in_flange"], color=SERIES[0], edgecolor=PAPER, s=36)
@@ -170,7 +170,7 @@ def _sweep(figure: Any, facts: Facts) -> None:
     axes.legend(loc="upper right", fontsize=8, ncols=3)
 
 
-def _correlation(figure: Any, facts: Facts) -> None:
+def _draw_correlation(figure: Any, facts: Facts) -> None:
     axes = figure.add_subplot()
     matrix = np.abs(np.array(facts["correlation"]["matrix"]))
     n = len(matrix)
@@ -209,7 +209,7 @@ def _methods(figure: Any, facts: Facts) -> None:
     force.invert_yaxis()
 
 
-def _contact(figure: Any, facts: Facts) -> None:
+def _draw_contact(figure: Any, facts: Facts) -> None:
     axes, found = figure.add_subplot(), facts["contact"]
     if found["without_loads_N"] is not None:
         axes.plot(found["force_N"], found["without_loads_N"], "--", color=SERIES[1], label="without known loads")
@@ -255,7 +255,7 @@ def _time_residuals(figure: Any, facts: Facts) -> None:
     axes.set_xlabel(f"time since the first pose, {unit}" if timed else words)
 
 
-def _noise(figure: Any, facts: Facts) -> None:
+def _draw_noise(figure: Any, facts: Facts) -> None:
     rows = [pose["row"] - 1 for pose in shown_poses(facts["poses"])]
     both = figure.subplots(2, 1, sharex=True)
     for axes, key, label in zip(both, ("force_N", "torque_Nm"), ("mN", "mN·m"), strict=True):
@@ -274,7 +274,7 @@ def _name_poses(axes: Any, poses: Sequence[Facts]) -> None:
     axes.set_xlabel("pose")
 
 
-def _comparison(figure: Any, facts: Facts) -> None:
+def _draw_comparison(figure: Any, facts: Facts) -> None:
     axes, found = figure.add_subplot(), facts["comparison"]["parameters"]
     values = [one["sigmas"] or 0.0 for one in found]
     axes.barh([label_of(one["name"]) for one in found], values, color=SERIES[0], height=0.6)
@@ -298,13 +298,13 @@ _Margins = tuple[float, float, float, float]
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),
-    "contact": (2.6, (0.65, 0.2, 0.5, 0.1), _contact),
-    "correlation": (4.6, (1.05, 0.1, 1.05, 0.1), _correlation),
+    "contact": (2.6, (0.65, 0.2, 0.5, 0.1), _draw_contact),
+    "correlation": (4.6, (1.05, 0.1, 1.05, 0.1), _draw_correlation),
     "methods": (lambda facts: 1.0 + 0.25 * len(facts["cross_validation"]["methods"]), (1.35, 0.2, 0.5, 0.1), _methods),
     "pose_residuals": (2.8, (0.55, 0.1, 0.65, 0.1), _pose_residuals),
     "time_residuals": (3.8, (0.65, 0.1, 0.5, 0.35), _time_residuals),
-    "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _noise),
-    "coverage": (2.7, (0.1, 0.1, 0.1, 0.1), _coverage),
+    "noise": (3.6, (0.65, 0.1, 0.65, 0.1), _draw_noise),
+    "coverage": (2.7, (0.1, 0.1, 0.1, 0.1), _draw_coverage),
     "sweep": (2.6, (0.65, 0.2, 0.5, 0.1), _sweep),
-    "comparison": (3.8, (1.2, 0.2, 0.5, 0.1), _comparison),
+    "comparison": (3.8, (1.2, 0.2, 0.5, 0.1), _draw_comparison),
 }

@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
 
-def page(facts: Facts) -> str:
+def render_page(facts: Facts) -> str:
     """Write the page of the facts from `ftdrive.report.facts.facts_of`. Raises `ConfigError` without jinja2."""
     environment = templates("ftdrive.report", "a report in HTML", "report", "--format json")
     from markupsafe import Markup
 
-    from ftdrive.report.figures import draw
+    from ftdrive.report.figures import draw_figure
 
     sections = sections_of(facts)
     environment.filters["sentence"] = lambda text: with_code(capital(text))
-    drawn = {one.name: Markup(draw(one.name, facts)) for section in sections for one in section.figures}
+    drawn = {one.name: Markup(draw_figure(one.name, facts)) for section in sections for one in section.figures}
     template = environment.get_template("report.html.j2")
     return template.render(facts=facts, sections=sections, drawn=drawn, version=__version__)
 

@@ -25,7 +25,7 @@ _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class ReportTable:
     """Cells as text; the first of each row is its heading."""
 
     caption: str
@@ -57,7 +57,7 @@ class Section:
     title: str
     text: Sequence[str] = ()
     figures: Sequence[Figure] = ()
-    tables: Sequence[Table] = ()
+    tables: Sequence[ReportTable] = ()
 
 
 def rounded(value: float | None, digits: int = 3) -> str:
@@ -85,7 +85,7 @@ def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
     return [poses[row] for row in np.unique([*worst, *even])]
 
 
-def estimates(facts: Facts) -> Section:
+def estimates_section(facts: Facts) -> Section:
     """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
     result, strong = facts["result"], facts["correlation"]["strong"]
     taken = "poses" if facts["motion"] is None else "parts of the motion"
@@ -102,17 +102,17 @@ def estimates(facts: Facts) -> Section:
         "hardly separate two parameters: add other orientations.",
     )
     rows = [(name, value, sigma) for _, _, name, _, value, sigma in estimate_rows(result)]
-    tables = [Table("", ("quantity", "estimate", "± 1 sigma"), rows)]
+    tables = [ReportTable("", ("quantity", "estimate", "± 1 sigma"), rows)]
     if facts["mass"] is not None:
         text.append(f"Sigma: {SIGMA_OF_THE_TOOL}. Mass as read: {facts['mass']}.")
     if result["response"] is not None:
         columns = ("entry", "value", "± 1 sigma")
-        rows = list(_response(result["response"]))
-        tables.append(Table("Gain and cross-talk of the sensor", columns, rows, folded=True))
+        rows = list(_response_rows(result["response"]))
+        tables.append(ReportTable("Gain and cross-talk of the sensor", columns, rows, folded=True))
     return Section("estimates", "Estimates", text, [figure], tables)
 
 
-def _response(response: Facts) -> Iterator[tuple[str, str, str]]:
+def _response_rows(response: Facts) -> Iterator[tuple[str, str, str]]:
     kinds = (("force_gain", 100, "%", "force gain"), ("cross_talk_m", 1e3, "mN·m/N", "cross-talk"))
     for (key, scale, unit, label), (i, j) in product(kinds, combinations_with_replacement(range(3), 2)):
         value, sigma = (scale * one[key][i][j] for one in (response, response["sigma"]))
@@ -154,7 +154,9 @@ def error(facts: Facts) -> Section:
     ]
     caption = "Predicted error, one sigma: rms over all orientations, and largest"
     columns = ("error", "rms", "largest", "tool axis there, in base")
-    return Section("error", "Compensation error over all orientations", text, figures, [Table(caption, columns, rows)])
+    return Section(
+        "error", "Compensation error over all orientations", text, figures, [ReportTable(caption, columns, rows)]
+    )
 
 
 def contact(facts: Facts) -> Section:
@@ -212,9 +214,9 @@ def cross_validation(facts: Facts) -> Section:
     ]
     of_errors = (f"{words}, {unit}" for words in errors.values() for unit in ("N", "N·m"))
     columns = ("method", "mass, kg", "mounting differs, °", *of_errors)
-    tables = [Table("Methods on the same poses", columns, rows)]
+    tables = [ReportTable("Methods on the same poses", columns, rows)]
     if missing := [(one["method"], one["reason"]) for one in found["methods"] if "reason" in one]:
-        tables.append(Table("Methods without a result", ("method", "reason"), missing, folded=True))
+        tables.append(ReportTable("Methods without a result", ("method", "reason"), missing, folded=True))
     crossed = [one for one in solved if one["cross_validated"]["force_rms_N"]]
     best = min(crossed, key=lambda one: float(one["cross_validated"]["force_rms_N"]), default=None)
     figure = Figure(
@@ -275,7 +277,7 @@ def residuals(facts: Facts) -> Section:
     ]
     columns = ("pose", "t, s", *(f"F{a}, N" for a in _AXES), *(f"T{a}, mN·m" for a in _AXES), "sigma", "used")
     few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, the worst among them)"
-    tables = [] if in_motion else [Table(f"Table of the residuals{few}", columns, rows, folded=True)]
+    tables = [] if in_motion else [ReportTable(f"Table of the residuals{few}", columns, rows, folded=True)]
     return Section("residuals", "Residuals", text, figures, tables)
 
 
@@ -290,7 +292,7 @@ def drift(facts: Facts) -> Section:
         text.append(
             f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
         )
-    tables = tuple[Table, ...]()
+    tables = tuple[ReportTable, ...]()
     if found is None:
         text.append("The fit found no drift of the bias.")
     else:
@@ -304,7 +306,7 @@ def drift(facts: Facts) -> Section:
                 shown = [*_pair(scale * change, scale * sigma, "+"), f"{change / sigma:+.1f}"]
             rows.append((f"{'FT'[k // 3]}{_AXES[k % 3]}, {unit}", *shown))
         columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
-        tables = (Table("Bias at the last pose minus bias at the first", columns, rows),)
+        tables = (ReportTable("Bias at the last pose minus bias at the first", columns, rows),)
     if seen["in_use"] is not None:
         text.append(f"{capital(seen['in_use'])}. Tare before use.")
     return Section("drift", "Drift", text, (), tables)
@@ -384,8 +386,8 @@ def tour(facts: Facts) -> Section:
     keys = ("model", "serial", "firmware")
     devices = [(name, *(str(one.get(key, "-")) for key in keys)) for name, one in run["devices"].items()]
     tables = [
-        Table("Devices", ("device", *keys), devices),
-        Table("Settings", ("setting", "value"), list(_flattened(run["config"])), folded=True),
+        ReportTable("Devices", ("device", *keys), devices),
+        ReportTable("Settings", ("setting", "value"), list(_flattened(run["config"])), folded=True),
     ]
     plan = run["plan"]
     if plan is None:
@@ -402,16 +404,16 @@ def tour(facts: Facts) -> Section:
     rows, larger = [], []
     obtained = facts["result"]["sigma"] | facts["result"]["predicted_error"]
     for name, scale, key in _PREDICTED:
-        expected, got = _largest(plan["predicted_sigma"].get(key)), _largest(obtained[key])
+        expected, got = _largest_size(plan["predicted_sigma"].get(key)), _largest_size(obtained[key])
         rows.append((name, rounded(scale * expected, 2), rounded(scale * got, 2)))
         if got > _AS_PREDICTED * expected:
             larger.append(f"{name.partition(',')[0]} ({got / expected:.2g} times)")
     text.append(f"Larger sigma than predicted: {', '.join(larger)}. {_WHY_LARGER}" if larger else _AS_GOOD)
     caption = "One sigma as the plan predicted it, from a usual sensor, and as obtained"
-    return Section("tour", title, text, (), [Table(caption, ("sigma", "predicted", "obtained"), rows), *tables])
+    return Section("tour", title, text, (), [ReportTable(caption, ("sigma", "predicted", "obtained"), rows), *tables])
 
 
-def _largest(values: Any) -> float:
+def _largest_size(values: Any) -> float:
     return float(np.max(np.array(values, dtype=np.float64)))
 
 
@@ -454,8 +456,8 @@ def comparison(facts: Facts) -> Section:
         f"{LIMIT_SIGMAS} the scale is logarithmic. Good: bars within them, except for the biases.",
     )
     tables = [
-        Table("Joint test of each group", ("group", "chi2", "dof", "p"), groups),
-        Table("Differences (rad, N, m, N·m)", ("parameter", "difference", "in sigma"), rows, folded=True),
+        ReportTable("Joint test of each group", ("group", "chi2", "dof", "p"), groups),
+        ReportTable("Differences (rad, N, m, N·m)", ("parameter", "difference", "in sigma"), rows, folded=True),
     ]
     return Section("comparison", title, text, [figure], tables)
 
@@ -470,8 +472,8 @@ def provenance(facts: Facts) -> Section:
     text += _last_verification(facts["trust"] or {})
     rows, columns = list(_flattened(facts["result"]["provenance"])), ("field", "value")
     long = [row for row in rows if row[0].startswith(("devices.", "station."))]
-    tables = [Table("", columns, [row for row in rows if row not in long])]
-    tables += [Table("Devices", columns, long, folded=True)] if long else []
+    tables = [ReportTable("", columns, [row for row in rows if row not in long])]
+    tables += [ReportTable("Devices", columns, long, folded=True)] if long else []
     return Section("provenance", "Provenance and how to reproduce the result", text, (), tables)
 
 
@@ -500,11 +502,13 @@ def motion(facts: Facts) -> Section:
     ]
     entries = (1e3 * values_of(one, "inertia_kg_m2") for one in (moments, of_moments))
     rows = [(axes, f"{value:.3f}", f"{sigma:.3f}") for axes, value, sigma in zip(INERTIA_NAMES, *entries, strict=True)]
-    tables = [Table("Inertia about the centre of mass, sensor axes, g·m²", ("axes", "estimate", "± 1 sigma"), rows)]
+    tables = [
+        ReportTable("Inertia about the centre of mass, sensor axes, g·m²", ("axes", "estimate", "± 1 sigma"), rows)
+    ]
     keys, columns = ("duration_s", "force_N", "torque_Nm"), ("at, s", "for, s", "force, N", "torque, N·m")
     touches = [(f"{one['t_s']:.1f}", *(rounded(one[key], 2) for key in keys)) for one in found["contacts"]]
     if touches:
-        tables.append(Table("Contact, which was left out", columns, touches))
+        tables.append(ReportTable("Contact, which was left out", columns, touches))
     else:
         text.append("No contact was found.")
     if found["sweep"] is None:
@@ -524,7 +528,7 @@ def sections_of(facts: Mapping[str, Any]) -> list[Section]:
     """
     in_motion = facts["motion"] is not None
     return [
-        estimates(facts),
+        estimates_section(facts),
         error(facts),
         contact(facts),
         *([motion(facts)] if in_motion else [cross_validation(facts)]),
@@ -548,10 +552,10 @@ def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
         if isinstance(inner, Mapping):
             yield from _flattened(inner, f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}", _text(inner)
+            yield f"{prefix}{name}", _value_text(inner)
 
 
-def _text(value: Any) -> str:
+def _value_text(value: Any) -> str:
     if isinstance(value, list):
-        return " ".join(map(_text, value))
+        return " ".join(map(_value_text, value))
     return "-" if value is None else str(value)

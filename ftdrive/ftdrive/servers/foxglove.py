@@ -67,12 +67,12 @@ def _arrows(block: Block, t_utc_ns: int) -> messages.SceneUpdate:
         frame_id=block.frame.id,
         id="wrench",
         frame_locked=True,
-        arrows=[_arrow(FORCE_M_N * force_N, _ORANGE), _arrow(TORQUE_M_NM * torque_Nm, _BLUE)],
+        arrows=[_arrow_primitive(FORCE_M_N * force_N, _ORANGE), _arrow_primitive(TORQUE_M_NM * torque_Nm, _BLUE)],
     )
     return messages.SceneUpdate(entities=[entity])
 
 
-def _arrow(vector_m: Array, color: messages.Color) -> messages.ArrowPrimitive:
+def _arrow_primitive(vector_m: Array, color: messages.Color) -> messages.ArrowPrimitive:
     length_m = float(np.linalg.norm(vector_m))
     # An arrow points along x. Half a turn about the bisector of x and a direction swaps the two.
     bisector = np.array([1.0, 0.0, 0.0]) + (vector_m / length_m if length_m > 0 else 0.0)

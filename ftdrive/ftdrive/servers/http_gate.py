@@ -40,7 +40,7 @@ _HOST: Final = re.compile(r"(\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(:\d{1
 _log = logging.getLogger(__name__)
 
 
-def refusal(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Collection[str] | None = None) -> str:
+def refusal_reason(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Collection[str] | None = None) -> str:
     """Return why a request is refused; empty if it is served.
 
     Parameters
@@ -115,8 +115,8 @@ class Request:
 class Gate:
     """Listens for HTTP, refuses foreign requests, and calls `serve` for each of the others in a thread of its own.
 
-    A port of 0 lets the system choose, see `port`; `origins` are those of `refusal`. Raises `OSError` for an address
-    that cannot be used.
+    Port 0 lets the system choose, see `port`; `origins` as in `refusal_reason`. Raises `OSError` for an address that
+    cannot be used.
     """
 
     def __init__(self, bound: Address, origins: Collection[str] | None = None) -> None:
@@ -165,7 +165,7 @@ class Gate:
             else:
                 self._waiting.pop(writer, None)
                 request = Request(method, target, headers, head, reader, writer)
-                if why := refusal(headers, self._host, self._origins):
+                if why := refusal_reason(headers, self._host, self._origins):
                     self._refused += 1
                     if self._refused <= _LOGGED:
                         last = "; further ones are not logged" if self._refused == _LOGGED else ""

@@ -74,7 +74,7 @@ def change(stream: "Stream", frame: WrenchFrame, stages: Stages, then: Callable[
 _FRAME_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_./-]*")
 
 
-def _described(default: Any, text: str) -> Any:
+def _described_parameter(default: Any, text: str) -> Any:
     return field(default=default, metadata={"text": text})
 
 
@@ -82,16 +82,16 @@ def _described(default: Any, text: str) -> Any:
 class Fixed:
     """Parameters that a running node does not change. Raises `ConfigError` for values that cannot be used."""
 
-    rate: float = _described(
+    rate: float = _described_parameter(
         500.0, "Highest rate of the wrench topics in Hz. A message is the mean of the samples of one interval."
     )
-    reliable: bool = _described(
+    reliable: bool = _described_parameter(
         False, "Reliable delivery. Otherwise best effort, depth 5, of which a reliable subscriber receives nothing."
     )
-    base_frame: str = _described("base", "Frame of the controller's base: base of a UR, not base_link.")
-    flange_frame: str = _described("tool0", "Frame of the flange, z out of it: tool0 of a UR, not flange.")
-    sensor_frame: str = _described("ft_sensor", "Frame of the sensor, which ~/wrench_raw has.")
-    publish_base_tf: bool = _described(
+    base_frame: str = _described_parameter("base", "Frame of the controller's base: base of a UR, not base_link.")
+    flange_frame: str = _described_parameter("tool0", "Frame of the flange, z out of it: tool0 of a UR, not flange.")
+    sensor_frame: str = _described_parameter("ft_sensor", "Frame of the sensor, which ~/wrench_raw has.")
+    publish_base_tf: bool = _described_parameter(
         False, "Also publish base to flange on /tf, which a driver of the arm usually does."
     )
 
@@ -134,7 +134,7 @@ class NodeParameters:
                 # 20 and 20.0 are both a frequency; what cannot be used is rejected with a reason
                 dynamic_typing=True,
             )
-            given[name] = _plain(node.declare_parameter(name, value, descriptor).value)
+            given[name] = _as_builtin(node.declare_parameter(name, value, descriptor).value)
         fixed, tool = {name: given.pop(name) for name in _FIXED}, given.pop("tool")
         self.frame, self.stages = with_changes(frame, Stages(), given.items())
         self.tool, self.fixed = _checked_tool(tool), Fixed(**fixed)
@@ -144,7 +144,7 @@ class NodeParameters:
         """Apply all changes or none; called in the thread of the node."""
         result = ros2_module("rcl_interfaces.msg").SetParametersResult
         # others, such as use_sim_time, are those of rclpy
-        given = {one.name: _plain(one.value) for one in changes if one.name in _TEXTS.keys() - _FIXED.keys()}
+        given = {one.name: _as_builtin(one.value) for one in changes if one.name in _TEXTS.keys() - _FIXED.keys()}
         try:
             tool = _checked_tool(given.pop("tool", self.tool))
             now = *with_changes(self.frame, self.stages, given.items()), tool
@@ -155,7 +155,7 @@ class NodeParameters:
         return result(successful=True)
 
 
-def _plain(value: Any) -> Any:
+def _as_builtin(value: Any) -> Any:
     """Return a value of rclpy, which has arrays, as checks and messages have it."""
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 

@@ -42,13 +42,13 @@ _ALIKE_RAD: Final = 0.1
 _COUNT_LIMIT: Final = 2**30
 
 
-class Command(IntEnum):
+class ServiceCommand(IntEnum):
     """What a program may request."""
 
     WEIGH, ZERO, STATUS = 1, 2, 3
 
 
-class State(IntEnum):
+class ServiceState(IntEnum):
     """State of the service, and of the last request while `number` is its number."""
 
     STOPPED, READY, BUSY, REFUSED = range(4)
@@ -102,7 +102,7 @@ class ProgramService(Sink):
         # Of the last request; None until the first was read, which may be that of a program before us.
         self._number: int | None = None
         self._command, self._since_ns, self._due_ns = 0, 0, 0
-        self._state, self._code, self._condition = State.READY, 0, Condition.FREE
+        self._state, self._code, self._condition = ServiceState.READY, 0, Condition.FREE
         self._wrench, self._weight = [0.0] * 6, [0.0] * 9
         self._newest_ns = 0
         self._ends = threading.Event()
@@ -146,7 +146,7 @@ class ProgramService(Sink):
         if self._watching.ident is not None:
             self._watching.join()
         with self._lock:
-            self._state, self._condition = State.STOPPED, Condition.STALE
+            self._state, self._condition = ServiceState.STOPPED, Condition.STALE
             self._write()
             if self._registers is not None:
                 self._registers.close()
@@ -170,7 +170,7 @@ class ProgramService(Sink):
             self._ends.wait(0.5)
             return
         with self._lock:
-            self._registers, self._number, self._state, self._code = registers, None, State.READY, 0
+            self._registers, self._number, self._state, self._code = registers, None, ServiceState.READY, 0
         self._say("The controller answers again.")
 
     def _write(self) -> None:
@@ -183,7 +183,7 @@ class ProgramService(Sink):
             # All inputs go in one package, so that a program never reads half of an answer.
             self._registers.write(integers, [*self._wrench, *self._weight, *tracked])
         except DeviceError as error:
-            if self._state is not State.STOPPED:
+            if self._state is not ServiceState.STOPPED:
                 self._say(f"{error}. Trying again.")
             self._registers.close()
             self._registers = None
@@ -217,17 +217,17 @@ class ProgramService(Sink):
         elif request is not None and request[0] != self._number:
             (self._number, self._command), self._since_ns = request, t_ns
             self._due_ns = t_ns + round(WEIGH_S * 1e9)
-            self._state, self._code = State.BUSY, 0
-        if self._state is not State.BUSY:
+            self._state, self._code = ServiceState.BUSY, 0
+        if self._state is not ServiceState.BUSY:
             return
-        if self._command == Command.STATUS:
+        if self._command == ServiceCommand.STATUS:
             self._answer("")
-        elif self._command not in (Command.WEIGH, Command.ZERO):
+        elif self._command not in (ServiceCommand.WEIGH, ServiceCommand.ZERO):
             self._answer("command")
         elif t_ns >= self._due_ns:
             self._due_ns = t_ns + _TRY_NS
             try:
-                if self._command == Command.WEIGH:
+                if self._command == ServiceCommand.WEIGH:
                     self._weigh()
                 else:
                     self._scale.zero(self._since_ns)
@@ -240,7 +240,7 @@ class ProgramService(Sink):
                 self._answer("")
 
     def _answer(self, code: str) -> None:
-        self._state, self._code = State.REFUSED if code else State.READY, CODES[code]
+        self._state, self._code = ServiceState.REFUSED if code else ServiceState.READY, CODES[code]
         if code:
             self._weight = [0.0] * 9
 

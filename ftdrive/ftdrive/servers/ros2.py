@@ -32,7 +32,7 @@ from ftdrivers.ros2.middleware import Node, ros2_module
 _TF_HZ: Final = 50.0
 
 
-class Transforms:
+class TransformPublisher:
     """Publishes sensor and tcp in the flange once, and on request what moves: base to flange.
 
     A frame of base axes about another point also moves, because the flange turns in the base. It is published too.
@@ -180,13 +180,13 @@ def reports_of(stream: Stream, lost_before: int, sent: int) -> list[PartState]:
     words = status.failure or f"{stream.frame}; {stages}"
     return [
         PartState("stream", Level.ERROR if status.failure else Level.OK, words, values),
-        _link("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before),
-        _link("arm", status.arm, info.arm, 0),
+        _link_state("sensor", status.sensor, info.sensor, status.sensor.lost - lost_before),
+        _link_state("arm", status.arm, info.arm, 0),
         PartState("calibration", level, text, {"file": info.calibration_name, "verdict": verdict}),
     ]
 
 
-def _link(part: str, link: LinkStatus, device: Any, lost: int) -> PartState:
+def _link_state(part: str, link: LinkStatus, device: Any, lost: int) -> PartState:
     values = {"rate_Hz": f"{link.rate_Hz:.1f}", "lost": str(link.lost), "age_s": f"{link.age_s:.3f}"}
     if link.error:
         level, text = Level.ERROR, link.error
@@ -267,7 +267,7 @@ class Ros2Node(Sink):
             self._overall = node.create_publisher(self._diagnostics.DiagnosticArray, "/diagnostics", 10)
             node.create_service(trigger, "~/tare", partial(self._answer, methodcaller("tare")))
             node.create_service(trigger, "~/undo_tare", partial(self._answer, methodcaller("undo_tare")))
-            self._transforms = Transforms(node, self.fixed)
+            self._transforms = TransformPublisher(node, self.fixed)
             self._ros.spin()
             stack.pop_all()
 

@@ -51,8 +51,8 @@ class UdpSender(Sink):
         for i, t_ns in enumerate((few.t_host_ns + self._offset_ns).tolist()):
             values = {
                 "timestamp": t_ns * 1e-9,
-                "raw_sensor": _named(few.raw[i].tolist()),
-                compensated: _named(few.wrench[i].tolist()),
+                "raw_sensor": _by_component(few.raw[i].tolist()),
+                compensated: _by_component(few.wrench[i].tolist()),
                 "chi2": chi2 if isfinite(chi2 := float(few.chi2[i])) else None,
                 "in_contact": int(few.in_contact[i]),
             }
@@ -64,7 +64,7 @@ class UdpSender(Sink):
         self._socket.close()
 
 
-def _named(wrench: list[float]) -> dict[str, dict[str, float]]:
+def _by_component(wrench: list[float]) -> dict[str, dict[str, float]]:
     return {
         "force_N": dict(zip("xyz", wrench[:3], strict=True)),
         "torque_Nm": dict(zip("xyz", wrench[3:], strict=True)),

@@ -38,7 +38,7 @@ _STILL_RAD = 5e-4
 
 
 @dataclass(frozen=True, slots=True)
-class Note:
+class FeedNote:
     """An event, or an answer to a request."""
 
     t_host_ns: int | None
@@ -82,14 +82,14 @@ class Feed(Sink):
         self.recorded: list[Path] = []
         self.sinks: list[Sink] = [self]
         """What takes the stream; others may be added and removed between two reads."""
-        self._readers: list[tuple[deque[Block], deque[Note]]] = []
+        self._readers: list[tuple[deque[Block], deque[FeedNote]]] = []
         self._recorder = recorder
         self._recording: Sink | None = None
         self._recording_since_ns = 0
         self._status_ns = 0
         self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
 
-    def subscribe(self) -> tuple[deque[Block], deque[Note]]:
+    def subscribe(self) -> tuple[deque[Block], deque[FeedNote]]:
         """Return what one more reader takes blocks and notes from; those from now on are in it."""
         self._readers.append((deque(maxlen=_MOST_BLOCKS), deque(maxlen=_MOST_NOTES)))
         return self._readers[-1]
@@ -100,7 +100,7 @@ class Feed(Sink):
 
     def note(self, text: str, kind: str = "") -> None:
         """Add a line to the events."""
-        self._add_note(Note(self.newest_ns, text, kind))
+        self._add_note(FeedNote(self.newest_ns, text, kind))
 
     def turns(self, patience_s: float = math.inf, until: Callable[[], object] | None = None) -> Iterator[Block | None]:
         """Read as `pump` does, and do what was requested between two reads."""
@@ -132,9 +132,9 @@ class Feed(Sink):
             # the screen has a place for what is tracked
             if event.kind != "tracked":
                 text = f'mark "{event.text}"' if event.kind == "mark" else event.text
-                self._add_note(Note(event.t_host_ns, text, event.kind))
+                self._add_note(FeedNote(event.t_host_ns, text, event.kind))
 
-    def _add_note(self, note: Note) -> None:
+    def _add_note(self, note: FeedNote) -> None:
         for _, notes in self._readers:
             notes.append(note)
 

@@ -107,7 +107,7 @@ class _State(NamedTuple):
     R_base_flange: Array
 
 
-class _Fit(NamedTuple):
+class _WindowFit(NamedTuple):
     """A window of a run, and the state and the centre of mass of the part after it."""
 
     window: Window
@@ -156,8 +156,8 @@ class FreeToolFilter:
         # The state before an interruption, and its part.
         self._held, self._before = self._state, (np.zeros(4), _EMPTY)
         # The last windows of an interruption that agree.
-        self._run: list[_Fit] = []
-        self._drift_N_h = np.maximum(_TRUSTED_N, _sizes(drift_per_h))
+        self._run: list[_WindowFit] = []
+        self._drift_N_h = np.maximum(_TRUSTED_N, _force_sizes(drift_per_h))
         self._known_walk_N = _USUAL_WALK_N
         # The bias that no slow contact has changed, and the sigma of the estimate that it was taken from.
         self._trusted, self._trusted_sigma = np.zeros(6), np.zeros(6)
@@ -179,7 +179,7 @@ class FreeToolFilter:
         t_s = self._t_s if self._open_s is None else min(self._t_s, self._open_s + _CONTACT_S)
         x, P, *_ = self._ahead(self._mixed(self._state), t_s, R_base_flange, systematic)
         off = x[_BIAS] - self._trusted
-        kept = np.minimum(1.0, self._doubtful(np.diag(P)[_BIAS]) / np.maximum(_sizes(off), 1e-12))
+        kept = np.minimum(1.0, self._doubtful(np.diag(P)[_BIAS]) / np.maximum(_force_sizes(off), 1e-12))
         offset = _FREE @ x - (1 - np.repeat(kept, 3)) * off - self._subtracted
         return offset, _FREE @ P @ _FREE.T
 
@@ -291,28 +291,30 @@ class FreeToolFilter:
         return self._ahead(state, window.t_s, window.R_base_flange, window.systematic)
 
     def _doubtful(self, variance: Array) -> Array:
-        """Return how far (2,) a bias may be from the trusted one, as `_sizes`."""
-        return np.maximum(_DOUBTFUL_N * max(self._known_walk_N, 1.0), _DOUBTFUL_SIGMAS * _sizes(np.sqrt(variance)))
+        """Return how far (2,) a bias may be from the trusted one, as `_force_sizes`."""
+        return np.maximum(
+            _DOUBTFUL_N * max(self._known_walk_N, 1.0), _DOUBTFUL_SIGMAS * _force_sizes(np.sqrt(variance))
+        )
 
     def _trust(self, bias: Array, variance: Array, dt_s: float) -> tuple[Array, list[StreamEvent]]:
         """Let the trusted bias follow by no more than drift and a better estimate; return variance (6,), events."""
         sigma, limit = np.sqrt(variance), self._doubtful(variance)
         off = bias - self._trusted
-        if self._is_doubtful and (_sizes(off) < limit / 2).all():
+        if self._is_doubtful and (_force_sizes(off) < limit / 2).all():
             # the end of a slow contact, which has moved the trusted bias by no more
             self._is_doubtful, self._trusted_sigma = False, _DOUBTFUL_N * _UNIT
         if not self._is_doubtful:
             seen = np.minimum(self._trusted_sigma, sigma)
             most = self._drift_N_h * max(self._known_walk_N, 1.0) * dt_s / 3600
-            most = most + 3 * _sizes(self._trusted_sigma - seen)
+            most = most + 3 * _force_sizes(self._trusted_sigma - seen)
             self._trusted_sigma = seen
             # One contact moves all axes.
-            self._trusted = self._trusted + off / max(1.0, float((_sizes(off) / np.maximum(most, 1e-12)).max()))
+            self._trusted = self._trusted + off / max(1.0, float((_force_sizes(off) / np.maximum(most, 1e-12)).max()))
             off = bias - self._trusted
             walk_N = float(self._weights @ self._walks_N)
             self._known_walk_N += (walk_N - self._known_walk_N) * -np.expm1(-dt_s / _WALK_KNOWN_S)
         beyond = np.maximum(np.abs(off) - sigma, 0.0)
-        if self._is_doubtful or (_sizes(off) < limit).all():
+        if self._is_doubtful or (_force_sizes(off) < limit).all():
             return variance + beyond**2, []
         self._is_doubtful = True
         force_N, torque_Nm = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
@@ -391,7 +393,9 @@ class FreeToolFilter:
         state = self._decided(fits[-1].state) if fits else None
         return [] if state is None else self._end(state, [fit.window for fit in run[-_GUARD:]])
 
-    def _extended(self, run: list[_Fit], windows: Sequence[Window], place: Array | None = None) -> list[_Fit] | None:
+    def _extended(
+        self, run: list[_WindowFit], windows: Sequence[Window], place: Array | None = None
+    ) -> list[_WindowFit] | None:
         """Return a run with more windows, or None if one does not agree with those before."""
         run, state = list(run), self._state
         for window in windows:
@@ -402,7 +406,7 @@ class FreeToolFilter:
             if distance >= _GATE:
                 return None
             state, _ = _corrected(state, window.residual, C * _less(distance), H)
-            run.append(_Fit(window, state, _place(self._mixed(state)) if run else place))
+            run.append(_WindowFit(window, state, _place(self._mixed(state)) if run else place))
         return run
 
     def _decided(self, state: _State) -> _State | None:
@@ -423,7 +427,7 @@ class FreeToolFilter:
         # a slow contact has ended, so far from the trusted bias as it had moved that
         if (
             self._is_doubtful
-            and (_sizes(mean[_BIAS] - self._trusted) < 2 * self._doubtful(np.diag(covariance)[_BIAS])).all()
+            and (_force_sizes(mean[_BIAS] - self._trusted) < 2 * self._doubtful(np.diag(covariance)[_BIAS])).all()
         ):
             self._trusted, self._is_doubtful = mean[_BIAS], False
         change_kg = float(mean[_PART][0] - self._before[0][0])
@@ -471,7 +475,7 @@ class FreeToolFilter:
         return float(left @ np.linalg.solve(H @ state.P @ H.T + C, left)), H, C
 
 
-def _sizes(wrench: Array) -> Array:
+def _force_sizes(wrench: Array) -> Array:
     """Return the sizes (2,) of force, and of torque as that of a usual sensor, N."""
     return np.asarray(np.sqrt(np.square(wrench / _UNIT).reshape(2, 3).sum(axis=1)))
 

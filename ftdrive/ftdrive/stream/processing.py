@@ -38,7 +38,7 @@ from ftdrive.stream.samples import (
 )
 from ftdrive.stream.stages import (
     TARE_S,
-    Frame,
+    FrameChange,
     FreeTool,
     Neighbours,
     Passing,
@@ -74,7 +74,7 @@ class ToolMonitor:
         info: StreamInfo,
         temperature: BiasTemperature | None,
         noise: NoiseEstimator,
-        frame: Frame,
+        frame: FrameChange,
         note: Callable[..., StreamEvent],
         lock: AbstractContextManager[object],
     ) -> None:
@@ -240,7 +240,7 @@ class ToolMonitor:
         """End an open contact."""
         self._take(self._tracker.end())
 
-    def turn_to(self, frame: Frame) -> None:
+    def turn_to(self, frame: FrameChange) -> None:
         """Give contacts in another frame from now on."""
         self.end_contact()
         self._frame = frame
@@ -289,8 +289,8 @@ class Processor:
         self._newest_seq: int | None = None
 
     @property
-    def _turn(self) -> Frame:
-        return next(stage for stage in self.stages if isinstance(stage, Frame))
+    def _turn(self) -> FrameChange:
+        return next(stage for stage in self.stages if isinstance(stage, FrameChange))
 
     # ------------------------------------------------------------------------------------------------ what is settable
 
@@ -303,11 +303,11 @@ class Processor:
     def frame(self, frame: WrenchFrame) -> None:
         if frame == self._frame or self._monitor is None:
             return
-        turn = Frame(frame, self.info)
+        turn = FrameChange(frame, self.info)
         with self._lock:
             self._monitor.turn_to(turn)
             self._frame = frame
-            self.stages = tuple(turn if isinstance(stage, Frame) else stage for stage in self.stages)
+            self.stages = tuple(turn if isinstance(stage, FrameChange) else stage for stage in self.stages)
             self.note("frame", str(frame), frame.to_dict())
 
     @property

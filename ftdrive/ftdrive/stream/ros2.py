@@ -48,23 +48,27 @@ class Schema(NamedTuple):
     text: str
 
 
-def _schema(name: str, fields: str, *used: str) -> Schema:
+def _message_schema(name: str, fields: str, *used: str) -> Schema:
     return Schema(name, f"\n{'=' * 80}\nMSG: ".join((fields, *used, _HEADER, _TIME)))
 
 
-_WRENCH_STAMPED = _schema("geometry_msgs/msg/WrenchStamped", "std_msgs/Header header\nWrench wrench", _WRENCH, _VECTOR)
+_WRENCH_STAMPED = _message_schema(
+    "geometry_msgs/msg/WrenchStamped", "std_msgs/Header header\nWrench wrench", _WRENCH, _VECTOR
+)
 
 SCHEMAS = {
     RAW: _WRENCH_STAMPED,
     COMPENSATED: _WRENCH_STAMPED,
-    POSE: _schema("geometry_msgs/msg/PoseStamped", "std_msgs/Header header\nPose pose", _POSE, _POINT, _QUATERNION),
-    JOINTS: _schema(
+    POSE: _message_schema(
+        "geometry_msgs/msg/PoseStamped", "std_msgs/Header header\nPose pose", _POSE, _POINT, _QUATERNION
+    ),
+    JOINTS: _message_schema(
         "sensor_msgs/msg/JointState",
         "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort",
     ),
 }
 """The schema of each topic."""
-TRANSFORMS_SCHEMA = _schema(
+TRANSFORMS_SCHEMA = _message_schema(
     "tf2_msgs/msg/TFMessage",
     "geometry_msgs/TransformStamped[] transforms",
     "geometry_msgs/TransformStamped\nstd_msgs/Header header\nstring child_frame_id\nTransform transform",
@@ -76,17 +80,17 @@ TRANSFORMS_SCHEMA = _schema(
 
 def pack_wrenches(t_utc_ns: NDArray[np.int64], wrench: Array, frame: str) -> Messages:
     """Pack (n, 6) wrenches, N and N·m, as WrenchStamped."""
-    return _pack(ENCODING, _stamps(t_utc_ns), _strings(frame), wrench)
+    return _pack(ENCODING, _stamps(t_utc_ns), _pack_strings(frame), wrench)
 
 
 def pack_poses(t_utc_ns: NDArray[np.int64], p_base_flange_m: Array, quaternion: Array) -> Messages:
     """Pack poses of the flange in base, (n, 3) and x, y, z, w (n, 4), as PoseStamped."""
-    return _pack(ENCODING, _stamps(t_utc_ns), _strings("base"), p_base_flange_m, quaternion)
+    return _pack(ENCODING, _stamps(t_utc_ns), _pack_strings("base"), p_base_flange_m, quaternion)
 
 
 def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> Messages:
     """Pack (n, 6) joint angles as JointState without velocity and effort."""
-    names = _strings("", len(JOINT_NAMES), *JOINT_NAMES, q_rad.shape[1])
+    names = _pack_strings("", len(JOINT_NAMES), *JOINT_NAMES, q_rad.shape[1])
     return _pack(ENCODING, _stamps(t_utc_ns), names, q_rad, struct.pack("<II", 0, 0))
 
 
@@ -104,7 +108,7 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[Transform]
     parts: list[bytes | NDArray[Any]] = []
     for parent, child, p_m, R in transforms:
         # the count stands before the first
-        names = _strings(parent, child, start=0 if parts else 4)
+        names = _pack_strings(parent, child, start=0 if parts else 4)
         parts += [_stamps(t_utc_ns), names, np.atleast_2d(p_m), quaternions(R.reshape(-1, 3, 3))]
     return _pack(ENCODING + struct.pack("<I", len(transforms)), *parts)
 
@@ -115,7 +119,7 @@ def _stamps(t_utc_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.asarray(seconds + (ns << 32))
 
 
-def _strings(*fields: str | int, start: int = 0) -> bytes:
+def _pack_strings(*fields: str | int, start: int = 0) -> bytes:
     """Pack strings and counts (uint32), each aligned to 4 bytes; what follows is aligned to 8 from `start` before."""
     packed = b""
     for item in fields:

@@ -58,7 +58,7 @@ class Read(NamedTuple):
     """One sigma of the delay of the wrench after the pose."""
 
 
-class Source(ABC):
+class SampleSource(ABC):
     """Gives paired samples to one stream.
 
     Attributes
@@ -102,7 +102,7 @@ class Source(ABC):
         return ()
 
 
-class CellSource(Source):
+class CellSource(SampleSource):
     """The sensor of a cell, paired with the poses of its arm; without a calibration the sensor alone. It moves nothing.
 
     Parameters
@@ -388,7 +388,7 @@ class CellSource(Source):
             self.note(StreamEvent(self.clock.now_ns(), "recovered", text, {"silent_s": silent_s}))
 
 
-class RecordingSource(Source):
+class RecordingSource(SampleSource):
     """Paired rows of a recording in place of a cell, at `speed` times its own; infinity is as fast as they are read.
 
     While it is paused and at its end, `read` returns no rows. The clock is that of the one who watches.

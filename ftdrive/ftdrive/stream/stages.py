@@ -194,7 +194,7 @@ class _Filter(Stage):
         return np.asarray(filtered)
 
 
-class Frame(Stage):
+class FrameChange(Stage):
     """Turn the wrench to the axes and the point of a frame; needs what `FrameTransform` needs."""
 
     def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
@@ -235,7 +235,7 @@ class _Deadband(Stage):
         return np.asarray((vectors * left).reshape(-1, 6))
 
 
-STAGES: tuple[type[Stage], ...] = (_FreeToolAtRest, _InertialWrench, _Decoder, _Filter, Frame, _Deadband)
+STAGES: tuple[type[Stage], ...] = (_FreeToolAtRest, _InertialWrench, _Decoder, _Filter, FrameChange, _Deadband)
 """All, in their order."""
 
 

@@ -20,7 +20,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.stream.contact import Contact
 from ftdrive.stream.processing import SENSOR_FRAME, Processor
 from ftdrive.stream.samples import Block, Sample, Stages, StreamEvent, StreamInfo, StreamStatus, Tracking, WrenchFrame
-from ftdrive.stream.sources import STALE_S, CellSource, Source
+from ftdrive.stream.sources import STALE_S, CellSource, SampleSource
 from ftdrive.stream.stages import stages_in_words
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
@@ -62,7 +62,7 @@ class Stream(Displayed):
 
     def __init__(
         self,
-        source: Source,
+        source: SampleSource,
         *,
         frame: WrenchFrame = SENSOR_FRAME,
         stages: Stages | None = None,

@@ -410,7 +410,7 @@ class Weighing(Sink):
                 self._scale = Scale(self.stream)
         self._last = weight
         values = load_values(weight, self.stream.info) | {"count": shown.count}
-        self.stream.processor.note("load", line_of(shown), values)
+        self.stream.processor.note("load", format_scale(shown), values)
         self._keep(values)
         return True
 
@@ -423,7 +423,7 @@ class Weighing(Sink):
         return CannotWeigh(code, shown.weight)
 
 
-def line_of(shown: ScaleState) -> str:
+def format_scale(shown: ScaleState) -> str:
     """Return a state as one line."""
     if shown.stale:
         return f"stale: {shown.stale}"

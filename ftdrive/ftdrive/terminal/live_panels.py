@@ -11,7 +11,7 @@ from rich.live import Live
 
 from ftdrive.checks.check import Check, who
 from ftdrive.checks.sensor import AXES, check_rate
-from ftdrive.stream.feed import Note
+from ftdrive.stream.feed import FeedNote
 from ftdrive.stream.samples import LinkStatus
 from ftdrive.stream.stages import words_of
 from ftdrive.terminal.console import answer
@@ -50,11 +50,11 @@ def head(view: View, width: int, page: Line | None = None) -> list[Line]:
         calibration.add(text, _TONES.get(tone, ""))
     for text in words.bias_in_words(view):
         calibration.add(f"  {text}")
-    return [_title(view, width), _provenance(view, width), calibration, rule]
+    return [_live_title(view, width), _provenance(view, width), calibration, rule]
 
 
-def _title(view: View, width: int) -> Line:
-    line = Line(" ftdrive live", STRONG).add(f"  {words.devices(view.info)}")
+def _live_title(view: View, width: int) -> Line:
+    line = Line(" ftdrive live", STRONG).add(f"  {words.name_devices(view.info)}")
     right = Line()
     for mark in view.info.marks:
         right.add(f" {mark} ", WARNING)
@@ -96,7 +96,7 @@ def _provenance(view: View, width: int) -> Line:
 # --------------------------------------------------------------------------------------------------------- table
 
 
-def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
+def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
     """List each component with sigma, extremes, a bar and, if there is room, a trace."""
     trace_cells = width - _NUMBERS - 23 - 4 if with_trace else 0
     if trace_cells < 8:
@@ -109,15 +109,15 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
         full = words.full_scale(columns, reading, first)
         head = Line("        now     ± σ   -peak   +peak ", FAINT) if first == 0 else _at_rest(view)
         head.to(_NUMBERS)
-        head.join(_scale(full, unit, bar_cells))
+        head.join(_scale_line(full, unit, bar_cells))
         if trace_cells and first == 0:
             head.to(_NUMBERS + bar_cells + 4).add(columns.span, FAINT)
         lines.append(head)
         for i in range(first, first + 3):
             low, high = view.peaks.low[i], view.peaks.high[i]
             peaks = "" if low > high else "".join(f"{_fixed(peak, places - 1, 7):>8}" for peak in (low, high))
-            now = ("", "") if reading is None else component(reading, i)
-            line = _row(view, f" {AXES[i]} ", now, peaks)
+            now = ("", "") if reading is None else format_component(reading, i)
+            line = _component_row(view, f" {AXES[i]} ", now, peaks)
             if bar_cells:
                 line.to(_NUMBERS).join(_bar(view, i, full, bar_cells))
             if trace_cells:
@@ -126,13 +126,13 @@ def table(view: View, width: int, *, with_trace: bool) -> list[Line]:
         size, along = (0.0, 0.0) if reading is None else reading.size(first)
         peak = "" if reading is None else f"{view.peaks.sizes[first // 3]:16.{places - 1}f}"
         now = f"{size:.{places}f}", _digits(along, places)
-        line = _row(view, "|T| " if first else "|F| ", now, peak).to(_NUMBERS)
-        beside = _contact(view) if first == 0 else Line(words.line_of_force(reading))
+        line = _component_row(view, "|T| " if first else "|F| ", now, peak).to(_NUMBERS)
+        beside = _contact_line(view) if first == 0 else Line(words.line_of_force(reading))
         lines.append(line.join(beside))
     return lines
 
 
-def component(reading: ShownWrench, i: int) -> tuple[str, str]:
+def format_component(reading: ShownWrench, i: int) -> tuple[str, str]:
     """Return the value of a component and its sigma, which have the same decimals."""
     places = _decimals(reading, i // 3 * 3)
     return _fixed(reading.wrench[i], places, 8), _digits(reading.sigma[i], places)
@@ -144,7 +144,7 @@ def _decimals(reading: ShownWrench | None, first: int) -> int:
     return usual if reading is None or not reading.rest_sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
-def _row(view: View, name: str, now: tuple[str, str], peaks: str) -> Line:
+def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> Line:
     """Show a name, the present value with its sigma, and the extremes; an old value is not shown as live."""
     line = Line(name, STRONG)
     if view.live is None:
@@ -173,7 +173,7 @@ def _fixed(value: float, places: int, width: int) -> str:
     return f"{value:+z.{places}f}"
 
 
-def _scale(full: float, unit: str, cells: int) -> Line:
+def _scale_line(full: float, unit: str, cells: int) -> Line:
     if not cells:
         return Line(unit, FAINT)
     left, right, half = f"-{full:g}", f"+{full:g} {unit}", cells // 2
@@ -194,7 +194,7 @@ def _bar(view: View, i: int, full: float, cells: int) -> Line:
     return Line(rest, FAINT).add(filled[::-1], style).add("│" + "·" * half, FAINT)
 
 
-def _contact(view: View) -> Line:
+def _contact_line(view: View) -> Line:
     if view.live is None or view.info.is_raw:
         return Line()
     state, test = words.state(view)
@@ -210,17 +210,22 @@ def _contact(view: View) -> Line:
 def links(view: View) -> list[Line]:
     """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
     if view.info.is_raw:
-        return [_raw(view), _range(view), _link(view, "sensor", view.status.sensor)]
+        return [_raw(view), _range(view), _link_line(view, "sensor", view.status.sensor)]
     dial = [""] * 5
     if view.reading is not None:
-        dial = _arrow(view.reading.R_base_flange.T @ view.info.calibration.parameters.down)
-    rows = [_raw(view), _range(view), _link(view, "sensor", view.status.sensor), _link(view, "robot", view.status.arm)]
+        dial = _gravity_arrow(view.reading.R_base_flange.T @ view.info.calibration.parameters.down)
+    rows = [
+        _raw(view),
+        _range(view),
+        _link_line(view, "sensor", view.status.sensor),
+        _link_line(view, "robot", view.status.arm),
+    ]
     payload = next((check for check in view.checks if check.name == "robot.payload"), None)
-    rows.append(Line(" payload   ", FAINT).join(_checked(payload) if payload else Line("not checked", FAINT)))
+    rows.append(Line(" payload   ", FAINT).join(_check_line(payload) if payload else Line("not checked", FAINT)))
     return [Line(left).to(12).join(right) for left, right in zip(dial, rows, strict=True)]
 
 
-def _arrow(down_flange: Array) -> list[str]:
+def _gravity_arrow(down_flange: Array) -> list[str]:
     angle_deg = float(np.degrees(np.arccos(np.clip(down_flange[2], -1, 1))))
     aside = float(np.hypot(down_flange[0], down_flange[1]))
     eighth = round(np.arctan2(down_flange[1], down_flange[0]) / (np.pi / 4)) % 8
@@ -246,7 +251,7 @@ def _range(view: View) -> Line:
     return line.add(f" {100 * share:.0f} % used", style).add(f", most by {axis}")
 
 
-def _link(view: View, name: str, link: LinkStatus) -> Line:
+def _link_line(view: View, name: str, link: LinkStatus) -> Line:
     rate, lost, age, delay = words.link_in_words(view, link)
     is_usual = check_rate(link.rate_Hz, link.nominal_rate_Hz).state == "ok"
     line = Line(f" {name:<10}", FAINT).add(rate, "" if is_usual else WARNING)
@@ -254,7 +259,7 @@ def _link(view: View, name: str, link: LinkStatus) -> Line:
     return line.add(f"  {delay}")
 
 
-def _checked(check: Check) -> Line:
+def _check_line(check: Check) -> Line:
     mark, style = _STATE[check.state]
     line = Line(f"{mark} ", style).add(check.found)
     return line.add(f": {check.fix}", STRONG) if check.fix and check.state != "ok" else line
@@ -333,7 +338,7 @@ def identity(view: View, width: int) -> list[Line]:
         # stands beside the links
         if check.name == "robot.payload" and check.state == "ok":
             continue
-        mark, *found = _checked(check).parts
+        mark, *found = _check_line(check).parts
         lines += _hanging(Line(f" {check.name.partition('.')[2]:<10}", FAINT).add(*mark), found, width)
     return lines
 
@@ -344,7 +349,7 @@ def events(view: View, width: int, rows: int) -> list[Line]:
     for note in view.notes:
         if len(lines) > rows:
             break
-        item = _event(view, note, width)
+        item = _event_lines(view, note, width)
         if rows <= 3 and lines and lines[-1].width + item[0].width + 3 <= width and len(item) == 1:
             lines[-1].add("   ").join(item[0])
         else:
@@ -354,10 +359,10 @@ def events(view: View, width: int, rows: int) -> list[Line]:
 
 def newest_rows(view: View, width: int) -> int:
     """Return how many lines the newest event takes."""
-    return next((len(_event(view, note, width)) for note in view.notes), 0)
+    return next((len(_event_lines(view, note, width)) for note in view.notes), 0)
 
 
-def _event(view: View, note: Note, width: int) -> list[Line]:
+def _event_lines(view: View, note: FeedNote, width: int) -> list[Line]:
     head = Line(" ")
     if note.t_host_ns is not None:
         head.add(f"{words.time_of_day(view.info, note.t_host_ns)} ", FAINT)
@@ -407,7 +412,7 @@ def show_table(views: Iterable[View]) -> None:
         for view in views:
             width = answer.width
             separator = Line("─" * width, FAINT)
-            lines = [*head(view, width), *table(view, width, with_trace=True), separator, *links(view)]
+            lines = [*head(view, width), *component_table(view, width, with_trace=True), separator, *links(view)]
             shown = Group(*(line.fit(width).as_text() for line in lines))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))

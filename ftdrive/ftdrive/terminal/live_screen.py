@@ -21,7 +21,7 @@ from ftdrive.terminal import live_panels
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, envelope, plot
-from ftdrive.words.stream import Summary, View, full_scale
+from ftdrive.words.stream import StreamSummary, View, full_scale
 
 _HELP = """\
  ftdrive live: the wrench on the tool, ten times a second
@@ -60,7 +60,7 @@ def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> Non
     if not info.is_raw:
         checks = [check_calibration(info.calibration, {"arm": info.arm, "sensor": info.sensor}), *checks]
         dataset = fitted_dataset(info.calibration, Path(info.calibration_name))
-    screen = LiveScreen(feed, Summary(feed, checks, dataset), address)
+    screen = LiveScreen(feed, StreamSummary(feed, checks, dataset), address)
     try:
         screen.run()
     finally:
@@ -73,13 +73,13 @@ def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> Non
 class LiveScreen(Canvas):
     """Draws what a `Feed` knows."""
 
-    def __init__(self, feed: Feed, summary: Summary, address: str = "") -> None:
+    def __init__(self, feed: Feed, summary: StreamSummary, address: str = "") -> None:
         super().__init__(address)
         self._feed, self._summary = feed, summary
 
     def draw(self, width: int, height: int) -> list[Line]:
         """Draw the present state."""
-        return frame(self._summary.view(), width, height, self.page())
+        return draw_live(self._summary.view(), width, height, self.page())
 
     def turns(self) -> Iterator[object]:
         """Read for the screen and the page."""
@@ -140,17 +140,17 @@ _GUTTER = 7
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
-def frame(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
+def draw_live(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
     """Draw the screen as `height` lines of `width` cells, with the address of a page in the browser."""
     head = live_panels.head(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
-    body = _wide(view, width, rows) if width >= _WIDE else _narrow(view, width, rows)
+    body = _wide(view, width, rows) if width >= _WIDE else _narrow_layout(view, width, rows)
     return [line.fit(width) for line in [*head, *body, *[Line()] * (rows - len(body)), foot][:height]]
 
 
-def _narrow(view: View, width: int, rows: int) -> list[Line]:
-    body = live_panels.table(view, width, with_trace=True)
+def _narrow_layout(view: View, width: int, rows: int) -> list[Line]:
+    body = live_panels.component_table(view, width, with_trace=True)
     separator = Line("─" * width, FAINT)
     if rows - len(body) >= 3 * _LEAST_PLOT_ROWS + 10:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
@@ -169,7 +169,7 @@ def _narrow(view: View, width: int, rows: int) -> list[Line]:
 
 def _wide(view: View, width: int, rows: int) -> list[Line]:
     separator = Line("─" * _LEFT, FAINT)
-    left = [*live_panels.table(view, _LEFT, with_trace=False), separator, *live_panels.links(view), separator]
+    left = [*live_panels.component_table(view, _LEFT, with_trace=False), separator, *live_panels.links(view), separator]
     for extra in (live_panels.others(view), live_panels.sphere(view), live_panels.identity(view, _LEFT)):
         if extra and rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
             left += [*extra, separator]
@@ -189,7 +189,7 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
         return []
     columns = view.columns(2 * cells)
     full = [full_scale(columns, view.reading, first) for first in (0, 3)]
-    drawn = [_plot(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
+    drawn = [_plot_lines(view, columns, i, full[i // 3], each, with_value=across == 1) for i in range(6)]
     below = 6 // across
     beside = [parts for first in range(below) for parts in zip(*drawn[first::below], strict=True)]
     axis, half, lines = Line(" " * _GUTTER).add(f"-{columns.span}", FAINT), f"-{columns.span_s / 2:.0f}", []
@@ -202,7 +202,7 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
     return lines
 
 
-def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
+def _plot_lines(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
     """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
 
     The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.
@@ -210,7 +210,7 @@ def _plot(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, w
     reading, unit = view.reading, "N" if i < 3 else "N·m"
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)
     if with_value and view.live is not None:
-        head.add(f"{' ± '.join(live_panels.component(view.live, i))} {unit} ")
+        head.add(f"{' ± '.join(live_panels.format_component(view.live, i))} {unit} ")
     contact, marks = columns.contact_cells, [column // 2 for column in columns.marks]
     cells, start = len(contact), head.width - _GUTTER
     text, styles = np.where(contact, "━", "─"), np.where(contact, CONTACT, FAINT)

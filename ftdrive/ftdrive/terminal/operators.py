@@ -53,7 +53,7 @@ def not_an_answer(question: Question, typed: str) -> str:
     return f"'{word}' is no answer here: type {full[0] + ' in full' if len(full) == 1 else choice}."
 
 
-def read_line(supervisor: Supervisor, question: Question) -> str:
+def read_answer(supervisor: Supervisor, question: Question) -> str:
     """Read one line; raises as `Supervisor.read_line`."""
     return supervisor.read_line(
         f"no answer to '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
@@ -104,7 +104,7 @@ class JsonOperator(_Keyless):
                     "error": error,
                 }
             )
-            typed = read_line(self.supervisor, question)
+            typed = read_answer(self.supervisor, question)
             if (answer := match(question, typed)) is not None:
                 return answer
             error = not_an_answer(question, typed)
@@ -158,7 +158,7 @@ class PlainOperator(_Keyless):
         while True:
             self._write(prompt(question))
             try:
-                typed = read_line(self.supervisor, question)
+                typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
                 # the next message begins on a new line
                 self._write("\n")

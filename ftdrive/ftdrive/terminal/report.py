@@ -55,7 +55,7 @@ def print_result(
     amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
     printed = " as published" if result.provenance.get("as_published") else ""
     answer.print(Text.assemble(("Result", "bold cyan"), f"  {amount}, method {result.method}{printed}"))
-    answer.print(_table(result, truth, every=every))
+    answer.print(_result_table(result, truth, every=every))
     first, *lines = conclusion(result, drift=drift, records=records, hinted=hinted, every=every)
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
     answer.print(hanging(head, first.words, answer))
@@ -67,7 +67,7 @@ def print_result(
         answer.print(f" Saved {saved}")
 
 
-def _table(result: CalibrationResult, truth: Mapping[str, Any] | None, *, every: bool) -> Table:
+def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *, every: bool) -> Table:
     data = result.to_dict()
     errors = {} if truth is None else errors_in_sigma(result, truth)
     table = Table(box=None, padding=(0, 1))
@@ -92,9 +92,9 @@ def _error_style(error_sigma: float) -> str:
 
 def print_comparison(compared: Sequence[MethodResult]) -> None:
     """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
-    table = _comparison(compared, vectors=True)
+    table = _comparison_table(compared, vectors=True)
     if answer.is_terminal and table.width is not None and table.width > answer.width:
-        table = _comparison(compared, vectors=False)
+        table = _comparison_table(compared, vectors=False)
     answer.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
@@ -137,7 +137,7 @@ def _to_digits(value: float) -> str:
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
 
 
-def _comparison(compared: Sequence[MethodResult], *, vectors: bool) -> Table:
+def _comparison_table(compared: Sequence[MethodResult], *, vectors: bool) -> Table:
     table = Table(box=None, padding=(0, 1))
     for title, shown in (
         *(("method", True), ("mass\nkg", True)),

@@ -30,7 +30,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_line
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_answer
 from ftdrive.terminal.supervisor import Supervisor
 from ftdrive.words.session import (
     ESTIMATES,
@@ -62,19 +62,21 @@ _NUMBER_WIDTH = 9
 _NARROWEST_BAR = 8
 
 
-def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
+def draw_session(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
     """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
 
     If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
-    blocks: list[tuple[int, list[Text]]] = [(0, [_title(view, now_s, width), *_state(view, now_s, width)])]
+    blocks: list[tuple[int, list[Text]]] = [
+        (0, [_session_title(view, now_s, width), *_state_lines(view, now_s, width)])
+    ]
     if view.folder or view.last is not None:
         drift = drift_so_far(view)
         blocks += [
             (3, _last(view)),
             (9, [_rule(width)]),
-            *_findings(view, width, with_cube=wide and height > 20),
+            *_finding_rows(view, width, with_cube=wide and height > 20),
             (5, [Text(f"drift  {drift.words}", drift.style)]),
         ]
     note = "" if view.note is None else in_words(view.note)
@@ -82,7 +84,7 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
         (1, _folded(view, note, width, "bold red" if isinstance(view.note, GuardTripped) else "yellow")),
         (9, [_rule(width)]),
         (0, _keys(view)),
-        (0, _kept(view, width)),
+        (0, _saved_lines(view, width)),
     ]
     while sum(len(lines) for _, lines in blocks) > height - 1 and max(number for number, _ in blocks) > 0:
         blocks.remove(max(blocks, key=lambda block: block[0]))
@@ -94,7 +96,7 @@ def frame(view: SessionView, now_s: float, *, width: int = 80, height: int = 24)
     return Group(*lines)
 
 
-def _title(view: SessionView, now_s: float, width: int) -> Text:
+def _session_title(view: SessionView, now_s: float, width: int) -> Text:
     kept, right = view.kept, progress_in_words(view, now_s)
     name = f"ftdrive {view.command}"
     room = width - len(name) - len(right)
@@ -107,7 +109,7 @@ def _title(view: SessionView, now_s: float, width: int) -> Text:
     )
 
 
-def _state(view: SessionView, now_s: float, width: int) -> list[Text]:
+def _state_lines(view: SessionView, now_s: float, width: int) -> list[Text]:
     where, state, words = state_in_words(view, now_s)
     stopped = view.now is not None and view.now.state in {State.STOP, State.HOLD}
     style = "" if view.now is None else "bold red" if stopped else "bold cyan"
@@ -131,9 +133,9 @@ def _last(view: SessionView) -> list[Text]:
     return [line, residual.append(" OUT OF LINE: press r to redo" if off else "")]
 
 
-def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+def _finding_rows(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     if view.command == "calibrate":
-        return [*_estimates(view, with_cube=with_cube), *_coverage(view, width)]
+        return [*_estimate_rows(view, with_cube=with_cube), *_coverage_rows(view, width)]
     lines = [Text("measured minus predicted, ± one sigma expected", "dim")]
     for event in view.compared.values():
         force, torque, sigmas = differences(event)
@@ -145,10 +147,10 @@ def _findings(view: SessionView, width: int, *, with_cube: bool) -> list[tuple[i
     return [(1, lines), (4, _folded(view, hint, width))]
 
 
-def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
+def _estimate_rows(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     rows = [Text(f"{'estimate':<13}{'':27}{'± 1 sigma':>12}", "dim")]
-    rows += [_estimate(fit, label, factor, name) for label, factor, name, _ in ESTIMATES]
+    rows += [_estimate_text(fit, label, factor, name) for label, factor, name, _ in ESTIMATES]
     newest = view.last.gravity_flange if view.last else None
     counts = (0,) * 6 if fit is None else fit.faces
     if with_cube:
@@ -164,7 +166,7 @@ def _estimates(view: SessionView, *, with_cube: bool) -> list[tuple[int, list[Te
     return [(7, rows[:1]), *each, (4, [Text(f"gravity along {seen}")])]
 
 
-def _estimate(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
+def _estimate_text(fit: Estimated | None, label: str, factor: float, name: str) -> Text:
     values, sigma = rounded_estimate(fit, factor, name)
     if not sigma:
         return Text(f"{label:<13}{'-':>9}")
@@ -193,7 +195,7 @@ def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
     ]
 
 
-def _coverage(view: SessionView, width: int) -> list[tuple[int, list[Text]]]:
+def _coverage_rows(view: SessionView, width: int) -> list[tuple[int, list[Text]]]:
     fit = view.estimated
     if fit is None:
         return [(1, [Text("coverage  nothing yet", "dim")])]
@@ -220,7 +222,7 @@ def _keys(view: SessionView) -> list[Text]:
     return [line]
 
 
-def _kept(view: SessionView, width: int) -> list[Text]:
+def _saved_lines(view: SessionView, width: int) -> list[Text]:
     if not view.folder:
         return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
     resume = as_typed(view.resume) or "starts again: a recording in motion is not continued"
@@ -345,7 +347,7 @@ class Screen:
                 self._console.print(line)
             self._console.print(last, end=" ", soft_wrap=True)
             try:
-                typed = read_line(self.supervisor, question)
+                typed = read_answer(self.supervisor, question)
             except (KeyboardInterrupt, Declined):
                 # the next message begins on a new line
                 self._console.file.write("\n")
@@ -363,7 +365,7 @@ class Screen:
         size = self._console.size
         with self._lock:
             self._view.waiting = () if self._keyboard is None else self._keyboard.waiting
-            return frame(self._view, self._clock(), width=size.width, height=size.height)
+            return draw_session(self._view, self._clock(), width=size.width, height=size.height)
 
 
 def _history(event: Event, view: SessionView) -> bool:

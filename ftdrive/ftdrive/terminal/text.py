@@ -152,10 +152,10 @@ def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[s
     texts = zip(row[:beside], widths, strict=False)
     folded = [wrap(text, width, break_long_words=False, break_on_hyphens=False) for text, width in texts]
     for parts in zip_longest(*folded, fillvalue=""):
-        yield _line(parts, widths)
+        yield _table_line(parts, widths)
     if row[beside:]:
-        yield " " * len(GAP) + _line(row[beside:], widths[beside:])
+        yield " " * len(GAP) + _table_line(row[beside:], widths[beside:])
 
 
-def _line(row: Sequence[str], widths: Sequence[int]) -> str:
+def _table_line(row: Sequence[str], widths: Sequence[int]) -> str:
     return unglued(GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip())

@@ -5,10 +5,10 @@ from itertools import takewhile
 from textwrap import wrap
 
 from ftcalib.rounding import counted, to_place_of
-from ftdrive.stream.weighing import Weighing, line_of
+from ftdrive.stream.weighing import Weighing, format_scale
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.lines import STRONG, Line
-from ftdrive.words.stream import devices
+from ftdrive.words.stream import name_devices
 from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
@@ -42,10 +42,10 @@ class WeighScreen(Canvas):
             zero, helps = zero_in_words(self._weighing)
             beside += [zero] if helps else []
         keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
-        title = "   ".join(["ftdrive weigh", devices(info), *info.marks])
+        title = "   ".join(["ftdrive weigh", name_devices(info), *info.marks])
         lines = [Line(f"  {title}"), self.page() or Line(), Line()]
         lines += [Line(f"  {row}", STRONG) for row in large(mass)]
-        for text in ("", "   ".join(beside), line_of(shown), self._weighing.note):
+        for text in ("", "   ".join(beside), format_scale(shown), self._weighing.note):
             lines += [Line(f"  {line}") for line in wrap(text, max(width - 4, 1)) or [""]]
         return [*lines, *[Line()] * (height - 1 - len(lines)), Line(f"  {keys}q quit")]
 

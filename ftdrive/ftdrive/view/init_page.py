@@ -19,7 +19,7 @@ from ftdrive.checks.discovery import places
 from ftdrive.errors import ConfigError
 from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for
 from ftdrive.view.page import Page
-from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, button, controls, lines, select, text_field
+from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, button, choice, controls, lines, text_field
 from ftdrive.view.scene import arm_parts, camera, label, legend, size_of, surroundings
 from ftdrivers.errors import DeviceError
 from ftdrivers.ur.kinematics import model_named
@@ -65,7 +65,7 @@ class _Field:
         """Return what is chosen, what is typed, and the removal of a row."""
         found, is_wall = [], self.key == WALLS
         if self.options:
-            found += [select(f"{self.name} choice", self.label + " at" * is_wall, self.choice, self.options)]
+            found += [choice(f"{self.name} choice", self.label + " at" * is_wall, self.choice, self.options)]
         if is_wall or self.choice in ("", "degrees"):
             words = "Distance" if is_wall else "Degrees" if self.options else self.label
             found += [text_field(self.name, words, self.typed)]

@@ -17,12 +17,12 @@ from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.stream.feed import SPANS_S, Feed
 from ftdrive.stream.samples import Axes, Point, StreamInfo, frames_in_flange
 from ftdrive.stream.stages import stages_in_words
-from ftdrive.stream.weighing import Weighing, line_of
+from ftdrive.stream.weighing import Weighing, format_scale
 from ftdrive.view import parts, scene
 from ftdrive.view.page import Page
 from ftdrive.view.parts import Part
 from ftdrive.words import stream as words
-from ftdrive.words.stream import ShownWrench, Summary, View
+from ftdrive.words.stream import ShownWrench, StreamSummary, View
 from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
@@ -59,7 +59,7 @@ class LivePage:
         self, page: Page, feed: Feed, checks: Sequence[Check], certifier: Certifier | None, *, controls: bool
     ) -> None:
         self._page, self._feed, self._tares = page, feed, controls
-        self._summary = Summary(feed, checks)
+        self._summary = StreamSummary(feed, checks)
         self._drawn, self._q_rad = 0, np.full(6, np.inf)
         self._arm = None if certifier is None else certifier.arm
         page.put(_still(certifier))
@@ -99,14 +99,14 @@ class LivePage:
             at, speeds = f"{replay.at_s:.1f} of {replay.duration_s:.1f} s", sorted({*_SPEEDS, replay.speed})
             found.append(parts.button("play", "Play" if replay.is_paused or replay.has_ended else "Pause"))
             found.append(parts.slider("seek", "Time", round(replay.at_s, 1), replay.duration_s, step=0.1, text=at))
-            found.append(parts.select("speed", "Speed", f"{replay.speed:g}", [f"{speed:g}" for speed in speeds]))
+            found.append(parts.choice("speed", "Speed", f"{replay.speed:g}", [f"{speed:g}" for speed in speeds]))
         shown: dict[str, Part | None] = {}
         if found:
             about = frame.about if isinstance(frame.about, str) else ""
-            axes = parts.select("axes", "Axes", frame.axes, get_args(Axes))
-            point = parts.select("about", "Torque about", about, get_args(Point))
+            axes = parts.choice("axes", "Axes", frame.axes, get_args(Axes))
+            point = parts.choice("about", "Torque about", about, get_args(Point))
             shown["controls/frame"] = parts.controls(axes, point, note=_FOR_ALL)
-        span = parts.select("span", "Plots of the last", f"{span_s} s", [f"{one} s" for one in SPANS_S], words=_PLOTS)
+        span = parts.choice("span", "Plots of the last", f"{span_s} s", [f"{one} s" for one in SPANS_S], words=_PLOTS)
         return {"controls": parts.controls(*found, span), **shown}
 
     def _scene(self, view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
@@ -153,7 +153,7 @@ def _in_base(reading: ShownWrench, info: StreamInfo, p_base_flange_m: Array) -> 
 def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
     """Return a silent device, contact, force and torque, what they are, and events."""
     what, (state, _), info = words.WAITING, words.state(view), view.info
-    rows = [parts.number(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
+    rows = [parts.reading(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
     if reading is not None:
         what = f"{words.meaning(view)}, {reading.frame}; stages: {stages_in_words(reading.stages)}"
         value = f"{state}, {view.contact_s:.1f} s" if state == words.CONTACT else state
@@ -166,7 +166,7 @@ def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
     ]
     return {
         "alert": parts.lines(view.silent, head="No live values", tone=parts.BAD) if view.silent else None,
-        "numbers": parts.numbers(*rows),
+        "numbers": parts.readings(*rows),
         "table": _devices(info),
         "table/what": parts.lines(what, tone=parts.QUIET),
         "events": parts.lines(*notes, head="Events, newest first") if notes else None,
@@ -175,7 +175,7 @@ def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
 
 def _devices(info: StreamInfo) -> Part:
     """Name arm, sensor and tool, and what every output says of the cell, such as that it is emulated."""
-    texts = " · ".join([words.devices(info), *info.marks])
+    texts = " · ".join([words.name_devices(info), *info.marks])
     return parts.lines(texts, tone=parts.WARN if info.marks else parts.QUIET)
 
 
@@ -184,13 +184,17 @@ def _size(view: View, reading: ShownWrench, first: int) -> Part:
     name += f" {str(reading.frame).partition(', ')[2]}" if first else f", {words.meaning(view)}"
     around = f"± {to_place_of(sigma, sigma)} (1 sigma)" if np.isfinite(sigma) else ""
     note = words.direction(reading, first) or _BLANK
-    return parts.number(name, to_place_of(size, sigma), unit, sigma=around, note=note, size=large)
+    return parts.reading(name, to_place_of(size, sigma), unit, sigma=around, note=note, size=large)
 
 
 def plots(view: View, reading: ShownWrench) -> Part:
     """Return a plot of each component, with its present value as heading."""
     past, found, full = view.columns(_COLUMNS), list[Part](), dict[str, float]()
-    low, high, sigma = parts.plain(past.low, 3), parts.plain(past.high, 3), np.nan_to_num(reading.sample_sigma)
+    low, high, sigma = (
+        parts.rounded_list(past.low, 3),
+        parts.rounded_list(past.high, 3),
+        np.nan_to_num(reading.sample_sigma),
+    )
     for i, (axis, unit) in enumerate(zip(AXES, ["N"] * 3 + ["N·m"] * 3, strict=True)):
         label = f"{axis} {to_place_of(reading.wrench[i], reading.sigma[i], '+z')}"
         full[unit] = words.full_scale(past, reading, i // 3 * 3)
@@ -217,7 +221,7 @@ class WeighPage:
             return
         weighing, shown = self._weighing, self._weighing.shown
         mass, (zero, helps) = (
-            parts.number("Mass in the gripper", NO_MASS, "", note=_BLANK, size="huge"),
+            parts.reading("Mass in the gripper", NO_MASS, "", note=_BLANK, size="huge"),
             zero_in_words(weighing),
         )
         if (weight := shown.measured) is not None:
@@ -225,13 +229,13 @@ class WeighPage:
             mass |= {"value": kg, "unit": "kg", "sigma": f"± {sigma} kg", "note": worth_of(weight)}
         rows = [mass]
         if weighing.part_kg is not None:
-            rows.append(parts.number("Parts", "-" if shown.count is None else str(shown.count), "", size="large"))
-        line = parts.lines(line_of(shown), tone=parts.BAD if shown.stale else parts.WARN if shown.refusal else "")
+            rows.append(parts.reading("Parts", "-" if shown.count is None else str(shown.count), "", size="large"))
+        line = parts.lines(format_scale(shown), tone=parts.BAD if shown.stale else parts.WARN if shown.refusal else "")
         self._page.put(
             {
                 "alert": line if shown.stale else None,
                 "state": _devices(weighing.stream.info),
-                "numbers": parts.numbers(*rows),
+                "numbers": parts.readings(*rows),
                 "table/line": None if shown.stale else line,
                 "table/zero": parts.lines(zero, weighing.note, tone=parts.WARN if helps else ""),
             }

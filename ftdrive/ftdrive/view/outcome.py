@@ -14,7 +14,7 @@ from ftdrive.runs.verification import Verified
 from ftdrive.session.events import Operator
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.view.page import Page
-from ftdrive.view.parts import BAD, GOOD, WARN, number
+from ftdrive.view.parts import BAD, GOOD, WARN, reading
 from ftdrive.view.session_page import SessionPage, conclude
 from ftdrive.words.result import conclusion, verification_in_lines
 from ftdrive.words.text import in_one_line
@@ -60,7 +60,7 @@ def conclude_calibration(page: Page | None, result: CalibrationResult, commands:
         if key in _SHOWN and not known.all():
             sigma = float((factor * sigmas).max())
             rounded = ", ".join(to_place_of(factor * value, sigma) for value in values)
-            figures.append(number(label, rounded, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)"))
+            figures.append(reading(label, rounded, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)"))
     lines = [f"{one.head}{one.words}".strip() for one in conclusion(result, hinted=False)]
     tone = {"good": GOOD, "usable": WARN, "rejected": BAD}[result.verdict]
     conclude(page, result.verdict.upper(), *lines, tone=tone, figures=figures, following=commands)
@@ -76,7 +76,7 @@ def conclude_verification(page: Page | None, verified: Verified, *following: str
         sigma = float(np.linalg.norm(found.predicted_sigma[sizes.argmax(), axes]))
         value = to_place_of(sizes.max(), sigma)
         figures.append(
-            number(f"largest difference, {name}", value, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)")
+            reading(f"largest difference, {name}", value, unit, sigma=f"± {to_place_of(sigma, sigma)} (1 sigma)")
         )
     head, tone = ("PASS", GOOD) if verified.passed else ("FAILED", BAD)
     lines = [f"{one.head}{one.words}".strip() for one in verification_in_lines(verified)]

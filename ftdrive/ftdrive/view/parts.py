@@ -21,19 +21,19 @@ def lines(*texts: str, head: str = "", tone: str = "") -> Part:
     return {"kind": "lines", "head": head, "lines": [text for text in texts if text], "tone": tone}
 
 
-def number(
+def reading(
     label: str, value: str, unit: str, *, sigma: str = "", note: str = "", size: str = "", tone: str = ""
 ) -> Part:
     """One measured value in `numbers`, of size `huge`, `large` or the usual one; `sigma` stands behind the value."""
     return {"label": label, "value": value, "unit": unit, "sigma": sigma, "note": note, "size": size, "tone": tone}
 
 
-def numbers(*rows: Part, head: str = "") -> Part:
+def readings(*rows: Part, head: str = "") -> Part:
     """Values that are read from afar, made by `number`."""
     return {"kind": "numbers", "head": head, "rows": list(rows)}
 
 
-def table(rows: Iterable[Sequence[str]], columns: Sequence[str] = (), head: str = "") -> Part:
+def text_table(rows: Iterable[Sequence[str]], columns: Sequence[str] = (), head: str = "") -> Part:
     """Rows of texts; a text with newlines has several lines."""
     return {"kind": "table", "head": head, "columns": list(columns), "rows": [list(row) for row in rows]}
 
@@ -64,12 +64,12 @@ def text_field(name: str, label: str, value: str, **more: Any) -> Part:
     return {"name": name, "type": "text", "label": label, "value": value, **more}
 
 
-def select(name: str, label: str, value: str, options: Iterable[str], **more: Any) -> Part:
+def choice(name: str, label: str, value: str, options: Iterable[str], **more: Any) -> Part:
     """One of some texts."""
     return {"name": name, "type": "select", "label": label, "value": value, "options": list(options), **more}
 
 
-def check(name: str, label: str, *, value: bool) -> Part:
+def check_box(name: str, label: str, *, value: bool) -> Part:
     """A check box."""
     return {"name": name, "type": "check", "label": label, "value": value}
 
@@ -79,7 +79,7 @@ def slider(name: str, label: str, value: float, most: float, *, step: float = 1.
     return {"name": name, "type": "range", "label": label, "value": value, "max": most, "step": step, "text": text}
 
 
-def plain(values: ArrayLike, digits: int = 5) -> Any:
+def rounded_list(values: ArrayLike, digits: int = 5) -> Any:
     """Return an array as nested lists with so many significant digits; what is not finite becomes None."""
     array = np.asarray(values, dtype=np.float64)
     with np.errstate(all="ignore"):

@@ -12,7 +12,7 @@ from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan
 from ftdrive.view import scene
 from ftdrive.view.page import Page
-from ftdrive.view.parts import Part, button, check, controls, lines, select, slider
+from ftdrive.view.parts import Part, button, check_box, choice, controls, lines, slider
 from ftdrivers.ur.kinematics import Array
 
 _FRAME_S: Final = 0.04
@@ -24,7 +24,7 @@ PLAN_LEGEND: Final = (
 """What `plan_parts` and an arm are."""
 
 
-class Timeline:
+class PlanTimeline:
     """A plan over time at its speeds, after the approach (k + 1, 6) to its first pose if there is one."""
 
     def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
@@ -58,7 +58,7 @@ class PlanPage:
     """Fills a page with a plan; `certifier` is that of the same arm, tool and scene."""
 
     def __init__(self, page: Page, plan: Plan, certifier: Certifier) -> None:
-        self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, Timeline(plan)
+        self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, PlanTimeline(plan)
         self._volumes = _swept(certifier, self._tour.q_rad)
         self._lock = threading.Lock()
         self._chosen: dict[str, Any] = {"along": 0.0, "play": False, "speed": "1 ×", "swept": False}
@@ -96,8 +96,8 @@ class PlanPage:
             button("next", "Next pose"),
             button("largest", "Largest move"),
             self._tour.slider(t_s),
-            select("speed", "Speed", chosen["speed"], _SPEEDS),
-            check("swept", "Room that the tool sweeps over", value=swept),
+            choice("speed", "Speed", chosen["speed"], _SPEEDS),
+            check_box("swept", "Room that the tool sweeps over", value=swept),
         )
         parts = {"scene/legend": scene.legend(*rows), "state": lines(*words, head=head), "controls": shown}
         volumes = self._volumes if swept else dict.fromkeys(self._volumes)
@@ -115,7 +115,7 @@ class PlanPage:
             self.draw()
 
 
-def plan_parts(certifier: Certifier, tour: Timeline) -> dict[str, Part | None]:
+def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | None]:
     """Return cell, free ball, the path of the tool's tip, and the camera."""
     arm, size_m, plan = certifier.arm, scene.size_of(certifier), tour.plan
     farthest = int(np.argmax([part.to_m for part in arm.tool]))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import Scene
-from ftdrive.view.parts import Part, plain
+from ftdrive.view.parts import Part, rounded_list
 from ftdrivers.ur.kinematics import Array
 
 # Names of colours; `shell/page.css` has them for light and dark.
@@ -22,8 +22,10 @@ def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, 
 
     `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), places and quaternions.
     """
-    shape = plain([half_length_m, radius_m, rounding_m])
-    return {"kind": "body", "shape": shape, "colour": colour} | {name: plain(value) for name, value in more.items()}
+    shape = rounded_list([half_length_m, radius_m, rounding_m])
+    return {"kind": "body", "shape": shape, "colour": colour} | {
+        name: rounded_list(value) for name, value in more.items()
+    }
 
 
 def ball(radius_m: float, colour: str, **more: Any) -> Part:
@@ -33,32 +35,34 @@ def ball(radius_m: float, colour: str, **more: Any) -> Part:
 
 def box(size_m: ArrayLike, colour: str, **more: Any) -> Part:
     """A box about its middle; `more` as for `body`."""
-    return {"kind": "box", "size": plain(size_m), "colour": colour} | {name: plain(one) for name, one in more.items()}
+    return {"kind": "box", "size": rounded_list(size_m), "colour": colour} | {
+        name: rounded_list(one) for name, one in more.items()
+    }
 
 
 def path(points_m: Array, colour: str) -> Part:
     """A line through points (n, 3)."""
-    return {"kind": "path", "points": plain(points_m), "colour": colour}
+    return {"kind": "path", "points": rounded_list(points_m), "colour": colour}
 
 
 def dots(points_m: ArrayLike, colours: Sequence[str], at: ArrayLike) -> Part:
     """Round dots at points (n, 3) from `at`, of one size on every screen."""
-    return {"kind": "dots", "points": plain(points_m), "colours": list(colours), "at": plain(at)}
+    return {"kind": "dots", "points": rounded_list(points_m), "colours": list(colours), "at": rounded_list(at)}
 
 
 def axes(length_m: float, at: ArrayLike = (0, 0, 0), turn: ArrayLike = (1, 0, 0, 0), *, named: bool = False) -> Part:
     """Axes x, y, z in red, green and blue, with their names."""
-    return {"kind": "axes", "length": length_m, "at": plain(at), "turn": plain(turn), "named": named}
+    return {"kind": "axes", "length": length_m, "at": rounded_list(at), "turn": rounded_list(turn), "named": named}
 
 
 def label(text: str, at: ArrayLike) -> Part:
     """A text at a point (3,), always in front."""
-    return {"kind": "label", "text": text, "at": plain(at)}
+    return {"kind": "label", "text": text, "at": rounded_list(at)}
 
 
 def camera(at_m: ArrayLike, from_m: ArrayLike) -> Part:
     """Where browsers look at first, and from where; (3,) each."""
-    return {"kind": "camera", "at": plain(at_m), "from": plain(from_m)}
+    return {"kind": "camera", "at": rounded_list(at_m), "from": rounded_list(from_m)}
 
 
 def legend(*rows: tuple[str, str, str]) -> Part:
@@ -96,8 +100,8 @@ def arm_parts(
         # The preset "along the tool" looks from the last body towards the flange.
         parts[f"scene/{name}/along"] = {
             "kind": "along",
-            "at": plain(bodies.centre_m[0, -1]),
-            "axis": plain(bodies.axis[0, -1]),
+            "at": rounded_list(bodies.centre_m[0, -1]),
+            "axis": rounded_list(bodies.axis[0, -1]),
         }
     return parts
 
@@ -129,7 +133,7 @@ def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: 
     parts: dict[str, Part | None] = dict.fromkeys(NO_WRENCH)
     for name, vector, m in (("force", wrench_base[:3], m_per_N), ("torque", wrench_base[3:], m_per_Nm)):
         if vector.any():
-            ends = plain([p_base_m, p_base_m + m * vector])
+            ends = rounded_list([p_base_m, p_base_m + m * vector])
             parts[f"scene/{name}"] = {"kind": "arrow", "ends": ends, "colour": name}
     force, torque = wrench_base[:3], wrench_base[3:]
     if squared := float(force @ force):

@@ -19,8 +19,8 @@ from ftdrive.session.events import Event, Key, Operator, Question, State
 from ftdrive.session.guards import Guard, RangeGuard, Seen
 from ftdrive.view import scene
 from ftdrive.view.page import HUNG_S, Page
-from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, bar, bars, controls, lines, numbers, table
-from ftdrive.view.plan_page import PLAN_LEGEND, Timeline, describe, plan_parts
+from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, bar, bars, controls, lines, readings, text_table
+from ftdrive.view.plan_page import PLAN_LEGEND, PlanTimeline, describe, plan_parts
 from ftdrive.words.session import (
     ESTIMATES,
     SessionView,
@@ -212,13 +212,13 @@ class SessionPage:
         if self._scene is None and self._plan is not None and self._cell is not None:
             self._scene = _Cell(self._plan, self._cell[0])
             self._page.put(self._scene.fixed)
-        parts = {"question": asked(question), **_state(view, note, self._stopped_by), **_results(view)}
+        parts = {"question": asked(question), **_state_panel(view, note, self._stopped_by), **_results(view)}
         if self._scene is not None:
             parts |= self._scene.parts(view.now, self._stop, seen, question, ended=ended)
         if seen is not None and self._cell is not None:
             parts |= self._forces(seen, self._cell[1])
         downs = [(pose.gravity_flange, residuals.get(stop)) for stop, (pose, _) in view.taken.items()]
-        parts |= _gravity(downs, None if self._scene is None else self._scene.sphere_m)
+        parts |= _gravity_sphere(downs, None if self._scene is None else self._scene.sphere_m)
         # Drawing that has hung may go on after the end.
         self._page.put(parts | (_ENDED if self._ended.is_set() else {}))
 
@@ -235,10 +235,10 @@ class SessionPage:
             rows.append(bar(axis, value, limit, words, tone=WARN if abs(value) > _NEAR * limit else ""))
         head = "Force and torque, since the start" if load.zero.any() else "Force and torque"
         speed_deg_s, age_ms = np.degrees(np.abs(seen.state.qd_rad_s).max()), 1e3 * self._onlooker.age_s
-        guards = table([("joint speed", f"{speed_deg_s:.0f} °/s"), ("age of the sample", f"{age_ms:.0f} ms")])
+        guards = text_table([("joint speed", f"{speed_deg_s:.0f} °/s"), ("age of the sample", f"{age_ms:.0f} ms")])
         if load.range is None:  # there is nothing to draw a bar to
             forces = [(row["label"], row["text"]) for row in rows]
-            return {"bars": table(forces, head=f"{head}; range not known"), "bars/guards": guards}
+            return {"bars": text_table(forces, head=f"{head}; range not known"), "bars/guards": guards}
         return {"bars": bars(*rows, head=head), "bars/guards": guards}
 
 
@@ -246,7 +246,7 @@ class _Cell:
     """The arm, its next pose as a ghost, and the plan, as parts of a page."""
 
     def __init__(self, planned: events.Planned, certifier: Certifier) -> None:
-        self._tour, self._arm = Timeline(planned.plan, planned.way_rad), certifier.arm
+        self._tour, self._arm = PlanTimeline(planned.plan, planned.way_rad), certifier.arm
         self._asked: Question | None = None
         self.chosen_s = 0.0
         """Place of the plan that is shown while a question waits."""
@@ -286,7 +286,7 @@ def asked(question: Question | None) -> Part | None:
     return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 
 
-def _state(view: SessionView, note: str, stopped_by: str) -> Parts:
+def _state_panel(view: SessionView, note: str, stopped_by: str) -> Parts:
     """Return state, progress and time left, as the terminal says them, the last note, and what has stopped the arm."""
     now, last, now_s = view.now, view.last, time.monotonic()
     where, state, words = state_in_words(view, now_s)
@@ -312,16 +312,16 @@ def _results(view: SessionView) -> Parts:
     if (fit := view.estimated) is not None:
         found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
         estimates = [(label, f"{', '.join(values)} ± {sigma}") for label, values, sigma in found if sigma]
-        parts["table/estimates"] = table(estimates, ("estimate", "± 1 sigma")) if estimates else None
+        parts["table/estimates"] = text_table(estimates, ("estimate", "± 1 sigma")) if estimates else None
         parts["table/words"] = lines(in_words(fit).strip())
     rows = []
     for one in view.compared.values():
         rows.append((f"R{one.number:02d}", *differences(one)))
         parts["table/words"] = lines(in_words(one).strip())
-    return parts | ({"table/compared": table(rows, ("", "N off", "N·m off", "sigmas"))} if rows else {})
+    return parts | ({"table/compared": text_table(rows, ("", "N off", "N·m off", "sigmas"))} if rows else {})
 
 
-def _gravity(downs: Sequence[tuple[Array, float | None]], above_m: Array | None) -> Parts:
+def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array | None) -> Parts:
     """Return the directions of gravity so far on a sphere, above the arm where there is one."""
     if not downs:
         return {}
@@ -345,7 +345,7 @@ def conclude(
     page.put(
         {
             "result": lines(head=head, tone=tone),
-            "result/figures": numbers(*figures) if figures else None,
+            "result/figures": readings(*figures) if figures else None,
             "result/words": lines(*map(as_typed, words)),
             "result/next": lines(*map(as_typed, following), head="Next") if following else None,
             **dict.fromkeys(("table/estimates", "table/words")),

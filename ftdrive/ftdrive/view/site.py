@@ -192,7 +192,7 @@ class Site(Gate):
 
 
 @contextmanager
-def serve(title: str, address: Address | None = None) -> Iterator[Page]:
+def serve_page(title: str, address: Address | None = None) -> Iterator[Page]:
     """Serve a page while the block runs. Raises `ConfigError` if the address is not usable or the extra `viz` missing.
 
     Without an address only this computer is served: at port 8080, or another one if that is taken.

@@ -73,12 +73,12 @@ def result_table(
     results: Iterable[StoredResult], last: Mapping[str, VerificationRecord], now: datetime
 ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
     """Return titles and rows, with the last verification of each result by its id."""
-    rows = [_row(one, last.get(one.id), now) for one in results]
+    rows = [_history_row(one, last.get(one.id), now) for one in results]
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     return [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows]
 
 
-def _row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> tuple[str, ...]:
+def _history_row(one: StoredResult, check: VerificationRecord | None, now: datetime) -> tuple[str, ...]:
     verified = "-"
     if check is not None:
         since = age_days(check.created_utc, now)

@@ -69,7 +69,7 @@ def error_in_words(result: CalibrationResult) -> str:
     for elsewhere, where in _ELSEWHERE:
         error = result.likely_error(where)
         if error[0] > _WORSE * likely[0]:
-            larger += "; {} {} N, {} N·m".format(elsewhere, *map(_in_brief, error))
+            larger += "; {} {} N, {} N·m".format(elsewhere, *map(_two_digits, error))
     return f"{words} ({kind}{larger})"
 
 
@@ -155,7 +155,7 @@ def _drift_lines(result: CalibrationResult, drift: DriftCheck | None, *, every: 
     return lines
 
 
-def _in_brief(value: float) -> str:
+def _two_digits(value: float) -> str:
     """Write two digits, without an exponent; a drift of one quantity alone is zero in the other but for rounding."""
     return "0" if value < _ROUNDING else to_place_of(value, value)
 
@@ -183,7 +183,7 @@ def drift_in_use(result: CalibrationResult) -> str | None:
     if result.mean_bias is None or not growth.size:
         return None
     off, grow = (
-        "{} N, {} N·m".format(*(_in_brief(float(np.linalg.norm(part))) for part in np.split(values, 2)))
+        "{} N, {} N·m".format(*(_two_digits(float(np.linalg.norm(part))) for part in np.split(values, 2)))
         for values in (result.parameters.bias - result.mean_bias, growth)
     )
     return f"the result has the bias of the last pose, {off} off the mean; it moves {grow} a minute"
@@ -254,7 +254,7 @@ def verification_in_lines(verified: Verified, *, every: bool = False) -> list[Te
 
 def _verdict_in_words(verified: Verified) -> str:
     """Describe the largest differences, and the limits that decide."""
-    words = f"largest difference {_in_brief(verified.force_N.max())} N, {_in_brief(verified.torque_Nm.max())} N·m"
+    words = f"largest difference {_two_digits(verified.force_N.max())} N, {_two_digits(verified.torque_Nm.max())} N·m"
     limits = zip(verified.limits, ("N", "N·m"), strict=True)
     if given := [f"{limit:g} {unit}" for limit, unit in limits if limit is not None]:
         return f"{words}; limit {', '.join(given)}"

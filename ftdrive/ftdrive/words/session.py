@@ -181,10 +181,10 @@ def _head_and_words(event: Event) -> tuple[str, str]:
         case Compared():
             return "  ", _comparison_in_words(event)
         case _:
-            return "", _sentence(event)
+            return "", _event_sentence(event)
 
 
-def _sentence(event: Event) -> str:
+def _event_sentence(event: Event) -> str:
     match event:
         case MotionRecorded():
             amount = f"{event.samples} samples of the sensor, {event.states} of the arm"
@@ -245,7 +245,7 @@ _LEVEL_DEG = 0.05
 
 def proposal_in_lines(push: Push) -> list[str]:
     """Return the controller's values beside the new ones, and what speaks for and against the change."""
-    lines = _table(push)
+    lines = _push_table(push)
     if (restored := push.reason.get("restores")) is not None:
         lines.append(f"The new values are the old ones of {restored}.")
     if push.load is not None and push.new.mass_kg is not None:
@@ -264,7 +264,7 @@ def proposal_in_lines(push: Push) -> list[str]:
     return lines
 
 
-def _table(push: Push) -> list[str]:
+def _push_table(push: Push) -> list[str]:
     values = {
         "mass, kg": (push.old.mass_kg, push.new.mass_kg, 1.0, 3),
         "centre, mm": (push.old.p_flange_com_m, push.new.p_flange_com_m, 1e3, 1),
@@ -273,8 +273,10 @@ def _table(push: Push) -> list[str]:
     rows = [("", "controller", "new", "change")]
     for name, (old, new, scale, digits) in values.items():
         if new is not None:
-            change = "" if old is None else _numbers(np.subtract(new, old) * scale, f"+.{digits}f")
-            rows.append((name, _numbers(old, f".{digits}f", scale), _numbers(new, f".{digits}f", scale), change))
+            change = "" if old is None else _format_vector(np.subtract(new, old) * scale, f"+.{digits}f")
+            rows.append(
+                (name, _format_vector(old, f".{digits}f", scale), _format_vector(new, f".{digits}f", scale), change)
+            )
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
@@ -295,8 +297,8 @@ def settings_in_words(settings: ControllerSettings | None) -> str:
     """Return what a controller reports."""
     if settings is None or settings.mass_kg is None:
         return "the controller does not report its payload: compare it at the pendant"
-    up = "" if settings.up_base_m_s2 is None else f", gravity {_numbers(settings.up_base_m_s2, '.3f')} m/s²"
-    return f"{settings.mass_kg:.3f} kg at {_numbers(settings.p_flange_com_m, '.1f', 1e3)} mm{up}"
+    up = "" if settings.up_base_m_s2 is None else f", gravity {_format_vector(settings.up_base_m_s2, '.3f')} m/s²"
+    return f"{settings.mass_kg:.3f} kg at {_format_vector(settings.p_flange_com_m, '.1f', 1e3)} mm{up}"
 
 
 def _lean(push: Push) -> str:
@@ -304,14 +306,14 @@ def _lean(push: Push) -> str:
     if up is None:
         return f"The base {push.lean}, compared with [workcell] mounting; the controller does not report its gravity."
     off_deg = np.degrees(np.arccos(np.clip(up[2] / np.linalg.norm(up), -1, 1)))
-    setting = "level" if off_deg < _LEVEL_DEG else f"{_numbers(up, '.3f')} m/s²"
+    setting = "level" if off_deg < _LEVEL_DEG else f"{_format_vector(up, '.3f')} m/s²"
     advice = (
         "" if push.lean is None or not push.lean.is_significant or push.new.up_base_m_s2 else "; --gravity sends it"
     )
     return f"The base {push.lean}; the controller is set to {setting}{advice}."
 
 
-def _numbers(value: ArrayLike | None, form: str, scale: float = 1.0) -> str:
+def _format_vector(value: ArrayLike | None, form: str, scale: float = 1.0) -> str:
     if value is None:
         return "not reported"
     numbers = [f"{one:{form}}" for one in scale * np.atleast_1d(value)]

@@ -1,4 +1,4 @@
-"""The state of a stream that its faces show, and its words: a `Summary` makes a `View` of what a `Feed` has read."""
+"""The state and the words of a stream that its faces show: a `StreamSummary` makes a `View` of a `Feed`."""
 
 import json
 from collections import deque
@@ -17,7 +17,7 @@ from ftdrive.checks.sensor import AXES
 from ftdrive.errors import ConfigError
 from ftdrive.runs.calibration import EMULATED
 from ftdrive.runs.verification import age_in_words
-from ftdrive.stream.feed import MEAN_S, SPANS_S, Feed, History, NoiseWatch, Note, PlotColumns
+from ftdrive.stream.feed import MEAN_S, SPANS_S, Feed, FeedNote, History, NoiseWatch, PlotColumns
 from ftdrive.stream.samples import Block, FrameTransform, LinkStatus, Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.stream.sources import STALE_S, RecordingSource
 from ftdrive.stream.stream import RECOVER_S
@@ -110,7 +110,7 @@ class View:
     peaks: Peaks
     contact_s: float
     """Duration of the present contact."""
-    notes: Sequence[Note]
+    notes: Sequence[FeedNote]
     """Newest first."""
     checks: Sequence[Check]
     columns: Callable[[int], PlotColumns]
@@ -188,7 +188,7 @@ class View:
         }
 
 
-class Summary:
+class StreamSummary:
     """Sums up what a `Feed` has read, with findings to show.
 
     `dataset` has the poses of the calibration, where they are known: the noise at rest is compared with theirs.
@@ -205,7 +205,7 @@ class Summary:
         self._recent: Block | None = None
         self._peaks = Peaks()
         self._contact_since_ns = 0
-        self._notes: deque[Note] = deque(maxlen=_MOST_NOTES)
+        self._notes: deque[FeedNote] = deque(maxlen=_MOST_NOTES)
         self._calibrated: Array | None = None
         if dataset is not None:
             feed.sinks.append(NoiseWatch(dataset, self._found.append))
@@ -222,7 +222,7 @@ class Summary:
             self._checks.append(check := self._found.popleft())
             if check.state in {"failed", "warning"}:
                 text = f"{check.found}. Fix: {check.fix}" if check.fix else check.found
-                self._notes.appendleft(Note(None, text, "warning"))
+                self._notes.appendleft(FeedNote(None, text, "warning"))
         while self._new_notes:
             note = self._new_notes.popleft()
             times = 1 + (self._notes.popleft().times if self._notes and self._notes[0].text == note.text else 0)
@@ -359,7 +359,7 @@ def meaning(view: View) -> str:
     return "bias included" if stages.gravity else "as measured"
 
 
-def devices(info: StreamInfo) -> str:
+def name_devices(info: StreamInfo) -> str:
     """Name arm, sensor and tool."""
     serial = "" if info.sensor.serial == NOT_REPORTED else f" {info.sensor.serial}"
     return " · ".join(filter(None, [info.arm.model, info.sensor.model + serial, info.tool]))
@@ -367,10 +367,10 @@ def devices(info: StreamInfo) -> str:
 
 def short_frame(frame: WrenchFrame) -> str:
     """Return axes and reference point, such as "base @ tcp"."""
-    return f"{frame.axes} @ {_point(frame)}"
+    return f"{frame.axes} @ {_point_name(frame)}"
 
 
-def _point(frame: WrenchFrame) -> str:
+def _point_name(frame: WrenchFrame) -> str:
     return (
         frame.about if isinstance(frame.about, str) else "({:g},{:g},{:g}) mm".format(*(1e3 * x for x in frame.about))
     )
@@ -393,9 +393,9 @@ def line_of_force(reading: ShownWrench | None) -> str:
     p_m = np.cross(force, torque) / float(force @ force)
     distance_m = float(np.linalg.norm(p_m))
     if distance_m < 5e-4:
-        return f"line of force passes through {_point(reading.frame)}"
+        return f"line of force passes through {_point_name(reading.frame)}"
     along = " ".join(axes_along(p_m / distance_m))
-    return f"line of force {1e3 * distance_m:.0f} mm from {_point(reading.frame)}, {along}"
+    return f"line of force {1e3 * distance_m:.0f} mm from {_point_name(reading.frame)}, {along}"
 
 
 def _utc(info: StreamInfo, t_host_ns: int) -> datetime:

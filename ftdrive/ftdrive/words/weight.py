@@ -1,4 +1,4 @@
-"""What screen and page of a scale say beside its line of words, `ftdrive.stream.weighing.line_of`."""
+"""What screen and page of a scale say beside its line of words, `ftdrive.stream.weighing.format_scale`."""
 
 from datetime import timedelta
 from math import isfinite

@@ -17,11 +17,11 @@ _OUTPUT = click.option("-o", "--output", type=NewFile(), help="Save as a new fil
 
 
 @click.group(cls=Group)
-def export() -> None:
+def export_group() -> None:
     """Write a plan or a calibration for another program. Files are never overwritten."""
 
 
-@export.result_callback()
+@export_group.result_callback()
 def _deliver(made: Made | None) -> None:
     """Save or print what a command has made."""
     if made is None:
@@ -36,7 +36,7 @@ def _deliver(made: Made | None) -> None:
         echo(text, nl=False, fold=False)
 
 
-@export.command()
+@export_group.command("plan")
 @click.argument("path", metavar="PLAN.json", required=False, type=FILE)
 @click.option(
     "--format",
@@ -51,13 +51,15 @@ def _deliver(made: Made | None) -> None:
 )
 @simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
 @JSON
-def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, simulate: bool, as_json: bool) -> Made:
+def export_plan(
+    path: Path | None, target: str, output: Path | None, dwell_s: float, simulate: bool, as_json: bool
+) -> Made:
     """Write a plan of `ftdrive plan --output` as a URScript program or as a table.
 
     The program asks before it moves, and stops unless the arm is near the first pose, because the approach is not
     planned. Unlike `ftdrive calibrate`, it has no guards.
     """
-    from ftdrive.exports.urscript import program, table
+    from ftdrive.exports.urscript import plan_table, program
     from ftdrive.planning.plan import Plan
     from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, plan_for
 
@@ -70,11 +72,11 @@ def plan(path: Path | None, target: str, output: Path | None, dwell_s: float, si
         with Station.of(None) as station:
             cell = station.cell
         made = plan_for(cell, certifier_for(cell, cell.robot.model), USUAL_POSTURE_RAD)
-    text = program(made, dwell_s=dwell_s) if target == "urscript" else table(made)
+    text = program(made, dwell_s=dwell_s) if target == "urscript" else plan_table(made)
     return text, output, {"format": target, "plan": made.sha256}, {}, as_json
 
 
-@export.command()
+@export_group.command()
 @click.option("--first", type=click.IntRange(24, 33), default=24, show_default=True, help="As `serve-load --first`.")
 @click.option("--example", is_flag=True, help="Append a program that weighs a part and sets the payload.")
 @_OUTPUT
@@ -91,7 +93,7 @@ def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_
     return functions(first, example=example), output, {}, {}, as_json
 
 
-@export.command()
+@export_group.command()
 @JSON
 def formats(as_json: bool) -> None:
     """List the formats of `ftdrive export calibration`."""
@@ -105,4 +107,4 @@ def formats(as_json: bool) -> None:
         answer.print(hanging(f"{name:{width}}  ", one.description, answer))
 
 
-export.add_command(calibration)
+export_group.add_command(calibration)

@@ -24,7 +24,7 @@ def _measured(option: str, name: str, most: float, unit: str, words: str) -> Cal
     return click.option(option, name, type=Number(0, most), metavar=unit, help=words)
 
 
-def _frame(option: str, usual: str, words: str) -> Callable[[Any], Any]:
+def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
     return click.option(option, default=usual, show_default=True, help=words)
 
 
@@ -46,14 +46,16 @@ def _frame(option: str, usual: str, words: str) -> Callable[[Any], Any]:
     metavar="X,Y,Z",
     help="Centre of mass of sensor and adapter, mm from the flange face along its axes. [default: half way up]",
 )
-@_frame(
+@_frame_option(
     "--base-frame",
     "base",
     "Name of the controller's base frame; with base_link, vectors are turned by 180° about z, as in ROS.",
 )
-@_frame("--flange-frame", "tool0", "Name of the flange frame, z out; with flange, x points out, as in ROS-Industrial.")
-@_frame("--sensor-frame", "ft_sensor", "Name of the sensor and its frame.")
-@_frame("--tool-frame", "tool", "Name of the tool and its frame.")
+@_frame_option(
+    "--flange-frame", "tool0", "Name of the flange frame, z out; with flange, x points out, as in ROS-Industrial."
+)
+@_frame_option("--sensor-frame", "ft_sensor", "Name of the sensor and its frame.")
+@_frame_option("--tool-frame", "tool", "Name of the tool and its frame.")
 @click.option(
     "--max-force-error",
     "max_force_error_N",
@@ -105,7 +107,7 @@ def calibration(
         verification=verification,
         **frames,
     )
-    made = registry.export(result, target, settings, max_force_error_N=max_force_error_N)
+    made = registry.export_calibration(result, target, settings, max_force_error_N=max_force_error_N)
     notes = [*made.notes]
     if verification is not None and not verification.passed:
         notes.append(f"the last verification of this calibration failed: {verification.reason}")

@@ -20,7 +20,7 @@ from ftdrive.terminal.text import echo
 _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 
 
-@click.command()
+@click.command("solve")
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
 @click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
 @click.option(
@@ -29,7 +29,7 @@ _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 @click.option("--cluster", metavar="dask://HOST:PORT", help="Compute on this Dask cluster instead.")
 @STORE
 @JSON
-def solve(
+def fleet_solve(
     folders: Sequence[Path],
     since: str | None,
     workers: int | None,

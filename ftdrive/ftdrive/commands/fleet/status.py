@@ -56,14 +56,14 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         messages.print("No cells. `ftdrive fleet add cells.toml` adds them.")
     elif page_path is None:
         shown = len(_TITLES) if any(one.weighings for one in fleet.cells) else -1
-        rows = [_row(one, now)[:shown] for one in fleet.cells]
+        rows = [_status_row(one, now)[:shown] for one in fleet.cells]
         print_table(_TITLES[:shown], rows, folding={"cell", "tool"})
         answer.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
             answer.print(hanging(" ! ", words, answer), style="yellow")
 
 
-def _row(one: CellState, now: datetime) -> tuple[str, ...]:
+def _status_row(one: CellState, now: datetime) -> tuple[str, ...]:
     drift = "-"
     if one.drift is not None:
         drift = f"{one.drift.level_sigmas:.1f}{' DRIFTS' if one.drift.found else ''}"
@@ -76,7 +76,7 @@ PORT = 10018
 MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
 
-@click.command()
+@click.command("serve")
 @click.option(
     "--metrics",
     "address",
@@ -86,7 +86,7 @@ MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
     help="Address of /metrics; port 0 is a free one. A host that is not loopback is unprotected.",
 )
 @STORE
-def serve(address: str, url: str | None) -> None:
+def fleet_serve(address: str, url: str | None) -> None:
     """Serve the state of all cells to Prometheus, and as a page.
 
     The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a

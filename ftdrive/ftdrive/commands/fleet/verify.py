@@ -28,11 +28,11 @@ from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
 
 
-@click.command()
+@click.command("verify")
 @click.argument("names", metavar="[CELL]...", nargs=-1)
 @click.option("--due", is_flag=True, help="Only the cells whose verification is due.")
 @STORE
-def verify(names: Sequence[str], due: bool, url: str | None) -> None:
+def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     """Verify cells one after the other, with an operator at each.
 
     For each cell the command first asks whether an operator stands there with the emergency stop in reach. Only yes
@@ -47,7 +47,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
     url = url or store_url()
     store, now = Store(url), datetime.now(UTC)
     fleet = fleet_state(store, now)
-    chosen = [one for one in _named(store.cells(), names) if not due or fleet.is_due(one, now)]
+    chosen = [one for one in _select_cells(store.cells(), names) if not due or fleet.is_due(one, now)]
     if not chosen:
         echo("No cell is due.", err=True)
     failed, errors, lines = list[str](), list[Exception](), list[str]()
@@ -63,7 +63,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
             except Declined as error:
                 outcome, words = "ended", str(error)
             except Exception as error:
-                outcome, words = "not verified", _sentence(error)
+                outcome, words = "not verified", _fixable_message(error)
                 errors.append(error)
             if outcome == "FAILED":
                 failed.append(one.name)
@@ -77,7 +77,7 @@ def verify(names: Sequence[str], due: bool, url: str | None) -> None:
         raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its line is printed
 
 
-def _named(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
+def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
     """Return the cells with these names in their order; all without names."""
     if not cells:
         raise ConfigError("the store has no cells: add them with `ftdrive fleet add cells.toml`")
@@ -89,7 +89,7 @@ def _named(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell
 
 def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tuple[str, str]:
     """Ask at a cell and verify it; return the outcome and why. Raises as `Verifying.take`."""
-    cell = _described(one)
+    cell = _read_cell(one)
     known = fleet.id_of(one.name, cell.tool.name) or ""
     paths = [Path(result.path) for result in store.find(known) if result.id == known] if known else []
     if not paths:
@@ -117,7 +117,7 @@ def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
     return verified
 
 
-def _described(one: StoredCell) -> CellConfig:
+def _read_cell(one: StoredCell) -> CellConfig:
     """Read the configuration of a cell; raises `ConfigError` if the store does not know its robot."""
     cell = CellOptions(Path(one.config)).cell()
     if one.robot_host not in {None, cell.robot.host}:
@@ -139,7 +139,7 @@ def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
         return False
 
 
-def _sentence(error: Exception) -> str:
+def _fixable_message(error: Exception) -> str:
     """Return the message of an error that a user can fix; raises any other."""
     if exit_code(error) is None:
         raise error

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from ftdrive import cli
-from ftdrive.recording.files import read_recording
+from ftdrive.recording.files import load_recording
 from tests.unit.ftdrive.recorded import calibration
 
 
@@ -94,4 +94,4 @@ def test_a_closed_terminal_ends_a_command_of_the_stream_well(command: str, tmp_p
         process.wait()
     assert "Traceback" not in shown
     if command.startswith("record"):
-        assert read_recording(tmp_path / "a.mcap")
+        assert load_recording(tmp_path / "a.mcap")

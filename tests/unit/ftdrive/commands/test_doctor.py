@@ -14,7 +14,7 @@ from ftdrive.checks.arm import check_clock, check_flange
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import PUSH_S, examine_push
 from ftdrive.commands import doctor
-from ftdrive.commands.doctor import _is_pushing, _print
+from ftdrive.commands.doctor import _is_pushing, _print_checks
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo, Fact
 from tests.fake_clock import FakeClock
@@ -136,13 +136,13 @@ def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(capsys: pyte
         Check("robot.speed", "warning", "slider at 30 %", "raise it"),
         Check("sensor.noise", "failed", "saturated", "take the load off"),
     ]
-    _print(checks, every=True)
+    _print_checks(checks, every=True)
     lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
     assert [line.split()[0] for line in lines] == ["robot", "!", "fix:", "sensor", "fix:", "Not"]
     assert lines[2].split("fix: ")[1] == "raise it"
-    _print(checks[:2], every=True)
+    _print_checks(checks[:2], every=True)
     assert capsys.readouterr().out.endswith(" Usable; see the lines with !.\n")
-    _print(checks[:1], every=True)
+    _print_checks(checks[:1], every=True)
     assert capsys.readouterr().out.endswith(" All checks passed.\n")
 
 
@@ -156,7 +156,7 @@ def test_a_summary_has_each_subject_and_all_that_needs_attention(capsys: pytest.
         Check("noise.change", "skipped", "not known"),
         Check("push.sign", "skipped", "no push"),
     ]
-    _print(checks, every=False)
+    _print_checks(checks, every=False)
     assert [line.strip() for line in capsys.readouterr().out.splitlines()] == [
         "robot       ✔ UR5e (2 more checks passed)",
         "! slider at 30 %",

@@ -127,7 +127,7 @@ def test_without_a_terminal_nothing_is_asked_and_nothing_moves(terminals: str, l
 
 
 def test_no_option_answers_for_the_operator() -> None:
-    assert {one.name for one in command.verify.params} == {"names", "due", "url"}
+    assert {one.name for one in command.fleet_verify.params} == {"names", "due", "url"}
 
 
 @pytest.mark.parametrize("no", ["", "no", Declined("no answer")])

@@ -16,7 +16,7 @@ import pytest
 from ftcalib import CalibrationResult
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig, user_folder
-from ftdrive.commands.options import CellOptions, Source
+from ftdrive.commands.options import CellOptions, SourceOptions
 from ftdrive.runs.run import Run
 from ftdrive.runs.weighings import FOLDER, append_weighings
 from ftdrive.store import index_run
@@ -301,7 +301,7 @@ def test_weighings_are_kept_with_a_calibration_of_a_file(
     calibration = result(1, station={} if emulated else None)
     config = CellConfig(RobotConfig(host="10.0.0.7"), SensorConfig("ati-can://can0"))
     stream: Any = SimpleNamespace(info=replace(info(calibration), emulated=emulated), cell=config)
-    source = Source(None, None, False, CellOptions(), emulated)
+    source = SourceOptions(None, None, False, CellOptions(), emulated)
     with ExitStack() as stack:
         if emulated:
             source.open_log(stream, stack, print)({"refused": "cable"})

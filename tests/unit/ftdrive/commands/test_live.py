@@ -24,7 +24,7 @@ from ftdrive.stream.samples import Links, Stages, WrenchFrame
 from ftdrive.stream.sources import Read, RecordingSource
 from ftdrive.stream.stream import Stream
 from ftdrive.terminal import live_panels
-from ftdrive.words.stream import Summary, View
+from ftdrive.words.stream import StreamSummary, View
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import NOISE, calibrated, dwells, info, paired
@@ -142,7 +142,7 @@ def shown_table(monkeypatch: pytest.MonkeyPatch, views: Iterable[View]) -> str:
 def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_panels, "Keyboard", Quiet)
     checks = [Check("robot.payload", "ok", "robot 1.44 kg")]
-    shown = shown_table(monkeypatch, Summary(Feed(pushed()), checks).views())
+    shown = shown_table(monkeypatch, StreamSummary(Feed(pushed()), checks).views())
     assert shown.rstrip().endswith("The recording has ended.")
     assert "Ctrl-C" not in shown
     lines = shown.splitlines()
@@ -173,7 +173,7 @@ class Interrupted(RecordingSource):
 
 
 def test_a_silent_device_is_shown_and_no_old_number(monkeypatch: pytest.MonkeyPatch) -> None:
-    views = list(islice(Summary(Feed(pushed(10.0, Interrupted))).views(), 12))
+    views = list(islice(StreamSummary(Feed(pushed(10.0, Interrupted))).views(), 12))
     first, second = (view for view in views if view.silent)
     for reading in (first.to_dict(), second.to_dict()):
         assert reading["stale"].endswith(": no new sample for 0.300 s")
@@ -191,7 +191,7 @@ def test_a_failure_that_lasts_ends_the_command() -> None:
         stream = pushed(10.0, Interrupted)
         stream.source.failures = failures  # type: ignore[attr-defined]
         with pytest.raises(DeviceTimeout):
-            list(Summary(Feed(stream)).views(raises=raises))
+            list(StreamSummary(Feed(stream)).views(raises=raises))
 
 
 def test_sigma_is_as_honest_as_the_headline_of_the_report() -> None:

@@ -12,7 +12,7 @@ from ftcalib import CalibrationResult, solve
 from ftcalib.loads.model import LoadRun
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
-from ftdrive.commands.options import Source
+from ftdrive.commands.options import SourceOptions
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.runs.calibration import next_sensor_file, read_calibration, sensor_files
 from ftdrive.stream.samples import Paired
@@ -125,7 +125,7 @@ def test_an_emulated_cell_hangs_the_load_itself_also_without_a_place(monkeypatch
     cell, hung = stream(rests((POSE, part(POSE, 1.0)), seconds=2.0)), list[dict[str, object]]()
     station = SimpleNamespace(control=lambda **request: hung.append(request))
     monkeypatch.setattr(Stream, "station", station)
-    monkeypatch.setattr(Source, "open", lambda *_: cell)
+    monkeypatch.setattr(SourceOptions, "open", lambda *_: cell)
     found = run("check", "1.000", "--simulate", "--json")
     assert found.exception is None, found.output
     assert [(one["do"], one["mass_kg"], one["at_mm"]) for one in hung] == [("hang", 1.0, (0.0, 0.0, 200.0))]
@@ -136,7 +136,7 @@ def test_a_load_that_hangs_nowhere_is_named_after_an_unsteady_second(monkeypatch
     touched = [(POSE, sign * part(POSE, 0.2)) for sign in (1, -1)]
     rows = Paired.concatenate([rests(*touched, seconds=0.1), rests((POSE, nothing), seconds=4.0)])
     rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
-    monkeypatch.setattr(Source, "open", lambda *_: stream(rows))
+    monkeypatch.setattr(SourceOptions, "open", lambda *_: stream(rows))
     found = run("check", "1.000", "--tool", "gripper", "--wait", "3")
     assert isinstance(found.exception, ConfigError)
     assert "no load of about 1 kg" in str(found.exception)

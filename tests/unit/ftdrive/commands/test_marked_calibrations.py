@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from ftcalib import CalibrationResult
-from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording import Recorder, load_recording
 from ftdrive.recording.recording import with_calibration
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.runs.run import Run
@@ -72,7 +72,7 @@ def test_an_edited_calibration_is_refused_unless_it_is_forced_and_then_marked(
 def test_a_file_made_with_an_edited_calibration_says_so(run: Callable[..., Ran]) -> None:
     add_6_N()
     assert run(*USES["compensate"], "--force", "-o", "new.csv")[0] == 0
-    assert read_recording(Path("new.csv")).header.info.marks == ("EDITED BY HAND",)
+    assert load_recording(Path("new.csv")).header.info.marks == ("EDITED BY HAND",)
     assert "EDITED BY HAND" in Path("new.csv").read_text(encoding="utf-8").partition("\n")[0]
     assert run("compensate", "new.csv")[1].startswith(" The file was EDITED BY HAND")
 
@@ -102,7 +102,7 @@ def emulated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CalibrationResu
 def test_every_output_of_an_emulated_calibration_says_so(
     run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.report.figures.draw", lambda *_: "")  # figures take most of the time
+    monkeypatch.setattr("ftdrive.report.figures.draw_figure", lambda *_: "")  # figures take most of the time
     run("report", "e.json", "-o", "report.html")
     assert "The cell was EMULATED: these are not the values of a real tool." in Path("report.html").read_text("utf-8")
     assert list(json.loads(run("report", "e.json", "--format", "json")[1])["marks"]) == ["EMULATED"]
@@ -134,7 +134,7 @@ def test_a_recording_of_an_emulated_cell_says_so_whatever_its_calibration(tmp_pa
     recorder = Recorder([path], replace(info(), emulated=True), {})
     recorder.add(block(3), [])
     recorder.end()
-    found = read_recording(path)
+    found = load_recording(path)
     assert found.header.info.marks == ("EMULATED",)
     assert with_calibration(found.header, calibration(), "c.json").info.marks == ("EMULATED",)
 

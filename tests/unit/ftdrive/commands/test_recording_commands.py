@@ -21,7 +21,7 @@ import pytest
 from ftdrive import cli
 from ftdrive.cell.config import CellConfig
 from ftdrive.commands.record import Duration
-from ftdrive.recording import Recorder, read_recording
+from ftdrive.recording import Recorder, load_recording
 from ftdrive.recording import recorder as recorder_module
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.stream.samples import Block, Stages, StreamEvent
@@ -100,7 +100,7 @@ def test_count_ends_exactly_and_files_are_equal(run_record: Run) -> None:
     assert (answer["axes"], answer["about"]) == ("sensor", "sensor")
     assert answer["calibration"] == stream.info.calibration_name
     assert "the serial number is unknown" in err
-    one, other = (read_recording(Path(name)) for name in answer["files"])
+    one, other = (load_recording(Path(name)) for name in answer["files"])
     assert one.rows.tobytes() == other.rows.tobytes()
     assert len(one.rows) == 1234
     assert one.header.configuration["robot"]["host"] == "10.0.0.2"
@@ -124,7 +124,7 @@ def test_control_c_keeps_the_data(run_record: Run) -> None:
     assert answer["samples"] == 300
     assert "Saved a.mcap: 300 samples, 0.30 s, 1000 Hz, gaps: 0" in err
     assert answer["rate_Hz"] == pytest.approx(1000.0, rel=1e-4)
-    assert read_recording(Path("a.mcap")).cut == ""
+    assert load_recording(Path("a.mcap")).cut == ""
 
 
 def test_a_lost_link_keeps_the_data(run_record: Run) -> None:
@@ -134,7 +134,7 @@ def test_a_lost_link_keeps_the_data(run_record: Run) -> None:
     assert code == 4
     assert "error: sensor silent for 0.3 s; check its cable" in err
     assert answer is not None
-    assert [event.kind for event in read_recording(Path("a.csv")).events] == ["stale", "delay"]
+    assert [event.kind for event in load_recording(Path("a.csv")).events] == ["stale", "delay"]
 
 
 def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, m
     assert answer["partial"].keys() == {"a.mcap.partial", "a.csv.partial"}
     for path, samples in answer["partial"].items():
         assert f"{path} keeps {samples} samples" in err
-        assert len(read_recording(Path(path)).rows) == samples > 0
+        assert len(load_recording(Path(path)).rows) == samples > 0
     assert not Path("a.mcap").exists()
     assert not Path("a.csv").exists()
 
@@ -230,8 +230,8 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
     out, err = capsys.readouterr()
     answer = json.loads(out)
     assert (answer["samples"], answer["gaps"], answer["complete"]) == (1800, 0, True)
-    assert answer["duration_s"] == pytest.approx(read_recording(Path("b.mcap")).duration_s)
-    assert read_recording(Path("b.mcap")).rows.tobytes() == read_recording(Path("a.csv")).rows.tobytes()
+    assert answer["duration_s"] == pytest.approx(load_recording(Path("b.mcap")).duration_s)
+    assert load_recording(Path("b.mcap")).rows.tobytes() == load_recording(Path("a.csv")).rows.tobytes()
     assert cli.run(["convert", "b.csv.partial", "b.parquet", "--json"]) == 0
     out, err = capsys.readouterr()
     assert (json.loads(out)["samples"], json.loads(out)["complete"]) == (1500, False)
@@ -281,7 +281,7 @@ def test_compensate_answers_as_documented(recorded: Path, capsys: pytest.Capture
         "c.json",
         "b.parquet",
     )
-    assert str(read_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
+    assert str(load_recording(Path("b.parquet")).header.frame) == "base axes, about the sensor origin"
 
 
 def test_compensate_prints_a_table(recorded: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -326,7 +326,7 @@ def test_damage_and_control_c_keep_what_was_before(
     monkeypatch.setattr(recorder_module.RecordingFiles, "append", interrupted)
     assert cli.run(call) == 130
     kept = json.loads(capsys.readouterr().out)["samples"]
-    assert len(read_recording(target).rows) == written[0] == kept
+    assert len(load_recording(target).rows) == written[0] == kept
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     target.unlink()
@@ -338,7 +338,7 @@ def test_damage_and_control_c_keep_what_was_before(
     kept = json.loads(out)["samples"]
     assert f"Saved {target}: the first {kept} samples" in err
     assert "is incomplete" in err
-    found = read_recording(target)
+    found = load_recording(target)
     assert (len(found.rows), found.cut) == (kept, "")
     assert 8192 <= kept <= 16_400
     np.testing.assert_array_equal(found.rows["seq"], (1 << 33) + np.arange(kept))
@@ -387,7 +387,7 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
     assert re.search(r"\): \d+\.\d s of it are saved\.", " ".join(err.split()))
     Path(f"{target}.partial").unlink()
     assert cli.run(command) == 0
-    kept, whole = read_recording(f"kept{ending}").rows, read_recording(target).rows
+    kept, whole = load_recording(f"kept{ending}").rows, load_recording(target).rows
     assert json.loads(out)["samples"] == len(kept) == 16384
     assert kept.tobytes() == whole[: len(kept)].tobytes()
 

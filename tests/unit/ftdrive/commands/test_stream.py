@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.commands import stream
 from ftdrive.commands.options import CellOptions
-from ftdrive.commands.options import Source as Chosen
+from ftdrive.commands.options import SourceOptions as Chosen
 from ftdrive.errors import ConfigError
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.stream.sources import CellSource

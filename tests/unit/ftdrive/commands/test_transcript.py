@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
-from ftdrive.commands.transcript import _words
+from ftdrive.commands.transcript import _describe_bytes
 from ftdrive.errors import ConfigError
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo
@@ -43,10 +43,10 @@ def test_a_long_recording_is_collected_in_pieces() -> None:
     mean = (2 * 1 + 2 + 3) / 4
     assert seen["mean_force_N"] == pytest.approx([mean, -2 * mean, 3 * mean])
     assert seen["mean_torque_Nm"] == pytest.approx([0.1 * mean, -0.2 * mean, 0.3 * mean])
-    assert _words(seen) == (
+    assert _describe_bytes(seen) == (
         "Mini45, serial FT9: 4 samples, mean (1.750, -3.500, 5.250) N, (0.1750, -0.3500, 0.5250) N·m"
     )
-    assert (_words({"error": "it is gone"}), _words({})) == ("it is gone", "interrupted")
+    assert (_describe_bytes({"error": "it is gone"}), _describe_bytes({})) == ("it is gone", "interrupted")
 
 
 def test_a_silent_sensor_is_an_error() -> None:

@@ -41,7 +41,7 @@ def begun(tmp_path: Path) -> Path:
 )
 def test_options_that_contradict_are_refused(arguments: tuple[str, ...], words: str, begun: Path) -> None:
     given = [str(begun) if word == "RUN" else word for word in arguments]
-    outcome = CliRunner().invoke(command.verify, given)
+    outcome = CliRunner().invoke(command.verify_command, given)
     assert isinstance(outcome.exception, ConfigError)
     assert words in str(outcome.exception)
 
@@ -85,7 +85,7 @@ def test_an_update_is_saved_only_if_it_is_wanted(
     update: Any, typed: str, wanted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ftdrive.session.verifying.save_update", lambda _: tmp_path)
-    ask: Any = lambda question: command._ask(None, True, question)  # noqa: E731
+    ask: Any = lambda question: command._ask_on_page(None, True, question)  # noqa: E731
     with CliRunner().isolation(typed) as (out, *_):
         found = save_wanted_update(failed(tmp_path, NO_LIMITS), update, ask)
         printed = out.getvalue().decode()

@@ -10,8 +10,8 @@ import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
-from ftdrive.commands.options import Source
-from ftdrive.commands.weigh import _print
+from ftdrive.commands.options import SourceOptions
+from ftdrive.commands.weigh import _print_weights
 from ftdrive.errors import ConfigError
 from ftdrive.stream.weighing import CannotWeigh, ScaleState
 from tests.fake_clock import FakeClock
@@ -53,7 +53,7 @@ def printed(
     poses: int = 1,
     as_json: bool = False,
 ) -> list[str]:
-    _print(cast("Any", scale), scale.turns(), once=once, waits=waits, poses=poses, as_json=as_json)
+    _print_weights(cast("Any", scale), scale.turns(), once=once, waits=waits, poses=poses, as_json=as_json)
     return capsys.readouterr().out.splitlines()
 
 
@@ -106,8 +106,8 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
         assert (patience_s == 0.0) == ("--once" in options)
         return scale.turns()
 
-    monkeypatch.setattr(Source, "open", open_)
-    monkeypatch.setattr(Source, "open_log", lambda *_: None)
+    monkeypatch.setattr(SourceOptions, "open", open_)
+    monkeypatch.setattr(SourceOptions, "open_log", lambda *_: None)
     monkeypatch.setattr("ftdrive.commands.weigh.Weighing", weighing)
     monkeypatch.setattr("ftdrive.commands.weigh.pump", pump)
     outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])

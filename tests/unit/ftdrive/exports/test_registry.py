@@ -14,7 +14,7 @@ from ftcalib.compensation import Compensator
 from ftcalib.model import Parameters
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.exports.formats import FORMATS
-from ftdrive.exports.registry import Settings, _largest_norm, export
+from ftdrive.exports.registry import Settings, _largest_norm, export_calibration
 from tests.unit.ftdrive.exports.example import MEASURED, UPRIGHT, WEIGHT_N, calibration, rejected, tilted
 
 LEVER_M = sqrt(0.01**2 + 0.02**2 + 0.05**2)
@@ -22,7 +22,7 @@ LEVER_M = sqrt(0.01**2 + 0.02**2 + 0.05**2)
 
 @pytest.mark.parametrize("tilt_deg", [0.02, 1.8, 90, 180])
 def test_a_tilt_that_is_lost_costs_twice_the_weight_times_the_sine_of_half_of_it(tilt_deg: float) -> None:
-    made = export(tilted(tilt_deg), "admittance", MEASURED, max_force_error_N=100)
+    made = export_calibration(tilted(tilt_deg), "admittance", MEASURED, max_force_error_N=100)
     expected_N = 2 * WEIGHT_N * sin(radians(tilt_deg) / 2)
     assert made.max_force_error_N == pytest.approx(expected_N, rel=1e-6)
     assert made.max_torque_error_Nm == pytest.approx(LEVER_M * expected_N, rel=1e-6)
@@ -33,13 +33,13 @@ def test_a_tilt_that_is_lost_costs_twice_the_weight_times_the_sine_of_half_of_it
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "tilt" not in one.expresses])
 def test_a_tilt_that_would_change_the_force_is_an_error(name: str) -> None:
     with pytest.raises(NotAccepted, match=r"1.8°.*0.616 N.*the limit is 0.1 N.*json.*--max-force-error"):
-        export(tilted(1.8), name, MEASURED)
-    assert export(tilted(0.2), name, MEASURED).max_force_error_N == pytest.approx(0.0685, abs=1e-4)
+        export_calibration(tilted(1.8), name, MEASURED)
+    assert export_calibration(tilted(0.2), name, MEASURED).max_force_error_N == pytest.approx(0.0685, abs=1e-4)
 
 
 def test_no_model_is_proposed_in_place_of_a_target_that_reads_the_sensor() -> None:
     with pytest.raises(NotAccepted, match="Choose another format") as error:
-        export(tilted(1.8), "admittance", MEASURED)
+        export_calibration(tilted(1.8), "admittance", MEASURED)
     assert "ros2-control" in str(error.value)
     assert not [name for name in ("urdf", "mujoco", "ur-payload") if name in str(error.value)]
 
@@ -65,19 +65,19 @@ def test_no_orientation_differs_by_more_and_some_by_as_much(seed: int) -> None:
 
 def test_a_rejected_calibration_is_not_exported() -> None:
     with pytest.raises(NotAccepted, match="a very different mounting"):
-        export(rejected(), "json", MEASURED)
+        export_calibration(rejected(), "json", MEASURED)
 
 
 @pytest.mark.parametrize("name", ["urdf", "mujoco", "static-transform", "mc-rtc", "franka", "ur-payload"])
 def test_the_place_of_the_sensor_is_never_invented(name: str) -> None:
     with pytest.raises(ConfigError, match="--height MM"):
-        export(calibration(), name, replace(MEASURED, height_mm=None))
+        export_calibration(calibration(), name, replace(MEASURED, height_mm=None))
 
 
 @pytest.mark.parametrize("name", ["franka", "ur-payload"])
 def test_the_mass_of_the_sensor_is_never_invented(name: str) -> None:
     with pytest.raises(ConfigError, match="--sensor-mass KG"):
-        export(calibration(), name, replace(MEASURED, sensor_mass_kg=None))
+        export_calibration(calibration(), name, replace(MEASURED, sensor_mass_kg=None))
 
 
 def numbers_in(text: str) -> list[float]:
@@ -89,8 +89,8 @@ def numbers_in(text: str) -> list[float]:
 def test_the_centre_of_the_sensor_is_half_way_up_unless_given(name: str) -> None:
     assert MEASURED.height_mm is not None
     half_way = (0.0, 0.0, MEASURED.height_mm / 2)
-    assumed = export(calibration(), name, replace(MEASURED, sensor_com_mm=None))
-    given = export(calibration(), name, replace(MEASURED, sensor_com_mm=half_way))
+    assumed = export_calibration(calibration(), name, replace(MEASURED, sensor_com_mm=None))
+    given = export_calibration(calibration(), name, replace(MEASURED, sensor_com_mm=half_way))
     assert numbers_in(assumed.text) == pytest.approx(numbers_in(given.text))
     assert any("--sensor-com" in note for note in assumed.notes)
 
@@ -98,7 +98,7 @@ def test_the_centre_of_the_sensor_is_half_way_up_unless_given(name: str) -> None
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if one.file.endswith("yaml")])
 def test_what_needs_no_place_takes_none(name: str) -> None:
     if name not in ("franka", "mc-rtc"):
-        export(calibration(R_flange_sensor=np.eye(3)), name, Settings())
+        export_calibration(calibration(R_flange_sensor=np.eye(3)), name, Settings())
 
 
 @pytest.mark.parametrize("frame", ["", "a b", "a\nb: 1", "-x", "a--b", "a-", '"', "a#", "ö"])
@@ -117,12 +117,12 @@ def with_date(text: str) -> CalibrationResult:
 
 
 def test_a_date_from_a_file_cannot_add_lines() -> None:
-    text = export(with_date("2026\nmass: 99.0"), "ft-tools", MEASURED).text
+    text = export_calibration(with_date("2026\nmass: 99.0"), "ft-tools", MEASURED).text
     assert yaml.safe_load(text)["mass"] == pytest.approx(2.0)
-    assert "-->" not in export(with_date("--><x/>"), "urdf", MEASURED).text.partition("\n-->\n")[0]
+    assert "-->" not in export_calibration(with_date("--><x/>"), "urdf", MEASURED).text.partition("\n-->\n")[0]
 
 
 def test_without_a_load_gravity_points_down() -> None:
     empty = calibration(gravity_N=UPRIGHT * 0, R_flange_sensor=np.eye(3))
     for name in ("ros2-control", "kth", "xarm", "json"):
-        assert "nan" not in export(empty, name, MEASURED).text.lower().replace("nanosec", "")
+        assert "nan" not in export_calibration(empty, name, MEASURED).text.lower().replace("nanosec", "")

@@ -19,7 +19,7 @@ from ftcalib.model import Array
 from ftcalib.sensor_matrix import SIZE, Response, SensorMatrix, ranges
 from ftdrive.errors import NotAccepted
 from ftdrive.exports.formats import FORMATS, Property
-from ftdrive.exports.registry import Exported, Settings, export
+from ftdrive.exports.registry import Exported, Settings, export_calibration
 from tests.target_formulas import evaluate, mujoco_plugin, tool0_from, world_from_base
 
 ALL: tuple[Property, ...] = ("tilt", "rotation", "response")
@@ -149,7 +149,7 @@ def test_a_target_compensates_as_we_do(name: str, base_frame: str, flange_frame:
     rng = np.random.default_rng(16)
     for _ in range(2):
         calibration, settings = arbitrary(rng, FORMATS[name].expresses), settings_of(rng, base_frame, flange_frame)
-        made = export(calibration, name, settings, max_force_error_N=0.0)
+        made = export_calibration(calibration, name, settings, max_force_error_N=0.0)
         R, wrench = data(rng, 50)
         found = compensated(name, made, calibration, settings, R, wrench)
         wanted = expected(name, calibration, R, wrench)
@@ -163,7 +163,7 @@ def test_a_target_compensates_as_we_do(name: str, base_frame: str, flange_frame:
 def test_what_a_target_cannot_express_costs_what_the_export_says(name: str, lost: Property) -> None:
     rng = np.random.default_rng(4)
     calibration, settings = arbitrary(rng, (*FORMATS[name].expresses, lost)), settings_of(rng)
-    made = export(calibration, name, settings, max_force_error_N=np.inf)
+    made = export_calibration(calibration, name, settings, max_force_error_N=np.inf)
     R, wrench = data(rng, 4000)
     wanted = expected(name, calibration, R, wrench)
     difference = compensated(name, made, calibration, settings, R, wrench) - wanted
@@ -174,8 +174,8 @@ def test_what_a_target_cannot_express_costs_what_the_export_says(name: str, lost
     words = {"tilt": "base tilt", "rotation": "sensor turned by", "response": "gain and cross-talk"}[lost]
     assert re.search(rf"cannot express .*{words}.*{stated[0]:.3g} N and {stated[1]:.3g} N·m", made.notes[0])
     with pytest.raises(NotAccepted, match=words):
-        export(calibration, name, settings, max_force_error_N=0.999 * stated[0])
-    assert export(calibration, name, settings, max_force_error_N=1.001 * stated[0]).text == made.text
+        export_calibration(calibration, name, settings, max_force_error_N=0.999 * stated[0])
+    assert export_calibration(calibration, name, settings, max_force_error_N=1.001 * stated[0]).text == made.text
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name not in ONLY_THE_MOUNTING])
@@ -184,7 +184,7 @@ def test_a_sensor_known_by_loads_is_decoded_or_its_largest_error_is_named(name: 
     sensor = replace(SensorMatrix.usual(), source="loads", error=0.02 * rng.normal(size=(6, 6)) * MATRIX_UNITS)
     calibration = replace(arbitrary(rng, ()), sensor=sensor)
     settings = settings_of(rng)
-    made = export(calibration, name, settings, max_force_error_N=0.0)
+    made = export_calibration(calibration, name, settings, max_force_error_N=0.0)
     R, wrench = data(rng, 50)
     decoder, p = calibration.contact.decoder, calibration.p_sensor_com_m
     assert decoder is not None
@@ -209,7 +209,7 @@ def test_models_have_the_mass_without_the_error_of_a_sensor_known_by_loads() -> 
     rng = np.random.default_rng(5)
     sensor = replace(SensorMatrix.usual(), source="loads", error=0.03 * np.eye(6))
     calibration = replace(arbitrary(rng, ()), sensor=sensor)
-    mass = re.search(r'mass value="([^"]*)"', export(calibration, "urdf", settings_of(rng)).text)
+    mass = re.search(r'mass value="([^"]*)"', export_calibration(calibration, "urdf", settings_of(rng)).text)
     assert mass
     assert float(mass[1]) == pytest.approx(calibration.mass_kg / 1.03)
 
@@ -217,14 +217,14 @@ def test_models_have_the_mass_without_the_error_of_a_sensor_known_by_loads() -> 
 @pytest.mark.parametrize("name", [name for name, one in FORMATS.items() if "bias" not in one.subtracts])
 def test_a_target_without_bias_says_so(name: str) -> None:
     rng = np.random.default_rng(0)
-    made = export(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
+    made = export_calibration(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
     assert any("bias" in note for note in made.notes)
 
 
 @pytest.mark.parametrize("name", ["franka", "ur-payload", "xarm"])
 def test_a_formula_that_is_not_public_is_called_so(name: str) -> None:
     rng = np.random.default_rng(0)
-    made = export(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
+    made = export_calibration(arbitrary(rng, FORMATS[name].expresses), name, settings_of(rng))
     assert any("not public" in note for note in made.notes)
 
 
@@ -232,7 +232,7 @@ def test_a_formula_that_is_not_public_is_called_so(name: str) -> None:
 def test_the_note_turns_the_sensor_of_the_robot_model(base_frame: str, flange_frame: str) -> None:
     rng = np.random.default_rng(2)
     calibration = arbitrary(rng, ("rotation",))
-    (note,) = export(calibration, "kth", settings_of(rng, base_frame, flange_frame)).notes[-3:-2]
+    (note,) = export_calibration(calibration, "kth", settings_of(rng, base_frame, flange_frame)).notes[-3:-2]
     rpy = re.search(rf"turn ft_sensor against {flange_frame} by roll, pitch, yaw = \(([^)]*)\) rad", note)
     assert rpy
     R_frame_sensor = Rotation.from_euler("xyz", [float(x) for x in rpy[1].split(",")]).as_matrix()

@@ -15,14 +15,14 @@ from ftcalib import CalibrationResult
 from ftcalib.result import MotionResult
 from ftdrive import __version__
 from ftdrive.exports.formats import FORMATS
-from ftdrive.exports.registry import Exported, Settings, export
+from ftdrive.exports.registry import Exported, Settings, export_calibration
 from tests.unit.ftdrive.exports.example import MEASURED, calibration, responding
 
 IN_YAML = [name for name, one in FORMATS.items() if one.file.endswith(".yaml")]
 
 
 def made(name: str, settings: Settings = MEASURED, limit_N: float = 1e3) -> Exported:
-    return export(calibration(), name, settings, max_force_error_N=limit_N)
+    return export_calibration(calibration(), name, settings, max_force_error_N=limit_N)
 
 
 def document(name: str, settings: Settings = MEASURED) -> Any:
@@ -53,13 +53,13 @@ def test_ur_payload_is_one_statement_without_exponents() -> None:
 @pytest.mark.parametrize(("name", "parse"), [("json", json.loads), ("yaml", yaml.safe_load)])
 def test_the_complete_formats_keep_every_bit_and_the_response(name: str, parse: Any) -> None:
     result = responding(0.01, 0.002)
-    found = parse(export(result, name, MEASURED, max_force_error_N=0.0).text)
+    found = parse(export_calibration(result, name, MEASURED, max_force_error_N=0.0).text)
     saved = result.to_dict()
     for key in ("gravity_force_base_N", "R_flange_sensor", "force_bias_N", "torque_bias_Nm", "p_sensor_com_m", "id"):
         assert found[key] == saved[key]
     assert found["response"] == {key: saved["response"][key] for key in ("force_gain", "cross_talk_m")}
     assert found["p_flange_sensor_m"] == [0.0, 0.0, 0.033]
-    assert parse(export(result, name, Settings()).text)["p_flange_sensor_m"] is None
+    assert parse(export_calibration(result, name, Settings()).text)["p_flange_sensor_m"] is None
 
 
 @pytest.mark.parametrize("name", IN_YAML)
@@ -116,13 +116,13 @@ def test_notes_have_all_digits() -> None:
     parameters = replace(calibration(R_flange_sensor=R).parameters, force_bias_N=np.array([1, -2, 3]) / 7)
     odd = replace(calibration(), parameters=parameters)
     for name in ("ft-tools", "ros2-control", "admittance"):
-        notes = export(odd, name, MEASURED, max_force_error_N=1e3).notes
+        notes = export_calibration(odd, name, MEASURED, max_force_error_N=1e3).notes
         rpy = numbers_after("roll, pitch, yaw = ", notes)
         np.testing.assert_allclose(Rotation.from_euler("xyz", rpy).as_matrix(), R, rtol=0, atol=1e-15)
     bias = numbers_after("subtracts no bias: subtract ", notes)
     assert bias == [*(np.array([1, -2, 3]) / 7), *odd.parameters.torque_bias_Nm]
     raised = replace(MEASURED, height_mm=100 / 3)
-    notes = export(odd, "mc-rtc", raised, max_force_error_N=1e3).notes
+    notes = export_calibration(odd, "mc-rtc", raised, max_force_error_N=1e3).notes
     assert numbers_after("with the sensor at ", notes)[2] == pytest.approx(0.1 / 3, rel=1e-15)
 
 
@@ -132,7 +132,9 @@ def in_motion() -> CalibrationResult:
 
 
 def test_an_inertia_from_motion_is_written() -> None:
-    found = {name: export(in_motion(), name, MEASURED, max_force_error_N=1e3) for name in ("urdf", "mujoco")}
+    found = {
+        name: export_calibration(in_motion(), name, MEASURED, max_force_error_N=1e3) for name in ("urdf", "mujoco")
+    }
     written = re.findall(r'i([xyz]{2})="(\S+)"', found["urdf"].text)
     moments = {"xx": 0.002, "yy": 0.0024, "zz": 0.0014, "xy": 0.0001, "xz": -0.0002, "yz": 0.0003}
     assert {axes: float(value) for axes, value in written} == moments
@@ -142,7 +144,7 @@ def test_an_inertia_from_motion_is_written() -> None:
 
 
 def test_the_payload_has_the_inertia_of_tool_and_sensor_about_their_centre() -> None:
-    statement = export(in_motion(), "ur-payload", MEASURED, max_force_error_N=1e3).text.rsplit("\n", 2)[1]
+    statement = export_calibration(in_motion(), "ur-payload", MEASURED, max_force_error_N=1e3).text.rsplit("\n", 2)[1]
     xx, yy, zz, xy, xz, yz = map(float, statement.split("[")[2].split("]")[0].split(", "))
     found = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     calibrated = in_motion()
@@ -161,6 +163,6 @@ def test_an_inertia_that_no_body_has_is_not_written() -> None:
     result = in_motion()
     assert result.motion is not None
     wrong = replace(result, motion=replace(result.motion, inertia_kg_m2=np.diag([5.0, 1.0, 1.0]) * 1e-3))
-    written = export(wrong, "urdf", MEASURED, max_force_error_N=1e3)
+    written = export_calibration(wrong, "urdf", MEASURED, max_force_error_N=1e3)
     assert 'ixx="0.0"' in written.text
     assert "not identified well enough" in "".join(written.notes)

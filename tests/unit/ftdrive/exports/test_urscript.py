@@ -82,7 +82,7 @@ def test_a_plan_of_an_emulated_cell_says_so_before_it_moves(plan: Plan, tmp_path
     pendant = Pendant(list(plan.steps[0].q_rad))
     pendant.run(urscript.program(emulated, dwell_s=1.0))
     assert any(words.startswith("EMULATED CELL: no real arm may follow this plan.") for words in pendant.said)
-    assert "EMULATED" in urscript.table(emulated).splitlines()[0]
+    assert "EMULATED" in urscript.plan_table(emulated).splitlines()[0]
     assert not plan.emulated
     assert "EMULATED" not in urscript.program(plan, dwell_s=1.0)
 
@@ -231,7 +231,7 @@ def test_no_text_leaves_its_comment_or_string(plan: Plan, model: str) -> None:
 )
 def test_what_no_arm_should_follow_is_refused(plan: Plan, change: dict[str, Any]) -> None:
     steps = (*plan.steps[:5], replace(plan.steps[5], **change), *plan.steps[6:])
-    for target in (lambda plan: urscript.program(plan, dwell_s=1.0), urscript.table):
+    for target in (lambda plan: urscript.program(plan, dwell_s=1.0), urscript.plan_table):
         with pytest.raises(PlanRefused):
             target(replace(plan, steps=steps))
 

@@ -17,10 +17,10 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import predict
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
-from ftdrive.recording import Header, Recording, read_recording
+from ftdrive.recording import Header, Recording, load_recording
 from ftdrive.recording.compensation import compensate_recording, estimated_bias
-from ftdrive.recording.foreign import TablePair, numbers_of
-from ftdrive.recording.recording import Measured, rows_of, with_calibration
+from ftdrive.recording.foreign import TablePair, sample_numbers
+from ftdrive.recording.recording import Measured, to_records, with_calibration
 from ftdrive.stream.samples import Block, Stages, StreamEvent, WrenchFrame
 from ftdrive.tables import text as text_tables
 from ftdrive.tables.table import Table
@@ -69,7 +69,7 @@ def recording(parameters: Parameters = TRUTH, seconds: float = 8.0) -> Recording
     )
     header = Header(replace(info(), sensor_rate_Hz=RATE_HZ), WrenchFrame(), Stages())
     return Recording(
-        header, rows_of(samples), [StreamEvent(10**12, "mark", "begin"), StreamEvent(10**12, "contact", "old")]
+        header, to_records(samples), [StreamEvent(10**12, "mark", "begin"), StreamEvent(10**12, "contact", "old")]
     )
 
 
@@ -87,7 +87,7 @@ def test_the_push_is_found_and_the_weight_is_gone(tmp_path: Path) -> None:
     assert contact["duration_s"] == pytest.approx(1, abs=0.05)
     assert contact["peak_N"] == pytest.approx(6, abs=0.2)
     np.testing.assert_allclose(contact["direction"], TRUTH.R_flange_sensor[:, 0], atol=0.05)
-    saved = read_recording(output)
+    saved = load_recording(output)
     assert saved.header.frame == WrenchFrame("flange", "sensor")
     assert np.sqrt((saved.rows["wrench"][:, :3] ** 2).sum() / 4000) == pytest.approx(
         result["compensated"]["force_rms_N"]
@@ -190,7 +190,7 @@ def test_what_is_before_a_damaged_line_of_a_pair_is_kept(
     numbers, failure = compensate_recording(found, WrenchFrame(), tmp_path / "new.csv")
     assert isinstance(failure, BadDataset)
     assert re.match(rf"{damaged}: line \d+", numbers["cut"])
-    assert 2600 < numbers["samples"] == len(read_recording(tmp_path / "new.csv").rows) <= 3400
+    assert 2600 < numbers["samples"] == len(load_recording(tmp_path / "new.csv").rows) <= 3400
 
 
 @pytest.mark.parametrize(
@@ -236,9 +236,9 @@ JITTERS = {
 @pytest.mark.parametrize("name", JITTERS)
 def test_late_samples_of_another_program_are_no_gaps_and_missing_ones_are(name: str) -> None:
     t_s = JITTERS[name]
-    assert np.count_nonzero(np.diff(numbers_of(t_s)) != 1) == 0
+    assert np.count_nonzero(np.diff(sample_numbers(t_s)) != 1) == 0
     lost = [*range(3000, 3030), *range(9000, 9100), 15_000, 15_001]
-    numbers = numbers_of(np.delete(t_s, lost))
+    numbers = sample_numbers(np.delete(t_s, lost))
     assert np.count_nonzero(np.diff(numbers) != 1) in (3, 4)  # a gap amid batches may be found in two steps
     off = np.abs(numbers - np.delete(np.arange(len(t_s)), lost)).max()
     assert off <= {"batches": 2, "pauses": 1}.get(name, 0)  # there the place of a gap is not seen to the sample
@@ -247,7 +247,7 @@ def test_late_samples_of_another_program_are_no_gaps_and_missing_ones_are(name: 
 
 def test_the_log_of_a_real_sensor_has_one_gap(real_data: Path) -> None:
     t_s = np.loadtxt(real_data / "ur5e_pick_stream" / "wrench.csv", delimiter=",", usecols=0)
-    numbers = numbers_of(t_s)
+    numbers = sample_numbers(t_s)
     assert np.count_nonzero(np.diff(numbers) != 1) == 1
     assert numbers[-1] == round(500 * (t_s[-1] - t_s[0])) == len(t_s)  # the sensor of a UR5e has 500 Hz
 

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import files
 from ftdrive.errors import BadRecording
-from ftdrive.recording import Recorder, Recording, RecordingReader, read_recording, table_files, write_recording
+from ftdrive.recording import Recorder, Recording, RecordingReader, load_recording, table_files, write_recording
 from ftdrive.recording.recording import Header, changed
 from ftdrive.stream.samples import Stages, StreamEvent, WrenchFrame
 from tests.unit.ftdrive.recorded import BASE_TCP, CONFIGURATION, UTC_OFFSET_NS, block, info
@@ -60,13 +60,13 @@ def same(one: Recording, other: Recording) -> None:
 
 
 def test_all_formats_hold_the_same_bits(paths: Sequence[Path]) -> None:
-    first, *others = map(read_recording, paths)
+    first, *others = map(load_recording, paths)
     for other in others:
         same(first, other)
 
 
 def test_a_recording_holds_what_was_measured(paths: Sequence[Path]) -> None:
-    recording = read_recording(paths[0])
+    recording = load_recording(paths[0])
     frames = [(len(one.rows), one.header.frame, one.header.stages) for one in recording.pieces()]
     assert frames == [(1500, BASE_TCP, Stages()), (1100, PUSH, Stages(lowpass_Hz=40.0))]
     measured, found = block(100, 300), recording.paired().rows(slice(300, 400))
@@ -90,7 +90,7 @@ def test_a_recording_holds_what_was_measured(paths: Sequence[Path]) -> None:
 def test_a_file_of_another_version_lacks_stages_that_were_off_and_may_have_one_that_was_off(
     small: Sequence[Path],
 ) -> None:
-    header = replace(read_recording(small[0]).header, info=replace(info(), hour_change=np.arange(6.0)))
+    header = replace(load_recording(small[0]).header, info=replace(info(), hour_change=np.arange(6.0)))
     document: Any = json.loads(json.dumps(header.to_dict()))
     np.testing.assert_array_equal(Header.from_dict(document).info.hour_change, np.arange(6.0))
     earlier = {name: value for name, value in document.items() if name not in ("foreign", "hour_change")}
@@ -108,17 +108,17 @@ def test_a_file_of_another_version_lacks_stages_that_were_off_and_may_have_one_t
 
 
 def test_conversion_is_lossless(paths: Sequence[Path], tmp_path: Path) -> None:
-    first, path = read_recording(paths[0]), paths[0]
+    first, path = load_recording(paths[0]), paths[0]
     for name in ("a.csv", "b.parquet", "c.mcap"):
         write_recording(tmp_path / name, RecordingReader(path))
         path = tmp_path / name
-        same(first, read_recording(path))
+        same(first, load_recording(path))
     write_recording(tmp_path / "d.mcap", first)
     assert path.read_bytes() == (tmp_path / "d.mcap").read_bytes()  # messages name the frame of their samples too
 
 
 def test_rosbags_reads_the_messages(paths: Sequence[Path]) -> None:
-    rows, frames = read_recording(paths[0]).rows, set()
+    rows, frames = load_recording(paths[0]).rows, set()
     store = get_typestore(Stores.ROS2_HUMBLE)
     with AnyReader([paths[0]], default_typestore=store) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
@@ -190,7 +190,7 @@ def rotation(transform: Any) -> Rotation:
 
 
 def test_mcap_ros2_reads_the_messages(paths: Sequence[Path]) -> None:
-    rows = read_recording(paths[0]).rows
+    rows = load_recording(paths[0]).rows
     with paths[0].open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         attachments = {one.name: one for one in reader.iter_attachments()}
@@ -214,7 +214,7 @@ def test_a_weighing_is_an_event_and_a_message(tmp_path: Path) -> None:
         given = {**values, "p_sensor_com_m": com_m, "p_sensor_com_sigma_m": com_m}
         recorder.add(None, [StreamEvent(int(block(1, start).t_host_ns[0]), "load", "1.25 kg", given)])
     recorder.end()
-    assert [event.kind for event in read_recording(tmp_path / "a.mcap").events] == ["load", "load"]
+    assert [event.kind for event in load_recording(tmp_path / "a.mcap").events] == ["load", "load"]
     with (tmp_path / "a.mcap").open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         first, second = (decoded for *_, decoded in reader.iter_decoded_messages(["/ftdrive/load"]))
@@ -248,11 +248,11 @@ def test_a_file_that_another_program_has_divided_otherwise_is_read(paths: Sequen
             elif isinstance(one, DataEnd):
                 break
         writer.finish()  # type: ignore[no-untyped-call]
-    same(read_recording(paths[0]), read_recording(tmp_path / "other.mcap"))
+    same(load_recording(paths[0]), load_recording(tmp_path / "other.mcap"))
 
 
 def test_the_table_is_plain_to_other_programs(paths: Sequence[Path]) -> None:
-    recording = read_recording(paths[0])
+    recording = load_recording(paths[0])
     lines = [line for line in paths[1].read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
     names = lines[0].split(",")
     assert names[:7] == ["t_s", "t_utc_s", "t_host_ns", "t_device_s", "seq", "status", "raw_fx"]
@@ -283,14 +283,14 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
     small: Sequence[Path], ending: str, cuts: int, least: int, tmp_path: Path
 ) -> None:
-    whole, path = read_recording(small[0]).rows, small[ENDINGS.index(ending)]
+    whole, path = load_recording(small[0]).rows, small[ENDINGS.index(ending)]
     content = path.read_bytes()
     sizes = np.r_[0, 8, np.linspace(9, len(content) - 1, cuts)].astype(int)
     cut, lengths = tmp_path / f"cut{ending}", []
     for size in sizes.tolist():
         cut.write_bytes(content[:size])
         try:
-            found = read_recording(cut)
+            found = load_recording(cut)
         except BadRecording:
             lengths.append(0)
         else:
@@ -304,14 +304,14 @@ def test_a_file_cut_anywhere_is_read_up_to_there_or_rejected(
 @pytest.mark.parametrize("ending", ENDINGS)
 def test_a_flipped_bit_is_refused_or_changes_no_number(small: Sequence[Path], ending: str, tmp_path: Path) -> None:
     path = small[ENDINGS.index(ending)]
-    whole, content = read_recording(path), path.read_bytes()
+    whole, content = load_recording(path), path.read_bytes()
     rng = np.random.default_rng(3)
     damaged, rejected = tmp_path / f"damaged{ending}", 0
     for place in rng.integers(0, len(content), 40).tolist():
         flipped = bytes([content[place] ^ 1 << int(rng.integers(8))])
         damaged.write_bytes(content[:place] + flipped + content[place + 1 :])
         try:
-            found = read_recording(damaged)
+            found = load_recording(damaged)
         except BadRecording:
             rejected += 1
         else:
@@ -327,12 +327,12 @@ def test_each_block_of_a_csv_file_has_its_checksum(small: Sequence[Path], tmp_pa
     ends = [number for number, line in enumerate(lines) if line.startswith("# crc32 ")]
     assert len(ends) > 10
     path.write_text("".join(lines[: ends[3] + 4]), encoding="utf-8")  # three samples without a checksum
-    assert len(read_recording(path).rows) == ends[3] - 3 - 3
+    assert len(load_recording(path).rows) == ends[3] - 3 - 3
     changed = lines.copy()
     changed[ends[2] - 1] = changed[ends[2] - 1].replace("0.", "1.", 1)
     path.write_text("".join(changed), encoding="utf-8")
     with pytest.raises(BadRecording, match=f"line {ends[2] + 1} is not the checksum"):
-        read_recording(path)
+        load_recording(path)
 
 
 def test_a_csv_file_without_an_end_of_a_line_or_a_checksum_is_refused(
@@ -348,7 +348,7 @@ def test_a_csv_file_without_an_end_of_a_line_or_a_checksum_is_refused(
     ):
         path.write_bytes(damaged)
         with pytest.raises(BadRecording, match=why):
-            read_recording(path)
+            load_recording(path)
 
 
 @pytest.mark.parametrize("more", [bytes(9), b"\5" + (200_000_001).to_bytes(8, "little")])
@@ -358,7 +358,7 @@ def test_records_that_no_file_of_ours_has_are_refused_before_they_are_read(
     path = tmp_path / "a.mcap"
     path.write_bytes(small[0].read_bytes()[:8] + more + bytes(100))
     with pytest.raises(BadRecording, match="the file is damaged"):
-        read_recording(path)
+        load_recording(path)
 
 
 def test_parquet_of_the_writer_before_pyarrow_is_read_and_has_the_same_columns(
@@ -366,7 +366,7 @@ def test_parquet_of_the_writer_before_pyarrow_is_read_and_has_the_same_columns(
 ) -> None:
     path = tmp_path / "a.parquet"
     path.write_bytes(gzip.decompress(Path(__file__).with_name("numpy_writer.parquet.gz").read_bytes()))
-    first, second = (recording := read_recording(path)).pieces()
+    first, second = (recording := load_recording(path)).pieces()
     for piece, measured in ((first, block(4, 0, step_ns=6 * 10**9)), (second, block(4, 4, step_ns=6 * 10**9))):
         for name in ("t_host_ns", "t_device_s", "seq", "status", "in_contact"):
             np.testing.assert_array_equal(piece.rows[name], getattr(measured, name))
@@ -383,28 +383,28 @@ def test_parquet_that_pyarrow_has_copied_stays_a_recording_and_other_parquet_is_
 ) -> None:
     table = parquet.read_table(paths[2])
     parquet.write_table(table, tmp_path / "a.parquet")
-    same(read_recording(paths[2]), read_recording(tmp_path / "a.parquet"))
+    same(load_recording(paths[2]), load_recording(tmp_path / "a.parquet"))
     parquet.write_table(table.replace_schema_metadata(None), tmp_path / "b.parquet")
     with pytest.raises(BadRecording, match="no header of ftdrive: another program wrote it"):
-        read_recording(tmp_path / "b.parquet")
+        load_recording(tmp_path / "b.parquet")
     parquet.write_table(table.drop_columns(["fz"]), tmp_path / "c.parquet")
     with pytest.raises(BadRecording, match="columns are not those of a recording"):
-        read_recording(tmp_path / "c.parquet")
+        load_recording(tmp_path / "c.parquet")
 
 
 def test_an_mcap_file_of_another_program_without_checksums_is_read(
     small: Sequence[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    whole = read_recording(small[0])
+    whole = load_recording(small[0])
     monkeypatch.setattr("zlib.crc32", lambda _content, _before=0: 0)
     write_recording(tmp_path / "a.mcap", whole)
     monkeypatch.undo()
-    same(read_recording(tmp_path / "a.mcap"), whole)
+    same(load_recording(tmp_path / "a.mcap"), whole)
 
 
 def test_events_stand_where_they_happened_also_after_a_conversion(paths: Sequence[Path], tmp_path: Path) -> None:
     end = StreamEvent(7_602_000_000_000, "delay", "…", {"value": 0.0})
-    recording = read_recording(paths[0])
+    recording = load_recording(paths[0])
     last = StreamEvent(int(recording.rows["t_host_ns"][-1]), "mark", "at the last sample")
     write_recording(tmp_path / "a.csv", replace(recording, events=[*recording.events, last, end]))
     lines = (tmp_path / "a.csv").read_text(encoding="utf-8").splitlines()

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationResult
 from ftcalib.errors import FtdriveError
-from ftdrive.commands.solve import solve
+from ftdrive.commands.solve import solve_command
 from ftdrive.recording.files import write_recording
 from ftdrive.recording.recording import ROW, Header, Recording
 from ftdrive.stream.samples import Stages, WrenchFrame
@@ -35,7 +35,7 @@ def table(path: Path, names: str, *columns: np.ndarray) -> Path:
 
 
 def run(*arguments: object) -> dict[str, Any]:
-    result = CliRunner().invoke(solve, [*map(str, arguments), "--json"], catch_exceptions=False)
+    result = CliRunner().invoke(solve_command, [*map(str, arguments), "--json"], catch_exceptions=False)
     document: dict[str, Any] = json.loads(result.stdout)
     return document
 
@@ -100,4 +100,4 @@ def test_files_that_cannot_be_used_are_named(
     table(Path("w.csv"), "t,fx,fy,fz,tx,ty,tz", np.arange(14.0).reshape(2, 7))
     table(Path("back.csv"), "t,fx,fy,fz,tx,ty,tz", np.arange(14.0)[::-1].reshape(2, 7))
     with pytest.raises(FtdriveError, match=words):
-        CliRunner().invoke(solve, arguments, catch_exceptions=False)
+        CliRunner().invoke(solve_command, arguments, catch_exceptions=False)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ftdrive.errors import BadRecording, ConfigError
-from ftdrive.recording import Recorder, read_recording, write_recording
+from ftdrive.recording import Recorder, load_recording, write_recording
 from ftdrive.recording.files import grown_as, require_new_recordings
 from ftdrive.recording.growing_file import GrowingFile
 from ftdrive.recording.recording import Header
@@ -75,7 +75,7 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
     assert recorder.saved == []
     for path, samples in recorder.partial.items():
         assert f"{path} keeps {samples} samples" in str(failure.value)
-        found = read_recording(path)
+        found = load_recording(path)
         assert found.cut
         assert 0 < len(found.rows) == samples < 5000
         np.testing.assert_array_equal(found.rows["seq"], found.rows["seq"][0] + np.arange(len(found.rows)))
@@ -98,7 +98,7 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
         recorder.end()
     assert not path.exists()
     partial = tmp_path / f"a{ending}.partial"
-    found = read_recording(partial)
+    found = load_recording(partial)
     assert len(found.rows) == 1100
     assert found.cut
     with pytest.raises(OSError, match="No space left"):
@@ -106,7 +106,7 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
     assert not list(tmp_path.glob("c*"))
     fill_disk(10**9)
     write_recording(tmp_path / f"c{ending}", found)
-    assert read_recording(tmp_path / f"c{ending}").rows.tobytes() == found.rows.tobytes()
+    assert load_recording(tmp_path / f"c{ending}").rows.tobytes() == found.rows.tobytes()
     with pytest.raises(FileExistsError, match=r"ftdrive convert .*partial"):
         Recorder([path], info(), {})
 
@@ -128,7 +128,7 @@ def test_control_c_amid_a_write_waits_for_its_end(ending: str, tmp_path: Path, m
         recorder.add(block(200, 100), [])
     monkeypatch.undo()
     recorder.end()
-    assert [len(read_recording(path).rows) for path in recorder.saved] == [300, 300]
+    assert [len(load_recording(path).rows) for path in recorder.saved] == [300, 300]
     assert recorder.saved == paths
 
 
@@ -140,13 +140,13 @@ def test_after_a_power_failure_the_partial_file_is_readable(ending: str, tmp_pat
     for start in range(26):
         recorder.add(block(1, start, step_ns=1_000_000_000), [])
         recorder.add(None, [mark if start == 1 else StreamEvent(0, "frame", "the recorder notices it itself")])
-    found = read_recording(partial_of(path))
+    found = load_recording(partial_of(path))
     np.testing.assert_array_equal(found.rows["seq"], block(len(found.rows)).seq)
     assert len(found.rows) > 15
     assert list(found.events) == [mark]
     assert found.cut
     recorder.end()
-    assert len(read_recording(path).rows) == 26
+    assert len(load_recording(path).rows) == 26
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -159,7 +159,7 @@ def test_nothing_is_overwritten(ending: str, tmp_path: Path) -> None:
         recorder.end()
     assert path.read_text() == "another program's"
     kept, samples = next(iter(recorder.partial.items()))
-    assert len(read_recording(kept).rows) == samples == 3
+    assert len(load_recording(kept).rows) == samples == 3
     with pytest.raises(FileExistsError, match="never overwritten"):
         Recorder([path], info(), {})
 
@@ -182,8 +182,8 @@ def test_what_cannot_be_converted_to_parquet_stays_in_mcap(
     monkeypatch.undo()
     with pytest.raises(FileExistsError, match="never overwritten"):
         require_new_recordings([path])
-    write_recording(path, read_recording(kept))
-    assert len(read_recording(path).rows) == 1100
+    write_recording(path, load_recording(kept))
+    assert len(load_recording(path).rows) == 1100
 
 
 def test_without_a_sample_there_is_no_file(tmp_path: Path) -> None:
@@ -200,7 +200,7 @@ def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match=r"a\.csv\.partial keeps 3 samples"):
         recorder.end()
     assert recorder.saved == [tmp_path / "b.csv"]
-    assert len(read_recording(tmp_path / "b.csv").rows) == 3
+    assert len(load_recording(tmp_path / "b.csv").rows) == 3
 
 
 def test_an_unknown_ending_is_refused_before_any_work(tmp_path: Path) -> None:
@@ -219,7 +219,7 @@ def test_a_missing_package_is_named_with_its_extra(
         Recorder([tmp_path / f"a{ending}"], info(), {})
     (tmp_path / f"b{ending}").touch()
     with pytest.raises(ConfigError, match=r"of the extra record"):
-        read_recording(tmp_path / f"b{ending}")
+        load_recording(tmp_path / f"b{ending}")
     assert not (tmp_path / f"a{ending}.partial").exists()
 
 
@@ -228,7 +228,7 @@ def test_a_file_of_another_kind_is_named_with_its_fault(content: str, words: str
     path = tmp_path / "a.csv"
     path.write_text(content)
     with pytest.raises(BadRecording, match=f"a.csv: .*{words}"):
-        read_recording(path)
+        load_recording(path)
 
 
 def test_a_newer_version_is_refused() -> None:

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex, to_rgba
 
 from ftcalib.model import PARAMETER_NAMES, Array
-from ftdrive.report.figures import BAD, MOST_DOTS, SERIES, WIDTH_IN, draw
+from ftdrive.report.figures import BAD, MOST_DOTS, SERIES, WIDTH_IN, draw_figure
 from ftdrivers.sweep import Sweep
 
 Draw = Callable[[str, Mapping[str, Any]], Any]
@@ -37,7 +37,7 @@ def drawn() -> Iterator[Draw]:
     def figure(of: str, facts: Mapping[str, Any]) -> Any:
         nonlocal name
         name = of
-        draw(name, facts)
+        draw_figure(name, facts)
         return figures.pop()
 
     with pytest.MonkeyPatch.context() as patch:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftdrive.report.sections import coverage, cross_validation, drift, error, estimates, noise, residuals
+from ftdrive.report.sections import coverage, cross_validation, drift, error, estimates_section, noise, residuals
 from tests.unit.ftdrive.exports.example import calibration, responding
 
 
@@ -35,7 +35,7 @@ def test_a_drift_is_said_as_far_as_it_is_known() -> None:
 
 def estimated(result: Any, strong: Any = (), motion: Any = None) -> Any:
     seen = {"correlation": {"strong": strong}, "motion": motion, "mass": "1.2 kg ± 1.6 %"}
-    return estimates({"result": result.to_dict(), **seen})
+    return estimates_section({"result": result.to_dict(), **seen})
 
 
 def test_only_what_was_known_beforehand_is_fixed() -> None:

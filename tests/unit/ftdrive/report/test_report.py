@@ -28,7 +28,7 @@ from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import _about_of, _error_map, compared, contact_error, facts_of
 from ftdrive.report.figures import VARIABLES
-from ftdrive.report.page import page as written
+from ftdrive.report.page import render_page as written
 from ftdrive.report.sections import comparison, contact, coverage, cross_validation, sections_of, shown_poses
 from ftdrive.report.subject import Subject, read_subject
 from ftdrive.runs.run import Reading, Run
@@ -65,7 +65,7 @@ def test_the_head_names_arm_sensor_tool_and_date(monkeypatch: pytest.MonkeyPatch
     about = _about_of(replace(result(), provenance=known))
     assert about == "UR5e 1, Mini45 FT9, tool gripper, 2026-11-23 07:58 UTC"
     assert f"<p>{escape(facts()['about'])}</p>" in html()
-    monkeypatch.setattr("ftdrive.report.figures.draw", lambda *_: "")
+    monkeypatch.setattr("ftdrive.report.figures.draw_figure", lambda *_: "")
     assert f"<p>{about}</p>" in written({**facts(), "about": about})
 
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from ftcalib import CalibrationResult
 from ftdrive.cli import cli
-from ftdrive.report.page import page
+from ftdrive.report.page import render_page
 from ftdrive.report.subject import trust
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
@@ -58,13 +58,13 @@ def report(*arguments: str | Path) -> Result:
 def test_a_failed_verification_is_in_every_format_and_changes_the_next_step(
     calibrated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.report.figures.draw", lambda *_: "")
+    monkeypatch.setattr("ftdrive.report.figures.draw_figure", lambda *_: "")
     verified(new_run(tmp_path / "runs", "verify"), result(0).id, passed=False)
     path = calibrated / "calibration.json"
     document = json.loads(report(path, "--format", "json").stdout)
     assert document["trust"]["last_verification"]["reason"] == "the force bias has changed by 0.5 N"
     assert "accept the update" in document["next_step"]
-    text = page(document)
+    text = render_page(document)
     assert "VERIFICATION FAILED" in text
     assert "the force bias has changed by 0.5 N" in text
 

@@ -12,7 +12,7 @@ import pytest
 from websockets import InvalidStatus, Origin, Subprotocol
 from websockets.sync.client import connect
 
-from ftdrive.servers.http_gate import PassingGate, refusal
+from ftdrive.servers.http_gate import PassingGate, refusal_reason
 from tests.unit.ftdrive.servers.fake_stream import Client, FakeStream, serving
 
 PAGE = "https://evil.example"
@@ -100,20 +100,20 @@ def test_what_is_no_request_is_refused(port: int, request_head: bytes) -> None:
     ],
 )
 def test_the_host_is_the_bound_address(host: str, bound: str, served: bool) -> None:
-    assert (not refusal({"Host": host}, bound)) is served
+    assert (not refusal_reason({"Host": host}, bound)) is served
 
 
 @pytest.mark.parametrize(
     "host", ["127.0.0.1:10019.evil", "127.0.0.1:x", "evil@127.0.0.1", "127.0.0.1/evil", "[::1]evil"]
 )
 def test_what_only_begins_as_the_address_is_refused(host: str) -> None:
-    assert "the server is not" in refusal({"Host": host}, "127.0.0.1")
+    assert "the server is not" in refusal_reason({"Host": host}, "127.0.0.1")
 
 
 def test_only_the_stream_has_an_option_for_other_pages() -> None:
     headers = {"Host": "127.0.0.1:1", "Origin": PAGE}
-    assert "`ftdrive stream --allow-origin https://evil.example`" in refusal(headers, "127.0.0.1", [])
-    assert refusal(headers, "127.0.0.1").endswith("not served; open the page of this server")
+    assert "`ftdrive stream --allow-origin https://evil.example`" in refusal_reason(headers, "127.0.0.1", [])
+    assert refusal_reason(headers, "127.0.0.1").endswith("not served; open the page of this server")
 
 
 def handshake(port: int, origin: str | None, host: str = "127.0.0.1", **options: Any) -> Any:

@@ -10,7 +10,7 @@ import pytest
 
 from ftdrive.servers import ros2
 from ftdrive.servers.parameters import Fixed
-from ftdrive.servers.ros2 import Level, PartState, Transforms, reports_of
+from ftdrive.servers.ros2 import Level, PartState, TransformPublisher, reports_of
 from ftdrive.stream.samples import LinkStatus, Stages, StreamStatus, WrenchFrame
 from ftdrivers.errors import NoRos2
 from tests.unit.ftdrive.terminal.fake_stream import INFO, R_BASE_FLANGE, FakeStream
@@ -105,7 +105,7 @@ FIXED = Fixed(base_frame="ur_base", flange_frame="ur_tool0", sensor_frame="wrist
 
 
 def test_the_names_of_frames_are_those_of_the_parameters(node: FakeNode) -> None:
-    found = Transforms(node, FIXED)
+    found = TransformPublisher(node, FIXED)
     names = {
         WrenchFrame("sensor", "sensor"): "wrist_ft",
         WrenchFrame("base", "tcp"): "ur_base_at_tcp",
@@ -117,21 +117,21 @@ def test_the_names_of_frames_are_those_of_the_parameters(node: FakeNode) -> None
 
 
 def test_sensor_and_tcp_are_published_once_where_the_height_is_known(node: FakeNode) -> None:
-    Transforms(node, FIXED).use(INFO)
+    TransformPublisher(node, FIXED).use(INFO)
     ((topic, (t_ns, found)),) = node.published
     assert (topic, t_ns) == ("/tf_static", 77)
     assert found.keys() == {("ur_tool0", "wrist_ft"), ("ur_tool0", "tcp")}
     R, p_m = found["ur_tool0", "wrist_ft"]
     np.testing.assert_allclose(R, INFO.calibration.R_flange_sensor)
     np.testing.assert_allclose(p_m, [0, 0, 0.035])
-    Transforms(node, FIXED).use(replace(INFO, p_flange_sensor_m=np.array([0.0, 0.0, np.nan])))
+    TransformPublisher(node, FIXED).use(replace(INFO, p_flange_sensor_m=np.array([0.0, 0.0, np.nan])))
     assert len(node.published) == 1
 
 
 def test_a_frame_that_turns_and_on_request_the_flange_are_published_as_they_move(node: FakeNode) -> None:
     stream = FakeStream()
     block = stream.read()
-    both = Transforms(node, replace(FIXED, publish_base_tf=True))
+    both = TransformPublisher(node, replace(FIXED, publish_base_tf=True))
     both.publish(block, INFO, 10**9)
     ((topic, (t_ns, found)),) = node.published
     assert (topic, t_ns) == ("/tf", 10**9)
@@ -143,9 +143,9 @@ def test_a_frame_that_turns_and_on_request_the_flange_are_published_as_they_move
     both.publish(block, INFO, 10**9 + 10**6)  # at most 50 a second
     assert len(node.published) == 1
     at_tcp = replace(block, frame=WrenchFrame("tcp", "tcp"), stages=Stages())
-    Transforms(node, FIXED).publish(at_tcp, INFO, 10**9)
+    TransformPublisher(node, FIXED).publish(at_tcp, INFO, 10**9)
     unknown = replace(at_tcp, p_base_flange_m=np.full((len(block), 3), np.nan))
-    Transforms(node, replace(FIXED, publish_base_tf=True)).publish(unknown, INFO, 10**9)
+    TransformPublisher(node, replace(FIXED, publish_base_tf=True)).publish(unknown, INFO, 10**9)
     assert len(node.published) == 1
 
 
@@ -154,7 +154,7 @@ def test_without_tf2_nothing_is_published(node: FakeNode, monkeypatch: pytest.Mo
         raise NoRos2(name)
 
     monkeypatch.setattr(ros2, "ros2_module", missing)
-    found = Transforms(node, FIXED)
+    found = TransformPublisher(node, FIXED)
     found.use(INFO)
     found.publish(FakeStream().read(), INFO, 10**9)
     assert not node.published

@@ -14,8 +14,8 @@ from ftdrive.recording.recorder import RawTable
 from ftdrive.stream.sources import CellSource
 from ftdrive.stream.stream import Stream
 from ftdrive.tables.table import Table
-from ftdrive.terminal.live_screen import LiveScreen, frame
-from ftdrive.words.stream import Summary
+from ftdrive.terminal.live_screen import LiveScreen, draw_live
+from ftdrive.words.stream import StreamSummary
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import NOISE, calibrated
@@ -75,7 +75,7 @@ def test_a_silent_sensor_raises_and_recovers(sensor: Sensor) -> None:
 def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
     with raw(sensor) as stream:
         feed = SteppedFeed(stream)
-        summary = Summary(feed)
+        summary = StreamSummary(feed)
         screen = LiveScreen(feed, summary)
         feed.step(220)
         for key in ("t", "x", "1"):
@@ -83,7 +83,7 @@ def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
         feed.step(60)
         view = summary.view()
     for size in ((80, 24), (120, 40)):
-        lines = [str(line) for line in frame(view, *size)]
+        lines = [str(line) for line in draw_live(view, *size)]
         text = "\n".join(lines)
         assert {len(line) for line in lines} == {size[0]}
         assert "sensor alone: no arm, no calibration  tare" in lines[2]

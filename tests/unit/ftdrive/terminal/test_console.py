@@ -22,7 +22,7 @@ import ftdrive.cli as cli_module
 from ftdrive.checks.check import Check
 from ftdrive.cli import cli
 from ftdrive.cli import run as cli_run
-from ftdrive.commands.doctor import _print
+from ftdrive.commands.doctor import _print_checks
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
@@ -108,7 +108,7 @@ def test_findings_of_doctor_and_their_cures_are_indented(
 ) -> None:
     monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
     monkeypatch.setattr(answer, "soft_wrap", False)  # as in a terminal
-    _print([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)], every=True)
+    _print_checks([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)], every=True)
     first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
     assert first.startswith(" robot       ✘ found [1]")
     cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: fix"))

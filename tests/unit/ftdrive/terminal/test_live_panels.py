@@ -7,12 +7,12 @@ import pytest
 
 from ftcalib.model import Array
 from ftdrive.runs.calibration import FOREIGN
-from ftdrive.stream.feed import Note
+from ftdrive.stream.feed import FeedNote
 from ftdrive.stream.samples import Stages, WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
 from ftdrive.terminal.live_panels import others, sphere
-from ftdrive.terminal.live_screen import frame
+from ftdrive.terminal.live_screen import draw_live
 from ftdrive.words.stream import View, line_of_force
 from ftdrivers.interfaces import Fact
 from tests.unit.ftdrive.terminal.fake_stream import BIAS, FREE, PARAMETERS, R_BASE_FLANGE, SIGMA, TARE, FakeStream
@@ -136,6 +136,6 @@ def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(vie
 def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:
     words = "tare refused: the reading differs from a free tool by 1.52 N, more than noise, calibration and a usual "
     words += "drift explain (test value 31, limit 22.5); take hand or contact away, or calibrate again"
-    refused = replace(view, notes=[Note(None, words, "tare-refused"), *view.notes])
-    shown = " ".join(text(line).strip() for line in frame(refused, 80, 24))
+    refused = replace(view, notes=[FeedNote(None, words, "tare-refused"), *view.notes])
+    shown = " ".join(text(line).strip() for line in draw_live(refused, 80, 24))
     assert words in " ".join(shown.split())

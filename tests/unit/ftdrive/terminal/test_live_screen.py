@@ -18,8 +18,8 @@ from ftdrive.errors import ConfigError
 from ftdrive.stream.samples import Block, Stages, WrenchFrame
 from ftdrive.stream.sources import STEP_S
 from ftdrive.terminal.console import messages
-from ftdrive.terminal.live_screen import LiveScreen, frame, run_live
-from ftdrive.words.stream import Summary
+from ftdrive.terminal.live_screen import LiveScreen, draw_live, run_live
+from ftdrive.words.stream import StreamSummary
 from ftdrivers.errors import DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import calibrated, dwells, info, paired, replayed
@@ -56,7 +56,7 @@ class Screen:
 
     def show(self, stream: Any) -> None:
         self.stream, self.feed = stream, SteppedFeed(stream)
-        self.summary = Summary(self.feed, CHECKS)
+        self.summary = StreamSummary(self.feed, CHECKS)
         self.screen = LiveScreen(self.feed, self.summary)
 
     def step(self, blocks: int) -> None:
@@ -87,7 +87,7 @@ def test_every_size_is_filled_exactly(scenario: Scenario) -> None:
     view = Screen(scenario).summary.view()
     tall = (40, 40), (60, 70), (119, 70), (121, 40), (200, 70)
     for width, height in (*product((1, 40, 60, 79, 81, 119, 121), (1, 8, 16, 23, 25)), *tall):
-        lines = frame(view, width, height)
+        lines = draw_live(view, width, height)
         assert {line.width for line in lines} == {width}
         assert len(lines) == height
 
@@ -105,7 +105,7 @@ def test_the_low_pass_fits_the_rate_of_the_sensor(rate_Hz: float, lowpass_Hz: fl
 
 
 def test_before_the_first_sample_the_screen_waits_and_the_page_has_its_place() -> None:
-    screen = LiveScreen(feed := SteppedFeed(FakeStream()), Summary(feed), "http://127.0.0.1:8080/?token=abc")
+    screen = LiveScreen(feed := SteppedFeed(FakeStream()), StreamSummary(feed), "http://127.0.0.1:8080/?token=abc")
     lines = [str(line) for line in screen.lines(80, 24)]
     assert "waiting for the first sample" in lines[1]
     assert lines[3].strip(" ─") == "http://127.0.0.1:8080/?token=abc  v QR code"
@@ -160,7 +160,7 @@ def test_at_80_columns_no_word_is_broken_and_none_touches_its_neighbour() -> Non
     status = replace(view.status, false_alarm_rate=1e-6, contact_limit=40.6)
     info = replace(view.info, tool="emulated gripper with long fingers and a camera")
     view = replace(view, reading=reading, info=info, status=status, recording_s=754.0, contact_s=123.4)
-    lines = list(map(str, frame(view, 80, 24)))
+    lines = list(map(str, draw_live(view, 80, 24)))
     assert all(cell_len(line) == 80 for line in lines)
     words = {*lines[0].split()[-3:], *f"ftdrive live UR5e · ATI Mini45 FT12345 {info.tool} …".split()}
     assert set(lines[0].split()) <= words

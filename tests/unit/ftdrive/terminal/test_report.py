@@ -19,7 +19,7 @@ from ftcalib.errors import NotObservable
 from ftcalib.model import DriftResult, SPECIAL_R_flange_base, predict
 from ftcalib.result import Method
 from ftcalib.routine import DriftCheck
-from ftdrive.commands.solve import solve as solve_command
+from ftdrive.commands.solve import solve_command
 from ftdrive.errors import ConfigError
 from ftdrive.terminal.console import answer, messages
 from ftdrive.terminal.report import _to_digits, print_cases, print_comparison, print_result

@@ -36,7 +36,7 @@ from ftdrive.session.events import (
 )
 from ftdrive.terminal.keyboard import Keyboard
 from ftdrive.terminal.operators import JsonOperator, PlainOperator
-from ftdrive.terminal.screen import Screen, frame, open_operator
+from ftdrive.terminal.screen import Screen, draw_session, open_operator
 from ftdrive.words.session import SessionText, SessionView, drift_so_far
 from tests.wire.waiting import wait_until
 
@@ -113,7 +113,7 @@ MIDDLE: tuple[Event, ...] = (
 
 def drawn(found: SessionView, *, width: int = 80, height: int = 24, now_s: float = 9.0) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None, force_terminal=False)
-    console.print(frame(found, now_s, width=width, height=height))
+    console.print(draw_session(found, now_s, width=width, height=height))
     file = console.file
     assert isinstance(file, io.StringIO)
     return [line.rstrip() for line in file.getvalue().splitlines()]
@@ -613,7 +613,7 @@ def test_a_verification_shows_each_pose_beside_its_prediction(width: int) -> Non
         view.update(
             Compared(stop=stop, number=number, residual=residual, sigma=sigma, poses=stop, light="amber"), float(stop)
         )
-    lines = [str(line) for line in frame(view, 3.0, width=width, height=24).renderables]
+    lines = [str(line) for line in draw_session(view, 3.0, width=width, height=24).renderables]
     assert lines[0].startswith("ftdrive verify")
     assert [line.split() for line in lines if line.startswith(("R103  ", "R101  "))] == [
         ["R103", "0.052", "±", "0.052", "N", "0.0017", "±", "0.0017", "N·m", "1.0", "sigma"],

@@ -18,7 +18,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.view.page import Page
-from ftdrive.view.plan_page import PlanPage, Timeline, describe
+from ftdrive.view.plan_page import PlanPage, PlanTimeline, describe
 from ftdrive.view.scene import arm_parts, turned_up, wrench_parts
 
 
@@ -62,7 +62,7 @@ def arm_is_at(shown: PlanPage, q_rad: Any) -> bool:
 
 
 def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> None:
-    tour = Timeline(plan)
+    tour = PlanTimeline(plan)
     np.testing.assert_allclose(tour.at(tour.begins_s), plan.nodes_rad)
     np.testing.assert_allclose(tour.at([0.0, tour.end_s]), plan.nodes_rad[[0, 0]])
     assert tour.end_s == pytest.approx(plan.motion_time_s)
@@ -77,7 +77,7 @@ def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> No
 
 def test_the_tour_begins_where_the_arm_stands(plan: Plan) -> None:
     way = plan.nodes_rad[0] + np.radians([[-20.0, 0, 0, 10, 0, 0], [0.0, 0, 0, 10, 0, 0], [0.0] * 6])
-    tour, alone = Timeline(plan, way), Timeline(plan)
+    tour, alone = PlanTimeline(plan, way), PlanTimeline(plan)
     approach_s = tour.begins_s[0]
     np.testing.assert_allclose(tour.at(0.0), way[0])
     assert approach_s > 1
@@ -89,7 +89,7 @@ def test_the_tour_begins_where_the_arm_stands(plan: Plan) -> None:
 
 def test_the_approach_of_a_resumed_run_ends_at_its_own_pose(plan: Plan) -> None:
     way = np.array([plan.nodes_rad[2] + 0.2, plan.nodes_rad[2]])
-    tour = Timeline(plan, way)
+    tour = PlanTimeline(plan, way)
     np.testing.assert_allclose(tour.at(tour.begins_s[0] - 1e-9), plan.nodes_rad[2], atol=1e-6)
     np.testing.assert_allclose(tour.at(tour.begins_s[0]), plan.nodes_rad[0])
 
@@ -99,7 +99,7 @@ def test_the_approach_of_a_resumed_run_ends_at_its_own_pose(plan: Plan) -> None:
     [(False, 0.0, "pose 1 of 6, 0 of "), (False, 1e9, "pose 6 of 6, "), (True, 0.0, "approach, 0 of ")],
 )
 def test_the_slider_says_pose_and_seconds(plan: Plan, approach: bool, t_s: float, words: str) -> None:
-    tour = Timeline(plan, [plan.nodes_rad[0] + 0.1, plan.nodes_rad[0]] if approach else ())
+    tour = PlanTimeline(plan, [plan.nodes_rad[0] + 0.1, plan.nodes_rad[0]] if approach else ())
     slider = tour.slider(min(t_s, tour.end_s))
     assert slider["text"].startswith(words)
     assert slider["text"].endswith(f" of {tour.end_s:.0f} s")
@@ -127,7 +127,7 @@ def test_viewers_step_from_pose_to_pose(shown: PlanPage, page: Page, plan: Plan)
 
 
 def test_the_slider_moves_the_arm(shown: PlanPage, page: Page, plan: Plan) -> None:
-    tour = Timeline(plan)
+    tour = PlanTimeline(plan)
     page.act("viewer 0", "along", 4.0)
     assert arm_is_at(shown, tour.at(4.0))
     assert (control(shown, "along")["value"], control(shown, "along")["text"].split(", ")[1]) == (

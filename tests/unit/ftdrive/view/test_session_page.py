@@ -538,7 +538,7 @@ def test_a_calibration_ends_with_verdict_estimates_and_next_command(
     outcome = lab.calibrate()
     assert isinstance(outcome, Outcome)
     capsys.readouterr()
-    calibrate._report(outcome, page, simulate=False, every=False, as_json=False)
+    calibrate._report_calibration(outcome, page, simulate=False, every=False, as_json=False)
     terminal, parts = printed(capsys), parts_of(page)
     verdict = parts["result"]
     tones = {"GOOD": "good", "USABLE": "warn"}
@@ -559,7 +559,7 @@ def test_a_calibration_ends_with_verdict_estimates_and_next_command(
 def test_the_result_of_json_is_shown_too(lab: Lab, page: Page, capsys: pytest.CaptureFixture[str]) -> None:
     outcome = lab.calibrate()
     assert isinstance(outcome, Outcome)
-    calibrate._report(outcome, page, simulate=False, every=False, as_json=True)
+    calibrate._report_calibration(outcome, page, simulate=False, every=False, as_json=True)
     assert json.loads(capsys.readouterr().out)["verdict"].upper() == parts_of(page)["result"]["head"]
 
 
@@ -576,7 +576,7 @@ def test_a_verification_ends_with_its_verdict(
     assert run is not None
     verified = verify_run(run, result, path, (limit_N, None))
     capsys.readouterr()
-    verify._report(verified, "no", page, again="", as_json=False)
+    verify._report_verification(verified, "no", page, again="", as_json=False)
     terminal, parts = printed(capsys), parts_of(page)
     assert (parts["result"]["head"], parts["result"]["tone"]) == (head, tone)
     assert f"{head} {parts['result/words']['lines'][0]}" in terminal
@@ -595,6 +595,6 @@ def test_the_question_of_a_verification_is_shown_while_it_waits(page: Page, monk
         return "yes"
 
     monkeypatch.setattr("ftdrive.terminal.operators.PlainOperator.ask", answer)
-    assert verify._ask(page, False, Question("Save it?")) == "yes"
+    assert verify._ask_on_page(page, False, Question("Save it?")) == "yes"
     assert waiting == ["Answer in the terminal\nSave it?"]
     assert "question" not in parts_of(page)

@@ -15,8 +15,8 @@ import pytest
 
 from ftdrive.terminal.console import print_page
 from ftdrive.view.page import Page, drawing
-from ftdrive.view.parts import button, check, controls, lines, select, slider, text_field
-from ftdrive.view.site import announced, serve
+from ftdrive.view.parts import button, check_box, choice, controls, lines, slider, text_field
+from ftdrive.view.site import announced, serve_page
 from tests.wire.waiting import wait_until
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
@@ -60,7 +60,7 @@ class Viewer:
 
 @pytest.fixture
 def page() -> Iterator[Page]:
-    with serve("a <b>page</b>") as page:
+    with serve_page("a <b>page</b>") as page:
         yield page
 
 
@@ -112,7 +112,7 @@ def test_parts_arrive_once_and_the_newest_counts(page: Page) -> None:
 
 
 def test_the_last_state_arrives_before_the_end() -> None:
-    with serve("a page") as page:
+    with serve_page("a page") as page:
         events = Viewer(page).follow()
         assert next(events)[1] == {"viewer": {"kind": "viewer", "number": 0}}
         page.put({"result": lines("GOOD")})
@@ -143,9 +143,9 @@ def test_controls_take_only_their_own_values(page: Page) -> None:
             "controls": controls(
                 button("go", "Go"),
                 button("off", "Off", disabled=True),
-                select("axes", "Axes", "base", ["base", "tcp"]),
+                choice("axes", "Axes", "base", ["base", "tcp"]),
                 slider("at", "seconds", 0, 12),
-                check("swept", "swept", value=False),
+                check_box("swept", "swept", value=False),
             ),
             "form/a": controls(text_field("name", "Name", "")),
         }

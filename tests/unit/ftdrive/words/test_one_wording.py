@@ -19,15 +19,15 @@ from ftdrive.report.sections import capital
 from ftdrive.report.subject import Subject
 from ftdrive.runs.calibration import EMULATED, FOREIGN
 from ftdrive.session.events import State, StateChanged
-from ftdrive.terminal.live_screen import frame as live_frame
+from ftdrive.terminal.live_screen import draw_live as live_frame
 from ftdrive.terminal.report import print_result
-from ftdrive.terminal.screen import frame
+from ftdrive.terminal.screen import draw_session
 from ftdrive.view.live_page import texts
 from ftdrive.view.outcome import conclude_calibration
 from ftdrive.view.page import Page
-from ftdrive.view.session_page import _state
+from ftdrive.view.session_page import _state_panel
 from ftdrive.words.session import SessionText, SessionView, state_in_words
-from ftdrive.words.stream import CONTACT, FREE, NOISE_UNKNOWN, Summary, calibration_in_words, state
+from ftdrive.words.stream import CONTACT, FREE, NOISE_UNKNOWN, StreamSummary, calibration_in_words, state
 from tests.finding_examples import examples
 from tests.unit.ftdrive.exports.example import calibration
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
@@ -85,8 +85,8 @@ def test_every_state_of_a_session_is_worded_alike(state: State) -> None:
     event, view = StateChanged(state=state, stop=3, stops=25, number=7, words="because"), SessionView()
     view.update(event, time.monotonic())
     where, said, words = state_in_words(view, time.monotonic())
-    screen = "\n".join(line.plain for line in frame(view, time.monotonic()).renderables)  # type: ignore[union-attr]
-    part: Any = _state(view, "", "")["state"]
+    screen = "\n".join(line.plain for line in draw_session(view, time.monotonic()).renderables)  # type: ignore[union-attr]
+    part: Any = _state_panel(view, "", "")["state"]
     assert said.startswith(state.upper())
     assert f"{where}  {said}  {words}" in screen
     assert (part["head"], part["lines"]) == (f"{where}  {said}", [words])
@@ -100,7 +100,7 @@ def test_every_state_of_a_stream_is_worded_alike(said: str, mark: str) -> None:
     stream = FakeStream("contact", block_s=0.05)
     stream.info = replace(stream.info, emulated=mark == EMULATED, foreign=mark == FOREIGN)
     feed = SteppedFeed(stream)
-    summary = Summary(feed)
+    summary = StreamSummary(feed)
     feed.step(240 if said == CONTACT else 20)
     view = summary.view()
     if said == NOISE_UNKNOWN and view.reading is not None:

@@ -11,7 +11,7 @@ from ftcalib import CalibrationDataset
 from ftdrive.checks.check import Check
 from ftdrive.stream.feed import History
 from ftdrive.stream.samples import Block, WrenchFrame
-from ftdrive.words.stream import ShownWrench, Summary, View
+from ftdrive.words.stream import ShownWrench, StreamSummary, View
 from tests.unit.ftdrive.terminal.fake_stream import R_BASE_FLANGE, SIGMA, FakeStream, SteppedFeed
 
 MS = 1_000_000
@@ -24,7 +24,7 @@ class Rig:
     def __init__(self, stream: FakeStream, dataset: CalibrationDataset | None = None, *checks: Check) -> None:
         self.stream = stream
         self.feed = SteppedFeed(stream)
-        self.summary = Summary(self.feed, checks, dataset)
+        self.summary = StreamSummary(self.feed, checks, dataset)
 
     def run(self, blocks: int) -> View:
         self.feed.step(blocks)
