@@ -1,4 +1,4 @@
-"""Contact: which readings a free tool does not explain, and what touched it from when to when."""
+"""Contact detection: readings that differ from the prediction for a free tool, joined to contacts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -24,42 +24,44 @@ from ftdrive.stream.noise import (
 )
 from ftdrive.stream.samples import Ns, Paired
 
-# The covariance of a calibration is evaluated again after so much turning.
+# The covariance of the prediction is evaluated again after the tool has turned by this angle.
 _TURN_RAD = 0.02
-# Acceleration of an arm in motion, one sigma, without positions; its error without the poses that follow; rotation.
+# Sigma of the acceleration of a moving arm: without positions, and predicted from past poses only. Sigma of the angular
+# acceleration.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
-# Error of the time of a predicted wrench, beside that of the delay: accelerations are means over as long.
+# Error of the time of a predicted wrench besides that of the delay: accelerations are means over a similar time.
 _INEXACT_S = 0.005
-# Friction of wrist 3, which the arm's own sensor feels.
+# Friction torque of wrist 3, which the force/torque sensor inside the arm measures too.
 _FRICTION_NM = 0.15
-# So many readings begin or end a contact.
-# Rules with one mean as long begin a contact later.
+# A contact begins after this many consecutive readings beyond the limit, and ends after as many within it. A single
+# longer mean would detect the begin later.
 _IN_A_ROW = 3
-# From one of them to the next; the shorter one where inertia is subtracted, which needs the poses that follow.
+# Time between these readings; the shorter one if inertia is subtracted, because the stream then waits for later poses.
 _LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
 
 
 class Inertia(Enum):
-    """How well the prediction of a free tool has its inertia."""
+    """Accuracy of the inertial wrench in the prediction for a free tool."""
 
     UNKNOWN = 0
     COARSE = 1
-    """From the poses before."""
+    """Acceleration from earlier poses only."""
     EXACT = 2
-    """From poses on both sides."""
+    """Acceleration from poses before and after the sample."""
 
 
 class ContactTest:
-    """Squared Mahalanobis distance of each reading from a free tool, with noise and calibration in the covariance.
+    """Squared Mahalanobis distance of each reading from the prediction for a free tool.
 
-    A reading is the mean of the samples of the last `READING_S` seconds, so each sample ends one; independent are those
-    without common samples. The distance of a free tool follows Hotelling's T², because the noise is estimated too.
-    Noise is that of the present state of motion. In motion, the error of the delay and, where inertia is not
-    subtracted, an unknown acceleration are in the covariance too.
+    A reading is the mean of the samples of the last `READING_S` seconds. Every sample completes a reading; only
+    readings without common samples are independent. The covariance contains the noise in the present state of motion
+    and the uncertainty of the calibration. In motion it also contains the error of the delay and, if inertia is not
+    subtracted, an unknown acceleration. The limit follows Hotelling's T² distribution, because the noise is estimated
+    from data.
 
-    The offset of the free tool, which drift and the error of the calibration in this orientation make, is that of its
-    filter. `beyond` (6,) is the variance beyond what the calibration predicts, N² and (N·m)², and `friction_axis` (3,)
-    the axis of wrist 3 in sensor axes, if the sensor feels its friction.
+    The mean reading of a free tool comes from the free-tool filter, which estimates drift and the local error of the
+    calibration. `beyond` (6,) is a variance added to that of the prediction, N² and (N·m)². `friction_axis` (3,) is the
+    axis of wrist 3 in sensor axes, if the sensor measures its friction torque.
     """
 
     def __init__(
@@ -72,7 +74,7 @@ class ContactTest:
         if friction_axis is not None:
             self._friction[3:, 3:] = _FRICTION_NM**2 * np.outer(friction_axis, friction_axis)
         self._calibration: Calibrated | None = None
-        # Covariance of what inertia leaves.
+        # Covariance of the inertial wrench that is not predicted.
         self._unknown = dict.fromkeys(Inertia, np.zeros((6, 6)))
         self.uncertainty = np.zeros((6, 6))
         """Covariance of the prediction at the newest orientation, sensor axes."""
@@ -81,9 +83,9 @@ class ContactTest:
         self.restart()
 
     def restart(self) -> None:
-        """Forget earlier samples."""
+        """Discard earlier samples."""
         self._earlier = np.zeros((self._size - 1, 6))
-        # The predictions of the last `READING_S` seconds.
+        # Predicted wrenches of the last `READING_S` seconds.
         self._predicted: Array | None = None
         self._R: Array | None = None
         self._whitening: tuple[tuple[SensorNoise, int, Inertia | None], Array, Array] | None = None
@@ -113,10 +115,10 @@ class ContactTest:
         delay_sigma_s: float,
         inertia: Inertia,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return readings (n, 6), their chi2 (n,), NaN until the noise is known, and which are beyond the limit (n,).
+        """Return readings (n, 6), squared distances (n,), NaN until the noise is known, and which are beyond it (n,).
 
-        `residual` is the measured minus the predicted wrench (n, 6), `motion` is that of `MotionTracker.follow`, and
-        `inertia` is how well the prediction has it. The samples are added to what is known of the free tool.
+        `residual` is the measured minus the predicted wrench (n, 6), `motion` the result of `MotionTracker.follow`, and
+        `inertia` the accuracy of the predicted inertial wrench. Pass the samples to the free-tool filter as well.
         """
         states, felt = motion
         n = len(residual)
@@ -140,7 +142,7 @@ class ContactTest:
         return readings, chi2, beyond
 
     def _change(self, predicted: Array, delay_sigma_s: float) -> Array:
-        """Return the change of the prediction (n, 6) within one sigma of its time."""
+        """Return the change (n, 6) of the predicted wrench within one standard deviation of its time."""
         if not len(predicted):
             return predicted
         if self._predicted is None:
@@ -160,7 +162,7 @@ class ContactTest:
             yield slice(start, stop)
 
     def _turn(self, R_base_flange: Array) -> None:
-        """Evaluate the covariance of the prediction at another orientation, where its error is another one."""
+        """Evaluate the covariance of the prediction for a new orientation."""
         known = self._calibration
         if known is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
             return
@@ -170,7 +172,7 @@ class ContactTest:
         self._whitening = None
 
     def _whiten(self, noise: SensorNoise, state: int, inertia: Inertia, free: Following) -> tuple[Array, Array]:
-        """Return the matrix that makes the readings of a free tool white, and their mean."""
+        """Return the whitening matrix (6, 6) and the mean (6,) of the readings of a free tool."""
         key = noise, free.filter.changes, None if state == REST else inertia
         if self._whitening is None or self._whitening[0] != key:
             offset, covariance = free.filter.offset(self.uncertainty, np.eye(3) if self._R is None else self._R)
@@ -183,7 +185,7 @@ class ContactTest:
 
 
 def _hotelling(rate: float, dof: float) -> float:
-    """Limit of the squared distance of six channels whose covariance was estimated with `dof` degrees of freedom."""
+    """Return the limit of the squared distance of six channels whose covariance has `dof` degrees of freedom."""
     if dof <= 6:
         return float("inf")
     return float(6 * dof / (dof - 5) * fdtri(6, dof - 5, 1 - rate))
@@ -191,11 +193,11 @@ def _hotelling(rate: float, dof: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """A contact, up to now or to its end.
+    """A contact from its begin to its end, or to the newest reading while it lasts.
 
     Examples
     --------
-    `open_stream` passes it to `on_contact`:
+    `open_stream` passes a `Contact` to `on_contact`:
 
     >>> import ftdrive, numpy as np
     >>> contact = ftdrive.Contact(begin_ns=0, last_ns=10**9, peak_N=5.0, peak=np.array([0, 0, -5.0, 0, 0, 0]))
@@ -204,22 +206,22 @@ class Contact:
     """
 
     begin_ns: int
-    """Clock of the cell."""
+    """Time of the first reading beyond the limit, on the clock of the cell."""
     last_ns: int
-    """The newest reading beyond the limit."""
+    """Time of the newest reading beyond the limit."""
     peak_N: float
     peak: Array
-    """(6,) mean over `READING_S` at the largest force, N and N·m, in `frame` of the stream."""
+    """(6,) reading with the largest force, a mean over `READING_S`, N and N·m, in the `frame` of the stream."""
     over: bool = False
 
     @property
     def t_s(self) -> float:
-        """When it began, as `Sample.t_s`."""
+        """Begin of the contact, on the clock of `Sample.t_s`."""
         return self.begin_ns * 1e-9
 
     @property
     def duration_s(self) -> float:
-        """From the first to the last reading beyond the limit."""
+        """Time from the first to the last reading beyond the limit."""
         return (self.last_ns - self.begin_ns) * 1e-9
 
     @property
@@ -229,12 +231,12 @@ class Contact:
 
     @property
     def line_m(self) -> Array:
-        """(3,) point of the line of force nearest to the reference point, along the axes of the frame."""
+        """(3,) point on the line of action of the force nearest to the reference point, axes of the frame."""
         force_N = self.peak[:3]
         return np.cross(force_N, self.peak[3:]) / (float(force_N @ force_N) or np.inf)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the values of its event, but for the frame."""
+        """Return the values of the contact event, without the frame."""
         return {
             "duration_s": self.duration_s,
             "peak_N": self.peak_N,
@@ -246,7 +248,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings beyond the limit to contacts: three in a row begin one, and three that are not end it."""
+    """Joins readings to contacts: three in a row beyond the limit begin one, three in a row within it end it."""
 
     def __init__(self, rate_Hz: float) -> None:
         self._lag, self._short_lag = (max(1, round(lag_s * rate_Hz)) for lag_s in (_LAG_S, _SHORT_LAG_S))
@@ -260,10 +262,10 @@ class ContactTracker:
     def follow(
         self, t_ns: Ns, beyond: NDArray[np.bool_], readings: Array, soon: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_], list[Contact]]:
-        """Return in which samples (n,) there is a contact, and each contact that has begun or is over.
+        """Return a mask of the samples in contact (n,), and the contacts that begin or end in these samples.
 
-        A reading (n, 6), in the frame of the stream, ends at each sample, and `beyond` is whether it is beyond the
-        limit. `soon` is whether a contact may begin sooner, because the poses that follow show rest.
+        One of `readings` (n, 6), in the frame of the stream, ends at each sample; `beyond` tells whether it exceeds the
+        limit. `soon` marks samples at which a contact may begin after the shorter lag, because later poses show rest.
         """
         n, before = len(t_ns), len(self._earlier[0])
         t_ns = np.concatenate([self._earlier[0], t_ns])
@@ -282,7 +284,7 @@ class ContactTracker:
         edges = np.flatnonzero(np.diff(in_contact, prepend=False, append=False)).tolist() if in_contact.any() else []
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             lag = self._short_lag if soon[start] else self._lag
-            first = start + before - (0 if self.open is not None else (_IN_A_ROW - 1) * lag)  # it has begun before
+            first = start + before - (0 if self.open is not None else (_IN_A_ROW - 1) * lag)
             at = first + np.flatnonzero(beyond[first : before + stop])
             if not len(at):
                 continue
@@ -303,7 +305,7 @@ class ContactTracker:
         return [] if contact is None else [replace(contact, over=True)]
 
     def end(self) -> list[Contact]:
-        """End an open contact, as at the end of a recording or when frame or bias change."""
+        """End an open contact, at the end of a recording or when frame or bias change."""
         over = self._over()
         self._forget()
         return over

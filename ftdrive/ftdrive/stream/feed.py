@@ -1,4 +1,4 @@
-"""What a stream delivers to its faces, the live screen and the page in the browser, and what these may request."""
+"""Data of a stream for the live screen and the page in the browser, and the requests that these may make."""
 
 import math
 from collections import deque
@@ -23,15 +23,15 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.interfaces import Array
 
 MEAN_S = 0.1
-"""Faces show means of so long."""
+"""The screen and the page show means over this time, s."""
 SPANS_S = (2, 10, 60, 600)
-"""Time spans that a plot can show."""
-# Bins of one span; twice as many are kept, because whole columns of a plot can be longer than its span.
+"""Time spans that a plot can show, s."""
+# Bins per span. Twice as many are stored, because whole columns of a plot can be longer than the span.
 _BINS = 1024
 _STATUS_NS = 50_000_000
-# Cut-off of the low-pass that a key switches on.
+# Cut-off of the low-pass filter that the key switches on, Hz.
 _LOWPASS_HZ = 40.0
-# A reader that takes nothing for many seconds misses the oldest ones; a recording never does.
+# Blocks and notes that wait for a slow screen or page; the oldest are dropped. Recordings do not use these queues.
 _MOST_BLOCKS, _MOST_NOTES = 2000, 200
 _REST_NS = 2_000_000_000
 _STILL_RAD = 5e-4
@@ -39,26 +39,26 @@ _STILL_RAD = 5e-4
 
 @dataclass(frozen=True, slots=True)
 class FeedNote:
-    """An event, or an answer to a request."""
+    """An event of the stream, or the answer to a request."""
 
     t_host_ns: int | None
     text: str
     kind: str = ""
-    """That of the event; of an answer "failed" or "warning", or empty."""
+    """Kind of the event; for an answer "failed", "warning" or empty."""
     times: int = 1
-    """How often it came in a row."""
+    """Number of consecutive occurrences."""
 
     @property
     def words(self) -> str:
-        """The text, with how often it came."""
+        """The text, followed by the number of occurrences if there are several."""
         return self.text if self.times == 1 else f"{self.text} ({self.times} times)"
 
 
 class Feed(Sink):
-    """Keeps what a stream delivers for the screen and the page, which never make it wait.
+    """Passes the blocks and events of a stream to the screen and the page, and never waits for them.
 
-    What they request is done between two reads, so that one thread uses the stream. `recorder` opens a recording in a
-    new file, and `push` pushes the tool of an emulated cell.
+    Requests of screen and page are carried out between two reads, so that only one thread uses the stream. `recorder`
+    opens a recording in a new file, and `push` pushes the tool of an emulated cell.
     """
 
     label = "screen"
@@ -73,15 +73,17 @@ class Feed(Sink):
         self.push = push
         self.status = stream.status()
         self.sigma = self.rest_sigma = self.sample_sigma = np.full(6, np.nan)
-        """(6,) one standard deviation of a mean over `MEAN_S` under the present contact, the same of a free tool, and
-        that of one of its samples. Like the status they are at most 50 ms of the stream older than the newest block."""
+        """(6,) standard deviations: of a mean over `MEAN_S` under the present contact, of such a mean of a free tool,
+        and of one sample of a free tool. Like the status, they are at most 50 ms of stream time older than the newest
+        block.
+        """
         self.newest_ns: int | None = None
         """Time of the newest sample."""
         self.turned_ns = stream.clock.now_ns()
-        """When the stream was last read, even if it had nothing."""
+        """Time of the last read of the stream, even if it returned no samples."""
         self.recorded: list[Path] = []
         self.sinks: list[Sink] = [self]
-        """What takes the stream; others may be added and removed between two reads."""
+        """Receivers of the stream; may be added and removed between two reads."""
         self._readers: list[tuple[deque[Block], deque[FeedNote]]] = []
         self._recorder = recorder
         self._recording: Sink | None = None
@@ -90,20 +92,20 @@ class Feed(Sink):
         self._requests: SimpleQueue[Callable[[], object]] = SimpleQueue()
 
     def subscribe(self) -> tuple[deque[Block], deque[FeedNote]]:
-        """Return what one more reader takes blocks and notes from; those from now on are in it."""
+        """Return the queues of blocks and notes of a new reader, filled from now on."""
         self._readers.append((deque(maxlen=_MOST_BLOCKS), deque(maxlen=_MOST_NOTES)))
         return self._readers[-1]
 
     def do(self, action: Callable[[], object]) -> None:
-        """Let the thread that reads call this between two reads; its error becomes a line of the events."""
+        """Call `action` between two reads, in the thread that reads the stream; its error becomes a note."""
         self._requests.put(action)
 
     def note(self, text: str, kind: str = "") -> None:
-        """Add a line to the events."""
+        """Add a note."""
         self._add_note(FeedNote(self.newest_ns, text, kind))
 
     def turns(self, patience_s: float = math.inf, until: Callable[[], object] | None = None) -> Iterator[Block | None]:
-        """Read as `pump` does, and do what was requested between two reads."""
+        """Read as `pump` does, and carry out the requests between two reads."""
         say = partial(self.note, kind="failed")
         for block in pump(self.stream, self.sinks, until=until, patience_s=patience_s, say=say):
             yield block
@@ -114,7 +116,7 @@ class Feed(Sink):
                     say(str(error))
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Hand samples and events on, and follow the state of the stream."""
+        """Queue the samples and events for all readers, and update the status."""
         self.turned_ns = self.stream.clock.now_ns()
         if block:
             self.newest_ns = int(block.t_host_ns[-1])
@@ -129,7 +131,7 @@ class Feed(Sink):
         elif block is None:
             self.status = self.stream.status()
         for event in events:
-            # the screen has a place for what is tracked
+            # screen and page show the tracked values in their own place
             if event.kind != "tracked":
                 text = f'mark "{event.text}"' if event.kind == "mark" else event.text
                 self._add_note(FeedNote(event.t_host_ns, text, event.kind))
@@ -138,23 +140,23 @@ class Feed(Sink):
         for _, notes in self._readers:
             notes.append(note)
 
-    # ------------------------------------------------------------------------------------- what may be done on request
+    # --------------------------------------------------------------------------------------------------------- requests
 
     @property
     def recording_s(self) -> float | None:
-        """Duration of the recording; None without one."""
+        """Duration of the running recording, s; None if none is running."""
         if self._recording not in self.sinks or self.newest_ns is None:
             return None
         return (self.newest_ns - self._recording_since_ns) * 1e-9
 
     def switch_recording(self) -> None:
-        """Begin a recording in a new file, or complete it."""
+        """Start a recording in a new file, or complete the running one."""
         if self._recording is not None and self._recording in self.sinks:
             self.sinks.remove(self._recording)
             try:
                 self._recording.end()
             except (ConfigError, OSError) as error:
-                self.note(f"recording ended: {error}", "failed")
+                self.note(f"recording stopped with an error: {error}", "failed")
             else:
                 self.note("recording complete")
         elif self._recorder is None:
@@ -162,7 +164,7 @@ class Feed(Sink):
         else:
             now_ns = self.newest_ns or 0
             utc = datetime.fromtimestamp((now_ns + self.stream.info.utc_offset_ns) * 1e-9, UTC)
-            # a recording has poses and a calibration, a table of readings has not
+            # recordings in MCAP need poses and a calibration; the readings of a sensor alone go to a table
             kind, ending = ("raw", "csv") if self.stream.info.is_raw else ("live", "mcap")
             path = Path(f"{kind}-{utc:%Y-%m-%dT%H%M%SZ}.{ending}").absolute()
             self._recording, self._recording_since_ns = self._recorder(path), now_ns
@@ -171,13 +173,13 @@ class Feed(Sink):
             self.note(f"recording to {path}")
 
     def push_tool(self) -> None:
-        """Push the tool of an emulated cell; do nothing with another one."""
+        """Push the tool of an emulated cell; on a real cell do nothing."""
         if self.push is not None:
             self.push()
             self.note("the emulated tool is pushed")
 
     def switch_stage(self, name: str) -> None:
-        """Switch a stage on or off; the low-pass gets a cut-off that the sensor allows."""
+        """Switch a stage on or off; the low-pass gets a cut-off below the Nyquist frequency of the sensor."""
         stages = self.stream.stages
         value: Any = not getattr(stages, name)
         if name == "lowpass_Hz":
@@ -185,7 +187,7 @@ class Feed(Sink):
         self.stream.stages = replace(stages, **{name: value})
 
     def next_frame(self, name: str, values: Sequence[Any]) -> None:
-        """Choose the next axes or the next point that the cell has; the others say what to configure."""
+        """Choose the next axes or point that the cell supports; for each one skipped, note what to configure."""
         frame = self.stream.frame
         now = getattr(frame, name)
         start = values.index(now) + 1 if now in values else 0
@@ -199,9 +201,9 @@ class Feed(Sink):
 
 
 class NoiseWatch(Sink):
-    """Compares the noise of a free tool at rest with that of the poses of a calibration, once; `found` takes the check.
+    """Compares the noise of a free tool at rest once with that in the poses of a calibration; `found` takes the check.
 
-    Compared are two seconds in which neither the arm moves nor a contact lasts.
+    The comparison uses two seconds in which the arm rests without contact.
     """
 
     label = "noise"
@@ -211,7 +213,7 @@ class NoiseWatch(Sink):
         self._resting: list[Block] | None = []
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:  # noqa: ARG002 - no event matters
-        """Keep the samples of a rest, and compare them when they are enough."""
+        """Collect the samples of a rest, and compare the noise after two seconds."""
         if not block or self._resting is None:
             return
         first = self._resting[0] if self._resting else block
@@ -228,18 +230,18 @@ class NoiseWatch(Sink):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlotColumns:
-    """A span cut into columns of equal duration, oldest first."""
+    """A time span divided into columns of equal duration, oldest first."""
 
     low: Array
-    """(6, n) smallest value; NaN where there is no sample."""
+    """(6, n) smallest value; NaN in a column without samples."""
     high: Array
-    """(6, n) largest value; NaN where there is no sample."""
+    """(6, n) largest value; NaN in a column without samples."""
     in_contact: NDArray[np.bool_]
-    """(n,)"""
+    """(n,) whether the column contains a contact."""
     start_ns: int
     column_ns: int
     marks: set[int]
-    """The columns with a mark, a tare, a gap or a change of stages."""
+    """Indices of the columns with a mark, a tare, a gap or a change of stages."""
 
     @property
     def span_s(self) -> float:
@@ -248,42 +250,42 @@ class PlotColumns:
 
     @property
     def span(self) -> str:
-        """That in words."""
+        """The duration as text."""
         return f"{self.span_s:.{0 if self.span_s > 5 else 1}f} s"
 
     @property
     def contact_cells(self) -> NDArray[np.bool_]:
-        """(n / 2,) in_contact, for characters of two columns."""
+        """(n / 2,) contact in each pair of columns, because one character shows two."""
         return self.in_contact[::2] | self.in_contact[1::2]
 
 
 class History:
-    """Smallest and largest wrench of each bin of time, for one span.
+    """Smallest and largest wrench per time bin, for one time span.
 
-    The bins are aligned to the clock, so that a plot moves by whole columns and a column never changes afterwards.
+    Bins are aligned to the clock: a plot moves by whole columns, and a completed column does not change.
     """
 
     def __init__(self, span_s: float) -> None:
         self._bin_ns = round(span_s * 1e9 / _BINS)
         self._size = 2 * _BINS
         self._bin = np.empty(self._size, np.int64)
-        # Of the wrench, and of minus the wrench.
+        # Minima of the wrench and of the negated wrench.
         self._least = np.empty((self._size, 12))
         self._in_contact = np.empty(self._size, np.bool_)
         self.clear()
 
     def clear(self) -> None:
-        """Forget everything."""
+        """Discard all samples."""
         self._bin.fill(-1)
 
     def add(self, t_ns: NDArray[np.int64], wrench: Array, in_contact: NDArray[np.bool_]) -> None:
-        """Add samples in the order of time: their times (n,), wrenches (n, 6), and whether in contact (n,)."""
+        """Add samples in order of time: times (n,), wrenches (n, 6), and whether each is in contact (n,)."""
         bins = t_ns // self._bin_ns
         starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
         bins = bins[starts]
         least = np.minimum.reduceat(np.hstack([wrench, -wrench]), starts)
         contact = np.logical_or.reduceat(in_contact, starts)
-        # only the first bin can have samples already
+        # only the first bin can contain earlier samples
         if self._bin[at := bins[0] % self._size] == bins[0]:
             np.minimum(least[0], self._least[at], out=least[0])
             contact[0] |= self._in_contact[at]
@@ -291,7 +293,7 @@ class History:
         self._bin[slots], self._least[slots], self._in_contact[slots] = bins, least, contact
 
     def columns(self, end_ns: int, n: int, marks_ns: Iterable[int] = ()) -> PlotColumns:
-        """Return n columns of which the last contains `end_ns`, and which of them have marks."""
+        """Return n columns, the last of which contains `end_ns`, with the indices of those that contain marks."""
         each = max(1, round(_BINS / n))
         first = (end_ns // self._bin_ns // each - n + 1) * each
         bins = np.arange(first, first + n * each)

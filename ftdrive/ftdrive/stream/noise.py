@@ -1,4 +1,4 @@
-"""States of motion of the arm, the noise of a sensor in each of them, and means of short windows, from its stream."""
+"""States of motion of the arm, the sensor noise in each state, and weighted means of short windows of a stream."""
 
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -17,53 +17,56 @@ from ftdrive.stream.samples import Paired, StreamInfo, gripping_point
 from ftdrivers.interfaces import Array
 
 READING_S = 0.02
-"""A reading is the mean of the samples of this time: contact is judged by readings."""
+"""Duration of a reading, s: the mean of its samples. Contacts are detected from readings."""
 GYRATION_M = 0.08
-"""Radius of gyration of a tool or a part, where its inertia is not known."""
+"""Radius of gyration of a tool or part with unknown inertia, m."""
 REST = 0
 SPEEDS_RAD_S = (0.15, 0.4, 0.7)
-"""Limits of the classes of speed: angular speed, plus that of the flange at 0.5 m."""
+"""Limits of the speed classes: angular speed plus flange speed divided by 0.5 m, rad/s."""
 ACCELERATION_RAD_S2 = 1.5
-"""Limit of the two classes of acceleration, likewise, beyond that of an even turn."""
+"""Limit between the two acceleration classes, rad/s²: angular acceleration plus that of the flange divided by 0.5 m,
+beyond the centripetal part.
+"""
 SLOW = 2
-"""So many classes of speed are divided by acceleration; faster ones ring and ripple alike."""
+"""Only the slow speed classes are divided by acceleration: at higher speeds ringing and ripple do not depend on it."""
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
-"""Rest, then the classes: the noise is learnt for each."""
+"""Number of states: rest, then the classes. The noise is estimated for each state."""
 
-# Largest motion at rest, from the mean of one reading to the next: beyond joint noise of 3e-5 rad.
+# Largest change between the means of two consecutive readings at rest; joint noise is 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
-# Motion of the centre of mass from which its wrench counts, which is felt before the motion is seen.
+# From this displacement of the centre of mass on, its inertial wrench counts. It shows before the motion does.
 _FELT_M = 4e-5
-# Rest begins so long after the last motion, and a state ends so long after it, because links ring behind it.
+# Rest begins this long after the last motion. A state of motion ends this long after its last sample, because links
+# ring.
 _HOLD_S, _RINGS_S = 0.5, 0.4
 _LEVER_M = 0.5
 _SPEEDS = np.array(SPEEDS_RAD_S)
 
-# Successive readings of a window at rest, and of one in motion or of a short rest.
+# Consecutive readings of a window at rest, and of one in motion or of a short rest.
 _WINDOW, _SHORT = 25, 8
-# Readings before a motion is seen: they do not count for the rest before it.
+# Readings before a detected motion, which are not used for the rest before it.
 _UNSEEN = 4
 _WINDOWS = 60
-# A window this many times louder than the median holds a touch or a jolt, and does not count.
+# A window whose noise exceeds the median by this factor contains a touch or a jolt, and is not used.
 _LOUD = {True: 1.5, False: 4.0}
-# A larger step between the means of two windows is the begin or the end of a contact.
+# A larger step between the means of two windows is the begin or end of a contact.
 _STEP_SIGMAS = 5.0
-# Until the noise of a state of motion is known, it counts as so many times that at rest, and as an acceleration.
+# Noise in motion until it is known: this multiple of the noise at rest, plus that of an acceleration.
 _FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
 _ENOUGH_DOF = 25.0
-# Degrees of freedom per reading: low-pass filters of sensors make neighbours alike.
+# Degrees of freedom per reading, less than 1 because low-pass filters of sensors correlate consecutive readings.
 _INDEPENDENT = 0.25
 
 
 def samples_in_reading(rate_Hz: float) -> int:
-    """Return how many samples of a sensor make one reading."""
+    """Return the number of samples per reading."""
     return max(1, round(READING_S * rate_Hz))
 
 
 class MotionTracker:
-    """State of motion at each sample, by the mean poses of successive readings; rest begins when it has lasted 0.5 s.
+    """State of motion at each sample, from the mean poses of readings; rest begins after 0.5 s without motion.
 
-    Where the position of the sensor is unknown (NaN), the centre of mass counts from the flange.
+    If the position of the sensor is unknown (NaN), the centre of mass is taken relative to the flange.
     """
 
     def __init__(self, rate_Hz: float, mass_kg: float, parameters: Parameters, p_flange_sensor_m: Array) -> None:
@@ -71,7 +74,7 @@ class MotionTracker:
         self._step_s = self._size / rate_Hz
         self._hold = round(_HOLD_S * rate_Hz)
         by_acceleration = wrench_by_acceleration(mass_kg, parameters.p_sensor_com_m) @ parameters.R_flange_sensor.T
-        # (6, 3) wrench by the change of a step of the centre of mass to the next, flange axes, m.
+        # (6, 3) inertial wrench per second difference of the centre of mass, flange axes, N/m and N.
         self._felt_by_change = -by_acceleration / self._step_s**2
         self._p_flange_com_m = np.nan_to_num(p_flange_sensor_m) + parameters.R_flange_sensor @ parameters.p_sensor_com_m
         self._earlier: Array | None = None
@@ -80,23 +83,22 @@ class MotionTracker:
         self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
-        """Return the states (n,) at these poses, `REST` or a class of motion, and what rest does not exclude.
+        """Return the states (n,), `REST` or a class of motion, and the inertial wrench (n, 6) if it shows.
 
-        That is the wrench of inertia (n, 6), N and N·m, sensor axes, zero where nothing shows. An unknown position does
-        not move.
+        The wrench is in N and N·m, sensor axes; zero without visible motion. An unknown position is taken as constant.
         """
         n, k = len(R_base_flange), self._size
         if not n:
             return np.zeros(0, np.int8), np.zeros((0, 6))
         turned_m = (R_base_flange.reshape(-1, 3) @ self._p_flange_com_m).reshape(n, 3)
         p_base_com_m = np.where(np.isfinite(p_base_flange_m), p_base_flange_m, 0.0) + turned_m
-        # (12, n), for sums along long rows
+        # (12, n), because sums along long rows are faster
         poses = np.concatenate([R_base_flange.reshape(n, 9).T, p_base_com_m.T])
         if self._earlier is None:
             self._earlier = np.repeat(poses[:, :1], 3 * k, axis=1)
         poses = np.concatenate([self._earlier, poses], axis=1)
         self._earlier = poses[:, n:].copy()
-        # means, because joint noise in single poses looks like motion
+        # means, because joint noise of single poses looks like motion
         sums = np.cumsum(poses, axis=1) / k
         moved = sums[:, 2 * k :] - 2 * sums[:, k:-k] + sums[:, : -2 * k]
         before, moved = moved[:, :n], moved[:, k:]
@@ -106,7 +108,7 @@ class MotionTracker:
         self._since = int(n - 1 - newest[-1])
         moving = np.arange(n) - newest < self._hold
         felt = self._felt(R_base_flange, moved[9:], change[9:])
-        # the usual block of a live stream, in half the time
+        # shortcut for the usual block of a live stream, in half the time
         if not (moving.any() or self._classes.any()):
             return np.full(n, REST, np.int8), felt
         speed = self._rate(moved) / self._step_s
@@ -122,7 +124,7 @@ class MotionTracker:
 
     @staticmethod
     def _rate(moved: Array) -> Array:
-        """Angle (n,) by which orientations, and positions at `_LEVER_M`, have moved."""
+        """Return the displacement (n,) as an angle: rotation plus translation divided by `_LEVER_M`."""
         squares = np.square(moved)
         return np.asarray(np.sqrt(squares[:9].sum(axis=0) / 2) + np.sqrt(squares[9:].sum(axis=0)) / _LEVER_M)
 
@@ -136,52 +138,55 @@ class MotionTracker:
 
 
 def wrench_by_acceleration(mass_kg: float, p_sensor_com_m: Array) -> Array:
-    """Wrench (6, 3) of a load by the three axes of its acceleration, N and N·m per m/s², sensor axes."""
+    """Return the wrench (6, 3) of a load per acceleration of its centre of mass, N and N·m per m/s², sensor axes."""
     return mass_kg * np.concatenate([np.eye(3), skew(p_sensor_com_m)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorNoise:
-    """Covariances of white and coloured noise alike, N and N·m, sensor axes."""
+    """Covariances of the white and coloured sensor noise, N and N·m, sensor axes."""
 
     sample: Array
     """(6, 6) of one sample."""
     reading: Array
-    """(6, 6) of the mean over `READING_S`, about its course over half a second."""
+    """(6, 6) of the mean over `READING_S`, about its trend over half a second."""
     wander: Array
-    """(6, 6) of what changes more slowly, from one half second to the next."""
+    """(6, 6) of the slower part, from one half second to the next."""
     dof: float
-    """Independent readings behind it."""
+    """Number of independent readings in the estimate."""
 
 
 class NoiseEstimator:
-    """Covariances over the last windows of each state of motion; older ones are forgotten.
+    """Noise covariances from the latest windows of each state of motion.
 
-    Readings are taken about a straight line through a window, and at rest the means of these windows from one to the
-    next, so that bias, drift, a constant contact and slow errors of a calibration do not count. A window counts for the
-    fastest state that it holds, and not for rest just before motion, which is felt before it is seen. `accelerated`
-    (6, 3) is the wrench of the load by its acceleration: what vibrates before the noise in motion is known.
+    The scatter of readings is taken about a straight line through a window. At rest, the differences between the means
+    of consecutive windows are used as well. Bias, drift, a constant contact and slow errors of a calibration therefore
+    have no effect. A window belongs to its fastest state of motion; readings just before motion are not used for rest,
+    because the wrench changes before the motion shows. `accelerated` (6, 3) is the wrench of the load per acceleration,
+    for the assumed vibration until the noise in motion is known.
     """
 
     def __init__(self, rate_Hz: float, accelerated: Array) -> None:
         self._size = samples_in_reading(rate_Hz)
         self._unread = np.empty((0, 7))
         self._at_rest = True
-        # Mean (6), scatter (6, 6) and state of the readings since the last window or change of rest and motion.
+        # Mean (6), scatter (6, 6) and state of each reading since the last window or transition between rest and
+        # motion.
         self._open = np.empty((0, 43))
         self._mean_before: Array | None = None
-        # Scatter of its readings, scatter of their samples, and step from the window before.
+        # Per window: scatter of the readings, scatter of the samples within readings, and step from the previous
+        # window.
         self._windows: list[deque[tuple[Array, Array, Array]]] = [deque(maxlen=_WINDOWS) for _ in range(STATES)]
         self._known: dict[int, SensorNoise] = {}
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
     def of(self, state: int) -> SensorNoise | None:
-        """Return the noise in a state, or what is assumed until a second of it; None before the first half second."""
+        """Return the noise in a state, assumed until about 1 s of it is measured; None before the first half second."""
         known, rest = self._known.get(state), self._known.get(REST)
         other = rest or next(iter(self._known.values()), None)
         if state == REST or other is None:
             return other
-        # A new class of motion counts as a loud one, for about 2 s of its motion.
+        # A new class of motion takes the noise of a faster class for about 2 s.
         if known is None or known.dof < _ENOUGH_DOF:
             learnt = (one for k, one in sorted(self._known.items()) if k > state and one.dof >= _ENOUGH_DOF)
             if (faster := next(learnt, None)) is not None:
@@ -191,7 +196,7 @@ class NoiseEstimator:
         return known if rest is None else replace(known, wander=rest.wander)
 
     def add(self, residual: Array, states: NDArray[np.int8]) -> None:
-        """Add samples (n, 6) of which the wrench of a free tool is subtracted, and the states of motion (n,)."""
+        """Add samples (n, 6) minus the predicted wrench of a free tool, and their states of motion (n,)."""
         rows = np.concatenate([self._unread, np.column_stack([residual, states])])
         n = len(rows) // self._size
         self._unread = rows[n * self._size :]
@@ -244,7 +249,7 @@ class NoiseEstimator:
         mean = reading[quiet].mean(axis=0) + np.diag(floor)
         steps = steps[np.isfinite(steps[:, 0])]
         if len(steps):
-            # the same quantile of chi²
+            # 0.1015 is the same quantile of chi² with one degree of freedom
             smallest = np.quantile(np.square(steps), 0.25, axis=0) / 0.1015
             usual = np.sqrt(smallest + np.diag(mean) / _WINDOW)
             steps = steps[(np.abs(steps) < _STEP_SIGMAS * usual).all(axis=1)]
@@ -255,19 +260,19 @@ class NoiseEstimator:
 
 @lru_cache
 def _about_line(n: int) -> Array:
-    """Return the matrix (n, n) that subtracts the straight line through n values."""
+    """Return the matrix (n, n) that subtracts the fitted straight line from n values."""
     basis = np.stack([np.ones(n), np.linspace(-1, 1, n)], axis=1)
     return np.asarray(np.eye(n) - basis @ np.linalg.pinv(basis))
 
 
 def variance_at_next_use(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) of an axis in any orientation beyond the prediction: what residuals leave, and drift."""
+    """Return the variance (6,) of each axis in any orientation beyond that of the prediction: misfit and drift."""
     excess = np.square(calibration.likely_error("workspace")) - np.square(calibration.predicted_error())
     return np.repeat(excess.clip(0.0) / 3, 3)
 
 
 def unexplained_variance(calibration: CalibrationResult) -> Array:
-    """Return the same (6,) without drift, where that counts on its own: zero where the noise explains the residuals."""
+    """Return the variance (6,) of `variance_at_next_use`; zero if the noise explains the residuals."""
     return np.zeros(6) if calibration.noise_explains else variance_at_next_use(calibration)
 
 
@@ -275,14 +280,14 @@ def unexplained_variance(calibration: CalibrationResult) -> Array:
 
 # Ringing at 8 to 20 Hz leaves 0.06 N in plain means at the end of a move, and 0.01 N with Hann weights.
 WINDOW_S = 0.3
-"""Each begins in the middle of the one before. The weights, a Hann window, suppress the ringing of the links."""
-# Poses of this spacing give the acceleration, with so many neighbours on each side.
+"""Duration of a window, s; windows overlap by half. Hann weights suppress the ringing of the links."""
+# The acceleration comes from poses at this spacing, with this many neighbours on each side.
 _KNOT_S, _REACH = 0.004, 5
-# Error of a tool's inertia that was calibrated, of what it is without.
+# Relative error of a calibrated inertia tensor of the tool, as a share of that of an unknown one.
 _TENSOR = 0.5
-# A window that took so many times as long has lost samples.
+# A window that takes longer by this factor has lost samples.
 _LATE = 1.2
-# Of the noise: that of the first half second may have a push in it, which the next one shows.
+# Degrees of freedom of the noise below which windows are dropped: the first half second may contain a push.
 _LEAST_DOF = 10.0
 _ROW = np.dtype(
     [
@@ -294,29 +299,29 @@ _ROW = np.dtype(
     ],
     align=True,
 )
-# No arm turns so far from one pose to the next, as where samples are lost.
+# A larger change between two poses means lost samples.
 _JUMP = 0.1
-# Acceleration in motion of an arm that reports no positions, one sigma.
+# Sigma of the acceleration in motion of an arm that reports no positions, m/s².
 _UNKNOWN_M_S2 = 1.0
-# Variance of such a mean over that of a reading, if the noise is white: vibration leaves less.
+# Variance of a window's mean over that of a reading for white noise; for vibration the ratio is smaller.
 _LIKE_WHITE = 1.5 * READING_S / WINDOW_S
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """The weighted mean of a short time."""
+    """Weighted mean of the samples of a short time."""
 
     t_s: float
     residual: Array
     """(6,) measured minus predicted wrench of the tool alone, N and N·m, sensor axes."""
     felt_m_s2: Array
-    """(3,) gravity minus the acceleration of the sensor's origin, sensor axes."""
+    """(3,) gravity minus acceleration of the sensor origin, sensor axes."""
     lever_s2: Array
-    """(3, 3) acceleration of a point by its place from there, as the sensor turns."""
+    """(3, 3) acceleration of a point per position vector from the sensor origin, as the sensor turns."""
     p_sensor_near_m: Array
-    """(3,) where the gripper holds parts."""
+    """(3,) position at which the gripper holds parts."""
     noise: Array
-    """(6, 6) covariance that is expected before the windows show it."""
+    """(6, 6) noise covariance expected before it is estimated from windows."""
     state: int
     """Fastest state of motion, as `MotionTracker.follow` returns it."""
     systematic: Array
@@ -324,15 +329,15 @@ class Window:
     turning_rad_s2: float
     """Mean angular acceleration."""
     tensor_Nm: float
-    """One sigma of the torque that an unknown inertia of the tool exerts."""
+    """Sigma of the torque exerted by the unknown part of the tool's inertia."""
     R_base_flange: Array
     p_base_flange_m: Array
     as_read: Array
-    """(6, 6) what the sensor reads of the wrench of a part."""
+    """(6, 6) response of the sensor to the wrench of a part."""
 
 
 class Windows:
-    """Collects samples of a stream to windows."""
+    """Forms overlapping windows from the samples of a stream."""
 
     def __init__(self, info: StreamInfo) -> None:
         calibration = info.calibration
@@ -342,22 +347,23 @@ class Windows:
         self._near_m = gripping_point(info)
         self._load = MovedLoad(self._tool, calibration.g_m_s2, np.nan_to_num(info.p_flange_sensor_m), _REACH)
         contact = calibration.known_contact
-        # a bias is added to the reading, which is not decoded, and the weight of a part is true
+        # the bias is added to the raw reading, while the weight of a part is a true wrench
         self._as_read = np.eye(6) if contact is None else np.asarray(np.linalg.inv(contact.decode(np.eye(6)).T))
         self._size = round(WINDOW_S * info.sensor_rate_Hz)
         self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
         self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
         self._unknown = wrench_by_acceleration(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
-        # Of one window and its margins: to join the blocks at its end would take too long at once.
+        # Samples of one window and its margins, copied as they arrive: joining blocks at the end would take too long at
+        # once.
         self._rows = np.empty(self._size + 2 * self._stride * _REACH, _ROW)
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples before an interruption."""
+        """Discard the samples before an interruption."""
         self._filled = 0
 
     def steps(self, n: int) -> NDArray[np.int64]:
-        """Return in which window each of the next n samples is the newest."""
+        """Return, for each of the next n samples, the index of the window that it completes or belongs to."""
         return (np.arange(n) + self._filled - len(self._rows)) // (self._size // 2)
 
     def add(self, rows: Paired, states: NDArray[np.int8], noise: NoiseEstimator, systematic: Array) -> Iterator[Window]:
@@ -391,12 +397,12 @@ class Windows:
         if t_s[-1] > _LATE * WINDOW_S * len(rows) / self._size or (np.diff(t_s[knots]) <= 0).any():
             return None
         tool, mass_kg = self._tool, self._calibration.mass_kg
-        # the wrench of a free tool is linear in R, so that the mean of R is as good as a rotation
+        # the wrench of a free tool is linear in R, so the mean of R can be used as a rotation
         R_mean = np.einsum("n,nij->ij", self._weights, inner["R_base_flange"])
         residual = np.asarray(self._compensator.sample(self._weights @ inner["raw"], R_mean), float)
         felt = tool.gravity_force_base_N / mass_kg @ R_mean @ tool.R_flange_sensor
         covariance, lever, turning = _LIKE_WHITE * known.reading, np.zeros((3, 3)), 0.0
-        # at rest the noise of the joints would only look like motion
+        # at rest, joint noise would only look like motion
         if state != REST:
             motion = self._load.motion(t_s[knots], R_base_flange, p_base_flange_m)
             weights = np.interp(motion.t_s, t_s[margin : margin + self._size], self._weights)

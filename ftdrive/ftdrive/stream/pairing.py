@@ -1,7 +1,7 @@
 """Wrench and pose on one time axis: times of measurement, the delay between the two links, the pose at each wrench.
 
-`Timeline` finds when each sample was measured, but for the shortest delay of each link. Only the difference between
-the two links matters, and `DelayEstimator` finds it from motion.
+`Timeline` estimates when each sample was measured, except for the constant delay of its link. Only the difference of
+the delays of both links matters; `DelayEstimator` estimates it from motion.
 """
 
 import math
@@ -20,46 +20,47 @@ from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
 from ftdrive.stream.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
-# A clock is no clock of seconds if it differs by so much over this time.
+# A device clock whose rate differs by this share over this time does not count real seconds.
 _SCALED_S, _SCALED = 0.2, 0.05
 _PASSES = 4
 _ROUNDS = 10
-# A recording is paired so often until its delay changes by less.
+# Pairing of a recording is repeated until its delay changes by less than this.
 _CONVERGED_S = 1e-8
-# A pose is extrapolated at most so far: one interval of a CB3 controller, with some delay.
-# A wrench does not wait for the next pose: waiting delayed a block by one interval and split it.
+# A pose is extrapolated by at most one interval of a CB3 controller with some delay: waiting for the next pose would
+# delay a block by one interval and split it.
 _MOST_AHEAD_NS = 10_000_000
-# Poses are kept so long, for samples that are late.
+# Poses are kept this long for late samples.
 _KEEP_NS = 2_000_000_000
 MOST_DELAY_S = 0.1
 
 PERIOD_S = 0.024
-"""Samples are averaged over this time: over a shorter one, noise of the poses passes for acceleration."""
+"""Samples are averaged over this time, s: over shorter times, noise of the poses looks like acceleration."""
 _BATCH_S = 1.0
-# Neighbours on each side from which the acceleration comes.
+# The acceleration comes from this many neighbours on each side.
 _REACH = 2
-# What means of an acceleration keep of it when it comes from means of the poses: a parabola through five of them.
+# Weights that smooth the force as the acceleration is smoothed, which comes from means of poses by a parabola through
+# five of them.
 _SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
-# The estimate is applied from this sigma on, which it must have without its best second.
+# The estimate is applied below this sigma, computed without the most informative second.
 _USABLE_S = 3e-3
-# Slower, a tool does not show the delay.
+# Below this angular speed, the motion does not show the delay.
 _SLOWEST_RAD_S = 0.02
-# Sigma of the delay before the first estimate, without and with that of a calibration in motion.
+# Sigma of the delay before the first estimate: without and with the delay of a calibration in motion.
 _PRIOR_S, _SAME_LINKS_S = 0.05, 0.005
 # Change of the bias since the calibration, one standard deviation.
 _BIAS_N = 0.5
-# Weight of what the tool may hold, relative to its own, one standard deviation.
+# Weight of a held part relative to that of the tool, one standard deviation.
 _HELD = 0.05
-# Error of the configured origin of the sensor; without one, `_ANY_LEVER_M`.
+# Sigma of the configured sensor origin; `_ANY_LEVER_M` if it is not configured.
 _LEVER_M = 0.005
 _ANY_LEVER_M = 0.1
 _FLOOR_N = 1e-3
-# After a larger change the samples of the next second are not used, because times follow it slowly.
+# After a larger change the samples of the next second are not used, because the times follow the change slowly.
 _NOTICED_S = 2e-4
 
 
 class PoseTrack:
-    """Poses of the flange over time, interpolated to any time between the first and the last.
+    """Flange poses over time, interpolated between the first and the last.
 
     Positions and joint angles are interpolated linearly, orientations by slerp: constant angular velocity.
     """
@@ -76,7 +77,7 @@ class PoseTrack:
 
     @property
     def ahead_ns(self) -> int:
-        """How long after the last pose the next one is due; so long, the motion is taken to continue."""
+        """Time after the last pose by which it may be extrapolated with constant velocity."""
         return min(int(self._t_ns[-1] - self._t_ns[-2]), _MOST_AHEAD_NS) if len(self._t_ns) > 1 else 0
 
     def add(self, t_host_ns: Ns, q_rad: Array, R_base_flange: Array, p_base_flange_m: Array) -> None:
@@ -99,14 +100,14 @@ class PoseTrack:
         self._columns[start:-1, 13] = np.maximum(2 * np.arcsin(np.minimum(chord / 2, 1.0)), 1e-9)
 
     def forget(self, t_ns: int) -> None:
-        """Drop the poses that no time from `t_ns` on needs."""
+        """Discard the poses that are not needed for times from `t_ns` on."""
         keep = max(int(np.searchsorted(self._t_ns, t_ns, "right")) - 1, 0)
         self._t_ns, self._columns = self._t_ns[keep:], self._columns[keep:]
 
     def at(self, t_ns: Ns) -> tuple[Array, Array, Array]:
         """Return joint angles (n, 6), R_base_flange (n, 3, 3) and p_base_flange_m (n, 3) at times (n,).
 
-        Times are inside `span_ns`, or after it by `ahead_ns` at most: the velocity between the last two poses lasts.
+        Times lie in `span_ns` or at most `ahead_ns` after it, where the velocity between the last two poses is kept.
         """
         if len(self._t_ns) == 1:
             i = np.zeros(len(t_ns), np.intp)
@@ -125,16 +126,16 @@ class PoseTrack:
 class DelayEstimator:
     """Recursive weighted least squares of the force on the time derivative of its prediction.
 
-    With d the delay that is left, the force of a free tool is
+    With the remaining delay d, the force of a free tool is
 
-        force = prediction - d * derivative of the prediction + errors of calibration, bias and lever + noise
+    force = prediction - d * derivative of the prediction + errors of calibration, bias and lever + noise
 
-    and the prediction holds weight, bias and inertia. The errors are estimated beside d, with the covariance of the
-    calibration as prior, so that they are not taken for a delay. Every second has the weight of its residual from what
-    all seconds have in common, reduced where residuals are correlated in time: a second with a contact counts little,
-    even if a delay or a bias of its own would explain the contact.
+    where the prediction contains weight, bias and inertia. The errors are estimated together with d, with the
+    covariance of the calibration as prior. Each second is weighted by its residual from the common estimate, less if
+    its residuals are correlated in time. A second with a contact therefore has little weight, even if a different delay
+    or bias would explain it.
 
-    `p_flange_sensor_m` (3,) is NaN where unknown. The last `window` seconds of motion count.
+    `p_flange_sensor_m` (3,) is NaN where unknown. The last `window` seconds of motion are used.
     """
 
     def __init__(self, calibration: CalibrationResult, p_flange_sensor_m: Array, window: int = 30) -> None:
@@ -142,7 +143,7 @@ class DelayEstimator:
         self._calibration = calibration
         place_m = p_flange_sensor_m if known else np.array([0.0, 0.0, 0.05])
         self._load = MovedLoad(calibration.parameters, calibration.g_m_s2, place_m, _REACH)
-        # maps 13 numbers of sigma 1 to delay, errors of the calibration, lever
+        # maps 13 unit-variance numbers to delay, errors of the calibration and lever
         self._scale = np.zeros((13, 13))
         self._scale[0, 0] = _PRIOR_S
         change = np.repeat([0.0, _HELD * calibration.weight_N, _BIAS_N], 3)
@@ -150,41 +151,44 @@ class DelayEstimator:
         eigenvalues, V = np.linalg.eigh(errors)
         self._scale[1:10, 1:10] = V * np.sqrt(np.maximum(eigenvalues, 0.0))
         self._scale[10:, 10:] = (_LEVER_M if known else _ANY_LEVER_M) * np.eye(3)
-        # of each second: products of derivatives and residual, their number, reduction, least variance
+        # per second: products of derivatives and residual, number of values, reduction for correlation, smallest
+        # variance
         self._seconds: deque[tuple[Array, int, float, float]] = deque(maxlen=window)
         self._pending: list[Paired] = []
         self._settling = False
         motion = calibration.motion
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
-        """Delay that samples are paired with: of the calibration, then the estimate as soon as it is good enough."""
+        """Delay by which samples are paired: first that of the calibration, then the estimate once it is accurate
+        enough.
+        """
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
-        """One standard deviation of the estimate."""
+        """Standard deviation of the delay."""
 
     def add(self, paired: Paired) -> None:
-        """Learn from samples that were paired with `delay_s`, and improve it."""
+        """Update the estimate with samples that were paired with `delay_s`."""
         pieces = self._whole_seconds(paired)
-        # part of it was paired with another delay
+        # part of these samples was paired with the previous delay
         if pieces and self._settling:
             self._settling = False
         elif sum(map(self._learn, pieces)):
             self._apply()
 
     def learn(self, samples: Iterable[FtSamples], states: Callable[[], Iterable[ArmStates]]) -> None:
-        """Estimate the delay of a recording as `pair_blocks` takes it, with a window as long as the recording.
+        """Estimate the delay of a recording with a window of its full length, as for `pair_blocks`.
 
-        Both are read several times; a call of `states` begins again. Raises `BadDataset`.
+        Samples and states are read several times; each call of `states` starts again. Raises `BadDataset`.
         """
         for _ in range(_PASSES):
             before_s = self.delay_s
             self._seconds.clear()
             self._pending, self._settling = [], False
-            # in seconds of the whole, whatever the blocks, which keep few poses in memory
+            # one-second windows do not depend on the size of the blocks, which keep few poses in memory
             self.add(Paired.concatenate(list(pair_blocks(samples, states(), before_s))))
             if abs(self.delay_s - before_s) < _CONVERGED_S:
                 break
 
     def _whole_seconds(self, paired: Paired) -> list[Paired]:
-        """Add samples; return the seconds that are complete."""
+        """Add samples; return the completed seconds."""
         self._pending.append(paired)
         begin_ns = int(self._pending[0].t_host_ns[0])
         seconds = int((paired.t_host_ns[-1] - begin_ns) * 1e-9 / _BATCH_S)
@@ -222,7 +226,7 @@ class DelayEstimator:
         return True
 
     def _linearised(self, t_s: Array, force: Array, R: Array, p: Array) -> tuple[Array, Array] | None:
-        """Return derivative and residual of the force of a free tool; None while the tool does not turn."""
+        """Return Jacobian and residual of the force of a free tool; None while the tool does not turn."""
         parameters, compensator = self._calibration.parameters, self._calibration.compensator
         motion = self._load.motion(t_s, R, p)
         W = skew(motion.angular_velocity_rad_s)
@@ -246,7 +250,7 @@ class DelayEstimator:
             found = np.linalg.solve(total[:13, :13] + np.eye(13), total[:13, 13])
             left = np.append(-found, 1.0)
             variance = np.maximum(left @ products @ left / count, least)
-        # a single second may be a contact that looks like a delay
+        # the most informative second may be a contact that looks like a delay
         both = np.array([total, total - weighted[np.argmax(weighted[:, 0, 0])]])[:, :13, :13] + np.eye(13)
         sigma_s, sigma_without_one_s = (_PRIOR_S * np.sqrt(np.linalg.inv(both)[:, 0, 0])).tolist()
         if sigma_without_one_s > _USABLE_S:
@@ -263,11 +267,11 @@ class DelayEstimator:
 
 
 class Pairing:
-    """Puts the samples of both links on one time axis and finds the pose of each wrench.
+    """Aligns the samples of sensor and arm in time, and finds the pose for each wrench.
 
-    `sensor_rate_Hz` is nominal, for a sensor without a clock of its own; NaN where it is polled, which is not at a
-    fixed rate. `delay` finds the delay of the wrench after the pose, or is that delay in s. Without an arm, position
-    and joint angles are unknown, and the flange never turns.
+    `sensor_rate_Hz` is the nominal rate of a sensor without a clock; NaN for a polled sensor, which has no fixed rate.
+    `delay` is the delay of the wrench after the pose, s, or its estimator. Without an arm, position and joint angles
+    are NaN, and the orientation of the flange is the identity.
     """
 
     def __init__(self, sensor_rate_Hz: float, delay: DelayEstimator | float, *, has_arm: bool = True) -> None:
@@ -287,22 +291,22 @@ class Pairing:
 
     @property
     def delay_sigma_s(self) -> float:
-        """One standard deviation; 0 if the delay is configured."""
+        """Standard deviation of the delay; 0 if it is configured."""
         return self._estimator.sigma_s if self._estimator else 0.0
 
     def use(self, estimator: DelayEstimator) -> None:
-        """Estimate with another calibration from now on, and keep the delay; a configured delay stays."""
+        """Use an estimator with another calibration, and keep the present delay; a configured delay stays."""
         if self._estimator is not None:
             estimator.delay_s, estimator.sigma_s = self._estimator.delay_s, self._estimator.sigma_s
             self._estimator = estimator
 
     @property
     def waits_for_pose(self) -> bool:
-        """Whether there are samples without a pose, which are too new to extrapolate it."""
+        """Whether samples wait for a later pose, because they are too new to extrapolate it."""
         return bool(self._waiting) and self._has_arm
 
     def add_states(self, states: ArmStates) -> None:
-        """Add what the arm has sent."""
+        """Add states of the arm."""
         if not len(states.t_host_ns):
             return
         t_ns = states.t_host_ns
@@ -314,7 +318,7 @@ class Pairing:
         self._poses.forget(int(t_ns[-1]) - _KEEP_NS)
 
     def add_samples(self, samples: FtSamples) -> None:
-        """Add what the sensor has sent."""
+        """Add samples of the sensor."""
         if not len(samples):
             return
         has_clock, counts = bool(np.isfinite(samples.t_device_s).all()), math.isfinite(self._rate_Hz)
@@ -322,7 +326,7 @@ class Pairing:
             count = samples.t_device_s
         elif counts:
             count = samples.seq.astype(np.float64)
-        else:  # polled: each time of receipt is its own
+        else:  # polled: the time of receipt is the time
             count = np.asarray(samples.t_host_ns * 1e-9)
         if self._sensor is None:
             self._sensor = Timeline(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else Timeline()
@@ -330,7 +334,7 @@ class Pairing:
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
 
     def take(self) -> Paired | None:
-        """Return the samples whose pose is known by now; None if there is none.
+        """Return the samples whose pose is known; None if there is none.
 
         Samples before the first pose are dropped.
         """
@@ -354,7 +358,7 @@ class Pairing:
         return paired
 
     def forget(self) -> None:
-        """Drop what waits, after an interruption of either link."""
+        """Discard the waiting samples after an interruption of sensor or arm."""
         self._waiting = []
         self._poses = PoseTrack()
         for line in (self._sensor, self._arm):
@@ -363,7 +367,7 @@ class Pairing:
 
 
 def _clock_of(states: ArmStates) -> Timeline:
-    """Return the timeline of a controller from its first states; an emulated one may run many times faster."""
+    """Return the timeline of a controller from its first states; an emulated clock may run many times faster."""
     host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
     device_s = float(states.t_device_s[-1] - states.t_device_s[0])
     if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
@@ -372,15 +376,15 @@ def _clock_of(states: ArmStates) -> Timeline:
 
 
 def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
-    """Give each sample the pose at its time, which must be inside the track."""
+    """Pair samples with the poses at their times, which must be inside the track."""
     return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
 
 
 def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay_s: float) -> Iterator[Paired]:
-    """Pair a recording whose times are those of measurement, in blocks; both are sorted by time.
+    """Yield the paired samples of a recording in blocks; samples and states have times of measurement, sorted.
 
-    Samples before the first and after the last state are dropped. `delay_s` is that of the wrench after the pose.
-    Raises `BadDataset` if the two do not overlap.
+    Samples before the first and after the last state are dropped. `delay_s` is the delay of the wrench after the pose.
+    Raises `BadDataset` if samples and states do not overlap in time.
     """
     poses, coming, found = PoseTrack(), iter(states), False
     for block in samples:
@@ -396,4 +400,4 @@ def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay
             found = True
             yield _paired_with(poses, t_ns[inside], block.rows(inside))
     if not found:
-        raise BadDataset("wrench and pose have no time in common: give files of the same recording and one clock")
+        raise BadDataset("wrench and pose have no common time: give files of the same recording, with one clock")

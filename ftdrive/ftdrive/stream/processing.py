@@ -1,7 +1,7 @@
-"""From paired samples to a block: the stages in their order, and what the samples show of noise, contact and drift.
+"""Processing of paired samples to blocks: the stages in order, and the estimates of noise, contact and drift.
 
-`Processor` runs the stages, for a sensor alone too. `ToolMonitor` is what a calibration adds: the free tool, its
-motion, contact, drift, and the load that is followed.
+`Processor` runs the stages, also for a sensor alone. `ToolMonitor` is used with a calibration: it follows the free
+tool, its motion, contacts, drift and the held part.
 """
 
 import math
@@ -52,18 +52,18 @@ from ftdrivers.interfaces import WRIST_SENSOR, Array
 
 SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
-"""Share of independent readings of a free tool beyond the limit of contact."""
-# More rows are processed in pieces that stay in the cache.
+"""Share of independent readings of a free tool that exceed the contact limit."""
+# Longer blocks are processed in chunks that fit the cache.
 _CHUNK_ROWS = 8192
-# A bias that is known less well is not applied, N and N·m, one sigma.
+# A tracked bias with a larger sigma is not applied, N and N·m.
 _APPLIED = np.repeat([0.1, 0.003], 3)
 
 
 class ToolMonitor:
-    """Follows a calibrated tool in a stream: what it exerts while it is free, its motion, contact, drift and load.
+    """Follows a calibrated tool in a stream: prediction for the free tool, motion, contact, drift and held part.
 
-    `noise` learns from what a free tool leaves, and `frame` is that of the contacts. A tare may come from another
-    thread, so `lock` is that of the processor.
+    `noise` is estimated from the residuals of the free tool, and contacts are reported in `frame`. `lock` is the lock
+    of the processor, because a tare may come from another thread.
     """
 
     track: Tracking = "off"
@@ -84,7 +84,7 @@ class ToolMonitor:
         self.response = info.calibration.contact
         self._neighbours = Neighbours(info)
         self._motion = self.tool.motion_tracker()
-        # the arm's own sensor feels the friction of wrist 3
+        # the force/torque sensor inside the arm measures the friction of wrist 3
         friction_axis = info.calibration.R_flange_sensor[2] if info.sensor.model == WRIST_SENSOR else None
         self.test = ContactTest(
             info.sensor_rate_Hz, FALSE_ALARM_RATE, variance_at_next_use(info.calibration), friction_axis
@@ -92,17 +92,17 @@ class ToolMonitor:
         self._tracker = ContactTracker(info.sensor_rate_Hz)
         self.following = Following(info, self.tool.bias_growth)
         self.contacts: list[Contact] = []
-        """Those that have begun or ended, and that nothing has taken."""
+        """Contacts that began or ended and are not taken yet."""
         self._is_learning = True
         self.state = REST
         self._newest_ns = 0
         self.reading = np.zeros(6)
-        """(6,) mean of the newest 20 ms minus the load."""
+        """(6,) mean of the newest 20 ms minus the prediction for the free tool."""
 
     # -------------------------------------------------------------------------------------------------------- samples
 
     def arrange(self, rows: Paired, *, subtracts_inertia: bool, last: bool) -> Passing:
-        """Add samples; return those that are due, with what is expected of a free tool."""
+        """Add samples; return the samples to process now, with the prediction for the free tool."""
         if len(rows):
             self._newest_ns = int(rows.t_host_ns[-1])
         motion = self._motion.follow(rows.R_base_flange, rows.p_base_flange_m)
@@ -110,7 +110,7 @@ class ToolMonitor:
         return Passing(*due, *self.tool.predict(due[0]))
 
     def learn(self, recording: Iterable[Paired], *, subtracts_inertia: bool) -> None:
-        """Learn the noise from blocks of a recording, before it is judged and instead of during that."""
+        """Estimate the noise from blocks of a recording before they are judged; `judge` then does not estimate it."""
         motion = self.tool.motion_tracker()
         for rows in recording:
             self._is_learning = False
@@ -123,9 +123,9 @@ class ToolMonitor:
             self._noise.add(residual, states)
 
     def judge(self, residual: Array, passing: Passing) -> tuple[Array, NDArray[np.bool_]]:
-        """Judge what a free tool leaves of samples (n, 6): return chi2 (n,) and in_contact (n,)."""
+        """Return the squared distances (n,) and contacts (n,) of samples with this residual (n, 6) of a free tool."""
         rows, states = passing.rows, passing.states
-        # chi2 is that of a free tool, so bias, weight and inertia are subtracted whatever is switched off
+        # bias, weight and inertia are subtracted even if their stages are off, because chi2 is defined for a free tool
         if (inertial := passing.inertial) is not None:
             known, left = Inertia.EXACT, residual
         else:
@@ -157,7 +157,7 @@ class ToolMonitor:
         return chi2, in_contact
 
     def covariance(self, noise: Array, settings: Stages, t_ns: int, *, loaded: bool) -> Array:
-        """Return the covariance (6, 6) of a wrench with this noise, sensor axes."""
+        """Return the covariance (6, 6) of a wrench with the noise covariance `noise`, sensor axes."""
         covariance = noise
         if settings.gravity or settings.bias:
             covariance = covariance + self.test.uncertainty
@@ -175,7 +175,7 @@ class ToolMonitor:
             if self.track == "off":
                 continue
             for event in events:
-                # Without a part the contact test reports contacts; one that is not applied hides them from that test.
+                # Without a part, the contact test reports contacts; a part that is not applied hides contacts from it.
                 if event.kind != "contact" or (self.tool.held is None and tracked.part_kg > NOTHING_KG):
                     self._note(event.kind, event.text, event.values, event.t_host_ns)
             if self.track != "apply":
@@ -188,11 +188,11 @@ class ToolMonitor:
 
     @property
     def tracked(self) -> Tracked | None:
-        """Bias and part as followed; None unless they are, and before the first window."""
+        """Tracked bias and part; None if tracking is off, and before the first window."""
         return None if self.track == "off" else self.following.tracked
 
     def reference(self) -> tuple[Calibrated, float]:
-        """Return the empty tool, and how many seconds ago it was tared; infinite without a tare."""
+        """Return the empty tool, and the time since its tare, s; infinite without a tare."""
         with self._lock:
             tare_ns = self.tool.tare_t_ns
             return self.tool.empty, math.inf if tare_ns is None else (self._newest_ns - tare_ns) * 1e-9
@@ -200,36 +200,36 @@ class ToolMonitor:
     # -------------------------------------------------------------------------------------------------------- changes
 
     def tare(self, update: Update, rows: Paired) -> None:
-        """Continue with the bias of a tare, which these samples of the free tool have given."""
+        """Use the bias of a tare from now on, measured from these samples of the free tool."""
         change = self.tool.set_tare(update, self._newest_ns)
         noise = np.cov(rows.raw.T) / len(rows)
         self.following.filter.tare(change, noise, self.test.uncertainty, rows.R_base_flange[-1])
         self.test.restart()
 
     def undo_tare(self) -> None:
-        """Continue with the bias before the last tare."""
+        """Use the bias before the last tare again."""
         self.following.filter.undo_tare(self.tool.undo_tare())
         self.test.restart()
 
     def warm(self, temperature_C: float) -> None:
-        """Correct the bias for this temperature of the sensor, if it is known how, and at which it was calibrated."""
+        """Correct the bias for this sensor temperature, if a model and the temperature at the calibration are known."""
         if self.tool.is_warmed_by(temperature_C):
             self.following.filter.warm(self.tool.warm(temperature_C))
             if (warming := self.tool.warming()) is not None:
                 self._note("temperature", *warming)
 
     def hold(self, weight: Weight | None) -> None:
-        """Count a part that was weighed as part of the tool from now on; None empties the gripper."""
+        """Treat a weighed part as part of the tool from now on; None empties the gripper."""
         with self._lock:
             self.end_contact()
             self.tool.hold(weight)
             self.following.hold(weight)
-            # The motion of another load is felt differently.
+            # The wrench of the motion depends on the load.
             self._motion = self.tool.motion_tracker()
             self.test.restart()
 
     def restart(self) -> None:
-        """Forget the samples before an interruption; tares and drift remain."""
+        """Discard the samples before an interruption; tares and drift remain."""
         self.end_contact()
         self.test.restart()
         self._motion = self.tool.motion_tracker()
@@ -241,7 +241,7 @@ class ToolMonitor:
         self._take(self._tracker.end())
 
     def turn_to(self, frame: FrameChange) -> None:
-        """Give contacts in another frame from now on."""
+        """Report contacts in another frame from now on."""
         self.end_contact()
         self._frame = frame
 
@@ -254,10 +254,10 @@ class ToolMonitor:
 
 
 class Processor:
-    """Compensates paired samples, one block after the other; a whole recording may be one block.
+    """Compensates paired samples block by block; a whole recording may be one block.
 
-    Without a calibration, as of a sensor alone, only a tare is subtracted, and nothing is known of contacts. Without
-    settings, they are the `standard_stages`. Raises `ConfigError` if frame or stages need what is not configured.
+    Without a calibration, for a sensor alone, only a tare is subtracted and no contact is detected. `settings` defaults
+    to `standard_stages`. Raises `ConfigError` if frame or stages need a setting that is missing.
     """
 
     def __init__(
@@ -268,13 +268,13 @@ class Processor:
         *,
         temperature: BiasTemperature | None = None,
     ) -> None:
-        # frame, stages and tare may come from another thread
+        # other threads may set frame, stages and tare
         self._lock = RLock()
         self.info, self._frame, self._settings = info, frame, settings or standard_stages(info)
         self.stages: tuple[Stage, ...] = stages_of(self._settings, frame, info)
-        """What is done to the raw wrench, in this order."""
+        """The stages applied to the raw wrench, in order."""
         self.events: list[StreamEvent] = []
-        """Those that nothing has taken yet."""
+        """Events that are not taken yet."""
         moved = np.zeros((6, 3))
         if not info.is_raw:
             moved = wrench_by_acceleration(info.calibration.mass_kg, info.calibration.parameters.p_sensor_com_m)
@@ -282,7 +282,7 @@ class Processor:
         self._monitor: ToolMonitor | None = None
         if not info.is_raw:
             self._monitor = ToolMonitor(info, temperature, self._noise, self._turn, self.note, self._lock)
-        # Of a sensor alone: what is subtracted, and since when.
+        # Tare of a sensor alone: subtracted wrench, and time.
         self._zero: tuple[Array, int] | None = None
         self._recent: deque[Paired] = deque()
         self._newest_ns = 0
@@ -292,11 +292,11 @@ class Processor:
     def _turn(self) -> FrameChange:
         return next(stage for stage in self.stages if isinstance(stage, FrameChange))
 
-    # ------------------------------------------------------------------------------------------------ what is settable
+    # -------------------------------------------------------------------------------------------------------- settings
 
     @property
     def frame(self) -> WrenchFrame:
-        """Axes and reference point of the wrench; setting them is an event. Raises `ConfigError`."""
+        """Axes and reference point of the wrench; setting them adds an event. Raises `ConfigError`."""
         return self._frame
 
     @frame.setter
@@ -312,7 +312,7 @@ class Processor:
 
     @property
     def settings(self) -> Stages:
-        """What is done to the raw wrench; setting it is an event. Raises `ConfigError`."""
+        """Settings of the stages; setting them adds an event. Raises `ConfigError`."""
         return self._settings
 
     @settings.setter
@@ -326,7 +326,7 @@ class Processor:
 
     @property
     def monitor(self) -> ToolMonitor:
-        """What is followed of the tool. Raises `ConfigError` for a sensor alone."""
+        """The monitor of the tool. Raises `ConfigError` for a sensor alone."""
         if self._monitor is None:
             raise ConfigError("a sensor alone has no tool: start with --calibration PATH or --tool NAME")
         return self._monitor
@@ -336,10 +336,10 @@ class Processor:
     def process(
         self, paired: Paired, *, last: bool = False, temperature_C: float | None = None, delay_sigma_s: float = 0.0
     ) -> Block:
-        """Process the next samples, at a temperature of the sensor, with one sigma of the delay after the pose.
+        """Process the next samples, with the sensor temperature and the sigma of the delay after the pose.
 
-        With the inertia stage the last milliseconds wait for the poses after them, unless these samples are the `last`;
-        a block may then be empty.
+        With the inertia stage the last milliseconds wait for later poses, unless these samples are the `last`. A block
+        may therefore be empty.
         """
         with self._lock:
             if self._monitor is not None:
@@ -393,16 +393,16 @@ class Processor:
         )
 
     def learn_noise(self, recording: Iterable[Paired]) -> None:
-        """Learn the noise from blocks of a recording, before it is processed and instead of during that."""
+        """Estimate the noise from blocks of a recording before they are processed, and not during processing."""
         if self._monitor is not None:
             pieces = (one.rows(slice(i, i + _CHUNK_ROWS)) for one in recording for i in range(0, len(one), _CHUNK_ROWS))
             with self._lock:
                 self._monitor.learn(pieces, subtracts_inertia=self._settings.inertia)
 
     def restart(self, *, elsewhere: bool = False) -> None:
-        """Forget the samples before an interruption; noise, tares and drift remain.
+        """Discard the samples before an interruption; noise, tares and drift remain.
 
-        With `elsewhere` the next sample is at another place of a recording, and none were lost.
+        With `elsewhere` the next sample is at another position of a recording, which is no gap.
         """
         with self._lock:
             if self._monitor is not None:
@@ -416,11 +416,11 @@ class Processor:
         self.stages = stages_of(self._settings, self._frame, self.info)
 
     def sigma_of_mean(self, R_base_flange: Array, duration_s: float = 0.0, *, loaded: bool = True) -> Array:
-        """Standard deviation (6,) of the newest sample in the frame, or of the mean over `duration_s`.
+        """Return the standard deviation (6,) of the newest sample in the frame, or of the mean over `duration_s`.
 
-        NaN until the noise is known. `R_base_flange` (3, 3) is that of the sample. It grows with the age of the bias,
-        where earlier runs of the sensor show how that moves. With `loaded` it has the errors of the sensor under the
-        present contact; without, it is that of a free tool.
+        NaN until the noise is known. `R_base_flange` (3, 3) is the orientation at the sample. The result grows with the
+        age of the bias, if earlier runs of the sensor show how the bias changes. With `loaded` it contains the errors
+        of the sensor under the present contact; without, it applies to a free tool.
         """
         monitor = self._monitor
         noise = self._noise.of(REST if monitor is None else monitor.state)
@@ -442,7 +442,7 @@ class Processor:
         return None if noise is None else np.sqrt(np.diag(noise.sample))
 
     def status(self, links: Links) -> StreamStatus:
-        """Return the state of a stream whose source has these links."""
+        """Return the status of the stream with these links of its source."""
         if (monitor := self._monitor) is None:
             tare, tare_t_ns = self._zero or (None, None)
             return StreamStatus(*links, tare, tare_t_ns, 0.0, 0.0, math.inf, FALSE_ALARM_RATE)
@@ -466,7 +466,7 @@ class Processor:
         return contacts
 
     def take_event(self, event: StreamEvent) -> None:
-        """Add an event of the source."""
+        """Add an event from the source."""
         self.events.append(event)
 
     def note(self, kind: EventKind, text: str, values: Mapping[str, JSON], t_ns: int | None = None) -> StreamEvent:
@@ -478,18 +478,18 @@ class Processor:
     # ------------------------------------------------------------------------------------------------------ bias, load
 
     def tare(self) -> StreamEvent:
-        """Change the bias so that the free tool reads zero in the last half second, or refuse; see `try_tare`.
+        """Change the bias so that the free tool reads zero over the last half second, or refuse; see `try_tare`.
 
-        Of a sensor alone the mean is subtracted, whatever is on the sensor.
+        For a sensor alone the mean is subtracted, whatever load it carries.
         """
         with self._lock:
             if (rows := self.recent()) is None:
-                return self.note("tare-refused", "tare refused: no sample has arrived yet; tare again", {})
+                return self.note("tare-refused", "tare refused: no sample has arrived yet. Tare again", {})
             rows = rows.rows(rows.t_host_ns >= self._newest_ns - round(TARE_S * 1e9))
             if self._monitor is None:
                 mean = rows.raw.mean(axis=0)
                 self._zero = mean, self._newest_ns
-                text = f"tare: {float(np.linalg.norm(mean[:3])):.2f} N are subtracted"
+                text = f"tare: {float(np.linalg.norm(mean[:3])):.2f} N are now subtracted"
                 values: Mapping[str, JSON] = {"tare": mean.tolist()}
             else:
                 update, text, values = try_tare(rows, self._monitor.tool.empty)
@@ -500,10 +500,10 @@ class Processor:
             return self.note("tare", text, values)
 
     def undo_tare(self) -> StreamEvent:
-        """Take the last tare back."""
+        """Undo the last tare."""
         with self._lock:
             if self.tare_wrench is None:
-                return self.note("tare-refused", "there is no tare to undo", {})
+                return self.note("tare-refused", "no tare to undo", {})
             self._zero = None
             if self._monitor is not None:
                 self._monitor.undo_tare()

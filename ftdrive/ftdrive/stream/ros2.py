@@ -1,7 +1,7 @@
 """Samples as ROS 2 messages: CDR bytes, `ros2msg` schemas and topics, shared by recordings and servers.
 
-CDR: 4 bytes that say "little endian", then the fields, each aligned to its size counted from there. All but the stamp
-and the numbers is the same in every message of a block, so that a block is packed as one array of records.
+CDR: 4 bytes for "little endian", then the fields, each aligned to its size relative to the first field. Only stamps and
+numbers differ between the messages of a block, so a block is packed as one array of records.
 """
 
 import struct
@@ -20,13 +20,13 @@ WARNINGS = "tare-refused", "drift", "gap", "stale"
 """Kinds of events that are logged as warnings."""
 
 Messages = NDArray[np.void]
-"""(n,) messages, all of one length; `tolist` makes bytes of them."""
+"""(n,) messages of equal length; `tolist` converts them to bytes."""
 
 Transform = tuple[str, str, Array, Array]
 """Parent, child, and the origin (3,) or (n, 3), m, and orientation (3, 3) or (n, 3, 3) of the child in the parent."""
 
 ENCODING = b"\0\1\0\0"
-"""The first bytes of a message: CDR, little endian."""
+"""First bytes of each message: CDR, little endian."""
 
 JOINT_NAMES = tuple(
     f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -42,7 +42,7 @@ _POSE = "geometry_msgs/Pose\nPoint position\nQuaternion orientation"
 
 
 class Schema(NamedTuple):
-    """A message type and its definition in the encoding `ros2msg`."""
+    """A message type and its definition in the `ros2msg` encoding."""
 
     name: str
     text: str
@@ -97,7 +97,7 @@ def pack_joints(t_utc_ns: NDArray[np.int64], q_rad: Array) -> Messages:
 def transforms_of(
     frame: WrenchFrame, info: StreamInfo, R_base_flange: Array, p_base_flange_m: Array
 ) -> list[Transform]:
-    """Return those of the flange (n, 3, 3), (n, 3) in base, and of sensor, tcp and the frame of a wrench in flange."""
+    """Return the transforms of the flange in base (n, …), and of sensor, tcp and wrench frame in the flange."""
     others = frames_in_flange(frame, info, R_base_flange)
     flange = "base", "flange", np.nan_to_num(p_base_flange_m), R_base_flange
     return [flange, *(("flange", name, p_m, R) for name, (R, p_m) in others.items())]
@@ -107,7 +107,7 @@ def pack_transforms(t_utc_ns: NDArray[np.int64], transforms: Sequence[Transform]
     """Pack transforms at n times as TFMessage."""
     parts: list[bytes | NDArray[Any]] = []
     for parent, child, p_m, R in transforms:
-        # the count stands before the first
+        # the number of transforms precedes the first one
         names = _pack_strings(parent, child, start=0 if parts else 4)
         parts += [_stamps(t_utc_ns), names, np.atleast_2d(p_m), quaternions(R.reshape(-1, 3, 3))]
     return _pack(ENCODING + struct.pack("<I", len(transforms)), *parts)
@@ -120,7 +120,7 @@ def _stamps(t_utc_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _pack_strings(*fields: str | int, start: int = 0) -> bytes:
-    """Pack strings and counts (uint32), each aligned to 4 bytes; what follows is aligned to 8 from `start` before."""
+    """Pack strings and counts (uint32), each aligned to 4 bytes; pad to 8 bytes, counted from `start` bytes before."""
     packed = b""
     for item in fields:
         packed += bytes(-len(packed) % 4)
@@ -132,14 +132,14 @@ def _pack_strings(*fields: str | int, start: int = 0) -> bytes:
 
 
 def _pack(*parts: bytes | NDArray[Any]) -> Messages:
-    """Join bytes that begin all messages, n stamps, and then numbers (n, k) or (1, k), more stamps and common bytes."""
+    """Join common first bytes, n stamps, and then numbers (n, k) or (1, k), further stamps and common bytes."""
     layout: list[Any] = [
         (f"{i}", f"V{len(part)}")
         if isinstance(part, bytes)
         else (f"{i}", "<i8" if part.ndim == 1 else "<f8", part.shape[1:])
         for i, part in enumerate(parts)
     ]
-    # Packed one by one, messages cost 12 µs each.
+    # Packing messages one by one takes 12 µs each.
     records = np.empty(len(parts[1]), layout)
     for i, part in enumerate(parts):
         records[f"{i}"] = np.void(part) if isinstance(part, bytes) else part

@@ -1,6 +1,6 @@
-"""The values of a compensated stream: blocks of samples, the frame they are given in, the stages applied, events.
+"""Data types of a compensated stream: blocks of samples, their frame and stages, events and status.
 
-`FrameTransform` turns a wrench to the axes and the point of a frame.
+`FrameTransform` transforms a wrench to the axes and reference point of a frame.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,24 +25,17 @@ from ftdrivers.interfaces import Array, Columns, DeviceInfo
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
 Ns = NDArray[np.int64]
-# One sigma.
+# A height from motion with a smaller sigma is used.
 _KNOWN_HEIGHT_M = 3e-3
 
 
 @dataclass(frozen=True, slots=True)
 class WrenchFrame:
-    """Axes and reference point of a wrench, which belong together: a torque without its point means nothing.
-
-    Examples
-    --------
-    >>> import ftdrive
-    >>> print(ftdrive.WrenchFrame("base", "tcp"))
-    base axes, about the tcp origin
-    """
+    """Axes and reference point of a wrench: a torque has no meaning without its reference point."""
 
     axes: Axes = "sensor"
     about: Point | tuple[float, float, float] = "sensor"
-    """The origin of a frame, or a point in flange axes from the flange, m."""
+    """The origin of a frame, or a point (3,) relative to the flange in flange axes, m."""
 
     def __str__(self) -> str:
         if isinstance(self.about, str):
@@ -67,10 +60,9 @@ class WrenchFrame:
 
 @dataclass(frozen=True, slots=True)
 class Stages:
-    """What is done to the raw wrench, in this order. Raw samples are always kept beside the result.
+    """Processing steps between raw and compensated wrench, in order of application. Raw samples are kept as well.
 
-    All interfaces and files take the settings from these fields; a default is a bool, None for a frequency, a number
-    or a count, and False, None or 0 is off.
+    All interfaces and files use these fields. False, None (for a frequency) or 0 switches a step off.
 
     Examples
     --------
@@ -85,11 +77,11 @@ class Stages:
     inertia: bool = field(
         default=False, metadata={"text": "Subtract the inertial wrench of the load; needs [sensor] height_mm."}
     )
-    """On by default where the calibration is one in motion."""
+    """On by default with a calibration in motion."""
     notch_Hz: float | None = field(default=None, metadata={"text": "Frequency of the notch filter; 0 is off."})
     lowpass_Hz: float | None = field(default=None, metadata={"text": "Frequency of the low-pass filter; 0 is off."})
-    deadband_N: float = field(default=0.0, metadata={"text": "Forces below it are 0."})
-    deadband_Nm: float = field(default=0.0, metadata={"text": "Torques below it are 0."})
+    deadband_N: float = field(default=0.0, metadata={"text": "Forces below this value become 0."})
+    deadband_Nm: float = field(default=0.0, metadata={"text": "Torques below this value become 0."})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,11 +89,11 @@ class Paired(Columns):
     """n consecutive samples of the sensor, each with the pose at its time."""
 
     t_host_ns: Ns
-    """(n,) time of the measurement on the clock of the cell: smoothed, and free of the delay between the links."""
+    """(n,) time of measurement on the clock of the cell: smoothed, and corrected for the delay between the links."""
     t_device_s: Array
-    """(n,) the sensor's own clock; NaN where it has none."""
+    """(n,) time on the sensor's own clock; NaN if it has none."""
     seq: Ns
-    """(n,) the sensor's sample numbers; a missing one is a lost sample."""
+    """(n,) sample numbers of the sensor; a missing number is a lost sample."""
     status: NDArray[np.uint32]
     """(n,) the sensor's status word."""
     raw: Array
@@ -109,24 +101,24 @@ class Paired(Columns):
     q_rad: Array
     """(n, 6) joint angles, interpolated; NaN where unknown."""
     R_base_flange: Array
-    """(n, 3, 3) interpolated."""
+    """(n, 3, 3) orientation of the flange, interpolated."""
     p_base_flange_m: Array
-    """(n, 3) interpolated; NaN where unknown."""
+    """(n, 3) position of the flange, interpolated; NaN where unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Block(Paired):
-    """Paired samples after processing, all in one frame and with the same stages; sigma is that of the newest."""
+    """Processed samples, all in one frame and with the same stages."""
 
     wrench: Array
     """(n, 6) after `stages`, N and N·m, in `frame`."""
     chi2: Array
-    """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, beyond what motion explains."""
+    """(n,) squared Mahalanobis distance of the last 20 ms from a free tool, with inertia subtracted as far as known."""
     in_contact: NDArray[np.bool_]
-    """(n,) see `Sample`."""
+    """(n,) contact, see `Sample.in_contact`."""
     sigma: Array
-    """(6,) standard deviation of one sample of `wrench`, N and N·m, in `frame`: noise, calibration, and errors of the
-    sensor under the present contact."""
+    """(6,) standard deviation of the newest sample of `wrench`, N and N·m, in `frame`: noise, calibration, and errors
+    of the sensor under the present contact."""
     frame: WrenchFrame
     stages: Stages
 
@@ -152,7 +144,7 @@ class Sample(Displayed):
     """One compensated sample."""
 
     t_s: float
-    """On the clock of the cell."""
+    """Time of the measurement, on the clock of the cell."""
     force_N: Array
     torque_Nm: Array
     force_sigma_N: Array
@@ -160,12 +152,12 @@ class Sample(Displayed):
     raw: Array
     """(6,) as measured, sensor axes, about the sensor origin."""
     in_contact: bool
-    """Whether three readings in a row exceed the limit; it ends when three do not.
+    """Whether the tool is in contact: from three consecutive readings beyond the limit until three within it.
 
     A reading is the mean over 20 ms, so a contact begins after 40 to 60 ms. One reading of a free tool in a million
-    exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also behind a
-    filter of the sensor. A force that grows by less than 20 N in an hour counts as drift of the bias. In motion,
-    inertia that is not subtracted counts as unknown, so a smaller contact is not found.
+    exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also with
+    filtered sensors. A force that grows by less than 20 N within an hour is taken for drift of the bias. In motion,
+    inertia that is not subtracted raises the limit, so smaller contacts are not detected.
     """
     frame: WrenchFrame
 
@@ -176,9 +168,9 @@ def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
 
 
 def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | None = None) -> Array:
-    """Return `p_flange_sensor_m` (3,) of a sensor whose origin is so high above the flange face; NaN where unknown.
+    """Return `p_flange_sensor_m` (3,) of a sensor with this height above the flange face; NaN if unknown.
 
-    A calibration in motion that knows the height well replaces one that is not configured.
+    If no height is configured, that of a calibration in motion is used if it is accurate.
     """
     motion = None if calibration is None else calibration.motion
     if height_mm is None and motion is not None and float(motion.covariance[HEIGHT, HEIGHT]) < _KNOWN_HEIGHT_M**2:
@@ -209,22 +201,22 @@ EventKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class StreamEvent:
-    """Something that happened at one moment of a stream."""
+    """Something that happened at one time of a stream."""
 
     t_host_ns: int
     kind: EventKind
     text: str
-    """One sentence for people."""
+    """One sentence for the user."""
     values: Mapping[str, JSON] = field(default_factory=dict)
 
 
 Tracking = Literal["off", "show", "apply"]
-"""Whether bias and held part are followed beside the calibration, and whether they are applied."""
+"""Whether changes of the bias and a held part are tracked, and whether they are applied."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Tracked(Displayed):
-    """Bias and held part, as followed while the arm works.
+    """Changes of the bias and the held part, tracked while the arm works.
 
     Examples
     --------
@@ -240,23 +232,23 @@ class Tracked(Displayed):
     bias: Array
     """(6,) change of the bias since the calibration, N and N·m, sensor axes."""
     sigma: Array
-    """(6,) one standard deviation; it grows while the bias cannot be seen."""
+    """(6,) standard deviation; it grows while the bias cannot be observed."""
     part_kg: float
-    """Mass that is held beside the tool."""
+    """Mass of the part in the gripper."""
     part_sigma_kg: float
     part_known: bool
-    """Whether the load is decided; else a contact or a new part is not yet, and the part is that before."""
+    """Whether the part is known; while a contact or a new part is undecided, `part_kg` is the previous part."""
     last_seen_s: float
-    """Since the bias was seen; infinite before the first time."""
+    """Time since the last observation of the bias; infinite before the first."""
     walk_N: float
-    """Random walk of the force bias in an hour, one sigma, as learnt."""
+    """Estimated random walk of the force bias within an hour, one sigma."""
     moment: tuple[Array, Array]
     """Mass and mass times centre of mass of the part (4,), kg and kg m, sensor axes, and their covariance."""
     events: tuple[StreamEvent, ...] = ()
-    """Grasps, releases and contacts that were decided since the last update, at the time of their begin."""
+    """Grasps, releases and contacts decided since the last update, with the time of their begin."""
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return what is followed as JSON; the age of the last look is None before the first."""
+        """Return the tracked values as JSON; `last_seen_s` is None before the first observation."""
         return {
             "bias": self.bias.tolist(),
             "sigma": self.sigma.tolist(),
@@ -268,7 +260,7 @@ class Tracked(Displayed):
         }
 
     def in_words(self) -> str:
-        """Return size and sigma of the bias and the part, as one line."""
+        """Return bias and part with their sigma as one line."""
         force_N = float(np.linalg.norm(self.bias[:3]))
         sigma_N = float(np.linalg.norm(self.sigma[:3]) / np.sqrt(3))
         seen = f", seen {self.last_seen_s:.0f} s ago" if self.last_seen_s >= 1 else ""
@@ -278,14 +270,14 @@ class Tracked(Displayed):
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StreamInfo(Displayed):
-    """What does not change while a stream runs with one calibration; every file and every client gets it."""
+    """Constant description of a stream with one calibration, for every file and client."""
 
     result: CalibrationResult | None
-    """The calibration; None of a sensor alone."""
+    """The calibration; None for a sensor alone."""
     calibration_name: str
-    """The file it was read from."""
+    """File of the calibration."""
     arm: DeviceInfo
-    """Without a model of a sensor alone."""
+    """Arm; without a model for a sensor alone."""
     sensor: DeviceInfo
     tool: str
     utc_offset_ns: int
@@ -293,38 +285,38 @@ class StreamInfo(Displayed):
     sensor_rate_Hz: float
     arm_rate_Hz: float
     p_flange_sensor_m: Array
-    """(3,) origin of the sensor, configured: gravity cannot identify it."""
+    """(3,) origin of the sensor, configured, because gravity cannot determine it."""
     R_flange_tcp: Array
-    """(3, 3)"""
+    """(3, 3) orientation of the TCP."""
     p_flange_tcp_m: Array
-    """(3,)"""
+    """(3,) position of the TCP."""
     versions: Mapping[str, str]
     verification: VerificationRecord | None = None
-    """The last one of the calibration, when the stream was opened."""
+    """Last verification of the calibration before the stream was opened."""
     calibration_state: str = ""
-    """Id, verdict, marks, age and last verification of the calibration, when the stream was opened; for people."""
+    """Id, verdict, marks, age and last verification of the calibration when the stream was opened, as text."""
     emulated: bool = False
     """Whether arm and sensor are emulated."""
     foreign: bool = False
-    """Whether the calibration is of another arm, sensor or mount, and was applied all the same."""
+    """Whether the calibration belongs to another arm, sensor or mount and was applied with --force."""
     hour_change: Array | None = None
-    """(6,) how far earlier runs of the sensor show its bias to move in an hour, one standard deviation, N and N·m."""
+    """(6,) standard deviation of the change of the bias within an hour in earlier runs of the sensor, N and N·m."""
 
     @property
     def marks(self) -> tuple[str, ...]:
-        """What every output says of the cell and the calibration, see `ftdrive.runs.calibration.MARKS`."""
+        """Marks of cell and calibration that every output shows, see `ftdrive.runs.calibration.MARKS`."""
         if self.result is None:
             return (EMULATED,) if self.emulated else ()
         return marks_of(self.result, emulated=self.emulated, foreign=self.foreign)
 
     @property
     def is_raw(self) -> bool:
-        """Whether these are readings of a sensor alone, without arm and calibration."""
+        """Whether the stream has a sensor alone, without arm and calibration."""
         return self.result is None
 
     @property
     def calibration(self) -> CalibrationResult:
-        """The calibration; only a sensor alone has none, see `is_raw`. Raises `ConfigError` then."""
+        """The calibration. Raises `ConfigError` for a sensor alone, which has none."""
         if self.result is None:
             raise ConfigError("a sensor alone has no calibration: give --calibration PATH or --tool NAME")
         return self.result
@@ -332,57 +324,57 @@ class StreamInfo(Displayed):
 
 @dataclass(frozen=True, slots=True)
 class LinkStatus:
-    """One device of the stream."""
+    """Status of one device of the stream."""
 
     rate_Hz: float
-    """Over the last second."""
+    """Rate over the last second."""
     nominal_rate_Hz: float
     lost: int
     age_s: float
-    """Since its newest sample."""
+    """Time since the newest sample."""
     error: str = ""
-    """Why it is silent or has failed; empty while it delivers."""
+    """Why no samples arrive; empty while they do."""
 
 
 class Links(NamedTuple):
-    """The devices of a stream, or of the recording that replaces them."""
+    """Status of the devices of a stream, or of the recording that replaces them, and the delay between them."""
 
     sensor: LinkStatus
     arm: LinkStatus
     delay_s: float
     """Delay of the wrench after the pose."""
     delay_sigma_s: float
-    """0 if the delay is configured."""
+    """Standard deviation of the delay; 0 if it is configured."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class StreamStatus(Displayed):
-    """The state of a stream beside its samples; the devices and the delay are those of `Links`."""
+    """Status of a stream; for devices and delay see `Links`."""
 
     sensor: LinkStatus
     arm: LinkStatus
     delay_s: float
     delay_sigma_s: float
     tare: Array | None
-    """(6,) what was subtracted from the bias, N and N·m, sensor axes; None without a tare."""
+    """(6,) change of the bias by tares, N and N·m, sensor axes; None without a tare."""
     tare_t_host_ns: int | None
     drift_N_h: float
-    """Drift of the force bias while nothing touches the tool."""
+    """Drift of the force bias while the tool is free."""
     drift_sigma_N_h: float
     contact_limit: float
     """Limit of `Block.chi2`."""
     false_alarm_rate: float
     tracked: Tracked | None = None
-    """Bias and held part beside the calibration; None unless the stream follows them."""
+    """Tracked bias and part; None unless the stream tracks them."""
 
     @property
     def failure(self) -> str:
-        """Why a device is silent or has failed; empty while both deliver."""
+        """Why no samples arrive from a device; empty while both devices send."""
         return self.sensor.error or self.arm.error
 
 
 def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
-    """Return an event for each gap in the sample numbers; `seq_before` is that of the sample before these."""
+    """Return an event per gap in the sample numbers; `seq_before` is the number before the first sample."""
     before = int(rows.seq[0]) - 1 if seq_before is None else seq_before
     if int(rows.seq[-1]) - before == len(rows):
         return []
@@ -398,18 +390,18 @@ def find_gaps(rows: Paired, seq_before: int | None) -> list[StreamEvent]:
 class FrameTransform:
     """Maps wrenches from sensor axes, about the sensor origin, to a frame.
 
-    f' = R f and t' = R (t + p x f), with R the axes and p the sensor origin seen from the new point. Raises
+    f' = R f and t' = R (t + p x f), with rotation R and sensor origin p relative to the new reference point. Raises
     `ConfigError` if the frame needs a point that is not configured.
     """
 
     def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
-        # of a sensor alone only its own frame is known
+        # for a sensor alone, only the sensor frame is known
         is_alone = info.is_raw and frame == WrenchFrame()
         R_flange_sensor = np.eye(3) if is_alone else info.calibration.R_flange_sensor
         lever_m = R_flange_sensor.T @ _sensor_from(frame, info)
         if frame.axes == "tcp":
             _require_tcp(info)
-        # base axes: to flange axes here, the rest differs from sample to sample
+        # for base axes, this matrix goes to flange axes, and `__call__` applies the rotation of each sample
         R_axes_flange = {"sensor": R_flange_sensor.T, "tcp": info.R_flange_tcp.T}.get(frame.axes, np.eye(3))
         R = R_axes_flange @ R_flange_sensor
         self._matrix = np.block([[R, np.zeros((3, 3))], [R @ skew(lever_m), R]])
@@ -433,10 +425,10 @@ class FrameTransform:
 
 
 def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array) -> dict[str, tuple[Array, Array]]:
-    """Return orientation and origin in the flange frame of sensor, tcp and the frame of a wrench, by their `frame_id`.
+    """Return orientation and origin in the flange of sensor, tcp and the frame of a wrench, by `frame_id`.
 
-    The sensor is at the flange if its height is unknown. With base axes the orientation of the wrench's frame has the
-    shape of `R_base_flange` (..., 3, 3).
+    If the sensor height is unknown, the sensor is placed at the flange. For base axes the orientation of the wrench
+    frame has the shape of `R_base_flange` (..., 3, 3).
     """
     sensor = info.calibration.R_flange_sensor, np.nan_to_num(info.p_flange_sensor_m)
     tcp = info.R_flange_tcp, info.p_flange_tcp_m
@@ -450,7 +442,7 @@ def frames_in_flange(frame: WrenchFrame, info: StreamInfo, R_base_flange: Array)
 
 
 def gripping_point(info: StreamInfo) -> Array:
-    """Return where the gripper holds parts, (3,) sensor frame: the TCP, or the tool's centre of mass without one."""
+    """Return the point at which the gripper holds parts, (3,) sensor frame: the TCP, else the tool's centre of mass."""
     p_flange_m = info.p_flange_tcp_m - info.p_flange_sensor_m
     if np.isfinite(p_flange_m).all() and info.p_flange_tcp_m.any():
         return np.asarray(info.calibration.R_flange_sensor.T @ p_flange_m)
@@ -458,13 +450,13 @@ def gripping_point(info: StreamInfo) -> Array:
 
 
 def _sensor_from(frame: WrenchFrame, info: StreamInfo) -> Array:
-    """Position of the sensor origin from the frame's point, in flange axes."""
+    """Return the sensor origin relative to the frame's reference point, in flange axes."""
     if frame.about == "sensor":
         return np.zeros(3)
     if not np.isfinite(info.p_flange_sensor_m).all():
         raise ConfigError(
-            f"a torque {str(frame).partition(', ')[2]} needs the position of the sensor: set [sensor] height_mm, the "
-            "height of its origin above the flange face, or choose --about sensor"
+            f"a torque {str(frame).partition(', ')[2]} needs the position of the sensor. Set [sensor] height_mm, "
+            "the height of its origin above the flange face, or choose --about sensor"
         )
     if frame.about == "tcp":
         _require_tcp(info)
@@ -480,7 +472,7 @@ def _require_tcp(info: StreamInfo) -> None:
 
 def quaternions(R: Array) -> Array:
     """Return unit quaternions x y z w (n, 4) of rotations (n, 3, 3)."""
-    # to check them takes ten times as long
+    # checking the matrices takes ten times as long
     return Rotation.from_matrix(R, assume_valid=True).as_quat()
 
 
@@ -495,9 +487,9 @@ def matrices(quat: Array) -> Array:
 
 
 class Picked:
-    """Picks at most `rate_Hz` samples a second, also across the limits of blocks: the first of each period.
+    """Selects at most `rate_Hz` samples per second: the first of each period, also across blocks.
 
-    A sample is picked, never averaged: what is sent was measured. The low-pass stage of the stream limits aliasing.
+    Samples are not averaged, so every sent value was measured. The low-pass stage of the stream limits aliasing.
     """
 
     def __init__(self, rate_Hz: float) -> None:
@@ -505,7 +497,7 @@ class Picked:
         self._last = -1
 
     def rows(self, t_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which samples (n,) to send, by their times in the order of measurement."""
+        """Return a mask (n,) of the samples to send, from their times (n,) in order of measurement."""
         period = t_ns // self._period_ns
         chosen = np.asarray(np.diff(period, prepend=self._last) != 0)
         if len(period):

@@ -1,4 +1,4 @@
-"""What gives a stream its paired samples: a cell, the sensor of a cell alone, or a recording that replaces it."""
+"""Sources of paired samples for a stream: a cell, the sensor of a cell alone, or a recording."""
 
 import math
 import time
@@ -32,47 +32,47 @@ from ftdrivers.follow import Follow
 from ftdrivers.interfaces import ArmStates, Array, DeviceInfo, ForceTorqueSensor, FtSamples, RobotArm
 
 STALE_S = 0.3
-"""Without a new sample of either device for so long, `CellSource.read` raises."""
+"""`CellSource.read` raises if one of the devices sends no new sample for this time, s."""
 
-# Between two attempts to reconnect.
+# Time between two attempts to reconnect, s.
 _RETRY_S = 0.2
-# At the beginning both rates are measured.
+# Both rates are measured over this time after opening, s.
 _RATE_S = 0.5
 _RATE_WINDOW_NS = 1_000_000_000
 _ALONE = DeviceInfo("", "", "")
 STEP_S = 0.01
-"""A read has so much of a recording."""
-# A read of a recording waits at most so long, so that a key finds the thread that reads.
+"""Duration of the samples per read of a recording, s."""
+# Longest wait of a read of a recording, s, so that the reading thread reacts to keys.
 _WAIT_S = 0.1
 
 
 class Read(NamedTuple):
-    """What a source has read."""
+    """Result of one read of a source."""
 
     rows: Paired
     begin: Literal["", "interrupted", "elsewhere"] = ""
-    """Why the rows do not continue those before: after an interruption, or at another place of a recording."""
+    """Why the rows do not continue the previous rows: an interruption, or another position in a recording."""
     temperature_C: float | None = None
-    """Of the sensor; None where it is not known."""
+    """Sensor temperature; None if unknown."""
     delay_sigma_s: float = 0.0
-    """One sigma of the delay of the wrench after the pose."""
+    """Standard deviation of the delay of the wrench after the pose."""
 
 
 class SampleSource(ABC):
-    """Gives paired samples to one stream.
+    """Source of the paired samples of one stream.
 
     Attributes
     ----------
     info : StreamInfo
-        What the samples are of; known once it is open.
+        Description of the cell; available once the source is open.
     temperature : BiasTemperature or None
         How the bias of the sensor changes with its temperature.
     warnings : tuple of str
-        What is doubtful about the calibration, and what could not be checked.
+        Doubts about the calibration, and checks that were not possible.
     note : callable
-        Takes the events of the devices; set by the stream.
+        Receives the events of the devices; set by the stream.
     has_ended : bool
-        Whether no more samples come.
+        Whether there are no further samples.
     """
 
     clock: Clock = REAL
@@ -83,49 +83,49 @@ class SampleSource(ABC):
     has_ended = False
 
     def open(self) -> None:  # noqa: B027 - a recording has nothing to open
-        """Begin to read."""
+        """Start reading."""
 
     def close(self) -> None:  # noqa: B027
-        """End to read; safe twice."""
+        """Stop reading; may be called twice."""
 
     @abstractmethod
     def read(self, timeout_s: float) -> Read:
-        """Return the next samples; none while a recording pauses. Raises `DeviceError`; the next call reconnects."""
+        """Return the next samples; none while a recording is paused. Raises `DeviceError`; the next call reconnects."""
 
     def links(self) -> Links:
-        """Return rates, losses and ages of the devices, and the delay between them; by default those of a recording."""
+        """Return rates, losses and ages of the devices and the delay between them; the default is for a recording."""
         rate_Hz, arm_rate_Hz = self.info.sensor_rate_Hz, self.info.arm_rate_Hz
         return Links(LinkStatus(rate_Hz, rate_Hz, 0, 0.0), LinkStatus(arm_rate_Hz, arm_rate_Hz, 0, 0.0), 0.0, 0.0)
 
     def beginning(self) -> Iterable[Paired]:
-        """Return samples whose noise is learnt beforehand; devices have none."""
+        """Return samples from which the noise is estimated beforehand; devices have none."""
         return ()
 
 
 class CellSource(SampleSource):
-    """The sensor of a cell, paired with the poses of its arm; without a calibration the sensor alone. It moves nothing.
+    """Samples of the sensor of a cell, paired with the poses of its arm; without a calibration, of the sensor alone.
 
     Parameters
     ----------
     cell : CellConfig or Station
-        An emulated cell is started by `open` and ended with the source.
+        `open` starts an emulated cell, and `close` stops it. Nothing moves the arm.
     calibration : CalibrationResult or str, optional
-        Of these devices, or the name of a tool: its newest accepted calibration is looked up when the source is opened.
-        Without it only the sensor is read.
+        A calibration of these devices, or the name of a tool: `open` looks up its newest accepted calibration. Without
+        it only the sensor is read.
     name : str
-        Of the calibration, such as its path.
+        Name of the calibration, such as its path.
     force : bool
-        Warn instead of raising an error if the calibration is of another arm, sensor or mount; of a tool, take one
-        that was edited by hand too.
+        Warn instead of raising an error if the calibration belongs to another arm, sensor or mount; for a tool, also
+        accept a calibration that was edited by hand.
     devices : ForceTorqueSensor and RobotArm, optional
-        Used in place of those that the cell names.
+        Devices to use instead of those in the configuration of the cell.
 
     Raises
     ------
     ConfigError
-        When it is opened: the calibration is of another arm, sensor or mount, or the tool has none.
+        On `open`: the calibration belongs to another arm, sensor or mount, or the tool has none.
     ConnectError
-        When it is opened: a device does not answer.
+        On `open`: a device does not answer.
     """
 
     def __init__(
@@ -140,13 +140,14 @@ class CellSource(SampleSource):
         self._given, self._wanted, self._name, self._force = cell, calibration, name, force
         self._devices = devices
         self.block_s = 0.003
-        """A read has the samples of so long, because a block costs about the same with one sample as with many. May be
-        set at any time: longer ones arrive later and take less of the processor."""
+        """Duration of the samples per read, s; a block costs about the same with one sample as with many. May be set at
+        any time: longer blocks arrive later and need less processor time.
+        """
         self.payload_kg: float | None = None
-        """As configured in the controller; None where it is not reported."""
+        """Payload in the controller; None if it is not reported."""
         self._arm: RobotArm | None = None
         self._stack, self._follows = ExitStack(), ExitStack()
-        # The device that has failed, "sensor" or "arm", and why.
+        # The failed device, "sensor" or "arm", and its error.
         self._failure: tuple[str, DeviceError] | None = None
         self._silent_since_ns: int | None = None
         self._was_interrupted = False
@@ -188,11 +189,11 @@ class CellSource(SampleSource):
     def station(self) -> Station:
         """The emulated cell; raises `ConfigError` for a real one."""
         if not isinstance(self._given, Station):
-            raise ConfigError("this is a real cell: only a stream with simulate=True has a station")
+            raise ConfigError("only a stream with simulate=True has a station: this is a real cell")
         return self._given
 
     def _described(self) -> StreamInfo:
-        """Describe the cell, without a calibration and before the rates are known."""
+        """Return the description of the cell without calibration and rates."""
         arm, offset = _ALONE, None
         if self._arm is not None:
             arm, status = self._arm.identify(), self._arm.status()
@@ -204,7 +205,7 @@ class CellSource(SampleSource):
             arm=arm,
             sensor=self._sensor.identify(),
             tool=self.cell.tool.name,
-            # the anchor of all times in files
+            # anchor of all times in files
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),
             sensor_rate_Hz=math.nan,
             arm_rate_Hz=0.0,
@@ -217,7 +218,7 @@ class CellSource(SampleSource):
         )
 
     def use_tool(self, name: str) -> StreamInfo:
-        """Take the newest accepted calibration of another tool. Raises `ConfigError`; then nothing has changed."""
+        """Use the newest accepted calibration of another tool; without one, raise `ConfigError` and change nothing."""
         self.info, self._wanted = self._chosen(name, self.info), name
         self._pairing.use(self._estimator())
         return self.info
@@ -226,7 +227,7 @@ class CellSource(SampleSource):
         return DelayEstimator(self.info.calibration, self.info.p_flange_sensor_m)
 
     def _chosen(self, wanted: CalibrationResult | str | None, info: StreamInfo) -> StreamInfo:
-        """Add the calibration of the devices and their mounting to a description. Raises `ConfigError`."""
+        """Add the calibration for these devices and their mount to a description. Raises `ConfigError`."""
         if wanted is None:
             return info
         calibration, name, warnings = wanted, self._name, tuple[str, ...]()
@@ -242,7 +243,7 @@ class CellSource(SampleSource):
             temperature, hour_change = tool.temperature, tool.hour_change
         belongs = compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}, mount)
         if belongs.others and not self._force:
-            raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply it all the same with --force")
+            raise ConfigError(f"{belongs.others[0]}: calibrate this cell, or apply the calibration anyway with --force")
         foreign = bool(belongs.others)
         verification, state = _trusted(
             calibration, name, marks_of(calibration, emulated=info.emulated, foreign=foreign)
@@ -272,7 +273,7 @@ class CellSource(SampleSource):
                 self._was_interrupted = False
                 return Read(rows, begin, self._sensor.temperature_C(), self._pairing.delay_sigma_s)
         role = "arm" if self._pairing.waits_for_pose else "sensor"
-        self._fail(role, DeviceTimeout(f"the {role} sent nothing new for {timeout_s:g} s", "check cable and supply"))
+        self._fail(role, DeviceTimeout(f"the {role} sent no new sample for {timeout_s:g} s", "check cable and supply"))
 
     def _next_rows(self, wait_s: float) -> Paired | None:
         waits_for_pose = self._pairing.waits_for_pose
@@ -290,12 +291,11 @@ class CellSource(SampleSource):
         return self._pairing.take()
 
     def _read_sensor(self, wait_s: float) -> FtSamples:
-        """Wait for the first samples, then for those of one block; the last of them have just arrived."""
+        """Wait for the first samples, then for a full block that ends with a sample that has just arrived."""
         blocks = [self._sensor_follow.read(wait_s)]
         rows = len(blocks[0])
         wanted = self.block_s * self.info.sensor_rate_Hz
-        # A pause between reads left the newest sample waiting for up to 5 ms, so the block ends with one that just
-        # arrived.
+        # After a pause between reads the newest sample may be 5 ms old, so wait for one that has just arrived.
         while 0 < rows < wanted and len(more := self._sensor_follow.read(self.block_s)):
             blocks.append(more)
             rows += len(more)
@@ -306,7 +306,7 @@ class CellSource(SampleSource):
         texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
         error = texts.get("sensor", "")
         sensor = LinkStatus(health.rate_Hz, self.info.sensor_rate_Hz, health.lost, health.age_s, error)
-        # an arm that is not there has no silence
+        # without an arm, its age is 0
         arm = LinkStatus(0.0, 0.0, 0, 0.0)
         if self._arm is not None:
             now_ns = self.clock.now_ns()
@@ -359,7 +359,7 @@ class CellSource(SampleSource):
         raise error
 
     def _reopen(self, role: str, failure: DeviceError) -> None:
-        """Open what has ended again; raises the failure that remains."""
+        """Reopen the devices; raise the error if they still fail."""
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
         self._unfollow()
@@ -374,7 +374,9 @@ class CellSource(SampleSource):
             raise
         arm = _ALONE if self._arm is None else self._arm.identify()
         if arm != self.info.arm or self._sensor.identify() != self.info.sensor:
-            raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
+            raise ConfigError(
+                f"a different device answers ({arm.model} {arm.serial}): start the command again"
+            ) from failure
         self._pairing.forget()
         self._was_interrupted = True
         self._failure = None
@@ -389,9 +391,9 @@ class CellSource(SampleSource):
 
 
 class RecordingSource(SampleSource):
-    """Paired rows of a recording in place of a cell, at `speed` times its own; infinity is as fast as they are read.
+    """Paired samples of a recording, played at `speed` times real time; infinity reads without waiting.
 
-    While it is paused and at its end, `read` returns no rows. The clock is that of the one who watches.
+    While paused and at the end, `read` returns no rows. `clock` times the playback.
     """
 
     def __init__(self, info: StreamInfo, rows: Paired, *, speed: float = 1.0, clock: Clock = REAL) -> None:
@@ -400,7 +402,7 @@ class RecordingSource(SampleSource):
         self.info, self.rows, self.clock = info, rows, clock
         self._seconds = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
         self._speed = speed
-        # The first row that was not read, whether it is at another place, and up to where a step goes.
+        # Index of the next row, whether the position has jumped, and the end of a single step.
         self._next, self._has_jumped, self._step_to_s = 0, False, -1.0
         self.is_paused = False
 
@@ -411,7 +413,7 @@ class RecordingSource(SampleSource):
 
     @property
     def at_s(self) -> float:
-        """Time in the recording of the newest row that was read."""
+        """Position in the recording of the newest row that was read."""
         return float(self._seconds[max(self._next - 1, 0)])
 
     @property
@@ -420,23 +422,23 @@ class RecordingSource(SampleSource):
         return float(self._seconds[-1])
 
     @property
-    def has_ended(self) -> bool:  # type: ignore[override]  # it follows from what was read
+    def has_ended(self) -> bool:  # type: ignore[override]  # derived from the position
         return self._next >= len(self.rows)
 
     @property
     def speed(self) -> float:
-        """Relative to the recording; settable."""
+        """Playback speed relative to real time; settable."""
         return self._speed
 
     @speed.setter
     def speed(self, speed: float) -> None:
         if not speed > 0:
-            raise ValueError(f"a speed of {speed} does not replay: give a positive one")
+            raise ValueError(f"speed {speed} is not possible: give a positive speed")
         self._speed = speed
         self._set_out(self.at_s)
 
     def toggle(self) -> None:
-        """Pause, go on after a pause, or begin again after the end."""
+        """Pause, continue after a pause, or start again after the end."""
         if self.has_ended:
             self.seek(0.0)
         else:
@@ -450,7 +452,7 @@ class RecordingSource(SampleSource):
         self._set_out(float(self._seconds[self._next]))
 
     def step(self) -> None:
-        """Let the next read have the next `STEP_S` of the recording, also while it is paused."""
+        """Let the next read return the next `STEP_S` of the recording, even while paused."""
         self._step_to_s = float(self._seconds[min(self._next, len(self.rows) - 1)]) + STEP_S
 
     def _set_out(self, at_s: float) -> None:
@@ -459,7 +461,7 @@ class RecordingSource(SampleSource):
     # -------------------------------------------------------------------------------------------------------- reading
 
     def read(self, timeout_s: float = _WAIT_S) -> Read:
-        """Return the rows that are due since the last read, and wait for them for a short time."""
+        """Return the rows that are due since the last read, after a short wait for them."""
         if self._step_to_s >= 0:
             end_s, self._step_to_s = self._step_to_s, -1.0
         elif self.is_paused or self.has_ended:
@@ -495,7 +497,7 @@ class RecordingSource(SampleSource):
 def _trusted(
     calibration: CalibrationResult, name: str, marks: tuple[str, ...]
 ) -> tuple[VerificationRecord | None, str]:
-    """Return the last verification of a calibration, and what is said of its age and of that."""
+    """Return the last verification of a calibration, and a text about its id, verdict, age and verification."""
     path = Path(name)
     verification = verification_near(path, calibration.id) if path.name and path.exists() else None
     state = age_and_check(calibration, verification, datetime.now(UTC))

@@ -1,8 +1,8 @@
-"""The stages between raw and compensated wrench, in `STAGES`, and the free tool that the first of them subtract.
+"""The stages between raw and compensated wrench, listed in `STAGES`, and the prediction for the free tool.
 
-A stage is a class: from the settings `Stages` it makes one of itself, or none where it has nothing to do. `Processor`
-runs them in this order. What a free tool exerts is subtracted first, whichever settings are on, because contact is
-judged by what that leaves; the decoder adds again what was not to be subtracted.
+A stage is a class that `Stage.of` creates from the settings, or None if it has nothing to do. `Processor` runs the
+stages in this order. Weight, bias and inertia of the free tool are always subtracted first, because contact is detected
+from the residual. The decoder adds weight or bias again if the settings keep them.
 """
 
 from abc import ABC, abstractmethod
@@ -26,55 +26,56 @@ from ftdrive.stream.noise import REST, MotionTracker
 from ftdrive.stream.samples import FrameTransform, Paired, Stages, StreamInfo, WrenchFrame
 from ftdrivers.interfaces import Array
 
-# Changes of the temperature that move the bias, and that are an event.
+# Temperature changes after which the bias is corrected, and after which an event is added, K.
 _STEP_K, _NOTED_K = 0.05, 1.0
 _HOUR_NS = 3600e9
 LOWPASS_ORDER = 2
-"""Butterworth."""
+"""Order of the Butterworth low-pass."""
 NOTCH_Q = 10.0
-"""Frequency over width at -3 dB."""
+"""Centre frequency divided by the width at -3 dB."""
 TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
-"""A tare accepts this much drift of the bias since the calibration or the tare before, one standard deviation."""
+"""Standard deviation of the drift of the bias since the calibration or the last tare that a tare accepts."""
 
-# Poses of this spacing give the acceleration, over twice so long: longer ones lose the edges of a move, and are later.
+# The acceleration comes from poses at this spacing over twice this reach: a longer reach smooths the edges of a move
+# and delays the samples more.
 _KNOT_S, _REACH_S = 0.002, 0.015
 # Largest motion of the flange during a tare.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4
 
 
 class Passing(NamedTuple):
-    """n samples on their way through the stages, and the wrench that is expected of a free tool, N and N·m."""
+    """n samples on their way through the stages, with the predicted wrench of the free tool, N and N·m."""
 
     rows: Paired
     states: NDArray[np.int8]
     """(n,) states of motion."""
     felt: Array
-    """(n, 6) inertial wrench that the poses before a sample show."""
+    """(n, 6) inertial wrench from earlier poses only."""
     inertial: Array | None
-    """(n, 6) inertial wrench by the poses on both sides of a sample; None while it is not subtracted."""
+    """(n, 6) inertial wrench from the poses before and after each sample; None if it is not subtracted."""
     gravity: Array
-    """(n, 6)"""
+    """(n, 6) wrench of the weight."""
     bias: Array
-    """(6,)"""
+    """(6,) bias."""
 
 
 class Stage(ABC):
     """A step from the raw to the compensated wrench."""
 
     is_of_free_tool: ClassVar = False
-    """Whether it subtracts what a free tool exerts: contact is judged behind the last of these."""
+    """Whether the stage subtracts the wrench of the free tool: contact is judged after the last of these stages."""
     power_gain = 1.0
-    """Variance of the noise of a sample behind the stage over that before it; one that is not linear states it too."""
+    """Factor on the noise variance of a sample; nonlinear stages give it too."""
 
     @classmethod
     @abstractmethod
     def of(cls, settings: Stages, frame: WrenchFrame, info: StreamInfo) -> Self | None:
-        """Return the stage with these settings; None where it does nothing. Raises `ConfigError` without its needs."""
+        """Return the stage; None if it has nothing to do. Raises `ConfigError` if a setting is missing."""
 
     @classmethod
     def words(cls, _settings: Stages) -> str:
-        """Return what it does, for the line that names the stages; empty where it is not named."""
+        """Return the description of the stage for the list of stages; empty if it is not listed."""
         return ""
 
     @abstractmethod
@@ -83,7 +84,7 @@ class Stage(ABC):
 
 
 class _FreeToolAtRest(Stage):
-    """Subtract weight and bias; of a sensor alone, which has no calibration, the tare."""
+    """Subtract weight and bias; for a sensor alone, the tare."""
 
     is_of_free_tool = True
 
@@ -100,7 +101,7 @@ class _FreeToolAtRest(Stage):
 
 
 class _InertialWrench(Stage):
-    """Subtract the inertial wrench of the load; needs a calibration and the position of the sensor."""
+    """Subtract the inertial wrench of the load; this needs a calibration and the position of the sensor."""
 
     is_of_free_tool = True
 
@@ -110,8 +111,8 @@ class _InertialWrench(Stage):
             return None
         if not np.isfinite(info.p_flange_sensor_m).all():
             raise ConfigError(
-                "the inertia stage needs the position of the sensor: set [sensor] height_mm, the height of its origin "
-                "above the flange face"
+                "the inertia stage needs the position of the sensor. Set [sensor] height_mm, the height of its "
+                "origin above the flange face"
             )
         return cls()
 
@@ -124,9 +125,9 @@ class _InertialWrench(Stage):
 
 
 class _Decoder(Stage):
-    """Decode a contact by the matrix of the sensor, as known loads have shown it; needs a calibration.
+    """Decode the contact wrench with the sensor matrix from known loads; this needs a calibration.
 
-    Weight or bias that is not to be subtracted is added again as read, because the matrix is that of contacts.
+    Weight and bias that the settings keep are added as read, because the matrix applies to contacts only.
     """
 
     def __init__(self, settings: Stages, info: StreamInfo) -> None:
@@ -144,10 +145,10 @@ class _Decoder(Stage):
 
 
 class _Filter(Stage):
-    """Notch and low-pass as second-order sections, whose state lasts from block to block.
+    """Notch and low-pass filters as second-order sections; their state continues from block to block.
 
-    It begins in the steady state of its first sample, so that there is no transient. A frequency is between 0 and half
-    the rate of the sensor.
+    The filter starts in the steady state of the first sample, to avoid a transient. Frequencies lie between 0 and half
+    the sensor rate.
     """
 
     def __init__(self, settings: Stages, rate_Hz: float) -> None:
@@ -159,8 +160,8 @@ class _Filter(Stage):
                 continue
             if not 0 < f_Hz < rate_Hz / 2:
                 raise ConfigError(
-                    f"a {name} of {f_Hz:g} Hz is not possible at {rate_Hz:g} Hz: choose more than 0 and less than "
-                    f"{rate_Hz / 2:g} Hz"
+                    f"a {name} at {f_Hz:g} Hz is not possible with samples at {rate_Hz:g} Hz: choose more than 0 "
+                    f"and less than {rate_Hz / 2:g} Hz"
                 )
             if name == "notch":
                 sections.append(signal.tf2sos(*signal.iirnotch(f_Hz, NOTCH_Q, rate_Hz)))
@@ -170,7 +171,7 @@ class _Filter(Stage):
         self._steady = signal.sosfilt_zi(self._sections)
         self._run = signal.sosfilt
         self._state: Array | None = None
-        # the area under |H|² is exact on this grid unless the cut-off is below a thousandth of the rate
+        # the sum of |H|² is exact on this grid unless the cut-off is below a thousandth of the rate
         self.power_gain = float(np.mean(np.abs(signal.sosfreqz(self._sections, 1 << 14)[1]) ** 2))
 
     @classmethod
@@ -195,7 +196,7 @@ class _Filter(Stage):
 
 
 class FrameChange(Stage):
-    """Turn the wrench to the axes and the point of a frame; needs what `FrameTransform` needs."""
+    """Transform the wrench to a frame; raises `ConfigError` as `FrameTransform`."""
 
     def __init__(self, frame: WrenchFrame, info: StreamInfo) -> None:
         self.frame, self._transform = frame, FrameTransform(frame, info)
@@ -210,10 +211,10 @@ class FrameChange(Stage):
 
 
 class _Deadband(Stage):
-    """Shorten force and torque vectors by a deadband; shorter ones become zero.
+    """Shorten force and torque vectors by the deadband; vectors shorter than the deadband become zero.
 
-    The length counts and not each axis, so that a deadband is the same in all axes. The noise of what remains is that
-    before.
+    The norm of the vector is compared, so that the deadband is equal in all directions. The noise of longer vectors
+    does not change.
     """
 
     def __init__(self, settings: Stages) -> None:
@@ -236,28 +237,28 @@ class _Deadband(Stage):
 
 
 STAGES: tuple[type[Stage], ...] = (_FreeToolAtRest, _InertialWrench, _Decoder, _Filter, FrameChange, _Deadband)
-"""All, in their order."""
+"""All stages in order."""
 
 
 def stages_of(settings: Stages, frame: WrenchFrame, info: StreamInfo) -> tuple[Stage, ...]:
-    """Return the stages of these settings; raises `ConfigError` if one needs what is not configured."""
+    """Return the stages for these settings; raises `ConfigError` if a stage needs a setting that is missing."""
     return tuple(stage for kind in STAGES if (stage := kind.of(settings, frame, info)) is not None)
 
 
 def standard_stages(info: StreamInfo) -> Stages:
-    """Return bias and gravity, with inertia where calibration and cell have what it needs; nothing without one."""
+    """Return bias and gravity, plus inertia if calibration and cell allow it; for a sensor alone, no stages."""
     if info.is_raw:
         return Stages(bias=False, gravity=False)
     return Stages(inertia=info.calibration.motion is not None and bool(np.isfinite(info.p_flange_sensor_m).all()))
 
 
 def words_of(settings: Stages) -> list[str]:
-    """Return what each stage does that is on, in their order."""
+    """Return the descriptions of the active stages in order."""
     return [words for kind in STAGES if (words := kind.words(settings))]
 
 
 def stages_in_words(settings: Stages) -> str:
-    """Return the stages that are on as one line."""
+    """Return the active stages as one line."""
     return ", ".join(["raw", *words_of(settings)])
 
 
@@ -265,9 +266,9 @@ def stages_in_words(settings: Stages) -> str:
 
 
 class Neighbours:
-    """Samples with the poses on both sides of them, which show the inertial wrench of the load.
+    """Buffer that pairs samples with the poses before and after them, which give the inertial wrench of the load.
 
-    While that is subtracted, the newest samples wait for the poses after them.
+    While the inertial wrench is subtracted, the newest samples wait for later poses.
     """
 
     def __init__(self, info: StreamInfo) -> None:
@@ -280,23 +281,23 @@ class Neighbours:
         self.restart()
 
     def restart(self) -> None:
-        """Forget the samples before an interruption."""
+        """Discard the samples before an interruption."""
         self._buffer: Paired | None = None
         self._states, self._felt = np.zeros(0, np.int8), np.zeros((0, 6))
-        # Rows of the buffer that are processed.
+        # Number of processed rows of the buffer.
         self._done = 0
 
     @property
     def knows_tensor(self) -> bool:
-        """Whether the inertia of the tool was calibrated."""
+        """Whether the inertia tensor of the tool was calibrated."""
         return self._tensor is not None
 
     def arrange(
         self, rows: Paired, states: NDArray[np.int8], felt: Array, load: Calibrated, *, on: bool, last: bool
     ) -> tuple[Paired, NDArray[np.int8], Array, Array | None]:
-        """Add samples with their motion; return those that are due, and the inertial wrench (n, 6) if it is wanted.
+        """Add samples with their motion; return the samples to process now, and their inertial wrench (n, 6) if `on`.
 
-        `last` is whether no more poses come, so that none waits for them.
+        With `last`, no later poses follow, so no sample waits.
         """
         if self._buffer is None and not (on and len(rows)):
             return rows, states, felt, None
@@ -307,14 +308,14 @@ class Neighbours:
         if on and np.isfinite(buffer.p_base_flange_m[-1]).all():
             inertial, ready = self.wrench(buffer, load)
             end = end if last else max(ready, self._done)
-            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # the poses after them
+            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # later poses
             state = self._states[ahead]
-            # at rest nothing is subtracted, because that would amplify the noise of the joints
+            # at rest inertia is not subtracted, because that would amplify the noise of the joints
             inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])
         else:
             state = self._states[self._done : end]
         rows, felt = buffer.rows(slice(self._done, end)), self._felt[self._done : end]
-        # knots stay where they are
+        # cut at a knot, so that the knots stay where they are
         keep = max(0, end - neighbours - self._stride) // self._stride * self._stride
         self._buffer, self._done = buffer.rows(slice(keep, None)), end - keep
         self._states, self._felt = self._states[keep:], self._felt[keep:]
@@ -326,7 +327,7 @@ class Neighbours:
         """Return the inertial wrench of all rows, and the number of those with neighbours on both sides."""
         knots = np.arange(0, len(rows), self._stride)
         t_s = (rows.t_host_ns - rows.t_host_ns[0]) * 1e-9
-        # a coarse clock repeats times
+        # times of a coarse clock repeat
         knots = knots[np.diff(t_s[knots], prepend=-1.0) > 0]
         if len(knots) < 2 * self._reach + 2:
             return np.zeros((len(rows), 6)), 0
@@ -338,27 +339,27 @@ class Neighbours:
 
 
 class _Reference(NamedTuple):
-    """The empty tool as calibrated, or since a tare."""
+    """The empty tool from the calibration or a tare."""
 
     empty: Calibrated
     t_ns: int
-    # Temperature of the sensor then; NaN where it is not known.
+    # Sensor temperature at that time; NaN if unknown.
     temperature_C: float
 
 
 class FreeTool:
-    """What a tool at rest exerts that touches nothing: bias and weight, after tares, warming and with a held part."""
+    """Prediction for a tool at rest without contact: bias and weight, with tares, temperature and a held part."""
 
     def __init__(self, info: StreamInfo, temperature: BiasTemperature | None) -> None:
         self._calibration, self._rate_Hz = info.calibration, info.sensor_rate_Hz
         self._p_flange_sensor_m = info.p_flange_sensor_m
         known_C = self._calibration.provenance.get("temperature_C")
-        # without the temperature at the calibration there is no change since then
+        # without the temperature at the calibration, the change since then is unknown
         self._temperature, made_C = (None, np.nan) if known_C is None else (temperature, float(known_C))
         self._now_C = self._noted_C = made_C
         self._hour_change = info.hour_change
         created = self._calibration.provenance.get("created_utc")
-        # Clock of the cell when the calibration was made; None where that is not known.
+        # Time of the calibration on the clock of the cell; None if unknown.
         self._made_ns = (
             round(datetime.fromisoformat(created).timestamp() * 1e9) - info.utc_offset_ns
             if isinstance(created, str)
@@ -369,28 +370,28 @@ class FreeTool:
         self.empty: Calibrated = self._calibration
         """The newest reference at the present temperature."""
         self.expected: Calibrated = self._calibration
-        """The empty tool with the part that is held."""
+        """The empty tool plus the held part."""
         self.load: Calibrated = self._calibration
-        """The tool as calibrated with the part that is held: weight and inertia do not change with the bias."""
+        """The calibrated tool plus the held part: weight and inertia do not depend on the bias."""
         self._compensator: Compensator = self._calibration.compensator
         self._bias_change = np.zeros(6)
 
     def predict(self, rows: Paired) -> tuple[Array, Array]:
-        """Return weight (n, 6) and bias (6,)."""
+        """Return wrench of the weight (n, 6) and bias (6,)."""
         gravity = rows.R_base_flange.reshape(-1, 9) @ self._compensator.matrix.T
         return gravity, np.asarray(self._compensator.offset + self._bias_change)
 
     @property
     def mass_kg(self) -> float:
-        """Mass of the tool and the part that is held."""
+        """Mass of the tool and the held part."""
         return float(np.linalg.norm(self.expected.parameters.gravity_force_base_N)) / self._calibration.g_m_s2
 
     def motion_tracker(self) -> MotionTracker:
-        """Return a tracker of the motion of this load."""
+        """Return a motion tracker for this load."""
         return MotionTracker(self._rate_Hz, self.mass_kg, self.expected.parameters, self._p_flange_sensor_m)
 
     def hold(self, weight: Weight | None) -> None:
-        """Count a part as part of the tool from now on; None empties the gripper."""
+        """Treat a part as part of the tool from now on; None empties the gripper."""
         self.held = weight
         self.load = self._with_part(self._calibration)
         self._compensator = Compensator(self.load.parameters, response=self.load.response)
@@ -399,27 +400,27 @@ class FreeTool:
     def _with_part(self, empty: Calibrated) -> Calibrated:
         return empty if self.held is None else holding(empty, self.held, self._calibration.g_m_s2)
 
-    # What follows changes the bias, and returns the change (6,).
+    # The following methods change the bias, and return the change (6,).
 
     def set_tare(self, update: Update, t_ns: int) -> Array:
-        """Take the bias of an update."""
+        """Use the bias of a tare."""
         return self._refer([*self._references, _Reference(update, t_ns, self._now_C)])
 
     def undo_tare(self) -> Array:
-        """Return to the bias before the last tare."""
+        """Use the bias before the last tare again."""
         return self._refer(self._references[:-1])
 
     def follow(self, update: Update, t_ns: int) -> Array:
-        """Take the bias of an update that replaces all tares."""
+        """Use the bias of an update in place of all tares."""
         return self._refer([self._references[0], _Reference(update, t_ns, self._now_C)])
 
     def warm(self, temperature_C: float) -> Array:
-        """Take the bias at a temperature of the sensor."""
+        """Use the bias at this temperature of the sensor."""
         self._now_C = temperature_C
         return self._refer(self._references)
 
     def _refer(self, references: list[_Reference]) -> Array:
-        """Take the newest reference, at the present temperature, as the empty tool."""
+        """Use the newest reference, at the present temperature, as the empty tool."""
         self._references = references
         empty, _, then_C = references[-1]
         if self._temperature is not None:
@@ -430,18 +431,18 @@ class FreeTool:
         return np.asarray(self._bias_change - before)
 
     def bias_growth(self, t_ns: int) -> Array:
-        """Return the variance (6,) of what the bias has moved since calibration or tare, as earlier runs show."""
+        """Return the variance (6,) of the change of the bias since calibration or tare, from earlier runs."""
         looked_ns = self._made_ns if self.tare_t_ns is None else self.tare_t_ns
         if self._hour_change is None or looked_ns is None:
             return np.zeros(6)
         return self._hour_change**2 * (max(t_ns - looked_ns, 0) / _HOUR_NS)
 
     def is_warmed_by(self, temperature_C: float) -> bool:
-        """Whether this temperature of the sensor moves its bias."""
+        """Whether the bias must be corrected for this temperature of the sensor."""
         return self._temperature is not None and not abs(temperature_C - self._now_C) < _STEP_K
 
     def warming(self) -> tuple[str, Mapping[str, JSON]] | None:
-        """Return text and values of an event, if the temperature has changed that much since the last one."""
+        """Return text and values of a temperature event, if the change since the last one is large enough."""
         if self._temperature is None or abs(self._now_C - self._noted_C) < _NOTED_K:
             return None
         self._noted_C = self._now_C
@@ -466,11 +467,11 @@ class FreeTool:
 
 
 def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Mapping[str, JSON]]:
-    """Estimate the bias again from the last `TARE_S` seconds, after earlier tares; None with the reason if refused.
+    """Estimate the bias from the last `TARE_S` seconds; return the update, None if refused, text and values.
 
-    It is refused when arm or reading are not still, and when the reading differs from the prediction of a free tool by
-    more than noise, calibration and a usual drift explain once in a thousand tares. The values are the `change` of the
-    bias (6,), its `force_N` and `torque_Nm`, and the distance from the free tool in `sigmas`.
+    A tare is refused if the arm moves, if the reading changes, or if the reading differs from the prediction for a free
+    tool by more than noise, calibration and typical drift explain (significance 0.001). The values are the `change` of
+    the bias (6,), its norms `force_N` and `torque_Nm`, and the distance in `sigmas`.
     """
     again = "tare again when arm and tool have rested for half a second"
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.5e9 * TARE_S:
@@ -501,7 +502,7 @@ def try_tare(rows: Paired, current: Calibrated) -> tuple[Update | None, str, Map
 
 
 def is_still(rows: Paired) -> bool:
-    """Check whether the arm rests; an unknown position counts as still."""
+    """Return whether the arm rests; an unknown position counts as resting."""
     R, p = rows.R_base_flange[-1:], rows.p_base_flange_m[-1]
     return not (
         np.abs(rows.R_base_flange - R).max() > _STILL_RAD or (np.abs(rows.p_base_flange_m - p) > _STILL_M).any()

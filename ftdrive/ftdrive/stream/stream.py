@@ -1,6 +1,6 @@
-"""The compensated stream, the loop that reads it, and the sinks that this fills: recorders, servers, scale, screen.
+"""The compensated stream, the loop that reads it, and the interface of its sinks: recorders, servers, scale, screen.
 
-A stream has a source and a processor. It knows no screen and no file.
+A stream has a source and a processor. It knows neither screen nor file.
 """
 
 from abc import ABC, abstractmethod
@@ -26,36 +26,36 @@ from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 
 RECOVER_S: Final = 10.0
-"""Default time-out of an interruption: a stream that delivers nothing for longer ends the loop."""
-# Tolerated delay of a sink, because a busy computer can stop any of them for a moment.
+"""Default time-out, s: the loop ends after a longer interruption."""
+# Tolerated delay of a sink, s, because a busy computer can stop any of them for a moment.
 _LATE_S: Final = 1.0
 
 
 class Stream(Displayed):
-    """Paired and compensated samples, as long as `with` lasts. An arm is only read.
+    """Stream of paired and compensated samples inside a `with` block. The arm is read, never moved.
 
-    Samples come from `read` or by iteration, without gaps: a lost sample is a gap in `Block.seq` and an event. After
-    `read` has raised an error of a device, the next `read` reconnects and goes on.
+    Get samples by `read` or by iteration. No sample is skipped; a lost one leaves a gap in `Block.seq` and an event.
+    After `read` has raised a device error, the next `read` reconnects.
 
     Parameters
     ----------
-    source : Source
+    source : SampleSource
         A cell, the sensor of a cell alone, or a recording.
     frame : WrenchFrame
         Axes and reference point; may be set at any time.
     stages : Stages
-        What is done to the raw wrench; may be set at any time. Without it, `standard_stages`.
+        Processing steps; may be set at any time. Default: `standard_stages`.
     track : "off", "show" or "apply"
-        Whether bias and held part are followed, and applied; may be set at any time. See `StreamStatus.tracked`.
+        Whether bias and held part are tracked, and applied; may be set at any time. See `StreamStatus.tracked`.
     on_contact : callable
-        Called by the thread that reads, once when a contact has lasted 40 to 60 ms and once when it is over. May be set
-        at any time.
+        Called by the reading thread 40 to 60 ms after the begin of a contact and again at its end. May be set at any
+        time.
 
     Raises
     ------
     ConfigError
-        On entry: the calibration is of another arm, sensor or mount, the tool has none, or the frame needs what is
-        not configured.
+        On entry: the calibration belongs to another arm, sensor or mount, the tool has none, or the frame needs a
+        setting that is missing.
     ConnectError
         On entry: a device does not answer.
     """
@@ -76,7 +76,7 @@ class Stream(Displayed):
     def open(self) -> Self:
         """Open the source and return the stream; `close` or the end of a `with` block closes it.
 
-        For a notebook, where one `with` block cannot span several cells.
+        Useful in a notebook, where a `with` block cannot span several cells.
         """
         self.source.open()
         try:
@@ -87,7 +87,7 @@ class Stream(Displayed):
         return self
 
     def close(self) -> None:
-        """Close the devices, and end an emulated cell; safe twice."""
+        """Close the devices, and stop an emulated cell; may be called twice."""
         self.source.close()
 
     def __enter__(self) -> Self:
@@ -105,36 +105,36 @@ class Stream(Displayed):
 
     @property
     def processor(self) -> Processor:
-        """What is done to the samples. Raises `ConfigError` before the stream is open."""
+        """The processor of the samples. Raises `ConfigError` before the stream is open."""
         if self._processor is None:
             raise ConfigError("the stream is not open: use it in a with block, or call open")
         return self._processor
 
     @property
     def info(self) -> StreamInfo:
-        """What does not change while the stream runs with one calibration."""
+        """Constant description of the stream with its calibration."""
         return self.processor.info
 
     @property
     def clock(self) -> Clock:
-        """Clock of all times."""
+        """Clock of the times in the stream."""
         return self.source.clock
 
     @property
     def devices(self) -> CellSource:
-        """The source of a stream of devices; raises `ConfigError` for a recording."""
+        """The source as devices; raises `ConfigError` for a recording."""
         if not isinstance(self.source, CellSource):
             raise ConfigError("a recording has no devices: open a cell")
         return self.source
 
     @property
     def cell(self) -> CellConfig:
-        """The configuration; raises `ConfigError` for a recording."""
+        """Configuration of the cell; raises `ConfigError` for a recording."""
         return self.devices.cell
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What is doubtful about the calibration, and what could not be checked."""
+        """Doubts about the calibration, and checks that were not possible."""
         return self.source.warnings
 
     @property
@@ -153,15 +153,7 @@ class Stream(Displayed):
     # -------------------------------------------------------------------------------------------------------- reading
 
     def read(self, timeout_s: float = STALE_S) -> Block:
-        """Return the next samples: at least one of a cell, none while a recording pauses.
-
-        Raises
-        ------
-        DeviceTimeout
-            A device is silent, or no sample came within `timeout_s`.
-        StreamBroken, DeviceFault, ConnectError
-            A device has failed. The next call reconnects.
-        """
+        """Return the next samples: at least one of a cell, none while a recording is paused."""
         source, processor = self.source, self.processor
         while True:
             rows, begin, temperature_C, delay_sigma_s = source.read(timeout_s)
@@ -171,12 +163,12 @@ class Stream(Displayed):
                 rows, last=source.has_ended, temperature_C=temperature_C, delay_sigma_s=delay_sigma_s
             )
             self._call_on_contact(processor)
-            # samples may wait for the poses after them
+            # samples may wait for later poses
             if len(block) or not len(rows):
                 return block
 
     def _call_on_contact(self, processor: Processor) -> None:
-        # Outside of the lock of the processor: the function may call the stream.
+        # Without the lock of the processor, because the function may call the stream.
         for contact in processor.take_contacts():
             if self.on_contact is not None:
                 self.on_contact(contact)
@@ -193,17 +185,17 @@ class Stream(Displayed):
     def use_tool(self, name: str) -> StreamEvent:
         """Continue with the newest accepted calibration of another tool, after a change of tools.
 
-        The devices stay open. Noise, contact, tares and drift begin again; the delay is kept. Call it between two
-        reads, and open new recorders and servers: each keeps the calibration with which it was opened.
+        The devices stay open. Noise, contact, tares and drift start from zero; the delay is kept. Call it between two
+        reads, and open new recorders and servers, because each keeps the calibration with which it was opened.
 
         Raises
         ------
         ConfigError
-            There is no such calibration. The stream continues with the one it has.
+            The tool has no accepted calibration. The stream continues with the present one.
         """
         before = self.processor
         info = self.devices.use_tool(name)
-        # a contact is not continued
+        # end an open contact
         before.restart()
         self._call_on_contact(before)
         self._process_with(before.frame, before.settings, self.track)
@@ -213,11 +205,11 @@ class Stream(Displayed):
             "tool", f"tool {name}, calibration {info.calibration_name}", values, self.clock.now_ns()
         )
 
-    # ------------------------------------------------------------------------------------------------ what is settable
+    # -------------------------------------------------------------------------------------------------------- settings
 
     @property
     def frame(self) -> WrenchFrame:
-        """Axes and reference point of the wrench; setting them is an event. Raises `ConfigError`."""
+        """Axes and reference point of the wrench; setting them adds an event. Raises `ConfigError`."""
         return self.processor.frame
 
     @frame.setter
@@ -226,7 +218,7 @@ class Stream(Displayed):
 
     @property
     def stages(self) -> Stages:
-        """What is done to the raw wrench; setting it is an event. Raises `ConfigError`."""
+        """Settings of the stages; setting them adds an event. Raises `ConfigError`."""
         return self.processor.settings
 
     @stages.setter
@@ -235,7 +227,7 @@ class Stream(Displayed):
 
     @property
     def track(self) -> Tracking:
-        """Whether bias and held part are followed, and applied; see `StreamStatus.tracked`."""
+        """Whether bias and held part are tracked, and applied; see `StreamStatus.tracked`."""
         return "off" if self.info.is_raw else self.processor.monitor.track
 
     @track.setter
@@ -243,11 +235,11 @@ class Stream(Displayed):
         self.processor.monitor.track = track
 
     def tare(self) -> StreamEvent:
-        """Change the bias so that the free tool reads zero in the last half second, or refuse."""
+        """Change the bias so that the free tool reads zero over the last half second, or refuse."""
         return self.processor.tare()
 
     def undo_tare(self) -> StreamEvent:
-        """Take the last tare back."""
+        """Undo the last tare."""
         return self.processor.undo_tare()
 
     def mark(self, text: str) -> StreamEvent:
@@ -258,7 +250,7 @@ class Stream(Displayed):
         """Return the events since the last call."""
         return self.processor.take_events()
 
-    # ---------------------------------------------------------------------------------------------------------- shown
+    # -------------------------------------------------------------------------------------------------------- display
 
     def _summary(self) -> Summary:
         name = type(self).__name__
@@ -281,12 +273,12 @@ class Stream(Displayed):
         return Summary(f"{name}: {info.calibration_state or info.calibration.id}", rows)
 
     def plot(self, duration_s: float = 2.0) -> Any:
-        """Read for so long, and draw what was read: the wrench in `frame`, after `stages`.
+        """Read for `duration_s`, and plot the wrench in `frame`, after `stages`.
 
         Parameters
         ----------
         duration_s : float
-            A loop over the stream does not get the samples of this time.
+            Time to read, s. A loop over the stream does not receive these samples.
 
         Returns
         -------
@@ -302,7 +294,7 @@ class Stream(Displayed):
         """
         begin_ns, blocks = self.clock.now_ns(), list[Block]()
         for block in pump(self, patience_s=0.0):
-            # what a pause between reads left is older
+            # samples from before the call are not plotted
             if block and block.t_host_ns[-1] >= begin_ns:
                 blocks.append(block)
             if blocks and blocks[-1].t_host_ns[-1] >= begin_ns + 1e9 * duration_s:
@@ -319,7 +311,7 @@ class Stream(Displayed):
 
 
 class Sink(ABC):
-    """A consumer of a stream. `pump` calls it between two reads, in the thread that reads."""
+    """A consumer of a stream, called by `pump` between two reads, in the reading thread."""
 
     label: ClassVar[str] = "output"
     """Name of the sink in messages."""
@@ -333,10 +325,10 @@ class Sink(ABC):
 
     @abstractmethod
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Take samples, and the events since the last call.
+        """Add samples, and the events since the last call.
 
-        `if block:` is true if there are samples. A block is empty while a recording pauses. It is None while a device
-        is silent, and when only the last events are left.
+        `if block:` tests for samples. A block is empty while a recording is paused. It is None while a device has
+        failed, and with the last events at the end.
         """
 
     def end(self) -> None:  # noqa: B027 - most have nothing to complete
@@ -352,7 +344,7 @@ def pump(
     say: Callable[[str], object] = lambda _: None,
     meanwhile: str = "",
 ) -> Generator[Block | None, None, None]:
-    """Read a stream block after block, hand each to the sinks, and yield it; yield None while a device has failed.
+    """Read a stream block by block, pass each block to the sinks, and yield it; yield None while a device has failed.
 
     Without sinks the events stay in the stream. A sink that fails is ended and removed. A sink that is more than 1 s
     late misses the next samples until it has caught up, unless it `keeps_all`.
@@ -364,12 +356,12 @@ def pump(
     sinks : list of Sink
         Between two reads the caller may add a sink, or end and remove one. The end of the loop ends the others.
     until : callable, optional
-        Ends the loop before a read when it returns true; without it, the end of a recording does.
+        Ends the loop before a read if it returns true; by default the loop ends with the recording.
     patience_s : float
         Longest duration of a failure; 0 raises the first one.
     say : callable
-        Receives a sentence when a sink has failed or has missed samples. With `meanwhile` it also receives one when an
-        interruption begins, and one when it ends.
+        Receives a sentence if a sink fails or has missed samples; with `meanwhile` also at the begin and end of an
+        interruption.
     meanwhile : str
         What happens during an interruption, in one sentence.
 
@@ -396,7 +388,7 @@ def pump(
                     if meanwhile:
                         say(f"{error}. {meanwhile}")
                 failure = error
-                # Each read has waited for the device already, so there is no pause here.
+                # No pause is needed, because each read has already waited for the device.
                 if now_s - failing_since_s >= patience_s:
                     raise
             else:
@@ -413,7 +405,7 @@ def pump(
 
 
 class _Outlets:
-    """The sinks of one loop, and the delay of each of them in s."""
+    """The sinks of one loop, with the present delay of each, s."""
 
     def __init__(self, stream: Stream, sinks: list[Sink], say: Callable[[str], object]) -> None:
         self._stream, self._sinks, self._say = stream, sinks, say
@@ -421,13 +413,13 @@ class _Outlets:
         self._late_s: dict[Sink, float] = {}
 
     def begin(self) -> None:
-        """Begin the sinks that are new."""
+        """Begin the new sinks."""
         for sink in [one for one in self._sinks if one not in self._late_s]:
             self._late_s[sink] = 0.0
             self._try(sink, sink.begin, self._stream)
 
     def add(self, block: Block | None) -> None:
-        """Hand a block to each sink, and the events since the block before."""
+        """Pass a block and the events since the previous block to each sink."""
         events = self._stream.take_events() if self._sinks else []
         for sink in [*self._sinks]:
             add = sink.add if not block or sink.keeps_all else partial(self._add_in_time, sink)
@@ -446,7 +438,7 @@ class _Outlets:
         self._late_s[sink] = max(self._late_s[sink] + took_s - lasted_s, 0.0)
 
     def end(self) -> None:
-        """Hand the last events to each sink, and end it, also if another sink fails."""
+        """Pass the last events to each sink and end it, even if another sink fails."""
         events = self._stream.take_events() if self._sinks else []
         with ExitStack() as stack:
             for sink in reversed(self._sinks):
@@ -454,7 +446,7 @@ class _Outlets:
 
     def _end(self, sink: Sink, events: Sequence[StreamEvent]) -> None:
         if sink.missed:
-            self._say(f"{sink.label} missed {sink.missed} samples, because it is slower than the sensor")
+            self._say(f"{sink.label} missed {sink.missed} samples because it is slower than the sensor")
         try:
             if events:
                 sink.add(None, events)
@@ -471,4 +463,4 @@ class _Outlets:
                 sink.end()
             if sink in self._given and (sink.keeps_all or not self._sinks):
                 raise
-            self._say(f"{sink.label} ended: {error}")
+            self._say(f"{sink.label} stopped with an error: {error}")

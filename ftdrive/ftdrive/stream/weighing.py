@@ -1,6 +1,6 @@
-"""Weigh what the gripper holds, from half a second of a stream at rest, or while the arm carries it.
+"""Weighing of the load in the gripper, from half a second of a stream at rest, or while the arm carries the load.
 
-`Scale` weighs once, `Weighing` is a sink that weighs ten times a second.
+`Scale` weighs once; `Weighing` is a sink that weighs ten times per second.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,40 +28,40 @@ from ftdrivers.interfaces import Array
 T = TypeVar("T")
 
 WEIGH_S: Final = TARE_S
-"""A weighing averages so long."""
+"""Averaging time of a weighing, s."""
 PATIENCE_S = 10.0
-"""So long a zero, or the only weight, may take."""
-# Between two weighings, each of the last half second.
+"""Time-out of a zero or a single weighing, s."""
+# Time between two weighings, each over the last half second, s.
 _STEP_S = 0.1
-# The variance of a mean comes from its own samples. With n of them it is raised by this over n.
+# The variance of a mean is estimated from n samples, and therefore increased by this factor over n.
 _FEW: Final = 10.0
-# In motion the last window may be so old.
+# Largest age of the last window of a weighing in motion, s.
 _LATE_S: Final = 1.0
-# Poses farther apart than this show more of the centre of mass.
+# Poses with a larger angle between them add information on the centre of mass.
 _NEW_POSE_RAD: Final = 0.17
-# So far from a whole number of parts is no number of parts.
+# Largest deviation from a whole number of parts.
 _WHOLE: Final = 0.1
 
 WORDS: Final[Mapping[str, str]] = {
     "samples": "too few samples: wait half a second",
     "moving": "the arm moves: weigh when it has rested for half a second",
-    "unsteady": "the reading changes: wait until the part hangs still, and take hands away",
-    "contact": "a force across gravity: contact, hand or cable; free the part",
-    "cable": "a torque that no weight in the gripper exerts: cable, hose or contact; let it hang free",
-    "changed": "the poses do not agree on one weight: the part slipped, a cable pulls, or the load has changed",
-    "lifted": "less than the empty tool: contact from below, or the gripper was not empty at the zero",
+    "unsteady": "the reading changes: wait until the part hangs still, and take your hands away",
+    "contact": "a force across gravity, from a contact, a hand or a cable: free the part",
+    "cable": "a torque that no weight in the gripper exerts, from a cable, hose or contact: let it hang free",
+    "changed": "the poses do not agree on one weight: the part slipped, a cable pulls or the load has changed",
+    "lifted": "less than the empty tool: contact from below, or the gripper was not empty at the zero; zero again",
     "not-empty": "the reading is too far from that of the empty tool for a zero: empty the gripper, or calibrate again",
-    "undecided": "a contact, or a load that is not decided yet: let the arm carry it freely for about 2 s",
-    "count": "no whole number of parts: check the mass of one part, and the gripper",
+    "undecided": "a contact, or a load that is not determined yet: let the arm carry it freely for about 2 s",
+    "count": "not a whole number of parts: check the mass of one part, and the gripper",
 }
-"""Why nothing was weighed, and what to do, by `CannotWeigh.code`."""
+"""Reason and remedy by `CannotWeigh.code`."""
 _FAULTS: Final = *get_args(Fault), "count"
 
 
 class CannotWeigh(AcceptanceError):
-    """The reading is not that of one weight at rest.
+    """The reading does not correspond to one weight at rest.
 
-    `code` is one of `WORDS`, and `weight` is what was found all the same, of a reading at rest.
+    `code` is a key of `WORDS`. `weight` is the weight fitted to a reading at rest in spite of the fault.
 
     Examples
     --------
@@ -76,21 +76,22 @@ class CannotWeigh(AcceptanceError):
 
 
 class Scale:
-    """Weighs what the gripper of a stream holds beyond its calibrated tool.
+    """Weighs the load in the gripper of a stream beyond its calibrated tool.
 
-    The reference is the calibration, or the last tare of the stream, which is the better the younger it is.
+    The reference is the calibration or the last tare of the stream. A recent tare gives the smallest error.
     """
 
     def __init__(self, stream: Stream) -> None:
         self._stream = stream
         self._readings: list[tuple[Array, Array, Array]] = []
-        # Noise of a sample at rest: steps of the load make it look louder for a while.
+        # Smallest noise of a sample at rest, because a step of the load increases the estimate for a while.
         self._quietest = np.full(6, np.inf)
 
     def weigh(self, since_ns: int = 0, *, more: bool = False) -> Weight:
-        """Weigh the last half second from `since_ns` on, clock of the cell; `more` joins the poses before of one load.
+        """Weigh over the last half second, not before `since_ns` on the clock of the cell; `more` adds earlier poses.
 
-        Raises `CannotWeigh` if arm or reading is not at rest, or the reading is not that of one weight.
+        Earlier poses must be with the same load. Raises `CannotWeigh` if arm or reading is not at rest, or the reading
+        does not correspond to one weight.
         """
         stream = self._stream
         reading = self._rest(since_ns)
@@ -119,17 +120,17 @@ class Scale:
 
     @property
     def poses(self) -> tuple[Array, Array, Array]:
-        """R_base_flange (n, 3, 3), means (n, 6) and covariances (n, 6, 6) of the poses that were joined last."""
+        """R_base_flange (n, 3, 3), means (n, 6) and covariances (n, 6, 6) of the poses of the last weighing."""
         R_base_flange, means, covariances = map(np.array, zip(*self._readings, strict=True))
         return R_base_flange, means, covariances
 
     def zero(self, since_ns: int = 0) -> StreamEvent:
-        """Tare the empty gripper by the last half second: the drift of the bias up to now is no error any more.
+        """Tare the empty gripper over the last half second, which removes the drift of the bias so far.
 
-        Raises `CannotWeigh` if arm or reading is not at rest, or the reading is too far from that of the empty tool.
+        Raises `CannotWeigh` if arm or reading is not at rest, or differs too much from that of the empty tool.
         """
         self._rest(since_ns)
-        # A zero is a tare, so it is refused where a tare is: else the contact wrench would keep the old bias.
+        # A zero is refused wherever a tare is, because otherwise the contact wrench would keep the old bias.
         event = self._stream.tare()
         if event.kind != "tare":
             raise CannotWeigh("not-empty")
@@ -137,7 +138,7 @@ class Scale:
         return event
 
     def warm_up(self) -> None:
-        """Compute once what a weighing and a zero compute: the first time takes ten times as long as later ones."""
+        """Run the computations of a weighing and a zero once, because the first run takes ten times as long."""
         rows = self._stream.processor.recent()
         if rows is not None and len(rows) >= LEAST_SAMPLES:
             try_tare(rows, self._stream.processor.monitor.reference()[0])
@@ -155,7 +156,7 @@ class Scale:
 
 
 def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
-    """Return R_base_flange (3, 3), mean (6,) and covariance (6, 6) of a rest; raises `CannotWeigh`."""
+    """Return R_base_flange (3, 3), mean (6,) and covariance (6, 6) of samples at rest. Raises `CannotWeigh`."""
     if len(rows) < LEAST_SAMPLES or rows.t_host_ns[-1] - rows.t_host_ns[0] < 0.95e9 * WEIGH_S:
         raise CannotWeigh("samples")
     if not is_still(rows):
@@ -167,16 +168,16 @@ def _reading(rows: Paired, rest_sigma: Array) -> tuple[Array, Array, Array]:
 
 
 def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
-    """Weigh what the arm carries, by the load that the stream follows from `since_ns` on, clock of the cell.
+    """Weigh the load that the arm carries, tracked by the stream since `since_ns` on the clock of the cell.
 
-    Raises `CannotWeigh` if there is a contact, a load that is not decided yet, or no sample, and `ConfigError` if the
-    stream does not follow the load.
+    Raises `CannotWeigh` during a contact, before the load is determined or without samples, and `ConfigError` if the
+    stream does not track the load.
     """
     if stream.track == "off":
-        raise ConfigError('the stream does not follow the load: open it with track="show" to weigh in motion')
+        raise ConfigError('the stream does not track the load: open it with track="show" to weigh in motion')
     rows, tracked = stream.processor.recent(), stream.processor.monitor.tracked
     if rows is None or tracked is None or not np.isfinite(tracked.last_seen_s):
-        # the first windows are no answer: an empty gripper is assumed
+        # the first windows assume an empty gripper
         raise CannotWeigh("samples")
     if round(1e9 * tracked.t_s) < max(since_ns, int(rows.t_host_ns[-1]) - round(1e9 * _LATE_S)):
         raise CannotWeigh("samples")
@@ -186,34 +187,34 @@ def weigh_in_motion(stream: Stream, since_ns: int = 0) -> Weight:
 
 
 def weigh(stream: Stream, *, poses: int = 1, moving: bool = False, timeout_s: float = 10.0) -> Weight:
-    """Wait until arm and reading rest, and weigh what the gripper holds beyond its calibrated tool.
+    """Wait until arm and reading rest, and weigh the load in the gripper beyond its calibrated tool.
 
-    Call `stream.tare()` at the empty gripper just before it grasps: that cancels the drift of the bias.
+    Call `stream.tare()` with the empty gripper just before it grasps, to remove the drift of the bias.
 
     Parameters
     ----------
     stream : Stream
-        Open; it is read here.
+        An open stream, which this function reads.
     poses : int
-        One gives the mass, and the centre of mass but for its place along gravity. From two on, another program turns
-        the arm meanwhile, and each rest that is 10° from the others counts.
+        One pose gives the mass, and the centre of mass except along gravity. For two or more, another program must turn
+        the arm; each rest at least 10° from the others is used.
     moving : bool
-        Do not wait for rest: take what the arm carries as the stream follows it, once it is decided. The stream was
-        opened with `track`, while the gripper was empty. `poses` does not count then.
+        Weigh while the arm moves, from the tracked load. The stream must be opened with `track` while the gripper is
+        empty. `poses` is ignored.
     timeout_s : float
-        For each pose.
+        Time-out per pose, s.
 
     Returns
     -------
     Weight
-        With `mass_kg`, `mass_sigma_kg`, `least_kg`, `p_sensor_com_m`, `com_covariance`, `line`.
+        The weight, with `mass_kg`, `mass_sigma_kg`, `least_kg`, `p_sensor_com_m`, `com_covariance`, `line`.
 
     Raises
     ------
     CannotWeigh
-        Nothing could be weighed in this time; its `code` is the reason of the last attempt.
+        No weighing succeeded in this time; `code` is the reason of the last attempt.
     ConfigError
-        With `moving`, the stream does not follow the load.
+        With `moving`, the stream does not track the load.
     DeviceError
         The stream has failed.
 
@@ -241,9 +242,9 @@ def weigh(stream: Stream, *, poses: int = 1, moving: bool = False, timeout_s: fl
 
 
 def first_success(stream: Stream, attempt: Callable[[int], T], timeout_s: float) -> T:
-    """Read a stream until `attempt` succeeds with the samples from now on; it gets their first time.
+    """Read a stream until `attempt` succeeds, which receives the time of the first sample; return its result.
 
-    After the time-out raise its last `CannotWeigh`.
+    After the time-out, raise the last `CannotWeigh` of `attempt`.
     """
     end_s, refusal, since_ns = stream.clock.now_s() + timeout_s, CannotWeigh("samples"), 0
     for block in pump(stream, until=lambda: stream.clock.now_s() > end_s, patience_s=0.0):
@@ -257,7 +258,7 @@ def first_success(stream: Stream, attempt: Callable[[int], T], timeout_s: float)
 
 
 def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
-    """Return a weight as JSON, in the axes of sensor and flange; what is not known is None."""
+    """Return a weight as JSON, in sensor and flange axes; unknown values are None."""
     R = info.calibration.R_flange_sensor
     known = weight.is_something
     p_flange_m = info.p_flange_sensor_m + R @ weight.p_sensor_com_m
@@ -281,7 +282,7 @@ def load_values(weight: Weight, info: StreamInfo) -> dict[str, JSON]:
 
 
 def count_of(weight: Weight, part_kg: float) -> int:
-    """Return how many parts of `part_kg` are held. Raises `CannotWeigh`."""
+    """Return the number of held parts of `part_kg`. Raises `CannotWeigh`."""
     parts = weight.mass_kg / part_kg
     whole = round(parts)
     sigma = float(np.hypot(weight.mass_sigma_kg, weight.scale_sigma * weight.mass_kg)) / part_kg
@@ -296,31 +297,31 @@ class ScaleState:
 
     weight: Weight | None
     refusal: str | None
-    """A key of `WORDS`; "contact" and the like have a weight too."""
+    """Key of `WORDS`; for faults such as "contact" there is a weight too."""
     count: int | None = None
     stale: str = ""
 
     @property
     def measured(self) -> Weight | None:
-        """The weight that is a mass to show: what cannot be counted has one too."""
+        """The weight to show; None for a fault, except that a failed count has a weight."""
         return self.weight if self.refusal in {None, "count"} else None
 
 
 class Weighing(Sink):
-    """Weighs ten times a second what the gripper of a stream holds, and zeroes on request.
+    """Weighs the load in the gripper of a stream ten times per second, and zeroes on request.
 
-    It `joins` the poses of one load, weighs what is `moving` too, and counts parts of `part_kg`. `keep` takes each new
-    weight or fault, see `WeighingLog.keep`.
+    `joins` combines the poses of one load, `moving` weighs in motion, and `part_kg` is the mass of one part to count.
+    `keep` receives each new weight or fault, see `WeighingLog.keep`.
     """
 
     label, keeps_all = "scale", True
     shown = ScaleState(None, "samples")
     is_new = False
-    """Whether the last block has brought a new weight, or a fault that lasts."""
+    """Whether the last block gave a new weight or a lasting fault."""
     note = ""
-    """Outcome of the last requested zero."""
+    """Outcome of the last zero request."""
     refusal: NotAccepted | None = None
-    """The error if it was refused."""
+    """Error of the last zero request, if it was refused."""
 
     def __init__(
         self,
@@ -333,26 +334,26 @@ class Weighing(Sink):
     ) -> None:
         self.stream, self.part_kg, self.joins, self.moving = stream, part_kg, joins, moving
         self._scale, self._keep = Scale(stream), keep
-        # Weight of the load that is held; None since the reading was not at rest.
+        # Weight of the present load; None since the reading was last not at rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
-        # When a zero was requested, on the clock of the cell; set by another thread.
+        # Time of a zero request on the clock of the cell; set by another thread.
         self._zero_ns: int | None = None
         self._fault: str | None = None
         self._fault_since_s = 0.0
 
     @property
     def is_zeroing(self) -> bool:
-        """Whether a zero is requested, and neither done nor refused."""
+        """Whether a requested zero is pending."""
         return self._zero_ns is not None
 
     def request_zero(self) -> None:
-        """Let the thread that reads tare the empty gripper, when it has rested for half a second."""
-        self.note, self.refusal = "zero: waits for half a second at rest …", None
+        """Request a tare of the empty gripper, done by the reading thread after half a second at rest."""
+        self.note, self.refusal = "zero: waiting for half a second at rest …", None
         self._zero_ns = self.stream.clock.now_ns()
 
     def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
-        """Weigh or zero if it is time to."""
+        """Weigh or zero if it is due."""
         now_s, zero_ns, self.is_new = self.stream.clock.now_s(), self._zero_ns, False
         if block is None:
             self._last = None
@@ -360,7 +361,7 @@ class Weighing(Sink):
         elif now_s < self._due_s:
             return
         elif zero_ns is not None:
-            # the number of before would look live
+            # an earlier weight would look current
             self.shown = ScaleState(None, "samples")
             self._zero(zero_ns)
         else:
@@ -374,10 +375,10 @@ class Weighing(Sink):
         except CannotWeigh as refusal:
             if refusal.code != "not-empty" and self.stream.clock.now_ns() <= since_ns + 1e9 * PATIENCE_S:
                 return
-            self.refusal = NotAccepted(f"no zero: {WORDS[refusal.code]}")
+            self.refusal = NotAccepted(f"zero refused: {WORDS[refusal.code]}")
         else:
             self._last = None
-        # first, because the operator may request another one now
+        # clear the request first, because the operator may make another one now
         self._zero_ns = None
         self.note = "zero: the empty gripper was tared" if self.refusal is None else str(self.refusal)
 
@@ -386,13 +387,13 @@ class Weighing(Sink):
             weight = weigh_in_motion(self.stream) if self.moving else self._scale.weigh(more=self.joins)
             return ScaleState(weight, None, None if self.part_kg is None else count_of(weight, self.part_kg))
         except CannotWeigh as refusal:
-            # then it may be the same load as before
+            # the load may still be the same
             if refusal.code not in ("unsteady", "samples"):
                 self._last = None
             return ScaleState(refusal.weight, refusal.code)
 
     def _is_new(self, shown: ScaleState, now_s: float) -> bool:
-        """Keep another weight than the last, or once a fault that lasts; return whether there is one."""
+        """Pass a new weight, or a lasting fault once, to `keep`; return whether there was one."""
         if shown.refusal != self._fault:
             self._fault, self._fault_since_s = shown.refusal, now_s
         if shown.refusal in _FAULTS and now_s - self._fault_since_s > WEIGH_S:
@@ -415,16 +416,16 @@ class Weighing(Sink):
         return True
 
     def given_up(self, shown: ScaleState) -> CannotWeigh:
-        """Return the error of the only weight that was wanted, after `PATIENCE_S`."""
+        """Return the error for a single weighing that did not succeed within `PATIENCE_S`."""
         code = shown.refusal or "samples"
-        # these are kept already
+        # faults are kept already
         if code not in _FAULTS:
             self._keep({"refused": code})
         return CannotWeigh(code, shown.weight)
 
 
 def format_scale(shown: ScaleState) -> str:
-    """Return a state as one line."""
+    """Return the state as one line."""
     if shown.stale:
         return f"stale: {shown.stale}"
     if shown.refusal is not None:

@@ -424,7 +424,7 @@ def test_real_recordings_are_judged_and_explained(
 @pytest.mark.usefixtures("no_other_methods")
 def test_no_report_is_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ftdrive.commands.report.page", lambda *_: "page")
+    monkeypatch.setattr("ftdrive.commands.report.render_page", lambda *_: "page")
     dataset().save(tmp_path / "dataset.json")
     (tmp_path / "report.html").write_text("mine")
     for n in (2, 3):

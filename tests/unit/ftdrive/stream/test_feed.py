@@ -58,7 +58,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_screen() -> None:
     assert len(blocks) == 5
     assert tape.closed == 1
     assert feed.recording_s is None
-    assert "recording ended: [Errno 28] No space left on device" in [note.text for note in notes]
+    assert "recording stopped with an error: [Errno 28] No space left on device" in [note.text for note in notes]
 
 
 def test_a_request_that_is_refused_is_a_line_on_the_screen() -> None:

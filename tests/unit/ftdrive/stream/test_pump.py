@@ -136,7 +136,7 @@ def test_a_recording_that_was_added_later_is_only_said_to_fail() -> None:
             if screen.got == "..":
                 sinks.append(added)
     assert (added.got, added.events, added.calls) == ("..", "c", ["begin", "end"])
-    assert said == ["recording ended: [Errno 28] No space left on device"]
+    assert said == ["recording stopped with an error: [Errno 28] No space left on device"]
     assert (screen.got, sinks) == (".....-", [screen])
 
 
@@ -150,4 +150,4 @@ def test_a_slow_sink_misses_samples_and_no_event_while_a_recorder_and_others_get
     assert slow.got.startswith("." * 5), "a delay of one second is nothing"
     assert given * 0.3 == pytest.approx(100 * 0.1 + 1, abs=0.3), "as many as it can take in time"
     assert (slow.missed, slow.events) == ((100 - given) * round(0.1 * RATE_HZ), "a" * 100 + "last")
-    assert said == f"output missed {slow.missed} samples, because it is slower than the sensor"
+    assert said == f"output missed {slow.missed} samples because it is slower than the sensor"

@@ -142,14 +142,14 @@ def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("refuses", "note"), [(False, "zero: the empty gripper was tared"), (True, f"no zero: {WORDS['not-empty']}")]
+    ("refuses", "note"), [(False, "zero: the empty gripper was tared"), (True, f"zero refused: {WORDS['not-empty']}")]
 )
 def test_a_zero_hides_the_number_of_before(refuses: bool, note: str) -> None:
     weighing = FakeWeighing(ScaleState(PART, None))
     weighing.refuses = refuses
     scale = Scale(weighing, "z")
     for _ in range(4):
-        assert (scale.mass, scale.note) == (mass("- - -"), "zero: waits for half a second at rest …")
+        assert (scale.mass, scale.note) == (mass("- - -"), "zero: waiting for half a second at rest …")
         scale.press("")
     assert not weighing.is_zeroing
     assert str(weighing.refusal or weighing.note) == note
