@@ -1,7 +1,7 @@
 """ftdrive: calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
 
 The names below are the library. Each is imported at its first use, so that `import ftdrive` takes a few milliseconds.
-Modules behind them may move; these names stay.
+Their modules may move; these names stay.
 
 | task | names |
 |---|---|
@@ -13,12 +13,12 @@ Modules behind them may move; these names stay.
 | errors | `FtdriveError`, `UsageError`, `DeviceError`, `DataError`, `AcceptanceError` |
 
 Two packages come with it. `ftcalib` has the parts of the solver, such as `Parameters`, `predict`, `Compensator` and
-`solve_loads`. `ftdrivers` has what a driver of your own needs, such as `StreamingSensor` and `ReadOnlyArm`.
+`solve_loads`. `ftdrivers` has the parts of a custom driver, such as `StreamingSensor` and `ReadOnlyArm`.
 """
 
 from importlib import import_module
 
-TYPE_CHECKING = False  # type checkers take it for that of `typing`, whose import would take most of the time
+TYPE_CHECKING = False  # as in `typing`, whose import would take most of the time
 if TYPE_CHECKING:
     from ftcalib.compare import compare
     from ftcalib.data.dataset import CalibrationDataset

@@ -1,4 +1,4 @@
-"""The command line: one group, lazy commands, and the words of an error."""
+"""The command line: one group with lazily imported commands, and the output of errors."""
 
 import atexit
 import gc
@@ -28,12 +28,12 @@ Exit codes: 0 ok, 1 unexpected, 2 usage or configuration, 3 cannot open a device
 141 the reader of the output has ended."""
 
 
-# Of every command: click takes it from the class.
+# click reads this attribute from the class for every command.
 click.Context.formatter_class = WholeWords
 
-# As a shell reports a program that SIGPIPE ended.
+# Exit code that shells report for a program ended by SIGPIPE.
 _CLOSED_PIPE = 128 + 13
-# Signals of a terminal that was closed; whatever fails after one is its consequence.
+# Hang-up signals of a closed terminal; later errors are their consequence.
 _closed_terminals: list[int] = []
 
 
@@ -41,7 +41,7 @@ _closed_terminals: list[int] = []
 def _closed_pipe() -> Iterator[None]:
     try:
         yield
-    except BrokenPipeError as error:  # click would end with 1, whichever pipe or socket it is
+    except BrokenPipeError as error:  # click would exit with 1 for any pipe or socket
         from ftdrive.terminal.supervisor import Supervisor
 
         if any(Supervisor(sys.stdin, stream, "it").absence() for stream in (sys.stdout, sys.stderr)):
@@ -50,9 +50,9 @@ def _closed_pipe() -> Iterator[None]:
 
 
 class _LazyGroup(click.Group):
-    """A command whose commands are imported when they are called: `modules` has the module and the help line of each.
+    """A group whose commands are imported when called: `modules` maps each name to its module and help line.
 
-    A mistyped command is answered with the name that is most like it.
+    For a mistyped command, the most similar name is proposed.
     """
 
     def __init__(self, *args: Any, modules: Mapping[str, tuple[str, str]], **options: Any) -> None:
@@ -112,9 +112,7 @@ def _help(words: tuple[str, ...]) -> None:
 
 @click.group(cls=_LazyGroup, modules=_MODULES, epilog=_EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
 @click.option("-v", "--verbose", count=True, help="Print details on stderr; -vv also prints debug messages.")
-@click.option(
-    "-q", "--quiet", is_flag=True, help="Print only answers, errors and, before a question, what it is about."
-)
+@click.option("-q", "--quiet", is_flag=True, help="Print only results, errors, and the context of each question.")
 @click.version_option(__version__, "-V", "--version", prog_name="ftdrive")
 def cli(verbose: int, quiet: bool) -> None:
     """Calibrate a wrist force/torque sensor on a Universal Robots arm, and see the true contact force.
@@ -134,16 +132,16 @@ cli.add_command(_help)
 
 @cli.group(cls=_LazyGroup, modules=_FLEET)
 def fleet() -> None:
-    """Watch many cells: which are due, which sensor drifts, what is wrong in several of them."""
+    """Watch many cells: which are due, which sensors drift, which faults occur in several cells."""
 
 
 class _MessageHandler(logging.Handler):
-    """Prints log records on stderr, above a live screen if there is one."""
+    """Prints log records on stderr, above a live screen if one is active."""
 
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import messages
 
-        with suppress(OSError):  # a terminal or a pipe that is closed
+        with suppress(OSError):  # a closed terminal or pipe
             if messages.quiet:
                 echo(self.format(record), err=True)
                 return
@@ -152,17 +150,18 @@ class _MessageHandler(logging.Handler):
 
 def main() -> int:
     """Run the command line; return the exit code."""
-    # The matrices of a calibration are small: several threads of linear algebra wait for each other longer than they
-    # compute, several times as long beside another process. Read when numpy is imported, later.
+    # The matrices of a calibration are small: threads of linear algebra wait for each other longer than they compute.
+    # numpy reads this variable when it is imported, later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Ctrl-C, `kill` and a terminal that closes all end a command the same way: the arm is stopped first. Set even where
-    # they are inherited as ignored, as in a job in the background; but `nohup` means that the terminal may close.
+    # Ctrl-C, `kill` and a closed terminal all end a command in the same way: the arm is stopped first. Also set the
+    # handlers if these signals are inherited as ignored, as in a background job; `nohup` means that the terminal may
+    # close.
     for name in ("SIGINT", "SIGTERM"):
         signal.signal(getattr(signal, name), signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
         signal.signal(signal.SIGHUP, _hang_up)
     _open_closed_streams()
-    # The memory ends with the process: at exit no collection looks at each object, which takes 0.5 s if others compute.
+    # A garbage collection at exit would take 0.5 s on a busy computer, and the memory is freed anyway.
     atexit.register(gc.freeze)
     code = run(sys.argv[1:])
     is_dead = _leave_dead_streams()
@@ -175,9 +174,9 @@ def _hang_up(number: int, frame: FrameType | None) -> None:
 
 
 def _leave_dead_streams() -> bool:
-    """Connect standard streams without a reader to nothing, because Python writes at its end what is left.
+    """Redirect standard streams without a reader to /dev/null, because Python flushes them at exit.
 
-    Return whether standard output was one.
+    Return whether standard output had no reader.
     """
     dead = []
     for stream in (sys.stdout, sys.stderr):
@@ -191,21 +190,21 @@ def _leave_dead_streams() -> bool:
 
 
 def _open_closed_streams() -> None:
-    """Connect standard streams that the caller has closed to nothing, so that no other file gets their numbers."""
+    """Open /dev/null for standard streams that the caller closed, so that no other file gets their descriptors."""
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_RDWR), mode))
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run one command line without the program's name; errors are printed, the exit code is returned."""
+    """Run one command line without the program's name; print errors, and return the exit code."""
     try:
         code = _run(arguments)
     except Exception:
         if not _closed_terminals:
             raise
         code = 1
-    if _closed_terminals:  # which is the cause of any other error
+    if _closed_terminals:  # the cause of any other error
         _say("error: the terminal was closed")
         return exit_code(SupervisorGone("")) or code
     return code
@@ -224,7 +223,7 @@ def _run(arguments: Sequence[str]) -> int:
         code = exit_code(error)
         if code is None or _closed_terminals:
             raise
-        # a file of another kind is the cause of whatever it lacks
+        # a file of the wrong kind is the cause of the error
         about = str(error) if isinstance(error, UsageError) else ""
         other = _other_command(arguments, about) if isinstance(error, DataError | UsageError | OSError) else ""
         _say(f"error: {in_one_line(other or in_a_sentence(error))}")
@@ -232,7 +231,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _explain_click_error(error: click.ClickException, arguments: Sequence[str]) -> None:
-    """Print an error of the line itself, and what to type."""
+    """Print an error in the command line, and what to type."""
     from ftdrive.mistakes import existing, missing, of_subcommand, without_value
 
     if isinstance(error, click.MissingParameter):
@@ -258,6 +257,6 @@ def _other_command(arguments: Sequence[str], about: str = "") -> str:
 
 
 def _say(text: str) -> None:
-    """Print on stderr, if that is open."""
+    """Print on stderr, unless it is closed."""
     with suppress(OSError):
         echo(text, err=True)

@@ -1,4 +1,4 @@
-"""Errors of the application itself, below those of `ftcalib.errors`, and the exit code of each error."""
+"""Errors of the application, derived from those of `ftcalib.errors`, and the exit code of each error."""
 
 import platform
 import sys
@@ -18,7 +18,7 @@ class BadPlan(DataError):
 
 
 class BadRecording(DataError):
-    """A file does not contain a recording that this version can read; its path stands before the problem."""
+    """A file does not contain a recording that this version can read; the message begins with its path."""
 
     def __init__(self, problem: str, path: Path | None = None) -> None:
         super().__init__(problem if path is None else f"{path}: {problem}")
@@ -38,7 +38,7 @@ class RecordingHasGaps(DataError):
 
 
 class NotAccepted(AcceptanceError):
-    """A check failed, or a result is rejected or differs from the one it must equal."""
+    """A check failed, or a result is rejected or does not equal the expected one."""
 
 
 class PlanRefused(NotAccepted):
@@ -50,16 +50,16 @@ class Declined(FtdriveError):
 
 
 class SupervisorGone(FtdriveError):
-    """The operator, or the program in their place, does not follow the session any more.
+    """The operator, or the program in their place, no longer follows the session.
 
-    `why` says what was closed, and `effect` what happens therefore and what to do.
+    `why` names what was closed, `effect` the consequence and the remedy.
     """
 
     def __init__(self, why: str, effect: str = "the session ends, the arm at rest; continue it with --resume") -> None:
         super().__init__(f"{why}: {effect}")
 
 
-# The first kind that fits counts.
+# The first matching class determines the code.
 _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
     (UsageError, 2),
     (ConnectError, 3),
@@ -77,16 +77,16 @@ _EXIT_CODES: tuple[tuple[type[BaseException], int], ...] = (
 def exit_code(error: BaseException) -> int | None:
     """Return the exit code of an error that a user can fix; None for a defect of ftdrive."""
     if isinstance(error, ModuleNotFoundError) and error.name in sys.stdlib_module_names:
-        return 2  # not on this system, as `termios` on Windows
+        return 2  # a module missing on this system, such as `termios` on Windows
     return next((code for kind, code in _EXIT_CODES if isinstance(error, kind)), None)
 
 
 def in_a_sentence(error: BaseException) -> str:
-    """Return the message of an error; for an error of the system also its file and what to check."""
+    """Return the message of an error; for an operating system error also the file and what to check."""
     if isinstance(error, ModuleNotFoundError):
         return f"Python on {platform.system()} has no module {error.name}, which this needs: use Linux"
     if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}: check this path, and who may read and write there"
+        return f"{error.filename}: {error.strerror}: check this path and its permissions"
     if isinstance(error, OSError) and error.errno == ENOSPC:
-        return f"{error.strerror}: make room where the output goes"
+        return f"{error.strerror}: free space for the output"
     return str(error)

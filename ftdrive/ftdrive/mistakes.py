@@ -1,4 +1,4 @@
-"""What to type instead of a line that cannot be run: another command for this file, or a name that exists."""
+"""Proposals for a command line that cannot run: another command for this file, or an existing name."""
 
 import re
 import shlex
@@ -15,17 +15,17 @@ from ftdrive.runs import is_run
 
 
 class Kind(NamedTuple):
-    """A kind of file, and the commands and options that take it."""
+    """A kind of file, and the commands and options that accept it."""
 
     words: str
     lines: tuple[str, ...]
-    """What a user wants with such a file, to type."""
+    """The usual commands for such a file, as typed."""
     others: tuple[str, ...] = ()
-    """What takes it too."""
+    """Further commands that accept it."""
 
     @property
     def places(self) -> set[str]:
-        """Where it may stand: options, and commands that have it as an argument."""
+        """Places of such a file: options, and commands that take it as an argument."""
         heads = (line.partition(" {}")[0] for line in (*self.lines, *self.others))
         return {head.rpartition(" ")[2] if " --" in head else head for head in heads}
 
@@ -77,14 +77,14 @@ KINDS: Final[Mapping[str, Kind]] = {
 _TEXTS, _BINARIES = {".csv", ".tsv", ".txt", ".dat", ".log"}, {".parquet", ".db3", ".bag", ".mcap"}
 _TWO_NUMBERS = re.compile(rb"\d[\s,;]+[-+.]?\d")
 _FORMAT = re.compile(rb"ftdrive\.(\w+)/\d")
-# A table of a TOML file that describes a cell.
+# A section of a TOML file that describes a cell.
 _CELL = re.compile(rb"^\[(?:robot|sensor|tool|workcell)\]", re.MULTILINE)
 _START = 4096
 _ALIKE = 0.75
 
 
 def kind_of(path: Path) -> str | None:
-    """Return the kind of a file or folder, by its first bytes and its ending; None for one that no command takes."""
+    """Return the kind of a file or folder, from its first bytes and its suffix; None if no command accepts it."""
     from ftdrive.recording.foreign import is_bag, is_recording
 
     with suppress(OSError):
@@ -110,14 +110,14 @@ def kind_of(path: Path) -> str | None:
 
 
 def _runs_in(folder: Path) -> Iterator[Path]:
-    """Yield the runs in a folder, the newest first."""
+    """Yield the runs in a folder, newest first."""
     yield from filter(is_run, sorted(folder.iterdir(), reverse=True))
 
 
 def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:
-    """Return what takes the first file of a line that is of another kind than its place; empty if there is none.
+    """Return the commands that accept the first misplaced file of a line; empty if there is none.
 
-    Where the error is `about` something, only a file that it names counts.
+    If the error is `about` something, only files named there are considered.
     """
     for number, place, name, command in _unmatched_arguments(group, arguments):
         path, kind = Path(name), kind_of(Path(name))
@@ -132,7 +132,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
         if " " in place:
             own += [line for line in (*KINDS[kind].lines, *KINDS[kind].others) if line.split()[0] == place.split()[0]]
         lines = [f"ftdrive {line.format(shlex.quote(str(path)))}" for line in dict.fromkeys([*own, *KINDS[kind].lines])]
-        # another place takes it, or the same place another path
+        # another place accepts this file, or this place accepts another file
         better = path if path != Path(name) else next(_runs_in(path), None) if kind == "runs" else None
         if better is not None:
             given = arguments[number].removesuffix(name) + str(better)
@@ -144,7 +144,7 @@ def other_command(group: click.Group, arguments: Sequence[str], about: str = "")
 
 
 def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterator[tuple[int, str, str, click.Command]]:
-    """Yield number, place, name and command of each argument that is an existing file, or that no command has."""
+    """Yield number, place, name and command of each argument that is an input file, or that no command expects."""
     command: click.Command = group
     words, option, number_of_place = list[str](), "", 0
     for number, argument in enumerate(arguments):
@@ -165,7 +165,7 @@ def _unmatched_arguments(group: click.Group, arguments: Sequence[str]) -> Iterat
             words.append(argument)
         else:
             places = [one for one in command.params if isinstance(one, click.Argument)]
-            # the runs of `diff` may also be named by their tool
+            # the runs of `diff` may also be given by their id
             if not places or command.name == "diff" or _is_read(places[min(number_of_place, len(places) - 1)]):
                 yield number, " ".join(words), argument, command
             number_of_place += 1
@@ -176,7 +176,7 @@ def _is_read(parameter: click.Parameter) -> bool:
 
 
 def existing(group: click.Group, arguments: Sequence[str]) -> str:
-    """Return a path like the one that does not exist, or where to find one, as a sentence."""
+    """Return a sentence with a path similar to the missing one, or with the way to find one."""
     for _, _, name, _ in _unmatched_arguments(group, arguments):
         path = Path(name)
         if path.exists():
@@ -184,13 +184,13 @@ def existing(group: click.Group, arguments: Sequence[str]) -> str:
         with suppress(OSError):
             if found := get_close_matches(path.name, [one.name for one in path.parent.iterdir()], 1, _ALIKE):
                 return _question([str(path.with_name(found[0]))])
-        # not for a plan, a table or a list of cells
+        # not for a plan, a table or a list of cells, which `history` does not list
         return " `ftdrive history` lists your runs." if path.suffix in {"", ".json"} else ""
     return ""
 
 
 def close_command(name: str, names: Sequence[str]) -> str:
-    """Return a question that names the command most like a mistyped one; empty if there is none."""
+    """Return a question with the command most similar to a mistyped one; empty if there is none."""
     return _question(get_close_matches(name, names, 1))
 
 
@@ -200,13 +200,13 @@ def _question(names: Iterable[str]) -> str:
 
 
 def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
-    """Return all that a line lacks, where `click` names the first, and the line with it."""
+    """Return all missing parameters of a line, of which `click` names only the first, and the complete line."""
     context = error.ctx
     if context is None or context.info_name not in arguments:
         return error.format_message()
     command, typed = context.command, list(arguments[arguments.index(context.info_name) + 1 :])
     given, _, _ = command.make_parser(context).parse_args(list(typed))
-    # what is not given is no text, of whatever kind in which version of `click`
+    # the value of a missing parameter depends on the version of `click`, but is never text
     absent = [
         one for one in command.params if one.required and not isinstance(given.get(one.name or ""), str | tuple | list)
     ]
@@ -220,7 +220,7 @@ def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
 
 
 def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Sequence[str]) -> str:
-    """Return the line with what may stand behind an option that has no value."""
+    """Return the line with a placeholder after an option that lacks its value."""
     command: click.Command = group
     words = ["ftdrive"]
     for argument in arguments:
@@ -234,11 +234,11 @@ def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Se
 
 
 def of_subcommand(error: click.NoSuchOption, arguments: Sequence[str]) -> str:
-    """Return the line of the command that has an option which stands before it, or without it."""
+    """Return the line with the option after the subcommand that has it, or the plain error."""
     context = error.ctx
     if context is not None and isinstance(group := context.command, click.Group):
         names = group.list_commands(context)
-        # to look at all commands takes a second
+        # only for subcommands, because importing all commands takes a second
         for name in [one for one in names if one in arguments] or (names if context.parent else []):
             command = group.get_command(context, name)
             if command is not None and any(error.option_name in one.opts for one in command.params):

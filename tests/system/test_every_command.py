@@ -280,7 +280,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("doctor", "--simulate", "--sensor", "bota:///dev/nope"), "bota:///dev/nope"),
         (("doctor", "--simulate", "--robot", "10.0.0.2"), "--robot does not go with --simulate"),
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
-        (("solve", "--sensor", "emulated://bota", "."), "--sensor goes only with --simulate"),
+        (("solve", "--sensor", "emulated://bota", "."), "--sensor is only for --simulate"),
         *(((command,), "--simulate") for command in ("solve", "replay", "report", "bundle", "live", "push")),
         (("push", ".", "--restore", "."), "--restore takes everything"),
         (("record", "-o", "a.csv"), "--simulate"),

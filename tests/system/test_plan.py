@@ -69,7 +69,7 @@ def test_the_plan_says_whether_its_cell_was_measured(
         )
     outcome = run("plan", "--model", "ur5e", *tool, "--output", "plan.json")
     assert outcome.exit_code == 0, outcome.output
-    assert ("for the eye only" in outcome.stderr) is not measured
+    assert ("for inspection only" in outcome.stderr) is not measured
     assert Plan.load(Path("plan.json")).measured is measured
     exported = run("export", "plan", "plan.json", "--format", "urscript")
     assert (exported.exit_code == 0) is measured

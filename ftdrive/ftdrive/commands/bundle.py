@@ -38,8 +38,9 @@ def bundle(
 ) -> None:
     """Write RUN into one zip file, which `ftdrive replay` and `ftdrive solve` read like the run.
 
-    It has configuration, versions, events, samples, results and checks of this computer. IP and MAC addresses, host and
-    user names and home directories are redacted; serial numbers stay. Look through it before you publish it.
+    The file contains configuration, versions, events, samples, results and checks of this computer. IP and MAC
+    addresses, host and user names and home directories are redacted; serial numbers stay. Check the file before you
+    publish it.
     """
     check_simulate(simulate, real={"RUN": run}, emulated={"--sensor": sensor})
     if run is None and not simulate:

@@ -83,12 +83,12 @@ HEADINGS = {
     "--tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of tool and sensor, mm from the flange face; replaces those of [tool]. Repeatable.",
+    help="Cylinder around tool and sensor, mm from the flange face; replaces those in [tool]. Repeatable.",
 )
 @CONTROL
 @simulate()
-@click.option("--quick", is_flag=True, help="12 poses instead of 24.")
-@click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option("--quick", is_flag=True, help="Take 12 poses instead of 24.")
+@click.option("--minimal", is_flag=True, help="Take 6 poses instead of 24.")
 @SETS
 @METHOD
 @click.option(
@@ -96,35 +96,39 @@ HEADINGS = {
     "earlier",
     metavar="RESULT",
     type=PATH,
-    help="A new tool: take mounting, base and gain from this result of the same sensor; 4 longer poses, or --sweep.",
+    help="For a new tool: use mounting, base and gain of this result of the same sensor; 4 longer poses, or --sweep.",
 )
 @click.option(
     "--load",
     metavar="MASS",
-    help="A weighed load on the tool, kg, such as 2.0 or 2.0±0.002, for `ftdrive loads solve`; with --at or --gripped.",
+    help="Mass of a weighed load on the tool, kg, such as 2.0±0.002, for `loads solve`; with --at or --gripped.",
 )
 @click.option(
     "--at",
     metavar="NAME=X,Y,Z",
-    help="The load hangs on a string from this point, mm from the flange face in flange axes: 12 tilts about it.",
+    help="Point where the load hangs on a string, mm from the flange face in flange axes; 12 poses tilted about it.",
 )
-@click.option("--gripped", is_flag=True, help="The load is in the gripper, at an unknown place: 6 poses.")
+@click.option("--gripped", is_flag=True, help="The gripper holds the load at an unknown position; 6 poses.")
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
-    "--passive", is_flag=True, help="No motion commands: read beside any program or freedrive until it is good."
+    "--passive",
+    is_flag=True,
+    help="No motion commands: record while any program or freedrive moves the arm, until the result is good.",
 )
 @click.option(
     "--seconds",
     type=Number(10, 3600),
-    help="Duration of --sweep at full speed (20, at most 120), or the longest of --passive (600).",
+    help="Duration of --sweep at full speed (20, at most 120), or longest duration of --passive (600).",
 )
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
-    "--fast", is_flag=True, help="Full speed of the plan (60 °/s, 250 mm/s at most), after one complete slow run."
+    "--fast",
+    is_flag=True,
+    help="Move at the speed of the plan (at most 60 °/s, 250 mm/s), after one complete slow run.",
 )
-@click.option("--manual", is_flag=True, help="No motion commands: you move the arm, ftdrive shows where to.")
+@click.option("--manual", is_flag=True, help="No motion commands: you move the arm to the poses that ftdrive shows.")
 @click.option("--listen", is_flag=True, help="No motion commands: a program on the pendant moves the arm.")
-@click.option("--dry-run", is_flag=True, help="Plan and check without control of the arm; nothing moves.")
+@click.option("--dry-run", is_flag=True, help="Plan and check only, without control of the arm; nothing moves.")
 @PLAN_FILES
 @view_options
 @click.option("--plan", type=FILE, help="Use this plan.")
@@ -150,9 +154,9 @@ def calibrate_command(
 ) -> None:
     """Move the arm through 24 orientations, average the sensor at each, and solve.
 
-    Every move is proven clear and shown before it happens. The first run of a plan is slow and starts after a typed
-    word. If there is room, only the three wrist joints move. Ctrl-C stops the arm; the poses are kept, and --resume
-    continues.
+    Every move is proven clear of collisions and shown before it starts. The first run of a plan is slow and starts
+    after you type a word. If possible, only the three wrist joints move. Ctrl-C stops the arm and keeps the poses;
+    --resume continues.
     """
     refuse_contradictions(_given(click.get_current_context()))
     options, load = _options_of(**chosen)
@@ -160,10 +164,10 @@ def calibrate_command(
         page = stack.enter_context(view.page("ftdrive calibrate"))
         header = {} if options.resume is None else Run(options.resume).header_to_resume()
         made_by = header.get("station")
-        # A resumed run keeps its cell.
+        # A resumed run keeps its emulated or real cell.
         simulate = simulate or bool(made_by and not (described.config or described.robot or tool))
         if simulate:
-            # A load swings as slowly as it does on a real arm.
+            # A hanging load needs real time to stop swinging.
             swings = load is not None and not load.gripped
             pace = REAL_PACE if options.mode in ("sweep", "passive") or swings else ()
             station = stack.enter_context(Station.of(made_by, described.sensor, pace, control_path=control))
@@ -228,7 +232,7 @@ def _options_of(
     seconds: float | None,
     **others: Any,
 ) -> tuple[SessionOptions, Load | None]:
-    """Return what the options mean, and the load on the tool. Raises `ConfigError`."""
+    """Return the session options, and the load on the tool. Raises `ConfigError`."""
     flags = {mode: others.pop(mode) for mode in _MODES}
     mode: Mode = next((mode for mode, is_given in flags.items() if is_given), "auto")
     poses = 6 if minimal or gripped else 24 if earlier is None else 4
@@ -244,7 +248,7 @@ def _options_of(
 
 
 def _given(context: click.Context) -> dict[str, Any]:
-    """Return the options that were given, with their values by name."""
+    """Return the values of the given options by name."""
     names = {one.name: max(one.opts, key=len) for one in context.command.params}
     given = {names[name]: value for name, value in context.params.items() if value}
     if context.get_parameter_source("method") is ParameterSource.DEFAULT:
@@ -253,9 +257,9 @@ def _given(context: click.Context) -> dict[str, Any]:
 
 
 def refuse_contradictions(given: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` for options that exclude one another; their values by name."""
+    """Raise `ConfigError` if given options exclude one another; `given` has their values by name."""
     if "--load" not in given and (place := [option for option in ("--at", "--gripped") if option in given]):
-        raise ConfigError(f"{place[0]} goes with --load MASS: give the mass of the load in kg")
+        raise ConfigError(f"{place[0]} needs --load MASS: give the mass of the load in kg")
     for group in _EXCLUDE_ONE_ANOTHER:
         both = [option for option in group if option in given]
         if len(both) > 1:
@@ -265,4 +269,6 @@ def refuse_contradictions(given: Mapping[str, Any]) -> None:
         raise ConfigError(f"{words}: leave it out, or choose --method lrom")
     seconds = given.get("--seconds")
     if seconds is not None and (seconds > _LONGEST_SWEEP_S if "--sweep" in given else "--passive" not in given):
-        raise ConfigError(f"--seconds {seconds:g} goes with --passive, or up to {_LONGEST_SWEEP_S} with --sweep")
+        raise ConfigError(
+            f"--seconds {seconds:g} is not possible: use up to {_LONGEST_SWEEP_S} with --sweep, or --passive"
+        )

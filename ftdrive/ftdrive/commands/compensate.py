@@ -1,4 +1,4 @@
-"""`ftdrive compensate`: a recording compensated at once, without a device."""
+"""`ftdrive compensate`: compensate a recording without a device."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,19 +23,23 @@ from ftdrive.terminal.text import echo
 
 @click.command()
 @click.argument("path", metavar="[RECORDING]", required=False, type=PATH)
-@click.option("--calibration", metavar="PATH", type=PATH, help="A calibration.json or its run folder.")
-@click.option("--wrench", metavar="FILE", type=FILE, help="Instead of RECORDING: table of the wrench.")
-@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: table of the poses of the flange.")
+@click.option(
+    "--calibration", metavar="PATH", type=PATH, help="Calibration to use: a calibration.json or its run folder."
+)
+@click.option("--wrench", metavar="FILE", type=FILE, help="Table of the wrench, instead of RECORDING.")
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="Table of the flange poses, with --wrench.")
 @BAG_TOPICS
 @TABLE
-@click.option("--delay", metavar="S|auto", help="Of another program: delay of the wrench, s.  [default: auto]")
+@click.option(
+    "--delay", metavar="S|auto", help="Delay of the wrench in a recording of another program, s.  [default: auto]"
+)
 @FORCE
 @click.option(
     "--bias",
     type=click.Choice(["keep", "estimate"]),
     default="keep",
     show_default=True,
-    help="Keep the calibration's bias, or estimate it from the recording: for sensors that are zeroed at start.",
+    help="Keep the calibration's bias, or estimate it from the recording, for sensors zeroed at the start.",
 )
 @FRAME
 @click.option("-o", "--output", type=NewFile(), help="Save the result as a new .mcap, .csv or .parquet.")
@@ -57,9 +61,9 @@ def compensate(
 ) -> None:
     """Compensate a whole recording with a calibration; no device is needed.
 
-    RECORDING is a file of `ftdrive record`; without --calibration its own is used. Recordings of other programs are a
-    table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), each at its own rate, or
-    a bag of ROS 1 or ROS 2. --columns and the options beside it say what a table does not.
+    RECORDING is a file of `ftdrive record`, compensated with its own calibration by default. Recordings of other
+    programs: a table with wrench and orientation, two tables on one clock (--wrench, --orientation-file), also with
+    different rates, or a ROS 1 or ROS 2 bag. Use --columns and the options below it for what a table does not contain.
     """
     if output is not None:
         format_of(output)
@@ -68,7 +72,7 @@ def compensate(
     if path is None and (wrench is None or orientation_file is None):
         raise ConfigError(_missing(wrench, orientation_file, calibration))
     if (wrench_topic or pose_topic) and not (path and is_bag(path)):
-        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
+        raise ConfigError("--wrench-topic and --pose-topic are only for a ROS bag: leave them out")
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
     pair = None if wrench is None or orientation_file is None else (wrench, orientation_file)
     delay_s = delay if delay is None or delay == "auto" else parse_numbers("--delay", delay, ",", [1])[0]
@@ -87,7 +91,7 @@ def compensate(
         "file": None if output is None else str(output),
     }
     if result["cut"]:
-        messages.print(f" {what} is incomplete ({result['cut']}): {result['duration_s']:.1f} s of it are used.")
+        messages.print(f" {what} is incomplete ({result['cut']}): {result['duration_s']:.1f} s are used.")
     if as_json:
         write_json({"schema_version": 1, **result})
     else:
@@ -100,7 +104,7 @@ def compensate(
 
 
 def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Path | None) -> str:
-    """Return the error of a line without a whole recording: it names all that is missing."""
+    """Return the error message for an incomplete command line, with everything that is missing."""
     if wrench is None and orientation_file is None:
         own = "" if calibration is None else f" --calibration {calibration}"
         missing, line = "the file of the recording", f"RECORDING{own}"

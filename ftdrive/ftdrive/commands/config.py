@@ -1,4 +1,4 @@
-"""`ftdrive config`: the values in force, and the origin of each."""
+"""`ftdrive config`: the values in use, and the origin of each."""
 
 import sys
 from dataclasses import replace
@@ -16,20 +16,19 @@ from ftdrive.terminal.text import Group, echo
 
 @click.group(cls=Group)
 def config() -> None:
-    """Show the configuration. `ftdrive init` writes one; any key may be set by a variable, FTDRIVE_ROBOT_HOST."""
+    """Show the configuration. `ftdrive init` writes it; a variable such as FTDRIVE_ROBOT_HOST sets any key."""
 
 
 @config.command("show")
-@click.option("--config", "path", type=FILE, help="TOML file to show, instead of ./ftdrive.toml.")
+@click.option("--config", "path", type=FILE, help="Show this TOML file instead of ./ftdrive.toml.")
 @click.option("--origin", is_flag=True, help="Print the origin of each value instead of its meaning.")
-@simulate("Show the configuration of an emulated cell. Its addresses are valid until this command ends.")
+@simulate("Show the configuration of an emulated cell. Its addresses end with this command.")
 @EMULATED_SENSOR
 @JSON
 def config_show(path: Path | None, origin: bool, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Print the configuration in force, as a file that could be used in its place; a password is left out.
+    """Print the configuration in use as a TOML file, without passwords.
 
-    An option of a command comes first, then the environment, then ./ftdrive.toml, then the user's file, then the
-    default.
+    Order of precedence: options of a command, environment variables, ./ftdrive.toml, the user's file, defaults.
     """
     check_simulate(simulate, real={"--config": path}, emulated={"--sensor": sensor})
     if simulate:

@@ -1,4 +1,4 @@
-"""`ftdrive convert`: a recording in another file format."""
+"""`ftdrive convert`: convert a recording to another file format."""
 
 from pathlib import Path
 
@@ -15,25 +15,25 @@ from ftdrive.terminal.console import beside, messages, working
 @click.command()
 @click.argument("source", metavar="IN", required=False, type=PATH)
 @click.argument("target", metavar="OUT", required=False, type=NewFile())
-@click.option("-o", "--output", type=NewFile(), help="The same as OUT.")
+@click.option("-o", "--output", type=NewFile(), help="New file, instead of OUT.")
 @JSON
 def convert(source: Path | None, target: Path | None, output: Path | None, as_json: bool) -> None:
     """Convert a recording between .mcap, .csv and .parquet, without loss.
 
-    IN may also be the .partial of a recording that was interrupted; OUT is complete then.
+    IN may also be the .partial file of an interrupted recording; OUT is then a complete file.
     """
     if source is None or (target is None) is (output is None):
         raise ConfigError(f"give one recording and one new file. Type\nftdrive convert {source or 'IN'} -o NEW.csv")
     target = target or output or Path()
     format_of(target)
     if not is_recording(source):
-        raise BadRecording("it is another program's: `ftdrive compensate` reads it", source)
+        raise BadRecording("another program wrote this file: read it with `ftdrive compensate`", source)
     with working("Converting") as show:
         reader = RecordingReader(source)
         found, failure = converted(reader, target, show)
     cut = reader.cut if failure is None else str(failure) or "interrupted"
     if cut:
-        messages.print(f" {source} is incomplete ({cut}): {found['duration_s']:.1f} s of it are saved.")
+        messages.print(f" {source} is incomplete ({cut}): {found['duration_s']:.1f} s are saved.")
     short = "" if failure is None else f": the first {found['samples']} samples"
     beside(as_json).print(f" Saved {target}{short}")
     if as_json:

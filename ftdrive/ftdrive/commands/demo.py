@@ -1,4 +1,4 @@
-"""`ftdrive demo`: a calibration of an emulated cell, with the truth beside each estimate."""
+"""`ftdrive demo`: calibrate an emulated cell, and compare each estimate with the truth."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -44,7 +44,7 @@ from ftdrive.terminal.screen import open_operator
 @click.option(
     "--polyscope",
     metavar="VERSION",
-    help="Version of the emulated controller, such as 10.11.0, which has no dashboard server.",
+    help="Version of the emulated controller, such as 10.11.0 (without dashboard server).",
 )
 @SETS
 @METHOD
@@ -52,11 +52,9 @@ from ftdrive.terminal.screen import open_operator
 @click.option(
     "--loads",
     is_flag=True,
-    help="Correct a sensor with errors of 2 % by two known loads, and compare a contact before and after.",
+    help="Correct a sensor with 2 % errors by two known loads, and compare a contact before and after.",
 )
-@click.option(
-    "--simulate", is_flag=True, expose_value=False, help="Emulate the cell: always on here, accepted by every command."
-)
+@click.option("--simulate", is_flag=True, expose_value=False, help="Use an emulated cell; always on for this command.")
 @runs_option()
 @ALL
 @JSON
@@ -73,10 +71,10 @@ def demo(
     every: bool,
     as_json: bool,
 ) -> None:
-    """Calibrate an emulated cell: no real device is connected or moved. Takes about 25 s, with loads 75 s.
+    """Calibrate an emulated cell: no real device is connected or moved. Takes about 25 s, with --loads 75 s.
 
-    A UR5e and a sensor are emulated in another process, down to the bytes on their wires. The arm moves 20 times faster
-    than a real one. The drivers, the session and the solver are those of a real cell.
+    Another process emulates a UR5e and a sensor, including the bytes on their wires. The arm moves 20 times faster than
+    a real one. Drivers, session and solver are the same as for a real cell.
     """
     if sweep and (sets is not None or method != "ml"):
         raise ConfigError("--sweep has no poses: leave out --set and --method")
@@ -124,13 +122,13 @@ def _show_loads(outcome: Outcome, solution: LoadSolution, truth: Mapping[str, An
         })  # fmt: skip
     else:
         answer.print(f"A contact of {CONTACT_N:g} N at the tip, error of the force:")
-        answer.print(f"  as the sensor reads it      {before['as_read_N']:.2f} N")
+        answer.print(f"  as read by the sensor        {before['as_read_N']:.2f} N")
         for words, found in (("calibrated with the tool", before), ("and with two known loads", after)):
             answer.print(f"  {words:26}  {found['decoded_N']:.2f} N, sigma {found['sigma_N']:.2f} N")
         for finding in solution.findings:
             answer.print(f"{finding.severity.upper()} {finding.words}")
     if solution.verdict == "rejected":
-        raise NotAccepted("the runs with loads do not agree on a matrix of the sensor")
+        raise NotAccepted("the runs with loads do not agree on a sensor matrix. Run the demo again with another --seed")
 
 
 def _draw(cell: CellConfig, run: Run) -> None:

@@ -1,4 +1,4 @@
-"""`ftdrive devices`: the ports and buses of this computer, and on request the known sensors on them."""
+"""`ftdrive devices`: the ports and buses of this computer, and with --probe the known sensors on them."""
 
 from pathlib import Path
 from typing import Any
@@ -27,16 +27,16 @@ A PLACE is
 
 @click.command(epilog=_PLACES)
 @click.option("--probe", "places", multiple=True, metavar="PLACE", help="Look for known sensors at PLACE. Repeatable.")
-@simulate("Show and probe the two ports of an emulated cell instead.")
+@simulate("Use the two ports of an emulated cell.")
 @JSON
 def devices_command(places: tuple[str, ...], simulate: bool, as_json: bool) -> None:
     """List serial ports by id and CAN interfaces; with --probe, the known sensors that answer there.
 
-    Nothing is opened and no byte is sent, except at each PLACE: the command listens there, and then sends read requests
-    in the protocols of the known sensors. Do not probe a serial port with another device on it.
+    Only a PLACE is opened: the command listens there, and then sends read requests in the protocols of the known
+    sensors. Do not probe a serial port that another device uses.
 
-    Only CAN adapters of the kernel (can0) and slcan can be probed. ATI sensors are expected at base identifier 0x20
-    (another: socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s. If another device uses the identifiers of a
+    Only kernel CAN interfaces (can0) and slcan adapters can be probed. ATI sensors are expected at base identifier 0x20
+    (else use socketcan://can0?base=0x7F), Robotous sensors at 1 Mbit/s. If another device uses the identifiers of a
     sensor, nothing is sent and the output reports it. A wrong bit rate disturbs a bus in use.
     """
     check_simulate(simulate, real={"--probe": places})
@@ -74,7 +74,7 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
 
 
 def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
-    """Probe one place. An error is an answer too, so that other places are probed, and is added to `failures`."""
+    """Probe one place. An error is added to `failures` and returned, so that the other places are probed."""
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
         answers = [nothing | {"url": answer.url, "what": answer.what} for answer in probe_place(place, clock)]

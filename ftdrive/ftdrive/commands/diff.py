@@ -1,4 +1,4 @@
-"""`ftdrive diff`: the difference of two calibrations, in sigmas."""
+"""`ftdrive diff`: the difference between two calibrations, in sigmas."""
 
 from dataclasses import asdict
 from math import degrees, isfinite
@@ -35,7 +35,7 @@ class _Side(NamedTuple):
     created_utc: str | None
     mass_kg: float
     mass_sigma_kg: float
-    # Whether it was made in an emulated cell.
+    # Whether the calibration was made in an emulated cell.
     emulated: bool
 
 
@@ -44,10 +44,10 @@ class _Side(NamedTuple):
 @click.argument("second", metavar="B")
 @JSON
 def diff(first: str, second: str, as_json: bool) -> None:
-    """Compare two calibrations: each a file, a run folder, or an id of `ftdrive history` (its first digits suffice).
+    """Compare two calibrations A and B: files, run folders, or ids of `ftdrive history` (the first digits suffice).
 
-    The differences B minus A are given in sigmas of both together, and tested jointly with both covariances. A rotation
-    is compared as one rotation about the flange axes. The exit code is 0 whatever the difference is.
+    The differences B minus A are given in combined sigmas, with a joint test that uses both covariances. The mounting
+    is compared as one rotation about the flange axes. The exit code is 0 for any difference.
     """
     a, b = _side(first), _side(second)
     found, sensors = difference(a.calibrated, b.calibrated), _sensors(a, b)
@@ -79,7 +79,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
         made = (side.created_utc or "unknown time")[:16].replace("T", " ")
         echo("  ".join([name, side.id[:6], made, *(["EMULATED"] if side.emulated else []), side.path]))
     if sensors is not None:
-        echo(f"One contact reads differently: errors of the sensor are {sensors[0]} in A, {sensors[1]} in B.")
+        echo(f"Contacts are measured differently: the errors of the sensor are {sensors[0]} in A, {sensors[1]} in B.")
     echo(f"{'B minus A':22}{'change':>12}{'± 1 sigma':>12}{'in sigmas':>11}")
     echo(_change_line("mass, kg", mass_change_kg, sigma_kg))
     for i, (_, label, unit, scale) in enumerate(_ROWS):
@@ -87,7 +87,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
             row = 3 * i + k
             echo(_change_line(f"{label} {axis}, {unit}", scale * found.change[row], scale * found.sigma[row]))
     if found.joint.dof:
-        echo("Sigma from noise: what gain and cross-talk of one sensor hide in these values is the same in A and B.")
+        echo("Sigma from noise only: the effects of gain and cross-talk of one sensor are equal in A and B.")
     echo(_describe_difference(found, sensors))
 
 
@@ -101,22 +101,22 @@ def _side(text: str) -> _Side:
         made = created if isinstance(created, str) else None
         return _Side(result, result.id, text, made, result.mass_kg, sigma_kg, emulated)
     if len(text) < 4 or not set(text) <= set("0123456789abcdef"):
-        raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or 4 digits or more of an id")
+        raise ConfigError(f"'{text}' is neither a file nor an id: give a path, or at least 4 digits of an id")
     store = open_store()
     found = store.find(text)
     if not found:
         raise ConfigError(f"the store {store.name} has no result {text}…: `ftdrive history` lists them")
     if len(found) > 1:
         ids = ", ".join(one.id for one in found)
-        raise ConfigError(f"{text} is the beginning of {ids}: give more digits")
+        raise ConfigError(f"{text} matches {ids}: give more digits")
     one = found[0]
     return _Side(one, one.id, one.path, one.created_utc, one.mass_kg, one.mass_sigma_kg, bool(one.emulated))
 
 
 def _sensors(a: _Side, b: _Side) -> tuple[str, str] | None:
-    """Say on what the errors of the sensor under contact rest in A and B; None if that is the same, or not known."""
+    """Return the sources of the sensor errors under contact in A and B; None if they are equal or unknown."""
     first, second = a.calibrated, b.calibrated
-    # A result of the store has no sensor.
+    # A result from the store has no sensor matrix.
     if not (isinstance(first, CalibrationResult) and isinstance(second, CalibrationResult)):
         return None
     if first.contact.sensor.to_dict() == second.contact.sensor.to_dict():
@@ -134,7 +134,7 @@ def _change_line(label: str, change: float, sigma: float) -> str:
 def _describe_difference(found: Difference, sensors: tuple[str, str] | None) -> str:
     joint = found.joint
     if joint.dof == 0:
-        but = "" if sensors is None else f", the errors of the sensor are not: {sensors[0]} in A, {sensors[1]} in B"
+        but = "" if sensors is None else f", but the errors of the sensor are {sensors[0]} in A, {sensors[1]} in B"
         return f"The calibrations are the same{but}."
     test = f"chi2 {joint.chi2:.1f} for {joint.dof} degrees of freedom, p = {joint.p_value:.2g}"
     if joint.p_value >= _SIGNIFICANT:

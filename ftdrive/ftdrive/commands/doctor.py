@@ -1,4 +1,4 @@
-"""`ftdrive doctor`: is the cell connected, quiet and permitted? Nothing moves."""
+"""`ftdrive doctor`: check whether the cell is connected, quiet and permitted. Nothing moves."""
 
 import sys
 from contextlib import ExitStack, closing
@@ -37,7 +37,7 @@ from ftdrive.session.guards import Limits
 from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.text import echo
 
-# What a summary shows of the checks of robot, sensor and noise; of the others the first that passed.
+# Checks that a summary shows for robot, sensor and noise; for other subjects, the first one that passed.
 _HEADLINES = ("robot.identity", "sensor.identity", "noise.accuracy")
 _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "red"), "skipped": ("-", "")}
 
@@ -51,14 +51,14 @@ _MARK = {"ok": ("✔", "green"), "warning": ("!", "yellow"), "failed": ("✘", "
     "path",
     metavar="PATH",
     type=click.Path(exists=True, path_type=Path),
-    help="Check that this calibration.json or run folder is of these devices.",
+    help="Check that this calibration.json or run folder belongs to these devices.",
 )
 @click.option(
     "--mass-kg", type=Number(0, min_open=True), help="Expected mass of the tool.  [default: [tool] mass_kg, else 1]"
 )
-@click.option("--push", is_flag=True, help="Find the sign of the sensor: you push the tool along +X of the base.")
-@runs_option("Folder of the runs, whose disk is checked.")
-@click.option("--all", "every", is_flag=True, help="Print the checks that passed or do not apply too, a line each.")
+@click.option("--push", is_flag=True, help="Determine the sign of the sensor: you push the tool along +X of the base.")
+@runs_option("Folder of the runs; the free space of its disk is checked.")
+@click.option("--all", "every", is_flag=True, help="Also print each check that passed or does not apply.")
 @JSON
 def doctor(
     described: CellOptions,
@@ -73,9 +73,9 @@ def doctor(
 ) -> None:
     """Check robot, sensor, noise, clocks, disk and permissions; print a fix for each finding.
 
-    Runs every check except the controller's safety limits, which can only be queried with control. The arm is only
-    read, nothing moves, no program is touched. With --sensor alone, and no robot in the configuration, checks the
-    sensor and skips the robot. Exit code 7 if a check fails.
+    All checks of a session are made except the controller's safety limits, which can only be read with control of the
+    arm. The arm is only read: nothing moves, and no program is stopped. With --sensor and no configured robot, only the
+    sensor is checked. The exit code is 7 if a check fails.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot, "--model": model})
     calibration = None if path is None else read_calibration(path)
@@ -117,7 +117,7 @@ def doctor(
         _print_checks(found, every=every)
         again = " --simulate" if simulate else ""
         if failed:
-            messages.print_next(f"ftdrive doctor{again}   (when what is marked ✘ is fixed)")
+            messages.print_next(f"ftdrive doctor{again}   (after you have fixed the lines with ✘)")
         elif not cell.robot.host:
             messages.print_next("ftdrive doctor --robot HOST --sensor URL   (the whole cell)")
         else:
@@ -127,7 +127,7 @@ def doctor(
 
 
 def _is_pushing() -> bool:
-    """Ask for a push; False if no operator can answer."""
+    """Ask the operator to push; return False if no operator can answer."""
     echo(f"Push the tool along +X of the base, about 20 N; press Enter and hold for {PUSH_S:.0f} s", err=True)
     return bool(sys.stdin.readline())
 
@@ -147,7 +147,7 @@ def _print_checks(found: list[Check], *, every: bool) -> None:
 
 
 def _attention_only(checks: list[Check]) -> list[Check]:
-    """Return what needs attention, behind the one check that names the subject, with the number of the others."""
+    """Return the checks that need attention, after one that names the subject, with the number of passed checks."""
     passed = [check for check in checks if check.state == "ok"]
     first = [check for check in passed if check.name in _HEADLINES][:1] or passed[:1] or checks[:1]
     if first[0].state == "ok" and len(passed) > 2:

@@ -1,4 +1,4 @@
-"""`ftdrive history`: results and verifications of the store, with trends and warnings."""
+"""`ftdrive history`: results and verifications in the store, with trends and warnings."""
 
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -19,22 +19,22 @@ from ftdrive.terminal.console import answer, hanging, messages
 from ftdrive.terminal.text import echo, print_table
 from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
-# Fewer records have no three pairs of runs, and numpy takes as long as all else of a short list.
+# With fewer records there are no three pairs of runs, and importing numpy takes as long as the rest.
 _FEWEST_RUNS = 4
-_HOUR = "bias, {sensor_serial}: moves by {force_N:.2g} N, {torque_Nm:.2g} N·m an axis in an hour (1 sigma)"
+_HOUR = "bias, {sensor_serial}: changes by {force_N:.2g} N, {torque_Nm:.2g} N·m per axis within an hour (1 sigma)"
 _MOUNTED = ("sensor_serial", "arm_serial", "mount")
-# Most days of weighings that are listed.
+# Largest number of days of weighings in the list.
 _MOST_DAYS = 20
-# An earlier weighing is not the last one of a list.
+# Older weighings are not shown as the last ones.
 _RECENT = timedelta(days=90)
 
 
 @click.command()
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
-@click.option("--tool", metavar="NAME", help="Only results of this tool.")
-@click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="First add the runs in FOLDER. Repeatable.")
-@click.option("--rebuild", is_flag=True, help="First read all runs again, and forget those that were deleted.")
-@click.option("--weighings", is_flag=True, help="List the last days with weighings instead.")
+@click.option("--tool", metavar="NAME", help="List only results of this tool.")
+@click.option("--index", metavar="FOLDER", multiple=True, type=FOLDER, help="Add the runs in FOLDER first. Repeatable.")
+@click.option("--rebuild", is_flag=True, help="Read all runs again first, and remove deleted ones.")
+@click.option("--weighings", is_flag=True, help="List the last days with weighings.")
 @STORE
 @JSON
 def history(
@@ -46,12 +46,12 @@ def history(
     url: str | None,
     as_json: bool,
 ) -> None:
-    """List results with their date and last verification, how bias and payload change, and the last weighings.
+    """List results with date and last verification, trends of bias and payload, and the last weighings.
 
-    They come from the store, where `calibrate` and `verify` add theirs, or from the run folders in RUNS. A trend is
-    significant if the uncertainty of the results explains it in less than one case of 100, and so does their scatter.
-    Where a sensor reports its temperature, its bias is fitted against that too. Runs within hours show how far the bias
-    moves in an hour.
+    The results come from the store, to which `calibrate` and `verify` add them, or from the run folders in RUNS. A
+    trend is reported if it is significant at 1 % with the uncertainty of the results and with their scatter. If the
+    sensor reports its temperature, the bias is also fitted against the temperature. Runs within a few hours give the
+    change of the bias within an hour.
     """
     left_out: tuple[str, ...] = ()
     weighed: Sequence[WeighingDay] = ()
@@ -102,7 +102,7 @@ def history(
         return
     if not results:
         messages.print(
-            "No results. `ftdrive calibrate` adds them, `ftdrive history --index runs` adds those of a folder."
+            "No results. Add them with `ftdrive calibrate`, or those of a folder with `ftdrive history --index runs`."
         )
         return
     titles, shown = result_table(results, last, now)
@@ -117,7 +117,7 @@ def history(
 
 
 def _fit_json(fit: Any) -> dict[str, Any]:
-    """Return the fields of a `ftcalib.after.series.BiasTemperature`."""
+    """Return the fields of a `ftcalib.after.series.BiasTemperature` as JSON."""
     return {
         "slope_per_K": fit.slope.tolist(),
         "sigma_per_K": fit.sigma.tolist(),
@@ -141,6 +141,6 @@ def _show_weighings(days: Sequence[WeighingDay], name: str, left_out: Sequence[s
     if as_json:
         write_json({"schema_version": 1, "store": name, "weighings": [asdict(one) for one in days]})
     elif not days:
-        messages.print("No weighings. `ftdrive weigh` and `ftdrive serve-load` add them.")
+        messages.print("No weighings. Add them with `ftdrive weigh` or `ftdrive serve-load`.")
     else:
         print_table(DAY_TITLES, [day_row(one) for one in days], folding={"arm", "tool", "refused"})

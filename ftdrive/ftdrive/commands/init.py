@@ -26,9 +26,7 @@ from ftdrive.terminal.console import beside, messages
 @click.command()
 @click.option("--robot", metavar="HOST", help="Address of the controller.")
 @MODEL
-@click.option(
-    "--sensor", metavar="URL|PLACE", help="Address of the sensor, or a place that `ftdrive devices --probe` takes."
-)
+@click.option("--sensor", metavar="URL|PLACE", help="Address of the sensor, or a PLACE of `ftdrive devices --probe`.")
 @click.option("--height", metavar="MM", help="Height of the sensor above the flange face. Measure it.")
 @click.option("--sensor-mass", metavar="KG", help="Mass of sensor and adapter.")
 @click.option("--tool-name", metavar="NAME", help="Name of the tool.")
@@ -36,21 +34,21 @@ from ftdrive.terminal.console import beside, messages
     "--tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of what is mounted, the sensor too, in mm from the flange face. Repeatable.",
+    help="Cylinder around sensor or tool, mm from the flange face. Repeatable.",
 )
-@click.option("--tool-mass", metavar="KG", help="Approximate mass of what hangs on the sensor.")
+@click.option("--tool-mass", metavar="KG", help="Approximate mass below the sensor.")
 @click.option(
     "--mounting",
-    help="Mounting of the base: floor, wall, ceiling, or degrees the base leans towards its -x: 90 is wall.",
+    help="Mounting of the base: floor, wall, ceiling, or its tilt towards -x in degrees (wall: 90).",
 )
 @click.option(
     "--plane",
     multiple=True,
     metavar="SIDE:MM|NX:NY:NZ:MM",
-    help="A wall: its side (+x, -x, +y, -y, above, below) and distance from the base, or a normal and where it lies: "
+    help="Wall: side (+x, -x, +y, -y, above, below) and distance from the base, or normal and offset: "
     "the arm stays where N·p >= MM, base axes. Repeatable.",
 )
-@click.option("--box", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block: two corners in mm, base axes. Repeatable.")
+@click.option("--box", multiple=True, metavar="X:Y:Z:X:Y:Z", help="Block: two corners in mm, base axes. Repeatable.")
 @click.option("--speed", metavar="DEG/S", help="Speed of the fastest joint.")
 @click.option(
     "-o",
@@ -61,15 +59,15 @@ from ftdrive.terminal.console import beside, messages
     help="Save the configuration as this new file.",
 )
 @view_options
-@simulate("Robot and sensor are emulated, and end with this command; --sensor emulated://NAME chooses the sensor.")
-@click.option("--yes", is_flag=True, help="Ask nothing: take the options and the defaults.")
+@simulate("Emulate robot and sensor while this command runs; --sensor emulated://NAME selects the sensor.")
+@click.option("--yes", is_flag=True, help="Do not ask: use the options and the defaults.")
 @JSON
 def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bool, **given: Any) -> None:
     """Describe a cell: read robot and sensor, ask for the rest, write ftdrive.toml.
 
-    The arm is only read and nothing moves. An existing file is never overwritten. Values that must be measured have no
-    default, and `measured = false` stays in the file until you change it. Lengths are in mm and masses in kg, or have
-    their unit. With --view the questions are a form in the browser, beside the cell as it is described.
+    The arm is only read; nothing moves. An existing file is never overwritten. Values that must be measured have no
+    default, and `measured = false` stays in the file until you change it. Lengths are in mm and masses in kg unless you
+    write a unit. With --view, the questions are a form in the browser, next to a view of the described cell.
     """
     from ftdrive.checks.description import ROBOT, SENSOR, Description
     from ftdrive.terminal.interview import Interview, say
@@ -79,7 +77,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
     check_simulate(simulate, real={"--robot": given["robot"]})
     in_force = {key: setting.value for key, setting in settings().items()}
     described = Description(clock_in_force(), in_force, simulate=simulate)
-    # Keeps the answers until the configuration file is written.
+    # The draft keeps the answers until the configuration file is written.
     draft = output.with_name(f".{output.name}.draft")
     again = "ftdrive init" + ("" if str(output) == "ftdrive.toml" else f" -o {quote(str(output))}")
     interview = Interview(described, None if yes else draft, again + " --simulate" * simulate)
@@ -99,12 +97,12 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
         else:
             from ftdrive.view.init_page import InitPage
 
-            messages.print(f"Fill in the form there. Ctrl-C ends, and {draft} keeps the answers.")
+            messages.print(f"Fill in the form there. Ctrl-C ends; the answers are kept in {draft}.")
             form = InitPage(page, described, draft, output.name, say)
             form.run()
         cell = described.cell()
         write_new(output, described.file())
-        words, end = ". Measure tool, planes and boxes, then set measured = true in it: nothing moves before.", ""
+        words, end = ". Measure tool, planes and boxes, then set measured = true in it: before that, nothing moves.", ""
         if simulate:
             words, end = " for an emulated cell: commands with --simulate use it, all others refuse it.", " --simulate"
         if page is not None:

@@ -1,4 +1,4 @@
-"""`ftdrive live`: raw and compensated wrench, ten times a second."""
+"""`ftdrive live`: show raw and compensated wrench, ten times per second."""
 
 import sys
 from collections.abc import Callable
@@ -58,20 +58,20 @@ HEADINGS = {
 @click.option(
     "--raw",
     is_flag=True,
-    help="Show the readings of the sensor alone: no robot and no calibration; t subtracts, r saves a .csv.",
+    help="Show the raw readings without robot and calibration; key t subtracts the mean, r saves a .csv.",
 )
 @click.option(
     "--replay",
     metavar="RUN|RECORDING",
     type=PATH,
-    help="Show the samples of a run, of a recording, which has a calibration, or of a table of any program.",
+    help="Show a run, a recording (with its own calibration), or a table of another program.",
 )
-@click.option("--speed", type=POSITIVE, help="Speed of --replay; 1 is the speed of the recording.")
+@click.option("--speed", type=POSITIVE, help="Speed of --replay; 1 is real time.")
 @FRAME
 @STAGES
-@click.option("--once", is_flag=True, help="Print one reading, then end.")
-@click.option("--plain", is_flag=True, help="Show a table instead of the full screen; lines in a file.")
-@click.option("--allow-control", is_flag=True, help="With --view: the page may tare and choose the frame.")
+@click.option("--once", is_flag=True, help="Print one reading and exit.")
+@click.option("--plain", is_flag=True, help="Show a table instead of the full screen; to a file, print lines.")
+@click.option("--allow-control", is_flag=True, help="Let the page of --view tare and choose the frame.")
 @view_options
 @JSON
 def live(
@@ -88,18 +88,18 @@ def live(
     view: ViewOptions,
     as_json: bool,
 ) -> None:
-    """Show the raw and the compensated wrench, refreshed ten times a second.
+    """Show the raw and the compensated wrench, ten times per second.
 
-    The compensated wrench is the contact wrench: measured minus bias and gravity, along the chosen axes and about the
-    chosen point. The arm is only read, never moved. With --json, one object per line. With --simulate, the key f pushes
-    the tool. With --raw, a sensor needs neither robot nor calibration.
+    The compensated wrench is the contact wrench: measured minus bias and gravity, in the chosen axes and about the
+    chosen point. The arm is only read, never moved. With --json, each line is one object. With --simulate, key f pushes
+    the tool. --raw needs neither robot nor calibration.
     """
     check_simulate(source.simulate, real={"--replay": replay})
     if raw:
         chosen = {"--track": track != "off", "--axes": frame.axes != "sensor", "--about": frame.about != "sensor"}
         source.require_alone({"--replay": replay, **chosen, "--stages": stages, "--view": view.wanted})
     if speed is not None and replay is None:
-        raise ConfigError("--speed goes only with --replay: add it, or leave --speed out")
+        raise ConfigError("--speed is only for --replay: add --replay, or leave --speed out")
     if replay is not None and source.tool:
         raise ConfigError("--tool does not go with --replay: leave one of the two out")
     view.require(once=once, allow_control=allow_control)
@@ -123,13 +123,13 @@ def live(
             checks = [check_weighed_payload(payload_kg, stream.info.calibration, mass_kg)]
             recorder = lambda path: Recorder([path], stream.info, stream.cell.to_dict())  # noqa: E731
         feed = Feed(stream, recorder)
-        if source.simulate:  # N and N·m, sensor axes, on the tool
+        if source.simulate:  # N and N·m, in sensor axes
             feed.push = partial(stream.station.control, do="push", wrench=[0.0, 0.0, -8.0, 0.0, 0.0, 0.0], seconds=1.0)
         title = "ftdrive live" if replay is None else f"ftdrive live, replay of {replay.name}"
         if (page := stack.enter_context(view.page(title))) is not None:
             certifier = certifier_of(stream, replay, messages.print)
             shown = LivePage(page, feed, checks, certifier, controls=allow_control)
-            # the full screen hides what is printed
+            # the full screen hides printed messages
             say = partial(feed.note, kind="failed") if full_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if full_screen:

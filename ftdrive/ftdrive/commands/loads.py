@@ -1,4 +1,4 @@
-"""`ftdrive loads`: known loads show whether a sensor reads a contact right, and correct its matrix."""
+"""`ftdrive loads`: known loads to check a sensor, and to correct its matrix."""
 
 from contextlib import ExitStack
 from functools import partial
@@ -24,17 +24,19 @@ from ftdrive.words.text import visible
 
 @click.group(cls=Group)
 def loads() -> None:
-    """Check a sensor by a known weight, and correct its matrix by several: so that 10 N are 10 N."""
+    """Check a sensor with a known weight, or correct its matrix with several."""
 
 
 @loads.command("check")
 @click.argument("mass", metavar="MASS")
-@click.option("--at", metavar="NAME=X,Y,Z", help="Where it hangs, mm from the flange face along the flange axes.")
+@click.option("--at", metavar="NAME=X,Y,Z", help="Point where the load hangs, mm from the flange face in flange axes.")
 @SOURCE
 @click.option("--replay", type=PATH, help="Check a recording instead of a cell.")
-@click.option("--zero", is_flag=True, help="First tare the free tool: then drift since the calibration is no error.")
-@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests to join.")
-@click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, seconds.")
+@click.option("--zero", is_flag=True, help="Tare the free tool first, which removes the drift since the calibration.")
+@click.option(
+    "--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses at rest to combine."
+)
+@click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, s.")
 @JSON
 def loads_check(
     mass: str,
@@ -46,11 +48,11 @@ def loads_check(
     wait_s: float,
     as_json: bool,
 ) -> None:
-    """Hang one known MASS (kg, such as 1.000) on a string, and compare what the sensor reads.
+    """Hang one known MASS (kg, such as 1.000) on a string, and compare it with the reading.
 
-    The arm is only read. Let the load hang still; with --poses another program or your hand turns the arm between the
-    rests. The answer has scale and line of action with one sigma of each, and whether the error is within what the
-    sensor promises. The exit code is 7 if it is not.
+    The arm is only read. Let the load hang still. With --poses, turn the arm by hand or by another program between the
+    rests. The output is the scale and the line of action with one sigma each, and whether the error is within the
+    accuracy stated for the sensor. The exit code is 7 if not.
     """
     load = Load("load", *mass_of(mass)) if at is None else Load.of(mass, at, gripped=False)
     with ExitStack() as stack:
@@ -72,11 +74,13 @@ def loads_check(
     else:
         echo("\n".join(check_lines(found, load)))
     if not isfinite(tare_age_s):
-        drifted = f"No tare: {100 * found.scale_sigma:.1f} % (1 sigma) has the drift since the calibration."
+        drifted = f"Not tared: {100 * found.scale_sigma:.1f} % (1 sigma) includes the drift since the calibration."
         free = "Record the free tool at rest for a second, and then hang the load."
         echo(f"{drifted} {'Use --zero.' if replay is None else free}", err=True)
     if not found.is_within:
-        raise NotAccepted("the load reads otherwise than the sensor promises")
+        raise NotAccepted(
+            "the reading of the load is outside the accuracy stated for the sensor: check mass and mounting"
+        )
 
 
 @loads.command("solve")
@@ -84,15 +88,15 @@ def loads_check(
 @click.option(
     "--tool-mass",
     metavar="KG",
-    help="Mass of the tool as weighed, such as 1.300 or 1.300±0.002; else that of [tool] mass_sigma_kg.",
+    help="Weighed mass of the tool, such as 1.300 or 1.300±0.002; default: [tool] mass_kg with mass_sigma_kg.",
 )
-@click.option("--accept", is_flag=True, help="Save a matrix that differs much from the one known before.")
+@click.option("--accept", is_flag=True, help="Save the matrix even if it differs much from the previous one.")
 @JSON
 def loads_solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_json: bool) -> None:
-    """Fit the matrix of the sensor to RUNS: the tool alone, and runs of `calibrate --load`.
+    """Fit the sensor matrix to RUNS: one with the tool alone, and runs of `calibrate --load`.
 
-    It is saved as sensor.json in this folder, only if the runs agree. Every command here then decodes contacts of this
-    sensor with it, whatever the tool. Later loads narrow it.
+    If the runs agree, the matrix is saved as sensor.json in this folder. Commands in this folder then use it to decode
+    contacts of this sensor with any tool. Further loads improve the matrix.
     """
     solution, prior = solve_load_runs(runs, tool_mass, partial(echo, err=True))
     hindering = [one for one in solution.findings if one.severity == "reject"]
@@ -107,13 +111,13 @@ def loads_solve(runs: tuple[Path, ...], tool_mass: str | None, accept: bool, as_
         if saved is not None:
             echo(f"The runs agree. Saved {saved}: commands in this folder decode contacts with it.")
     if saved is None:
-        raise NotAccepted("the runs do not agree on a matrix")
+        raise NotAccepted("the runs do not agree on a matrix: see the findings")
 
 
 @loads.command()
 @JSON
 def show(as_json: bool) -> None:
-    """Show the matrix of the sensor in this folder: sensor.json, or the newest sensor-N.json."""
+    """Show the sensor matrix in this folder: sensor.json, or the newest sensor-N.json."""
     path = _newest()
     sensor = SensorMatrix.load(path)
     if as_json:
@@ -128,7 +132,7 @@ def show(as_json: bool) -> None:
 @loads.command()
 @click.option("--yes", is_flag=True, help="Do not ask.")
 def drop(yes: bool) -> None:
-    """Delete the newest file of the sensor's matrix in this folder, so that the one before it, or none, counts."""
+    """Delete the newest sensor matrix in this folder, so that the previous one, if any, is used."""
     path = _newest()
     if yes or click.confirm(visible(f"Delete {path.name}?"), err=True):
         path.unlink()
@@ -137,5 +141,5 @@ def drop(yes: bool) -> None:
 
 def _newest() -> Path:
     if not (files := sensor_files()):
-        raise ConfigError("this folder has no sensor.json: `ftdrive loads solve RUN RUN …` makes one")
+        raise ConfigError("this folder has no sensor.json: create it with `ftdrive loads solve RUN RUN …`")
     return files[-1]

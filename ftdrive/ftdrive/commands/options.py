@@ -1,4 +1,4 @@
-"""The options that several commands share, as parameters of `click`, and what they stand for."""
+"""Options that several commands share, as `click` parameters, and the objects built from them."""
 
 import importlib.util
 import json
@@ -34,7 +34,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 class Headed(click.Command):
-    """A command whose help has its options under headings: `headings` maps each to the options below it."""
+    """A command whose help lists its options under headings: `headings` maps each heading to option names."""
 
     def __init__(self, *args: Any, headings: Mapping[str, str], **options: Any) -> None:
         super().__init__(*args, **options)
@@ -49,7 +49,7 @@ class Headed(click.Command):
 
 
 def _together(*options: Callable[[F], F]) -> Callable[[F], F]:
-    """Make one decorator of several options, the first of which comes first in the help."""
+    """Return one decorator for several options, in the order of the help."""
 
     def added(command: F) -> F:
         for option in reversed(options):
@@ -64,7 +64,7 @@ FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON object on stdout.")
 ALL = click.option(
-    "--all", "every", is_flag=True, help="Print each finding, the residuals and what sigma includes too."
+    "--all", "every", is_flag=True, help="Also print each finding, the residuals and the contents of sigma."
 )
 JSON_LINES = click.option(
     "--json", "as_json", is_flag=True, help="Print one JSON object per line: events, questions, the result."
@@ -77,12 +77,12 @@ MODEL = click.option(
 CONTROL = click.option(
     "--control",
     type=click.Choice(CONTROL_SETTINGS),
-    help="What moves the arm.  [default: [robot] control, else auto]",
+    help="Control path that moves the arm.  [default: [robot] control, else auto]",
 )
 
 
 def runs_option(words: str = "Parent folder of the new run folder.") -> Callable[[F], F]:
-    """Make the option --runs."""
+    """Return the option --runs."""
     folder = click.Path(file_okay=False, path_type=Path)
     return click.option("--runs", type=folder, default=Path("runs"), show_default=True, help=words)
 
@@ -104,43 +104,45 @@ SETS = click.option(
     "sets",
     metavar="A+E",
     callback=_known_sets,
-    help="Sets A to H of orientations of Yu's Fig. 6, such as A+E, instead of 24 poses.",
+    help="Sets of orientations A to H of Yu's Fig. 6, such as A+E, instead of 24 poses.",
 )
 METHOD = click.option(
     "--method",
     metavar="METHOD",
     default="ml",
     show_default=True,
-    help="Method that solves the poses, one of `ftdrive solve`; srom takes the 24 poses of its paper.",
+    help="Method of `ftdrive solve` for the poses; srom uses the 24 poses of its paper.",
 )
 
 YES = click.option(
     "--yes",
     is_flag=True,
-    help="Answer the safety questions automatically; never a first run, nor a move of the whole arm.",
+    help="Answer the safety questions automatically, except for a first run or a move of the whole arm.",
 )
-CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
+CONFIG = click.option(
+    "--config", type=FILE, help="TOML file with the description of the cell, instead of ./ftdrive.toml."
+)
 
 
 @dataclass(frozen=True, slots=True)
 class CellOptions:
-    """Options that describe a cell. A run keeps them, so that it is resumed with the same values."""
+    """Options that describe a cell. A run stores them, so that it is resumed with the same values."""
 
     config: Path | None = None
     robot: str | None = None
     sensor: str | None = None
     tool: tuple[str, ...] = ()
-    """Cylinders."""
+    """Cylinders around tool and sensor."""
     control: str | None = None
     model: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what run.json keeps of them."""
+        """Return the options stored in run.json."""
         kept = ("config", "robot", "sensor", "tool", "control")
         return {name: getattr(self, name) for name in kept} | {"config": self.config and str(self.config)}
 
     def _or_those(self, begun: Mapping[str, Any]) -> "CellOptions":
-        """Return them with those of a run, from `to_dict`, where none is given; a lost file of the run is left out."""
+        """Return these options, completed by those of a run from `to_dict`; a missing file is ignored."""
         config = Path(begun["config"]) if begun.get("config") else None
         return CellOptions(
             self.config or (config if config is not None and config.is_file() else None),
@@ -151,7 +153,7 @@ class CellOptions:
         )
 
     def settings(self) -> dict[str, Setting]:
-        """Return options, environment and files, in this order of precedence; see `cell.config.settings`."""
+        """Return the settings from options, environment and files, in this order; see `cell.config.settings`."""
         flags = {
             "robot.host": ("--robot", self.robot),
             "robot.model": ("--model", self.model),
@@ -162,24 +164,26 @@ class CellOptions:
         return settings(self.config, flags)
 
     def cell(self, *, sensor_alone: bool = False) -> CellConfig:
-        """Return the cell. With `sensor_alone`, a `sensor` needs no robot: its host is empty where none is set."""
+        """Return the cell. With `sensor_alone`, a given --sensor needs no robot; the host may then be empty."""
         values = self.settings()
         needs_robot = not sensor_alone or self.sensor is None or values["robot.host"].value is not None
         return cell_of(values, devices=needs_robot)
 
     def sensor_alone(self) -> CellConfig:
-        """Return the cell with a sensor; of the arm nothing is needed, even if it is configured."""
+        """Return the cell of a sensor; no settings of the arm are required."""
         cell = cell_of(self.settings(), devices=False)
         if not cell.sensor.url:
-            raise ConfigError("no sensor: give --sensor URL, or --simulate; `ftdrive devices --probe PLACE` finds one")
+            raise ConfigError(
+                "no sensor: give --sensor URL, or --simulate; find one with `ftdrive devices --probe PLACE`"
+            )
         return cell
 
     def cell_to_resume(self, folder: Path, header: Mapping[str, Any], say: Callable[[str], object]) -> CellConfig:
         """Return the cell of a resumed run with this header; options given now replace those of the run.
 
-        Files and environment describe tool and surroundings as they are now; the session refuses to continue if they
-        differ from those of the plan. If no file describes them any more, the run's own record is used. `say` takes a
-        sentence about where they come from.
+        Files and environment describe the present tool and surroundings; the session refuses to continue if they differ
+        from those of the plan. If no file describes them, the record of the run is used. `say` receives a sentence
+        about the source.
         """
         described = self._or_those(header.get("said", {}))
         found, before = described.settings(), recorded_cell(header["config"])
@@ -214,7 +218,7 @@ def CELL(command: Callable[..., None]) -> Callable[..., None]:
     return CONFIG(click.option("--robot", metavar="HOST", help="Address of the controller, or ros2:/TOPIC.")(found))
 
 
-EDITED = "that was edited by hand; every output then says so"
+EDITED = "that was edited by hand; every output then shows this"
 FORCE = click.option("--force", is_flag=True, help=f"Apply a calibration {EDITED}.")
 
 CALIBRATION = click.option(
@@ -222,16 +226,16 @@ CALIBRATION = click.option(
     "path",
     metavar="PATH",
     type=PATH,
-    help="A calibration.json or its run folder. With --simulate the default is a new one.",
+    help="Calibration to use: a calibration.json or its run folder. With --simulate the default is a new one.",
 )
 
 
 BAG_TOPICS = _together(
-    click.option("--wrench-topic", metavar="TOPIC", help="Of a bag of ROS: topic of WrenchStamped."),
+    click.option("--wrench-topic", metavar="TOPIC", help="Topic of WrenchStamped in a ROS bag."),
     click.option(
         "--pose-topic",
         metavar="TOPIC",
-        help="Of a bag of ROS: topic of PoseStamped, tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F.",
+        help="Topic of PoseStamped in a ROS bag, or tf?base=B&flange=F, or /joint_states?urdf=FILE&flange=F.",
     ),
 )
 
@@ -253,7 +257,7 @@ POSITIVE = Number(0, min_open=True)
 
 
 def require_extra(extra: str, what: str, *modules: str) -> None:
-    """Raise `ConfigError` before any work if one of the `modules` that an extra brings is missing for `what`."""
+    """Raise `ConfigError` before any work if a package in `modules`, part of an extra, is missing for `what`."""
     from ftdrivers.installation import missing_extra
 
     if missing := [name for name in modules if importlib.util.find_spec(name) is None]:
@@ -262,28 +266,28 @@ def require_extra(extra: str, what: str, *modules: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """Whether a command has a page in the browser, and where it is served."""
+    """Whether a command has a page in the browser, and its address."""
 
     view: bool
     address: str | None
 
     @property
     def wanted(self) -> bool:
-        """Whether there is one: an address implies it."""
+        """Whether there is a page; an address implies it."""
         return self.view or self.address is not None
 
     def require(self, *, once: bool = False, allow_control: bool = False) -> None:
-        """Raise `ConfigError` for options that would be ignored, or if a package of a page is missing."""
+        """Raise `ConfigError` for options that would be ignored, or if a package for the page is missing."""
         if once and self.wanted:
             raise ConfigError("--view does not go with --once: leave one of the two out")
         if allow_control and not self.wanted:
-            raise ConfigError("--allow-control goes only with --view: add it, or leave --allow-control out")
+            raise ConfigError("--allow-control is only for --view: add --view, or leave --allow-control out")
         if self.wanted:
             require_extra("viz", "--view", "uplot", "segno")
 
     @contextmanager
     def page(self, title: str) -> Iterator["Page | None"]:
-        """Serve a page while the block runs, and print its address; None where it is not wanted."""
+        """Serve a page while the block runs, and print its address; yield None without --view."""
         from ftdrive.servers.http_gate import host_and_port
 
         address = None
@@ -303,11 +307,11 @@ class ViewOptions:
 def view_options(command: F) -> F:
     """Add the options --view and --view-address, as one argument `view` of type `ViewOptions`."""
 
-    @click.option("--view", is_flag=True, help="Show it in the browser (needs ftdrive[viz]).")
+    @click.option("--view", is_flag=True, help="Show a page in the browser (needs ftdrive[viz]).")
     @click.option(
         "--view-address",
         metavar="HOST:PORT",
-        help="Serve that page to other devices too, such as 0.0.0.0:8080 for a tablet; implies --view.",
+        help="Serve the page to other devices too, such as 0.0.0.0:8080 for a tablet; implies --view.",
     )
     @wraps(command)
     def with_view(view: bool, view_address: str | None, **options: Any) -> None:
@@ -317,7 +321,7 @@ def view_options(command: F) -> F:
 
 
 class NewFile(click.Path):
-    """A file that a command creates. It is rejected before any work if it exists or its folder does not."""
+    """A new file. It is rejected before any work if it exists or its folder does not."""
 
     def __init__(self) -> None:
         super().__init__(dir_okay=False, path_type=Path)
@@ -333,7 +337,7 @@ class NewFile(click.Path):
 
 
 def _drawable(_context: click.Context, _parameter: click.Parameter, png: Path | None) -> Path | None:
-    """Refuse a picture before any work if its package is missing."""
+    """Refuse to draw before any work if the package for figures is missing."""
     if png is not None:
         require_extra("viz", "--png", "matplotlib")
     return png
@@ -345,8 +349,8 @@ PLAN_FILES = _together(
 )
 
 
-def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME chooses its sensor.") -> Callable[[F], F]:
-    """Make the option --simulate, which every command accepts."""
+def simulate(words: str = "Use an emulated cell; --sensor emulated://NAME selects its sensor.") -> Callable[[F], F]:
+    """Return the option --simulate, which every command accepts."""
     return click.option("--simulate", is_flag=True, help=words)
 
 
@@ -354,17 +358,17 @@ EMULATED_SENSOR = click.option("--sensor", metavar="emulated://NAME", help="With
 
 
 def check_simulate(simulate: bool, *, real: Mapping[str, object] = {}, emulated: Mapping[str, object] = {}) -> None:
-    """Raise `ConfigError` for an option that would be ignored: one of a real cell, or one that needs --simulate.
+    """Raise `ConfigError` for an option that --simulate excludes, or that needs --simulate.
 
-    `real` and `emulated` have the values by option. None, False and empty mean not given.
+    `real` and `emulated` map options to values; None, False and empty values mean that the option is not given.
     """
     if given := [option for option, value in (real if simulate else emulated).items() if value]:
         fix = "leave one of the two out" if simulate else "add --simulate, or leave it out"
-        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'goes only with'} --simulate: {fix}")
+        raise ConfigError(f"{given[0]} {'does not go with' if simulate else 'is only for'} --simulate: {fix}")
 
 
 class SourceOptions(NamedTuple):
-    """The cell and the calibration of a compensated stream, as the options of `SOURCE` name them."""
+    """Cell and calibration of a compensated stream, from the options of `SOURCE`."""
 
     path: Path | None
     tool: str | None
@@ -373,7 +377,7 @@ class SourceOptions(NamedTuple):
     simulate: bool
 
     def calibration(self) -> "CalibrationResult | None":
-        """Read it, or calibrate the emulated cell; None if a tool is named, or nothing."""
+        """Return the calibration, read or made in the emulated cell; None for a tool or without options."""
         from ftdrive.runs.calibration import read_calibration
         from ftdrive.session.rehearsal import short_calibration
         from ftdrive.terminal.screen import open_operator
@@ -385,15 +389,14 @@ class SourceOptions(NamedTuple):
     def stream(
         self, cell: CellConfig | None, calibration: "CalibrationResult | None", tool: str | None, **options: Any
     ) -> "Stream":
-        """Return the stream of a cell, not open yet, or without a cell that of an emulated one; a tool goes first.
+        """Return the unopened stream of a cell, or of an emulated one; a tool replaces the calibration.
 
-        Raises `ConfigError` without a calibration and without the name of a tool. Other keywords are those of
-        `open_stream`.
+        Raises `ConfigError` without a calibration and a tool. `options` are passed to `open_stream`.
         """
         from ftdrive.library import open_stream
         from ftdrive.session.rehearsal import station_of
 
-        # an emulated cell ends with its stream, so each stream has one of its own
+        # an emulated cell ends with its stream, so each stream gets a new one
         emulated = station_of(calibration, self.described.sensor) if cell is None and calibration is not None else None
         if (place := cell or emulated) is None or not (tool or calibration):
             raise ConfigError(
@@ -407,7 +410,7 @@ class SourceOptions(NamedTuple):
     def open(
         self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
     ) -> "Stream":
-        """Open the stream, with these settings of the stages, until `stack` closes it.
+        """Open the stream with these stages, until `stack` closes it; print the state of the calibration and warnings.
 
         The state of the calibration and warnings are printed.
         """
@@ -425,7 +428,7 @@ class SourceOptions(NamedTuple):
         return stream
 
     def require_alone(self, others: Mapping[str, object]) -> None:
-        """Raise `ConfigError` for options that need an arm or a calibration: of these, and `others` by their names."""
+        """Raise `ConfigError` for given options that need an arm or a calibration, including `others`."""
         own = {"--calibration": self.path, "--tool": self.tool, "--robot": self.described.robot}
         if given := [option for option, value in {**own, **others}.items() if value]:
             raise ConfigError(
@@ -435,9 +438,9 @@ class SourceOptions(NamedTuple):
     def open_log(
         self, stream: "Stream", stack: ExitStack, say: Callable[[str], object]
     ) -> Callable[[Mapping[str, files.JSON]], None]:
-        """Return a function that keeps a weighing of the stream, until `stack` ends; none with a temporary calibration.
+        """Return a function that logs weighings until `stack` ends, unless the calibration is temporary.
 
-        `say` takes a sentence for the operator, from any thread.
+        `say` receives sentences for the operator, from any thread.
         """
         from ftdrive.runs.calibration import EMULATED
         from ftdrive.store import store_url
@@ -461,7 +464,7 @@ class SourceOptions(NamedTuple):
 
 
 def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options that name cell and calibration, and pass them to the command as one `SourceOptions`."""
+    """Add the options for cell and calibration, and pass them to the command as one `SourceOptions`."""
 
     @wraps(command)
     def with_source(**options: Any) -> None:
@@ -474,7 +477,7 @@ def SOURCE(command: Callable[..., None]) -> Callable[..., None]:
         command(source=source, **options)
 
     force = f"Apply a calibration of another arm, sensor or mount, or one {EDITED}."
-    tool = "Newest accepted calibration of this tool on this cell."
+    tool = "Use the newest accepted calibration of this tool in this cell."
     words = "Use the emulated cell of the calibration, or one with --sensor emulated://NAME."
     found: Callable[..., None] = simulate(words)(with_source)
     found = click.option("--force", is_flag=True, help=force)(CELL(found))
@@ -486,13 +489,13 @@ TRACK = click.option(
     type=click.Choice(["off", "show", "apply"]),
     default="off",
     show_default=True,
-    help="Follow bias and held part while the arm works; only apply corrects the wrench.",
+    help="Track bias and held part while the arm works; only apply corrects the wrench.",
 )
 
 
 def frame_options(axes: "Axes", about: str) -> Callable[[F], F]:
-    """Make the options --axes and --about with their defaults, as one argument `frame` of type `WrenchFrame`."""
-    point = "Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange along its axes."
+    """Return the options --axes and --about with these defaults, passed as one `frame` of type `WrenchFrame`."""
+    point = "Reference point of the torque: sensor, flange, tcp, or x,y,z in m from the flange in its axes."
     choice = click.Choice(["sensor", "flange", "base", "tcp"])
 
     def added(command: F) -> F:
@@ -520,7 +523,7 @@ FRAME = frame_options("sensor", "sensor")
 
 
 def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: str) -> dict[str, Any]:
-    """Read settings of stages before a device is opened; raises `ConfigError`."""
+    """Parse settings of stages before a device is opened. Raises `ConfigError`."""
     from ftdrive.servers.parameters import STAGE_TEXTS, checked_value
 
     found = {}
@@ -539,14 +542,14 @@ STAGES = click.option(
     metavar="NAME=VALUE[,...]",
     default="",
     callback=_checked_stages,
-    help="Settings of the stages at the beginning, such as lowpass_Hz=20,bias=false.",
+    help="Initial settings of the stages, such as lowpass_Hz=20,bias=false.",
 )
 STORE = click.option("--store", "url", metavar="URL", help="Database to use, instead of [store] url.")
 
 
 @contextmanager
 def declined_aborts() -> Iterator[None]:
-    """Print why the operator ended a session, and abort the command."""
+    """Print the reason why the operator ended a session, and abort the command."""
     from ftdrive.terminal.console import messages
 
     try:
@@ -567,17 +570,19 @@ SOLVED_WITH = _together(
         type=click.Choice(["R_base_flange", "R_flange_base"]),
         default="R_base_flange",
         show_default=True,
-        help="Rotation in a table, also that of --test: flange to base coordinates, or the inverse (as in the papers).",
+        help="Rotation in a table, also in --test: from flange to base coordinates, or the inverse (as in the papers).",
     ),
     click.option(
         "--drift",
         type=click.Choice(["auto", "none", "linear", "random-walk"]),
         default="auto",
         show_default=True,
-        help="Model of the bias drift; rows without times count as equally spaced.",
+        help="Model of the bias drift; rows without times are taken as equally spaced.",
     ),
     click.option("--mass-kg", metavar="KG", type=POSITIVE, help="Known mass below the sensor."),
-    click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma)."),
+    click.option(
+        "--level-deg", metavar="DEG", type=Number(0, 180), help="Declare the base level within DEG (one sigma)."
+    ),
     click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange."),
     click.option(
         "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
@@ -587,29 +592,29 @@ _OF_TABLE = _together(
     click.option(
         "--columns",
         metavar="NAMES",
-        help='Columns of a table by our names, "t=Time [ms],fx=Force X", or a TOML file with [columns].',
+        help='Columns of a table by standard name, such as "t=Time [ms],fx=Force X", or a TOML file with [columns].',
     ),
-    click.option("--rate", metavar="HZ", type=POSITIVE, help="Samples a second of a table without times."),
+    click.option("--rate", metavar="HZ", type=POSITIVE, help="Sampling rate of a table without times."),
     click.option(
-        "--euler", metavar="ORDER", help="Three angles: rpy, ABC, WPR, OAT, ZYX (axes of the tool), xyz (of the base)."
+        "--euler", metavar="ORDER", help="Order of three angles: rpy, ABC, WPR, OAT, ZYX (tool axes), xyz (base axes)."
     ),
-    click.option(
-        "--tcp", metavar="X,Y,Z,RX,RY,RZ", help="TCP in the flange, m and rad, if the poses are those of the TCP."
-    ),
+    click.option("--tcp", metavar="X,Y,Z,RX,RY,RZ", help="TCP in the flange, m and rad, if the poses are TCP poses."),
     click.option(
         "--wrench-frame",
         type=click.Choice(["sensor", "flange", "tcp", "base"]),
-        help="Axes of the wrench; tcp and base are about the TCP.  [default: by the layout, mostly sensor]",
+        help="Axes of the wrench; tcp and base are about the TCP.  [default: from the layout, mostly sensor]",
     ),
-    click.option("--sign", type=click.Choice(["1", "-1"]), help="-1 for a sensor that reports the reaction."),
-    click.option("--model", help="Joint angles of a UR arm: its model, such as UR5e."),
-    click.option("--urdf", metavar="FILE", help="Joint angles of another arm: URDF, FILE?flange=LINK&base=LINK."),
+    click.option(
+        "--sign", type=click.Choice(["1", "-1"]), help="Sign of the wrench: -1 for a sensor that reports the reaction."
+    ),
+    click.option("--model", help="Model of the UR arm, such as UR5e, for joint angles."),
+    click.option("--urdf", metavar="FILE", help="URDF of another arm, FILE?flange=LINK&base=LINK, for joint angles."),
 )
 TABLE_NAMES = ("columns", "rate", "euler", "tcp", "wrench_frame", "sign", "model", "urdf")
 
 
 def TABLE(command: Callable[..., None]) -> Callable[..., None]:
-    """Add the options of a table, and pass them to the command as `TableOptions`; None if none is given."""
+    """Add the options of a table, and pass them to the command as `TableOptions`, or None if none is given."""
 
     @wraps(command)
     def with_table(**options: Any) -> None:
@@ -622,11 +627,11 @@ def TABLE(command: Callable[..., None]) -> Callable[..., None]:
 
 
 REPORTED = ("method", "orientation", "drift", "mass_kg", "level_deg", "mounting_deg", "up", *TABLE_NAMES)
-"""Names of the options of `solve` that `report` takes too."""
+"""Names of the options of `solve` that `report` also has."""
 
 
 def typed_options(context: click.Context, names: Sequence[str] | None = None) -> tuple[str, ...]:
-    """Return the options that were given, as words for a shell; with `names` only these."""
+    """Return the given options as words for a shell, limited to `names`."""
     words = list[str]()
     for one in context.command.params:
         is_given = one.name is not None and context.get_parameter_source(one.name) is not ParameterSource.DEFAULT

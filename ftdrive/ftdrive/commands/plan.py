@@ -1,4 +1,4 @@
-"""`ftdrive plan`: a tour proven clear, without an arm."""
+"""`ftdrive plan`: plan a tour proven clear of collisions, without an arm."""
 
 from contextlib import suppress
 from dataclasses import replace
@@ -40,7 +40,7 @@ HEADINGS = {
 
 
 def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | None:
-    """Return mm/s; infinity for none."""
+    """Return the speed in mm/s; infinity for "none"."""
     if text is None or text.lower() == "none":
         return None if text is None else inf
     with suppress(ValueError):
@@ -57,16 +57,20 @@ def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str |
     "tool",
     multiple=True,
     metavar="FROM:TO:DIAMETER[:X:Y]",
-    help="A cylinder of tool and sensor, mm from the flange face; X:Y is the offset of its axis. Repeatable.",
+    help="Cylinder around tool or sensor, mm from the flange face; X:Y is the offset of its axis. Repeatable.",
 )
-@click.option("--quick", is_flag=True, help="12 poses instead of 24.")
-@click.option("--minimal", is_flag=True, help="6 poses instead of 24.")
+@click.option("--quick", is_flag=True, help="Plan 12 poses instead of 24.")
+@click.option("--minimal", is_flag=True, help="Plan 6 poses instead of 24.")
 @SETS
 @click.option(
-    "--cone", "cone_deg", type=float, metavar="DEG", help="Only poses with the tool within DEG of straight down."
+    "--cone", "cone_deg", type=float, metavar="DEG", help="Use only poses with the tool within DEG of straight down."
 )
 @click.option(
-    "--free-box", "box_mm", type=float, metavar="MM", help="The flange may move MM to each side; the whole arm moves."
+    "--free-box",
+    "box_mm",
+    type=float,
+    metavar="MM",
+    help="Let the flange move by up to MM to each side; the whole arm moves.",
 )
 @click.option(
     "--posture",
@@ -75,32 +79,34 @@ def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str |
     metavar="Q1,Q2,Q3",
     help="Angles of the first three joints, degrees.",
 )
-@click.option("--mounting", help="floor, wall, ceiling, or degrees that the base leans towards its -x (wall: 90).")
+@click.option(
+    "--mounting", help="Mounting of the base: floor, wall, ceiling, or its tilt towards -x in degrees (wall: 90)."
+)
 @click.option(
     "--plane",
     "planes",
     multiple=True,
     metavar="NX:NY:NZ:MM",
-    help="A wall: the arm stays where N·p >= MM, base axes. The mounting surface is always included.",
+    help="Wall: the arm stays where N·p >= MM, base axes. The mounting surface is always included.",
 )
-@click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="A block, two corners in mm, base axes.")
+@click.option("--box", "boxes", multiple=True, metavar="X:Y:Z:X:Y:Z", help="Block: two corners in mm, base axes.")
 @click.option(
     "--tip-speed-limit",
     metavar="MM/S|none",
     callback=_tip_speed,
-    help="Speed of the tool's farthest points.  [default: [robot] tip_speed_mm_s, else 250]",
+    help="Largest speed of the tool's outermost points.  [default: [robot] tip_speed_mm_s, else 250]",
 )
 @click.option(
     "--mass",
     "mass_kg",
     metavar="KG",
     type=float,
-    help="Mass of the tool, for the prediction.  [default: [tool] mass_kg, else 1]",
+    help="Mass of the tool, for the predicted accuracy.  [default: [tool] mass_kg, else 1]",
 )
 @PLAN_FILES
-@click.option("--all", "every", is_flag=True, help="Print each pose and move too.")
+@click.option("--all", "every", is_flag=True, help="Also print each pose and move.")
 @view_options
-@simulate("Use arm and tool of an emulated cell instead of the configuration.")
+@simulate("Use arm and tool of an emulated cell, not the configuration.")
 @JSON
 def plan_command(
     config: Path | None,
@@ -124,16 +130,16 @@ def plan_command(
     simulate: bool,
     as_json: bool,
 ) -> None:
-    """Plan a tour proven clear of the arm itself, the tool, planes and boxes. Needs no robot.
+    """Plan a tour proven clear of collisions with the arm, the tool, planes and boxes. Needs no robot.
 
     Arm, tool and surroundings come from the configuration; options replace its values. Cables, fixtures and people are
-    not in the model: look at the space that must be clear before anything moves.
+    not in the model: check the space that must be clear before the arm moves.
     """
     for one, other in ((quick, minimal), (cone_deg, box_mm)):
         if one and other:
             raise ConfigError("give --quick or --minimal, and --cone or --free-box, not both")
     if sets is not None and (quick or minimal or cone_deg or box_mm):
-        raise ConfigError("--set names the poses: leave out --quick, --minimal, --cone and --free-box")
+        raise ConfigError("--set defines the poses: leave out --quick, --minimal, --cone and --free-box")
     check_simulate(simulate, real={"--config": config})
     page = click.get_current_context().with_resource(view.page("ftdrive plan"))
     emulated = None
@@ -158,15 +164,15 @@ def plan_command(
         cell = replace(cell, clock=emulated.clock)
     described = {found[key].origin for key in ("tool.cylinders_mm", "workcell.planes_mm", "workcell.boxes_mm")}
     described -= {"default", "--tool", "--plane", "--box"}
-    if not described:  # described by options, or nothing but arm and mounting
+    if not described:  # only options, or arm and mounting alone
         cell = replace(cell, workcell=replace(cell.workcell, measured=True))
     if not cell.workcell.measured:
         messages.print(
-            f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for the eye only."
+            f"Placeholders in {', '.join(sorted(described))} (measured = false): this plan is for inspection only."
         )
     certifier = certifier_for(cell, cell.robot.model)
-    again = "calibrate proves it again with the arm's own kinematics"
-    messages.print(f"Made for a nominal {certifier.arm.name}, with wider margins: {again}.")
+    again = "`ftdrive calibrate` proves the plan again with the kinematics of your arm"
+    messages.print(f"Planned for a nominal {certifier.arm.name} with wider margins; {again}.")
     q_rad = np.array([*np.radians(parse_numbers("--posture", posture, ",", (3,))), *USUAL_POSTURE_RAD[3:]])
     with working("Planning"):
         poses, unlimited = 6 if minimal else 12 if quick else 24, tip_speed_limit == inf

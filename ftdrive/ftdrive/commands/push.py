@@ -1,4 +1,4 @@
-"""`ftdrive push`: payload and gravity of a calibration to the controller."""
+"""`ftdrive push`: send payload and gravity of a calibration to the controller."""
 
 import json
 import shlex
@@ -38,9 +38,9 @@ from ftdrive.words.session import proposal_in_lines, settings_in_words
 @CELL
 @click.option("--payload", is_flag=True, help="Push mass and centre of mass; the default without --gravity.")
 @click.option("--gravity", is_flag=True, help="Push the direction of gravity in the base.")
-@click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=PATH, help="Send the values before a push back.")
-@click.option("--dry-run", is_flag=True, help="Compare only; nothing is sent.")
-@simulate("Push to an emulated cell; it is calibrated first if no result is given.")
+@click.option("--restore", "receipt", metavar="RECEIPT|RUN", type=PATH, help="Restore the values before a push.")
+@click.option("--dry-run", is_flag=True, help="Only compare; send nothing.")
+@simulate("Push to an emulated cell, calibrated first if no result is given.")
 @JSON
 def push(
     source: Path | None,
@@ -52,15 +52,15 @@ def push(
     simulate: bool,
     as_json: bool,
 ) -> None:
-    """Set payload or gravity in the controller as calibrated, after a typed word, and read it back.
+    """Set payload or gravity in the controller to the calibrated values after you type a word, and read them back.
 
-    The payload is everything below the flange: the identified tool, sensor and adapter. The old values are kept in a
-    receipt, push.json in the run, for --restore. The arm must be free and still, in remote control, without a program.
-    A program made at the pendant sets the values of its installation again when it starts.
+    The payload is everything below the flange: the calibrated tool, sensor and adapter. The old values are stored in a
+    receipt, push.json in the run, for --restore. The arm must be free and at rest, in remote control, without a running
+    program. A program made at the pendant sets the values of its installation again when it starts.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     if receipt is not None and (source or payload or gravity):
-        raise ConfigError("--restore takes everything from the receipt: leave RESULT, --payload and --gravity out")
+        raise ConfigError("--restore uses only the receipt: leave RESULT, --payload and --gravity out")
     if not (source or receipt or simulate):
         raise ConfigError("nothing to push: give a calibration.json or a run folder, --restore or --simulate")
     with ExitStack() as stack:
@@ -86,7 +86,9 @@ def push(
             echo("\n".join(proposal_in_lines(proposal)), err=True)
         if not sends:
             beside(as_json).print(
-                "Dry run: nothing was sent." if dry_run else "The controller agrees: nothing was sent."
+                "Dry run: nothing was sent."
+                if dry_run
+                else "The controller has these values already: nothing was sent."
             )
             return
 
@@ -95,7 +97,7 @@ def push(
 
         def require_supervisor() -> None:
             if why := operator.absence():
-                raise SupervisorGone(why, "nothing more is sent; start the push again")
+                raise SupervisorGone(why, "no more values are sent; start the push again")
 
         with declined_aborts():
             saved, read_back = send(arm, proposal, folder, ask, require_supervisor)
@@ -104,7 +106,7 @@ def push(
             return
     answer.print(f" ✔ Read back: {settings_in_words(read_back)}")
     answer.print(" Programs made at the pendant set the values of their installation: enter them there too.")
-    if saved.exists():  # not of a temporary run
+    if saved.exists():  # a temporary run is deleted
         answer.print(f" Receipt {saved}; undo: ftdrive push --restore {shlex.quote(str(saved))}")
 
 

@@ -1,4 +1,4 @@
-"""`ftdrive record`: the raw and the compensated wrench, with pose and events, to files."""
+"""`ftdrive record`: record the raw and the compensated wrench, with pose and events, to files."""
 
 import re
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ from ftdrive.terminal.console import beside, messages, working
 
 
 class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in newer versions of click only
-    """A time such as 90, 60s, 10min or 1h, in s."""
+    """A duration such as 90, 60s, 10min or 1h, s."""
 
     name = "duration"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return seconds."""
+        """Return the duration in s."""
         if isinstance(value, float):
             return value
         found = re.fullmatch(r"(\d+\.?\d*)(s|min|h)?", value)
@@ -47,9 +47,9 @@ class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in 
     "--duration",
     "duration_s",
     type=Duration(),
-    help="Duration, such as 60s, 10min or 1h; without a limit, until Ctrl-C.",
+    help="Duration, such as 60s, 10min or 1h.  [default: until Ctrl-C]",
 )
-@click.option("--count", type=click.IntRange(1), help="Number of samples.")
+@click.option("--count", type=click.IntRange(1), help="Number of samples to record.")
 @SOURCE
 @TRACK
 @FRAME
@@ -67,8 +67,8 @@ def record(
 ) -> None:
     """Record every sample: raw and compensated wrench, pose, joint angles, status, events and the calibration.
 
-    Foxglove, Lichtblick, PlotJuggler and ROS 2 open .mcap. The arm is only read, never moved. However the recording
-    ends, the files hold what was received until then. Exit code 8 if samples are missing.
+    Foxglove, Lichtblick, PlotJuggler and ROS 2 can open .mcap files. The arm is only read, never moved. However the
+    recording ends, the files contain all samples up to then. The exit code is 8 if samples are missing.
     """
     require_new_recordings(paths)
     with ExitStack() as stack:
@@ -84,13 +84,13 @@ def record(
                 _report_recording(recorder, frame, stream.info.calibration_name, as_json=as_json)
     if recorder.gaps:
         raise RecordingHasGaps(
-            f"gaps: {recorder.gaps}, samples lost: {recorder.lost}; check cable, supply and load of the computer, then "
-            "record again; the events in the file have the times"
+            f"gaps: {recorder.gaps}, samples lost: {recorder.lost}. Check cable, supply and load of the "
+            "computer, then record again. The times are in the events of the file"
         )
 
 
 def _report_recording(recorder: Recorder, frame: WrenchFrame, name: str, *, as_json: bool) -> None:
-    # of all samples: that of the first half second may differ much
+    # rate over all samples, because that of the first half second may differ much
     rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"

@@ -1,4 +1,4 @@
-"""`ftdrive replay`: a recorded run, repeated by the same routine and solver without a driver."""
+"""`ftdrive replay`: repeat a recorded run with the same routine and solver, without drivers."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from ftdrive.terminal.console import answer, hanging, messages, working
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import open_operator
 
-# Linear algebra rounds differently on different processors.
+# Tolerance for linear algebra, which rounds differently on different processors.
 _ROUNDING_SIGMA = 1e-6
 
 
@@ -31,9 +31,9 @@ _ROUNDING_SIGMA = 1e-6
 @ALL
 @JSON
 def replay(source: Path | None, simulate: bool, sensor: str | None, every: bool, as_json: bool) -> None:
-    """Repeat the recorded RUN and compare the result with the saved one: they must be equal.
+    """Repeat the recorded RUN, and compare the result with the saved one.
 
-    On the same kind of processor they are equal to the last digit, on another one to rounding: within 1e-6 sigma.
+    The results must be equal to the last digit on the same kind of processor, and within 1e-6 sigma on another one.
 
     RUN is a run folder, or the file of `ftdrive bundle`.
     """
@@ -72,7 +72,7 @@ def _repeat(run: Run, source: Path, every: bool, as_json: bool) -> None:
 
 
 def equality(again: CalibrationResult, saved: CalibrationResult) -> str:
-    """Return how equal two results are; raise `NotAccepted` if they differ by more than rounding."""
+    """Return how well two results agree; raise `NotAccepted` if they differ by more than rounding."""
     one, other = again.to_dict(), saved.to_dict()
     keys = [key for key in one if key != "provenance" and one[key] != other[key]]
     if not keys:
@@ -82,4 +82,4 @@ def equality(again: CalibrationResult, saved: CalibrationResult) -> str:
     alike = [[(finding.code, finding.severity) for finding in result.findings] for result in (again, saved)]
     if off.max() > _ROUNDING_SIGMA or alike[0] != alike[1]:
         raise NotAccepted(f"the replay differs from the saved calibration in {', '.join(keys)}")
-    return f"equal to rounding, within {off.max():.1g} sigma, as on another kind of processor"
+    return f"equal except for rounding, within {off.max():.1g} sigma, as on another kind of processor"

@@ -1,4 +1,4 @@
-"""`ftdrive report`: one file that says whether a calibration is good, and why."""
+"""`ftdrive report`: write one file on whether a calibration is good, and why."""
 
 import gc
 import json
@@ -49,26 +49,26 @@ _FORMATS = ("html", "json")
     type=click.Choice(get_args(Method)),
     default="ml",
     show_default=True,
-    help="Method, as of `ftdrive solve`; the report compares the others with it.",
+    help="Method of `ftdrive solve`; the report compares the others with it.",
 )
 @click.argument("source", required=False, type=click.Path(exists=True, path_type=Path))
 @click.option(
     "-o",
     "--output",
     type=NewFile(),
-    help="New file. [default: report.html in the run or beside SOURCE, or report-2; stdout for json]",
+    help="New file. [default: report.html in the run or next to SOURCE, or report-2; stdout for json]",
 )
 @click.option(
     "--format",
     "form",
     type=click.Choice(_FORMATS),
-    help="A page (needs ftdrive[report]), or the facts as JSON.  [default: by the ending of --output, else html]",
+    help="HTML page (needs ftdrive[report]) or facts as JSON.  [default: from the suffix of --output, else html]",
 )
 @click.option(
     "--parent",
     metavar="RESULT",
     type=click.Path(exists=True, path_type=Path),
-    help="Compare with this calibration.json or run folder. Default: the parent that the result names.",
+    help="Compare with this calibration.json or run folder. Default: the parent of the result.",
 )
 @TABLE
 @simulate("Report a short run of an emulated cell.")
@@ -86,9 +86,9 @@ def report(
     as_json: bool,
     **shared: Any,
 ) -> None:
-    """Report SOURCE: a calibration.json, a run folder, a dataset.json or a table, as `ftdrive solve` takes them.
+    """Report on SOURCE: a calibration.json, a run folder, or a dataset.json or table as for `ftdrive solve`.
 
-    The report has verdict, findings, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
+    The report contains verdict, findings, next step, uncertainty, cross-validation, residuals, drift, noise, coverage,
     settings and provenance. An unsolved source is solved with the options of `ftdrive solve`. Rejected results are
     reported too, with exit code 0.
     """
@@ -96,13 +96,13 @@ def report(
     if source is None and not simulate:
         raise ConfigError("nothing to report: give a calibration.json, a run folder or a table, or --simulate")
     if (form := form or (output.suffix[1:] if output is not None else "html")) not in _FORMATS:
-        raise ConfigError(f"{output} has no ending of a report: name it .html or .json, or give --format")
+        raise ConfigError(f"{output} has no suffix of a report: name it .html or .json, or give --format")
     if form == "html":
         require_extra("report", "a report in HTML (not --format json)", "jinja2", "matplotlib")
     orientation, drift, *known, up = (shared[name] for name in REPORTED[1:7])
     given = SolveOptions(method, orientation, drift, known_values(*known), up_direction(up), table=table)
     options = replace(given, words=typed_options(click.get_current_context(), REPORTED))
-    gc.freeze()  # or the imports are searched for garbage again and again, as in `fleet status`
+    gc.freeze()  # without this, the garbage collection searches the imports again and again, as in `fleet status`
     with unpack(source) if source is not None else _report_folder(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
@@ -130,7 +130,7 @@ def report(
 
 
 def _saved(text: str, folder: Path) -> Path:
-    """Save under the first name that is unused, which another report may take meanwhile."""
+    """Save under the first unused name; retry if another report takes it meanwhile."""
     while True:
         with suppress(FileExistsError):
             write_new(path := unused_path(folder / "report.html"), text)
@@ -138,7 +138,7 @@ def _saved(text: str, folder: Path) -> Path:
 
 
 def _report_folder(sensor: str | None) -> AbstractContextManager[Path]:
-    from ftdrive.session.rehearsal import rehearsed_run  # with the drivers and the screen of a session
+    from ftdrive.session.rehearsal import rehearsed_run  # imports drivers and screen
     from ftdrive.terminal.screen import open_operator
 
     return rehearsed_run(open_operator(), sensor)

@@ -1,4 +1,4 @@
-"""`ftdrive ros2`: the compensated wrench as topics of ROS 2."""
+"""`ftdrive ros2`: publish the compensated wrench on ROS 2 topics."""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -14,7 +14,7 @@ _ROS_ARGS = "--ros-args"
 
 
 class _RosCommand(click.Command):
-    """Keeps the arguments of ROS, which begin with `--ros-args`, from click."""
+    """Command that passes the arguments from `--ros-args` on to ROS instead of click."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         start = args.index(_ROS_ARGS) if _ROS_ARGS in args else len(args)
@@ -30,14 +30,14 @@ class _RosCommand(click.Command):
     _ROS_ARGS,
     "ros_args",
     metavar="...",
-    help="Arguments of ROS until the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
+    help="ROS arguments, to the end of the line: -r __ns:=/cell_1, -p rate:=100.0, --params-file FILE.",
 )
 def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> None:
-    """Publish the raw and the compensated wrench as topics of ROS 2.
+    """Publish the raw and the compensated wrench on ROS 2 topics.
 
-    The node has ~/wrench_raw, ~/wrench, ~/contact, ~/status, /diagnostics and the services ~/tare and ~/undo_tare.
-    `ros2 param describe` explains each parameter. While a device is silent or the calibration does not fit, no wrench
-    is published and /diagnostics has the reason. The arm is only read, never moved. Ctrl-C ends.
+    The topics are ~/wrench_raw, ~/wrench, ~/contact, ~/status and /diagnostics, the services ~/tare and ~/undo_tare.
+    `ros2 param describe` explains each parameter. While a device sends no samples or the calibration does not fit, no
+    wrench is published and /diagnostics gives the reason. The arm is only read, never moved. Ctrl-C ends.
     """
     ros2_module("rclpy")  # before any work
     from ftdrive.servers.ros2 import Ros2Node  # imports it

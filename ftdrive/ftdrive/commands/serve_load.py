@@ -1,4 +1,4 @@
-"""`ftdrive serve-load`: weight and contact wrench for the program that runs on the controller."""
+"""`ftdrive serve-load`: provide weight and contact wrench to the program on the controller."""
 
 from contextlib import ExitStack
 from functools import partial
@@ -20,17 +20,17 @@ from ftdrivers.ur.rtde import FIRST_REGISTER, LAST_REGISTER
 @TRACK
 @click.option("--first", type=int, default=FIRST_REGISTER, show_default=True, help="First register of each kind.")
 def serve_load(source: SourceOptions, frame: WrenchFrame, track: Tracking, first: int) -> None:
-    """Answer the program on the controller: weigh a part, zero, and the contact wrench all the time.
+    """Provide the contact wrench to the program on the controller, and weigh or zero on request.
 
-    Any program may run. It requests in two output registers and reads input registers, with the functions of `ftdrive
-    export urscript`. Nothing else is sent, and the arm is never moved. With --track the program also gets the bias as
-    followed. Ctrl-C ends.
+    Any program may run. It writes requests to two output registers and reads input registers, with the functions of
+    `ftdrive export urscript`. Nothing else is sent, and the arm is never moved. With --track, the program also gets the
+    tracked bias. Ctrl-C ends.
     """
     doubles = len(doubles_of(track))
     last = LAST_REGISTER + 1 - max(len(INTEGERS), doubles)
     if not FIRST_REGISTER <= first <= last:
         raise ConfigError(
-            f"--first is {first}: give {FIRST_REGISTER} to {last}, because fieldbuses and PLCs own the registers below "
+            f"--first is {first}: give {FIRST_REGISTER} to {last}, because fieldbuses and PLCs use the registers below "
             f"{FIRST_REGISTER}, and {LAST_REGISTER} is the last one"
         )
     with ExitStack() as stack:
@@ -44,6 +44,6 @@ def serve_load(source: SourceOptions, frame: WrenchFrame, track: Tracking, first
         )
         registers = "" if first == FIRST_REGISTER else f" --first {first}"
         messages.print(
-            f"For the program on the controller: `ftdrive export urscript{registers} -o FILE` writes functions."
+            f"Write the functions for the program on the controller with `ftdrive export urscript{registers} -o FILE`."
         )
         service.run()

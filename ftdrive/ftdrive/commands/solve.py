@@ -1,4 +1,4 @@
-"""`ftdrive solve`: a calibration from data on disk, without a device."""
+"""`ftdrive solve`: calibrate from data on disk, without a device."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -54,7 +54,7 @@ _EPILOG = "\b\nMETHOD is one of\n" + fill(
     ", ".join(_METHODS), 76, initial_indent="  ", subsequent_indent="  ", break_on_hyphens=False
 )
 
-# Options that only say what happens to a result.
+# Options that only control what happens to a result.
 _SAVING = ("output", "force", "every", "as_json")
 HEADINGS = {
     "How to solve": "--method --as-published --drift --from --together --point-mass",
@@ -77,34 +77,39 @@ HEADINGS = {
     type=click.Choice(_METHODS),
     default="ml",
     show_default=True,
-    help="Method, one of those below; all prints them side by side.",
+    help="Method, one of those listed below; all compares them.",
 )
 @SOLVED_WITH
-@click.option("--as-published", is_flag=True, help="Carlson's methods as they are printed, without biases.")
-@click.option("--wrench", metavar="FILE", type=FILE, help="In motion: table of the wrench, if it is a file of its own.")
-@click.option("--orientation-file", metavar="FILE", type=FILE, help="With --wrench: table of the poses of the flange.")
+@click.option("--as-published", is_flag=True, help="Use Carlson's methods as published, without biases.")
+@click.option(
+    "--wrench", metavar="FILE", type=FILE, help="In motion: table of the wrench, if it is in a separate file."
+)
+@click.option("--orientation-file", metavar="FILE", type=FILE, help="Table of the flange poses, with --wrench.")
 @click.option(
     "--from",
     "earlier",
     metavar="RESULT",
     type=PATH,
-    help="A new tool: take mounting, base and gain from this result of the same sensor. 4 poses or 10 s of motion do.",
+    help="For a new tool: use mounting, base and gain of this result of the same sensor; 4 poses or 10 s of motion.",
 )
 @click.option(
     "--test",
     metavar="RUN",
     type=PATH,
-    help="With --method all: largest errors on these poses of the free tool, as in Yu's Table III.",
+    help="With --method all: show the largest errors on these poses of the free tool, as in Yu's Table III.",
 )
 @click.option(
-    "--table-iii", "cases", is_flag=True, help=f"The 11 cases of Yu's Table III, from a run with --set {EVERY_SET}."
+    "--table-iii",
+    "cases",
+    is_flag=True,
+    help=f"Solve the 11 cases of Yu's Table III, from a run with --set {EVERY_SET}.",
 )
-@click.option("--together", "joined", is_flag=True, help="Join runs of one tool, each with a bias of its own.")
+@click.option("--together", "joined", is_flag=True, help="Combine runs of one tool, each with its own bias.")
 @BAG_TOPICS
 @TABLE
-@click.option("--point-mass", is_flag=True, help="In motion: the load is known to have no inertia of its own.")
+@click.option("--point-mass", is_flag=True, help="In motion: treat the load as a point mass.")
 @click.option("--output", "-o", type=NewFile(), help="Save the calibration as a new file.")
-@click.option("--force", is_flag=True, help="Save a rejected result too; it stays marked as rejected.")
+@click.option("--force", is_flag=True, help="Also save a rejected result; it stays marked as rejected.")
 @simulate("Solve a short run of an emulated cell.")
 @EMULATED_SENSOR
 @ALL
@@ -124,12 +129,12 @@ def solve_command(
 ) -> None:
     """Solve each DATASET: a run folder, the file of `ftdrive bundle`, a dataset.json, or a table of any program.
 
-    A table has one row a pose: the orientation of the flange, the wrench, and optionally a time and sigma_fx..sigma_tz,
-    the standard error of each mean. Separator, decimal sign, names and units are recognised; --columns and the options
-    beside it say what the file does not. With --json, one object a line.
+    A table has one row per pose: flange orientation, wrench, and optionally time and sigma_fx..sigma_tz, the standard
+    error of each mean. Separator, decimal mark, names and units are recognised. Use --columns and the options below it
+    for what the file does not contain. With --json, each line is one object.
 
-    A DATASET may also be a recording in motion, from which inertia and delay are estimated too: a file of `ftdrive
-    record`, a table with both streams, --wrench and --orientation-file on one clock, or a bag of ROS 1 or ROS 2.
+    A DATASET may also be a recording in motion, which gives inertia and delay too: a file of `ftdrive record`, a table
+    with wrench and pose, --wrench and --orientation-file on one clock, or a ROS 1 or ROS 2 bag.
     """
     check_simulate(simulate, real={"DATASET": sources, "--wrench": chosen["wrench"]}, emulated={"--sensor": sensor})
     given = {**chosen, "test": test, "cases": cases, "joined": joined, "output": output}
@@ -155,8 +160,8 @@ def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
 
 
 def _rehearsed_folder(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
-    """Make a run of an emulated cell with the poses that method or cases need."""
-    from ftdrive.session.rehearsal import rehearsed_run  # with the drivers and the screen of a session
+    """Record a run of an emulated cell with the poses for the method or the cases."""
+    from ftdrive.session.rehearsal import rehearsed_run  # imports drivers and screen
     from ftdrive.terminal.screen import open_operator
 
     poses = {"poses": 24 if method in (*SPECIAL, "all") else 6, "method": "ml" if method == "all" else method}
@@ -169,10 +174,10 @@ def _solve_each(
     show: Callable[[SolveOptions, bool, Path, Path], None],
     as_json: bool,
 ) -> None:
-    """Solve each source by itself, and show what it gives."""
+    """Solve each source separately, and show its result."""
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
-        # One source that fails does not keep the others from being solved.
+        # A source that fails does not prevent the others from being solved.
         try:
             with unpack(source) as place:
                 show(options, as_json, source, place)
@@ -182,7 +187,7 @@ def _solve_each(
             first_failure = first_failure or error
             if as_json and not isinstance(error, NotAccepted):
                 write_json({"schema_version": 1, "source": str(source), "error": str(error)})
-            # An error of a file names it, without its folder; one of the solution does not.
+            # Errors of files contain the file's name, but not its folder; errors of a solution contain neither.
             is_named = isinstance(error, DataError) and [one.name for one in sources].count(source.name) == 1
             echo(in_one_line(f"error: {error}" if is_named else f"error: {source}: {error}"), err=True)
     if first_failure is not None:
@@ -203,13 +208,13 @@ def _show_result(
         write_json({"source": str(source), "hints": found, **result.to_dict()})
     else:
         print_result(result, drift=drift_check(records) if records else None, records=records, every=every)
-        if not click.get_current_context().params["simulate"]:  # which has a temporary run
+        if not click.get_current_context().params["simulate"]:  # a simulated run is temporary
             messages.print_next(*_next_commands(result, source, output))
     _save(result, output, force, as_json)
 
 
 def _next_commands(result: CalibrationResult, source: Path, output: Path | None) -> list[str]:
-    """Return the commands to type after a result; `report` takes fewer options, and in motion only a run."""
+    """Return the next commands; `report` has fewer options, and in motion only reads a run."""
     why, context = "   (how good it is, and why)", click.get_current_context()
     if output is not None and (result.verdict != "rejected" or context.params["force"]):
         return [f"ftdrive report {quote(str(output))}{why}", f"ftdrive live --calibration {quote(str(output))}"]
@@ -231,7 +236,7 @@ def _solved(data: Any, options: SolveOptions) -> CalibrationResult:
 
 
 def _print_table(provenance: Mapping[str, Any]) -> None:
-    """Print what was recognised in a table, so that a wrong guess is seen."""
+    """Print what was recognised in a table, to reveal a wrong guess."""
     if words := provenance.get("table"):
         messages.print(hanging(" ", f"{provenance.get('source') or ''}: {words}".removeprefix(": "), messages))
 
@@ -244,8 +249,10 @@ def _solve_together(
         with unpack(source) as place:
             data = read_place(place, options)
             if not isinstance(data, RecordedData):
-                raise ConfigError(f"--together joins poses at rest, and {source} is in motion")
-            # Without the earlier result of a new tool, because a result from another one would count that twice.
+                raise ConfigError(
+                    f"--together combines runs with poses at rest, and {source} is in motion: leave it out"
+                )
+            # Without the earlier result of a new tool, which would otherwise be counted once per run.
             results.append(_solved(replace(data, earlier=None), options))
     result = together(results)
     if as_json:
@@ -299,7 +306,10 @@ def _show_all(
 def _show_cases(options: SolveOptions, as_json: bool, source: Path, place: Path) -> None:
     data = read_source(place, options)
     if not data.records:
-        raise ConfigError(f"--table-iii needs the folder of a run, and {source} is a file: calibrate --set {EVERY_SET}")
+        raise ConfigError(
+            f"--table-iii needs a run folder, and {source} is a file: record a run with `ftdrive calibrate --set "
+            f"{EVERY_SET}`"
+        )
     with working("Solving the cases of Table III"):
         cases = table_iii(data.dataset, numbers_in_dataset(data.records), data.truth, g_m_s2=data.g_m_s2)
     if as_json:

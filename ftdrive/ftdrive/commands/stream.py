@@ -1,4 +1,4 @@
-"""`ftdrive stream`: the compensated wrench for Foxglove, Lichtblick and PlotJuggler."""
+"""`ftdrive stream`: serve the compensated wrench to Foxglove, Lichtblick and PlotJuggler."""
 
 import socket
 from contextlib import ExitStack
@@ -24,14 +24,20 @@ from ftdrive.terminal.console import messages, print_address
     "--host",
     default="127.0.0.1",
     show_default=True,
-    help="Address to serve at. One that is not loopback is unprotected.",
+    help="Address of the server. An address other than loopback is unprotected.",
 )
 @click.option(
-    "--port", type=click.IntRange(0, 65535), default=8765, show_default=True, help="Port to serve at; 0 is a free one."
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=8765,
+    show_default=True,
+    help="Port of the server; 0 selects a free one.",
 )
-@click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also serve pages of this origin.")
-@click.option("--allow-control", is_flag=True, help="Pages may tare and change frame and stages; programs always may.")
-@click.option("--udp", metavar="HOST:PORT", help="Also send JSON to a PlotJuggler before 3.16, which listens on 9870.")
+@click.option("--allow-origin", "origins", metavar="URL", multiple=True, help="Also accept pages from this origin.")
+@click.option("--allow-control", is_flag=True, help="Let pages tare and change frame and stages, as programs can.")
+@click.option(
+    "--udp", metavar="HOST:PORT", help="Also send JSON to PlotJuggler before 3.16, which listens on port 9870."
+)
 def stream(
     source: SourceOptions,
     track: Tracking,
@@ -45,9 +51,9 @@ def stream(
 ) -> None:
     """Serve the raw and the compensated wrench to viewers.
 
-    Foxglove, Lichtblick and PlotJuggler from 3.16 connect to one WebSocket server. They receive every sample of the
-    sensor, poses, joint angles, frames, arrows and events. Programs can tare and change frame and stages. A page in a
-    browser is served if it is of Foxglove or Lichtblick. The arm is only read, never moved. Ctrl-C ends.
+    Foxglove, Lichtblick and PlotJuggler from 3.16 connect to a WebSocket server. They receive every sample, poses,
+    joint angles, frames, arrows and events. Programs can tare and change frame and stages. In a browser, only pages of
+    Foxglove and Lichtblick are accepted. The arm is only read, never moved. Ctrl-C ends.
     """
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:

@@ -23,7 +23,7 @@ from ftdrivers.transcript import Transcript, Writer
 
 @click.group(cls=Group)
 def transcript() -> None:
-    """Record the bytes on a sensor's wire, or play them to the driver: a bug report becomes a test.
+    """Record the bytes on a sensor's wire, or play them to the driver, to reproduce a bug report.
 
     For sensors on a serial port or a CAN bus. Capture others, such as a Net F/T, with Wireshark.
     """
@@ -31,7 +31,7 @@ def transcript() -> None:
 
 @transcript.command("record")
 @click.option("--sensor", metavar="URL", help="Address of the sensor, such as ati-serial:///dev/serial/by-id/NAME.")
-@simulate("Use an emulated sensor, on RS-485 from ATI unless --sensor emulated://NAME names another.")
+@simulate("Use an emulated sensor: ATI RS-485, or --sensor emulated://NAME.")
 @click.option("-o", "--output", "path", required=True, type=NewFile(), help="Save the transcript as this new file.")
 @click.option(
     "--duration",
@@ -63,8 +63,8 @@ def _emulated_address(sensor: str | None) -> str:
 
 
 def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = True) -> tuple[str, dict[str, Any]]:
-    """Record; return the address of the driver, and what it received. A file that is `kept` is named on the screen."""
-    # Rejected before an emulated one starts.
+    """Record; return the address of the driver, and what it received. Print the name of a file that is `kept`."""
+    # Check before an emulated sensor starts.
     if sensor.startswith("ur-ft:") or sensor == f"{EMULATED}ur-ft":
         raise ConfigError(
             f"{sensor} is read over RTDE, which is not recorded: capture TCP port 30004 of the arm with Wireshark"
@@ -81,7 +81,7 @@ def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = Tr
         "url": url,
         "duration_s": duration_s,
         "utc": datetime.now(UTC).isoformat(),
-        "t_ns": clock.now_ns(),  # of the same moment as `utc`: the anchor of all lines
+        "t_ns": clock.now_ns(),  # same time as `utc`, the anchor of all lines
         "versions": versions(),
     }
     writer = Writer(path, header, clock)
@@ -98,13 +98,13 @@ def _record_bytes(sensor: str, path: Path, duration_s: float, *, kept: bool = Tr
 
 @transcript.command()
 @click.argument("file", required=False, type=FILE)
-@simulate("Record a second of an emulated sensor first, and play that.")
+@simulate("Record an emulated sensor for a second, and play the recording.")
 @EMULATED_SENSOR
 @JSON
 def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -> None:
-    """Play the transcript FILE to the unmodified driver, and print what the driver measures this time.
+    """Play the transcript FILE to the unmodified driver, and print what the driver measures.
 
-    A recording that was interrupted is played to its end.
+    An interrupted recording is played to its end.
     """
     check_simulate(simulate, real={"FILE": file}, emulated={"--sensor": sensor})
     if simulate:
@@ -113,11 +113,11 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
             _record_bytes(_emulated_address(sensor), path, 1.0, kept=False)
             loaded = Transcript.load(path)
     elif file is not None:
-        open_file(file).close()  # raises for what has no end
+        open_file(file).close()  # raises for a pipe or device
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")
-    # A busy computer makes it slow, never late.
+    # On this clock a busy computer plays more slowly, but never late.
     played = loaded.play(LocalClock())
     recorded = {key: value for key, value in loaded.end.items() if key not in {"event", "t_ns"}}
     if as_json:

@@ -1,4 +1,4 @@
-"""`ftdrive verify`: fresh poses against the prediction of a calibration."""
+"""`ftdrive verify`: compare fresh poses with the prediction of a calibration."""
 
 from contextlib import ExitStack
 from dataclasses import replace
@@ -46,15 +46,17 @@ from ftdrive.view.session_page import asked
 @CALIBRATION
 @CELL
 @simulate(
-    "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME chooses its sensor."
+    "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME selects its sensor."
 )
-@click.option("--quick", is_flag=True, help="2 poses instead of 6, at the plan's speeds after one complete slow run.")
+@click.option(
+    "--quick", is_flag=True, help="Take 2 poses instead of 6, at the speed of the plan after one complete slow run."
+)
 @click.option("--poses", type=click.IntRange(2, 500), help="Number of poses.")
 @click.option("--max-force", "force_N", type=POSITIVE, metavar="N", help="Largest accepted difference of the force, N.")
 @click.option(
     "--max-torque", "torque_Nm", type=POSITIVE, metavar="N·m", help="Largest accepted difference of the torque, N·m."
 )
-@click.option("--manual", is_flag=True, help="No motion commands: you move the arm.")
+@click.option("--manual", is_flag=True, help="No motion commands: you move the arm to the poses.")
 @click.option(
     "--update",
     type=click.Choice(["ask", "no", "yes"]),
@@ -85,9 +87,9 @@ def verify_command(
 ) -> None:
     """Compare fresh poses, far from those of the calibration, with its prediction.
 
-    The session is that of `calibrate`: a certified plan, checks, safety questions, guards. Without --max-force and
-    --max-torque, 1 of 100 verifications near the poses of the fit is a false alarm, more far from them. A
-    verification that fails names what has changed, offers the smallest sufficient update, and ends with exit code 7.
+    The session is like that of `calibrate`: a certified plan, checks, safety questions and guards. Without --max-force
+    and --max-torque, 1 of 100 verifications near the calibrated poses is a false alarm, and more far from them. A
+    failed verification names what has changed, offers the smallest sufficient update, and ends with exit code 7.
     """
     check_simulate(simulate, real={"--config": described.config, "--robot": described.robot})
     mode: Mode = "manual" if manual else "auto"
@@ -126,7 +128,7 @@ def verify_command(
 
 
 def _report_verification(verified: Verified, update: Answer, page: Page | None, *, again: str, as_json: bool) -> None:
-    """Print the outcome and what to do next, and show both on the page; save the update if it is wanted."""
+    """Print the outcome and the next step, and show both on the page; save the update if it is wanted."""
     if not as_json:
         print_verification(verified)
     conclude_verification(page, verified)
@@ -142,7 +144,7 @@ def _report_verification(verified: Verified, update: Answer, page: Page | None, 
 
 
 def _ask_on_page(page: Page | None, as_json: bool, question: Question) -> str:
-    """Ask in the terminal; the page shows the question while it waits."""
+    """Ask in the terminal, and show the question on the page meanwhile."""
     show = (lambda _: None) if page is None else page.put
     show({"question": asked(question)})
     try:

@@ -1,4 +1,4 @@
-"""`ftdrive weigh`: what the gripper holds beyond its calibrated tool."""
+"""`ftdrive weigh`: weigh the load in the gripper beyond its calibrated tool."""
 
 from collections.abc import Iterable
 from contextlib import ExitStack, closing
@@ -32,14 +32,16 @@ from ftdrive.view.page import drawing
 @click.command()
 @SOURCE
 @click.option(
-    "--zero", is_flag=True, help="First tare the empty gripper: then drift since the calibration is no error."
+    "--zero", is_flag=True, help="Tare the empty gripper first, which removes the drift since the calibration."
 )
-@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Rests of one load to join.")
-@click.option("--moving", is_flag=True, help="Weigh what the arm carries, in motion too; begin with an empty gripper.")
-@click.option("--count", "part_kg", type=POSITIVE, metavar="KG", help="Mass of one part: count parts.")
-@click.option("--once", is_flag=True, help="Print one weight, then end; with --zero wait for a part.")
+@click.option(
+    "--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses of one load to combine."
+)
+@click.option("--moving", is_flag=True, help="Weigh the load while the arm carries it; start with an empty gripper.")
+@click.option("--count", "part_kg", type=POSITIVE, metavar="KG", help="Count parts of this mass.")
+@click.option("--once", is_flag=True, help="Print one weight and exit; with --zero, wait for a part.")
 @click.option("-o", "--output", type=NewFile(), help="Record samples and weighings: .mcap, .csv or .parquet.")
-@click.option("--allow-control", is_flag=True, help="With --view: the page may tare the empty gripper.")
+@click.option("--allow-control", is_flag=True, help="Let the page of --view tare the empty gripper.")
 @view_options
 @JSON
 def weigh_command(
@@ -54,15 +56,16 @@ def weigh_command(
     view: ViewOptions,
     as_json: bool,
 ) -> None:
-    """Weigh what the gripper holds beyond its calibrated tool, in half a second at rest.
+    """Weigh the load in the gripper beyond its calibrated tool, in half a second at rest.
 
-    One pose gives the mass, and the centre of mass but for its place along gravity. The answer has one sigma of each,
-    and the smallest mass that differs from zero. Contact, cables and moving parts are named and not weighed. With
-    --moving, the load is weighed while the arm carries it, and has its whole centre of mass. The arm is only read,
-    never moved. Ctrl-C ends.
+    One pose gives the mass, and the centre of mass except along gravity, each with one sigma, and the smallest mass
+    that differs from zero. Contacts, cables and moving parts are reported and not weighed. With --moving, the load is
+    weighed while the arm carries it, with its complete centre of mass. The arm is only read, never moved. Ctrl-C ends.
     """
     if moving and (zero or poses > 1):
-        raise ConfigError("--moving follows the bias and has the whole centre of mass: leave out --zero and --poses")
+        raise ConfigError(
+            "--moving tracks the bias and measures the complete centre of mass: leave out --zero and --poses"
+        )
     view.require(once=once, allow_control=allow_control)
     with ExitStack() as stack:
         stream = source.open(stack, SENSOR_FRAME, "show" if moving else "off")
@@ -83,7 +86,7 @@ def weigh_command(
         on_screen = not (once or as_json) and has_screen()
         if (page := stack.enter_context(view.page("ftdrive weigh"))) is not None:
             shown = WeighPage(page, weighing, controls=allow_control)
-            # the full screen hides what is printed, and has a line for notes
+            # the full screen hides printed messages, and has a line for notes
             say = partial(setattr, weighing, "note") if on_screen else messages.print
             stack.enter_context(drawing(page, shown.draw, say))
         if on_screen:
@@ -97,7 +100,7 @@ def weigh_command(
 def _print_weights(
     weighing: Weighing, turns: Iterable[object], *, once: bool, waits: bool, poses: int, as_json: bool
 ) -> None:
-    """Print each new weight or fault as a line; with `once` end with the first weight."""
+    """Print each new weight or fault as a line; with `once`, return after the first weight."""
     clock, info = weighing.stream.clock, weighing.stream.info
     head = {"schema_version": 1, "calibration_id": info.calibration.id, "marks": list(info.marks)}
     begin_s = clock.now_s()

@@ -29,7 +29,7 @@ Moving = Run | Path | tuple[Table, Table]
 def read_place(place: Path, options: SolveOptions) -> Moving | RecordedData:
     """Return a recording in motion, which is read when it is solved, or poses. Raises as `read_source`."""
     if any(options.topics) and (options.pair is not None or not is_bag(place)):
-        raise ConfigError("--wrench-topic and --pose-topic go with a bag of ROS: leave them out")
+        raise ConfigError("--wrench-topic and --pose-topic are only for a ROS bag: leave them out")
     moving: Moving | None
     if is_bag(place) and options.method != "ml":
         moving = place  # a bag is read whole, so it is not read to say this

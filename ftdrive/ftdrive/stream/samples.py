@@ -31,7 +31,14 @@ _KNOWN_HEIGHT_M = 3e-3
 
 @dataclass(frozen=True, slots=True)
 class WrenchFrame:
-    """Axes and reference point of a wrench: a torque has no meaning without its reference point."""
+    """Axes and reference point of a wrench: a torque has no meaning without its reference point.
+
+    Examples
+    --------
+    >>> import ftdrive
+    >>> print(ftdrive.WrenchFrame("base", "tcp"))
+    base axes, about the tcp origin
+    """
 
     axes: Axes = "sensor"
     about: Point | tuple[float, float, float] = "sensor"

@@ -153,7 +153,15 @@ class Stream(Displayed):
     # -------------------------------------------------------------------------------------------------------- reading
 
     def read(self, timeout_s: float = STALE_S) -> Block:
-        """Return the next samples: at least one of a cell, none while a recording is paused."""
+        """Return the next samples: at least one of a cell, none while a recording is paused.
+
+        Raises
+        ------
+        DeviceTimeout
+            A device is silent, or no sample came within `timeout_s`.
+        StreamBroken, DeviceFault, ConnectError
+            A device has failed. The next call reconnects.
+        """
         source, processor = self.source, self.processor
         while True:
             rows, begin, temperature_C, delay_sigma_s = source.read(timeout_s)

@@ -1,1 +1,1 @@
-"""Models in words: pure functions, and the view models of screens and pages."""
+"""Texts of results, sessions, streams and weighings: pure functions, and the view models of screens and pages."""

@@ -1,4 +1,4 @@
-"""What the store has, as rows of tables and as lines: results, their trends, weighings."""
+"""Contents of the store as table rows and lines: results, their trends, weighings."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
@@ -18,34 +18,34 @@ if TYPE_CHECKING:  # a list of results needs no numpy
 
 DAY_TITLES = ("day", "arm", "tool", "parts", "refused", "last, UTC", "mass", "file")
 _TITLES = ("id", "date", "arm", "tool", "verdict", "kg", "verified", "force bias, N", "run", "°C", "parent")
-# Shown if a result has one.
+# Columns shown only if a result has a value.
 _OPTIONAL = {"°C", "parent"}
 
 
 def tool_in_words(tool: str | None, *, emulated: bool) -> str:
-    """Return the name of a tool, which is EMULATED in an emulated cell whose tool has no other name."""
+    """Return the name of a tool, marked EMULATED for an emulated cell."""
     if not emulated:
         return tool or "-"
     return EMULATED if tool in (None, "emulated") else f"{tool} {EMULATED}"
 
 
 def last_weighing_in_words(one: WeighingDay) -> str:
-    """Return tool, time and mass of the last part of a day, and how many there were."""
+    """Return tool, time and mass of the last part of a day, and the number of parts."""
     counts = f"{counted(one.weighings, 'part')}, {sum(one.refusals.values())} refused on this day"
     time = one.day if one.last_utc is None else one.last_utc[:16].replace("T", " ")
     return f"{tool_in_words(one.tool, emulated=one.emulated)}, {time}: {_mass_in_words(one)}; {counts}"
 
 
 def temperature_lines(serial: str, fit: "BiasTemperature") -> Iterator[str]:
-    """Yield how the bias of a sensor follows its temperature: one line for the force and one for the torque."""
+    """Yield the temperature dependence of a sensor's bias: one line for the force and one for the torque."""
     for k, (quantity, unit) in enumerate((("force bias", "N"), ("torque bias", "N·m"))):
         pairs = zip(fit.slope[3 * k : 3 * k + 3], fit.sigma[3 * k : 3 * k + 3], strict=True)
         slopes = ", ".join(with_sigma(slope, sigma, "+") for slope, sigma in pairs)
         use = "applied by --tool" if fit.predicts[k] else "not applied"
         yield (
             f"temperature, {serial}, {quantity}: {slopes} {unit}/K (1 sigma, {fit.n} runs, "
-            f"{fit.coldest_C:.0f} to {fit.warmest_C:.0f} °C); runs left out differ by {fit.error[k]:.2g} {unit} "
-            f"with it, {fit.error_without[k]:.2g} {unit} without: {use}"
+            f"{fit.coldest_C:.0f} to {fit.warmest_C:.0f} °C); leave-one-out error {fit.error[k]:.2g} {unit} "
+            f"with the correction, {fit.error_without[k]:.2g} {unit} without: {use}"
         )
 
 
@@ -56,7 +56,7 @@ def _mass_in_words(one: WeighingDay) -> str:
 
 
 def day_row(one: WeighingDay) -> tuple[str, ...]:
-    """Return the weighings of a day below `DAY_TITLES`."""
+    """Return the weighings of a day as a row for `DAY_TITLES`."""
     return (
         one.day,
         one.arm_serial or one.robot_host or "-",
@@ -72,7 +72,7 @@ def day_row(one: WeighingDay) -> tuple[str, ...]:
 def result_table(
     results: Iterable[StoredResult], last: Mapping[str, VerificationRecord], now: datetime
 ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
-    """Return titles and rows, with the last verification of each result by its id."""
+    """Return titles and rows of a table of results; `last` has the last verification of each by its id."""
     rows = [_history_row(one, last.get(one.id), now) for one in results]
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     return [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows]

@@ -1,4 +1,4 @@
-"""What known loads show of a sensor, in words."""
+"""Texts about known loads: the check of a sensor, and its matrix."""
 
 from collections.abc import Iterator
 from math import degrees
@@ -14,7 +14,7 @@ from ftcalib.sensor_matrix import SensorMatrix
 
 
 def check_lines(found: LoadCheck, load: KnownLoad) -> Iterator[str]:
-    """Yield what the sensor reads of a known load, and whether that is within what it promises."""
+    """Yield the reading of a known load, and whether its error is within the uncertainty that the sensor claims."""
     off = with_sigma(100 * found.scale_error, 100 * found.scale_sigma, "+")
     yield f"reads {found.read_N:.3f} N, expected {found.expected_N:.3f} N: {off} %"
     line = ""
@@ -23,15 +23,15 @@ def check_lines(found: LoadCheck, load: KnownLoad) -> Iterator[str]:
     yield f"{degrees(found.off_vertical_rad):.1f}° off the vertical{line}"
     promised = f"{100 * found.promised_sigma:.1f} % (1 sigma) that the sensor promises"
     if not found.is_within:
-        yield f"OUTSIDE the {promised}: calibrate with known loads, or check the mass."
+        yield f"OUTSIDE the {promised}: check the mass, or calibrate with known loads."
     elif found.is_significant:
-        yield f"Within the {promised}; known loads correct it: ftdrive calibrate --load, ftdrive loads solve"
+        yield f"Within the {promised}. Known loads can correct the error: ftdrive calibrate --load, ftdrive loads solve"
     else:
-        yield f"Right within the check, and within the {promised}."
+        yield f"No significant error, and within the {promised}."
 
 
 def solution_lines(solution: LoadSolution, prior: SensorMatrix) -> Iterator[str]:
-    """Yield loads, tool and matrix of a solution, the contact that they decode, and the findings."""
+    """Yield the loads, the tool, the matrix and the findings of a solution."""
     yield f"{'load':14}{'mass, kg':>22}{'place from the flange, mm':>44}"
     for one in solution.loads:
         place = ", ".join(
@@ -41,12 +41,12 @@ def solution_lines(solution: LoadSolution, prior: SensorMatrix) -> Iterator[str]
     yield f"{'tool':14}{with_sigma(solution.tool_mass_kg, solution.tool_mass_sigma_kg):>22}"
     tip_m = max((abs(one["p_flange_m"][2]) for one in solution.loads), default=0.2)
     before, _ = _contact_sigma(prior, tip_m)
-    yield from matrix_lines(solution.sensor, tip_m, f" (of the sensor before: ± {before:.2g} N)")
+    yield from matrix_lines(solution.sensor, tip_m, f" (before this solution: ± {before:.2g} N)")
     yield from (f"{finding.severity.upper()}  {finding.words}" for finding in solution.findings)
 
 
 def matrix_lines(sensor: SensorMatrix, tip_m: float, beside: str) -> Iterator[str]:
-    """Yield the errors of the gains, and one sigma of a contact at the tip, with what stands beside it."""
+    """Yield the gain errors and the sigma of a contact at the tip, followed by the text `beside`."""
     diagonal = zip(AXES, sensor.error.diagonal(), sensor.sigma.diagonal(), strict=True)
     yield "diagonal, %: " + ", ".join(f"{axis} {with_sigma(100 * e, 100 * s, '+')}" for axis, e, s in diagonal)
     force, torque = _contact_sigma(sensor, tip_m)
@@ -54,7 +54,7 @@ def matrix_lines(sensor: SensorMatrix, tip_m: float, beside: str) -> Iterator[st
 
 
 def _contact_sigma(sensor: SensorMatrix, tip_m: float) -> tuple[float, float]:
-    """Return one sigma of force and torque of 100 N at the tip: of the length of the vector, mean over directions."""
+    """Return sigma of force and torque for 100 N at the tip: norm of the vector, averaged over directions."""
     nothing = Parameters(np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3))
     force, torque = sensor.contact_response(nothing).sigma_at(np.array([0, 0, tip_m]))
     return 100 * force, 100 * torque

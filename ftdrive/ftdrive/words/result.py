@@ -1,4 +1,4 @@
-"""What a result and a verification are in words."""
+"""Texts about a result and a verification."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal
@@ -15,26 +15,26 @@ from ftdrive.runs.pose_hints import find_moved, hints, pose_names
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.words.text import TextLine
 
-# So that verdict, findings and next command fit on one screen.
+# Number of findings shown, so that verdict, findings and next command fit on one screen.
 _MOST_FINDINGS = 3
-# An error elsewhere or later is named if it is larger by this.
+# An error elsewhere or later is shown if it is larger by this factor.
 _WORSE = 1.2
 _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
     ("after an hour", "hour"),
 )
-# N or N·m, or a share of a mass.
+# Values below this are rounding errors, N, N·m or share of a mass.
 _ROUNDING = 1e-9
 SIGMA_OF_THE_TOOL = (
-    "that of mounting, weight and centre of mass includes what errors of sensor, arm and mounts hide in them; the "
-    "compensation error does not, because there they cancel"
+    "sigma of mounting, weight and centre of mass includes errors of sensor, arm and mounts; the "
+    "compensation error does not include them, because they cancel there"
 )
 
 
 def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
-    """Yield each number of a result from its JSON: key, axis, name with unit, truth if known, value, sigma."""
+    """Yield each number in the JSON of a result: key, axis, name with unit, truth if known, value, sigma."""
     for one in estimates_of(document):
         label, scale, unit, key, values, sigmas, fixed = one
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
@@ -46,7 +46,7 @@ def estimate_rows(
 
 
 def mass_in_words(result: CalibrationResult) -> str | None:
-    """Describe the mass with both parts of its sigma; None if it was known, or the sensor is declared perfect."""
+    """Return the mass with both parts of its sigma; None if the mass was known, or the sensor is declared perfect."""
     session_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2
     if session_kg < _ROUNDING * result.mass_kg or result.scale_sigma <= LEAST_COMMON_GAIN:
         return None
@@ -55,7 +55,7 @@ def mass_in_words(result: CalibrationResult) -> str | None:
 
 
 def error_in_words(result: CalibrationResult) -> str:
-    """Describe the compensation error of a free tool at the next use, N and N·m, and where or when it is larger."""
+    """Return the expected compensation error of a free tool, N and N·m, and where or when it is larger."""
     likely = result.likely_error()
     words = "{:.4f} N, {:.5f} N·m rms".format(*likely)
     if result.noise_explains and (likely == result.predicted_error()).all():
@@ -74,8 +74,8 @@ def error_in_words(result: CalibrationResult) -> str:
 
 
 def error_source(result: CalibrationResult) -> str:
-    """Say on what the compensation error rests, beside what the noise alone predicts."""
-    sources = ["predicted by the noise: {:.4f} N, {:.5f} N·m".format(*result.predicted_error())]
+    """Return how the compensation error was determined, and the error predicted from the noise alone."""
+    sources = ["predicted from the noise: {:.4f} N, {:.5f} N·m".format(*result.predicted_error())]
     if result.motion is None and not result.noise_explains:
         why = "the noise was not measured" if result.p_value is None else "the residuals exceed the noise"
         sources.append(f"cross-validated, because {why}")
@@ -92,21 +92,21 @@ def conclusion(
     hinted: bool = True,
     every: bool = False,
 ) -> list[TextLine]:
-    """Return what a result comes to: first its compensation error, then what to know and what to do.
+    """Return the conclusion of a result: compensation error, findings and what to do.
 
-    Without `every` it has the first of the findings of each code that ask for something, three at most, so that
-    verdict and next command stay on one screen.
+    Without `every`, include at most three findings that need an action, one per code, so that verdict and next command
+    stay on one screen.
 
     Parameters
     ----------
     result : CalibrationResult
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Poses are named by their orientation, and bad fits are explained.
+        Names of the poses, and explanations of bad fits.
     hinted : bool
-        Return what a user should check in the cell.
+        Include hints about what to check in the cell.
     every : bool
-        Return also what needs no action: all findings, residuals, what sigma includes.
+        Include everything: all findings, residuals, contents of sigma.
     """
     lines = [TextLine("", f"compensation error {error_in_words(result)}")]
     if every:
@@ -156,29 +156,29 @@ def _drift_lines(result: CalibrationResult, drift: DriftCheck | None, *, every: 
 
 
 def _two_digits(value: float) -> str:
-    """Write two digits, without an exponent; a drift of one quantity alone is zero in the other but for rounding."""
+    """Return the value with two digits, without an exponent; rounding errors as 0."""
     return "0" if value < _ROUNDING else to_place_of(value, value)
 
 
 def sensor_in_words(result: CalibrationResult) -> str:
-    """Say on what the errors of the sensor under contact rest."""
+    """Return the source of the sensor errors under contact."""
     sensor = result.sensor
     if sensor is None or sensor.source == "assumed":
         return "assumed, not measured"
     if sensor.source == "data sheet":
-        return "those of the data sheet"
+        return "from the data sheet"
     made = sensor.provenance.get("created_utc")
     return "known from loads" + (f", sensor.json of {made[:16].replace('T', ' ')}" if isinstance(made, str) else "")
 
 
 def contact_in_words(result: CalibrationResult) -> str:
-    """Describe the sigma of a contact at the tip, and on what it rests."""
+    """Return sigma of a contact force at the tip, and its source."""
     sigma_N = float(force_sigma_at_tip(result))
     return f"{CONTACT_N:g} N at the tip ± {sigma_N:.2g} N (1 sigma); errors of the sensor are {sensor_in_words(result)}"
 
 
 def drift_in_use(result: CalibrationResult) -> str | None:
-    """Describe how the bias moves after the last pose, at which the result has it; None without drift, or in motion."""
+    """Return how the bias changes after the last pose; None without drift, and in motion."""
     growth = np.array(result.quality.get("bias_growth_per_min", ()))
     if result.mean_bias is None or not growth.size:
         return None
@@ -186,11 +186,11 @@ def drift_in_use(result: CalibrationResult) -> str | None:
         "{} N, {} N·m".format(*(_two_digits(float(np.linalg.norm(part))) for part in np.split(values, 2)))
         for values in (result.parameters.bias - result.mean_bias, growth)
     )
-    return f"the result has the bias of the last pose, {off} off the mean; it moves {grow} a minute"
+    return f"the result has the bias of the last pose, {off} from the mean; it changes by {grow} per minute"
 
 
 def _poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
-    """Describe the worst pose, by its name or number, and the cross-validation; None without these figures."""
+    """Return the worst pose, by name or number, and the cross-validation; None without these figures."""
     quality = result.quality
     if not quality:
         return None
@@ -203,7 +203,7 @@ def _poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str
 
 
 def truth_in_words(result: CalibrationResult, truth: Mapping[str, Any]) -> str:
-    """Describe what a free tool of a known cell reads after compensation, and before."""
+    """Return the reading of a free tool in a known cell after compensation, and before."""
     left = compensation_error(result, truth)
     return (
         f"a free tool reads {left['force_rms_N']:.4f} N, {left['torque_rms_Nm']:.5f} N·m rms; "
@@ -212,7 +212,7 @@ def truth_in_words(result: CalibrationResult, truth: Mapping[str, Any]) -> str:
 
 
 def residuals_in_words(result: CalibrationResult) -> str:
-    """Describe the residuals of the fit."""
+    """Return the residuals of the fit as text."""
     residual = result.to_dict()["residual"]
     return (
         f"force {residual['force_rms_N']:.4f} N rms, {residual['force_max_N']:.4f} max; "
@@ -221,7 +221,7 @@ def residuals_in_words(result: CalibrationResult) -> str:
 
 
 def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
-    """Describe the change of the first pose at the end; True if it exceeds the noise."""
+    """Return the change of the first pose when repeated at the end, and whether it exceeds the noise."""
     worst = float(np.max(np.abs(drift.change) / drift.sigma))
     force_N, torque_Nm = np.linalg.norm(drift.change[:3]), np.linalg.norm(drift.change[3:])
     apart_s = abs(drift.elapsed_s)
@@ -238,22 +238,22 @@ def drift_in_words(drift: DriftCheck) -> tuple[str, bool]:
 
 
 def verification_in_lines(verified: Verified, *, every: bool = False) -> list[TextLine]:
-    """Return the largest differences with the limits that decide, then what has changed, and what to do."""
+    """Return the lines of a verification: largest differences with the limits, the changes, and what to do."""
     found = verified.verification
     lines = [TextLine("", _verdict_in_words(verified))]
     lines += [] if found.passed else [TextLine("   ", found.reason, "yellow")]
     lines += [TextLine(" ? ", finding.words, "yellow") for finding in find_moved(verified.records)]
     lines += _first_pose_again(verified.drift, every=every)
     if not verified.passed and found.passed:
-        words = "Nothing has changed: the differences agree with their sigma. Average longer, or raise the limit."
+        words = "No significant change: the differences agree with their sigma. Average longer, or raise the limit."
         lines.append(TextLine("   ", words, "yellow"))
     elif not verified.passed and verified.update is None:
-        lines.append(TextLine("   ", "No update makes up for the change: calibrate again.", "yellow"))
+        lines.append(TextLine("   ", "No update corrects the change: calibrate again.", "yellow"))
     return [*lines, TextLine(" Saved ", str(verified.path))]
 
 
 def _verdict_in_words(verified: Verified) -> str:
-    """Describe the largest differences, and the limits that decide."""
+    """Return the largest differences, and the limits."""
     words = f"largest difference {_two_digits(verified.force_N.max())} N, {_two_digits(verified.torque_Nm.max())} N·m"
     limits = zip(verified.limits, ("N", "N·m"), strict=True)
     if given := [f"{limit:g} {unit}" for limit, unit in limits if limit is not None]:

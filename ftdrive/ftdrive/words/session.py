@@ -1,4 +1,4 @@
-"""A session and a push in words: what is planned, asked, estimated, changed; and the state that a face shows."""
+"""Texts about a session and a push: plan, questions, estimates, changes; and `SessionView`, the state to show."""
 
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -36,7 +36,7 @@ from ftdrive.words.result import drift_in_words
 from ftdrive.words.text import TextLine
 from ftdrivers.interfaces import ControllerSettings
 
-# Label and unit, factor from SI, name, and rank in `frame`: higher ranks are omitted first.
+# Label with unit, factor from SI, name, and rank on the screen: higher ranks are omitted first.
 ESTIMATES = (
     ("mass kg", 1.0, "mass_kg", 1),
     ("centre mm", 1e3, "p_sensor_com_m", 2),
@@ -47,10 +47,10 @@ ESTIMATES = (
     ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
 )
 _NUMBER_WIDTH = 9
-# A standard deviation below this, N or N·m, comes from rounding: its value was not fitted.
+# A smaller standard deviation, N or N·m, is a rounding error of a value that was not fitted.
 _ROUNDED = 1e-9
 OFF_SIGMA = 5.0
-"""A pose that differs by more is out of line."""
+"""A pose that differs by more standard deviations is an outlier."""
 
 _ASCII = str.maketrans(
     dict(zip("┌┐└┘├┤┬┴┼─│━", "+++++++++-|=", strict=True))
@@ -59,10 +59,10 @@ _ASCII = str.maketrans(
 
 
 class SessionText:
-    """Turns events into lines, in sections with headings; `poses` have a line each, unless a screen shows them already.
+    """Converts events to lines, in sections with headings; without `poses`, the poses get no lines.
 
-    `verbose` adds a line for each check, the table of the plan, and the estimate after each pose. Otherwise passed
-    checks share one line, and the plan has three.
+    `verbose` adds a line per check, the table of the plan, and the estimate after each pose. Otherwise passed checks
+    share one line, and the plan has three lines.
     """
 
     def __init__(self, *, verbose: bool = False, poses: bool = True) -> None:
@@ -72,7 +72,7 @@ class SessionText:
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[TextLine]:
-        """Return the lines to print for an event, those that waited for it first."""
+        """Return the lines to print for an event, after those that waited for it."""
         if isinstance(event, Checked) and event.passed and not self._verbose:
             heading = [] if self._passed else self._heading("Checks")
             self._passed.append(event.name)
@@ -83,7 +83,7 @@ class SessionText:
         return waiting + self._heading_before(event) + body
 
     def pending(self) -> list[TextLine]:
-        """Return the line of the checks that have passed so far."""
+        """Return the line with the checks passed so far."""
         passed, self._passed = self._passed, []
         return [TextLine(" ✔ ", ", ".join(passed), "green")] if passed else []
 
@@ -94,7 +94,7 @@ class SessionText:
                 return self._heading("Plan")
             case Checked():
                 return self._heading("Checks")
-            # a run that is continued is opened before its plan is known
+            # a resumed run is opened before its plan is known
             case RunOpened() if not self._sections:
                 return []
             case RunOpened() | PoseTaken() | StateChanged(state=State.APPROACH | State.MOVE | State.SWEEP):
@@ -103,7 +103,7 @@ class SessionText:
                 return []
 
     def _heading(self, name: str) -> list[TextLine]:
-        """Print each heading once: checks after a stop belong to the tour."""
+        """Return each heading once, because checks after a stop belong to the tour."""
         if name in self._sections:
             return []
         self._sections.append(name)
@@ -153,18 +153,18 @@ def _plan_in_brief(plan: Plan) -> tuple[str, str]:
 
 
 def in_words(event: Event) -> str:
-    """Return all words of an event: a plan in many lines, others in one. Empty for events that only a screen shows."""
+    """Return the text of an event: several lines for a plan, else one; empty for events that only a screen shows."""
     return "".join(_head_and_words(event))
 
 
 def _head_and_words(event: Event) -> tuple[str, str]:
-    """Return the mark an event begins with, under which its lines are not continued, and its words."""
+    """Return the mark at the start of an event's text, under which its lines are not indented, and the text."""
     match event:
         case RunOpened():
             return "", f"kept in {event.folder}" + (
                 f"; after a stop, continue with\n{event.resume}" * bool(event.resume)
             )
-        case StateChanged(state=State.HOLD):  # repeats the words of STOP
+        case StateChanged(state=State.HOLD):  # also describes STOP
             return "", f"{event.state.upper()}: {event.words}"
         case StateChanged(state=State.PREFLIGHT | State.APPROACH | State.SWEEP | State.CLOSE):
             return "", f"{event.state}{': ' if event.words else ''}{event.words}"
@@ -199,7 +199,7 @@ def _event_sentence(event: Event) -> str:
 
 
 def pose_in_words(event: PoseTaken) -> str:
-    """Describe an average, by the number of its orientation."""
+    """Return the text of an averaged pose, with the number of its orientation."""
     force_N, torque_Nm = rms_sigma(event.sigma)
     flags = [*["NOT STEADY"] * (not event.steady), *[f"{event.attempts} attempts"] * (event.attempts > 1)]
     settled = f"settled {event.settle_s:.1f} s, {event.samples} samples in {event.average_s:.1f} s"
@@ -217,10 +217,10 @@ def _estimate_in_words(event: Estimated) -> str:
 
 
 def residual_in_words(event: Estimated) -> str:
-    """Describe how far the newest pose was from the fit before it; empty without one."""
+    """Return the residual of the newest pose from the previous fit; empty without one."""
     if event.residual_sigma is None or event.residual_force_N is None:
         return ""
-    return f"{event.residual_force_N:.3f} N from the fit before, {event.residual_sigma:.1f} sigma"
+    return f"{event.residual_force_N:.3f} N from the previous fit, {event.residual_sigma:.1f} sigma"
 
 
 def _comparison_in_words(event: Compared) -> str:
@@ -230,13 +230,13 @@ def _comparison_in_words(event: Compared) -> str:
 
 
 def differences(event: Compared) -> tuple[str, str, str]:
-    """Return how far a pose is from the prediction, ± one sigma expected, N and N·m, and the largest in sigmas."""
+    """Return the differences of a pose from the prediction ± expected sigma, N and N·m, and the largest in sigmas."""
     (N, Nm), (N_sigma, Nm_sigma) = (np.linalg.norm(six.reshape(2, 3), axis=1) for six in (event.residual, event.sigma))
     return f"{N:.3f} ± {N_sigma:.3f}", f"{Nm:.4f} ± {Nm_sigma:.4f}", f"{sigmas_of(event):.1f}"
 
 
 def sigmas_of(event: Compared) -> float:
-    """Largest of the six differences over its standard deviation."""
+    """Return the largest of the six differences divided by its standard deviation."""
     return float(np.max(np.abs(event.residual) / event.sigma))
 
 
@@ -244,10 +244,10 @@ _LEVEL_DEG = 0.05
 
 
 def proposal_in_lines(push: Push) -> list[str]:
-    """Return the controller's values beside the new ones, and what speaks for and against the change."""
+    """Return the lines with old and new values of the controller, and the reasons for and against the change."""
     lines = _push_table(push)
     if (restored := push.reason.get("restores")) is not None:
-        lines.append(f"The new values are the old ones of {restored}.")
+        lines.append(f"The new values restore those before {restored}.")
     if push.load is not None and push.new.mass_kg is not None:
         lines += _payload(push, push.load)
     before_kg = push.reason.get("payload_at_calibration_kg")
@@ -294,7 +294,7 @@ def _payload(push: Push, load: FlangeLoad) -> list[str]:
 
 
 def settings_in_words(settings: ControllerSettings | None) -> str:
-    """Return what a controller reports."""
+    """Return the payload and gravity that a controller reports."""
     if settings is None or settings.mass_kg is None:
         return "the controller does not report its payload: compare it at the pendant"
     up = "" if settings.up_base_m_s2 is None else f", gravity {_format_vector(settings.up_base_m_s2, '.3f')} m/s²"
@@ -322,27 +322,27 @@ def _format_vector(value: ArrayLike | None, form: str, scale: float = 1.0) -> st
 
 @dataclass
 class SessionView:
-    """The state that the screen draws."""
+    """State of a session, as screen and page show it."""
 
     command: str = "calibrate"
     now: StateChanged | None = None
     since_s: float = 0.0
-    """Start of the state, in the clock of `frame`."""
+    """Start time of the state, on the clock of the screen."""
     folder: str = ""
     resume: str = ""
     taken: dict[int, tuple[PoseTaken, float]] = field(default_factory=dict)
-    """By stop, with the time."""
+    """Poses and their times by stop."""
     last: PoseTaken | None = None
     estimated: Estimated | None = None
     compared: dict[int, Compared] = field(default_factory=dict)
-    """By stop, in a verification."""
+    """Comparisons by stop, in a verification."""
     drift: DriftCheck | None = None
     note: Noted | GuardTripped | None = None
     tripped: bool = False
-    """A guard has stopped the arm, and STOP and HOLD repeat its words."""
+    """Whether a guard has stopped the arm; STOP and HOLD then repeat its text."""
     waiting: tuple[Key, ...] = ()
     ascii_only: bool = False
-    """The terminal's encoding is ASCII."""
+    """Whether the terminal's encoding is ASCII."""
     keys: Literal["live", "asking", "over"] = "live"
     """Whether keys are read now."""
 
@@ -366,12 +366,12 @@ class SessionView:
                 self.note, self.tripped = event, True
 
     def shown(self, text: str) -> str:
-        """Replace what the terminal's encoding lacks, which lengthens the text: call it before measuring or cutting."""
+        """Return text in the terminal's encoding; this can lengthen it, so call it before measuring or cutting."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     @property
     def kept(self) -> int:
-        """How many poses are kept; of a run that was resumed only the fit knows them all."""
+        """Number of stored poses; for a resumed run, only the fit knows all of them."""
         return max(len(self.taken), self.estimated.poses if self.estimated else 0)
 
     def _take(self, event: PoseTaken, now_s: float) -> None:
@@ -384,26 +384,26 @@ class SessionView:
 
 
 def progress_in_words(view: SessionView, now_s: float) -> str:
-    """Return how many poses are kept, and how long the others take, in the clock of `SessionView.since_s`."""
+    """Return the number of stored poses and the remaining time, on the clock of `SessionView.since_s`."""
     times_s = sorted(at_s for _, at_s in view.taken.values())
     kept = view.kept
     left = view.last.stops - kept if view.last else 0
     if len(times_s) <= 2 or left <= 0:
         return f"{kept} kept"
-    # a stop with questions takes longer than usual
+    # median, because a stop with questions takes longer
     usual_s = median(b - a for a, b in pairwise(times_s))
-    # a hold does not shorten the rest
+    # during a hold, the remaining time does not shrink
     rest_s = usual_s * left - min(now_s - times_s[-1], usual_s)
     return f"{kept} kept, about {_minutes(rest_s)} left"
 
 
 def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
-    """Return where a session is, such as "pose 3/24 R05", its state with how long it lasts, and words about it."""
+    """Return the position in the session, such as "pose 3/24 R05", its state with duration, and a text about it."""
     now = view.now
     if now is None:
         return "", "recording" if view.folder else "starting", ""
     if view.keys == "asking" and now.state in {State.MOVE, State.SETTLE, State.SAMPLE}:
-        # the motion before the question is over
+        # the motion before the question is complete
         return "", "WAITS for an answer", ""
     where = "" if now.stop is None else f"pose {now.stop}" + (f"/{now.stops}" if now.stops is not None else "")
     where += f" R{now.number:02d}" if where and now.number is not None else ""
@@ -412,7 +412,7 @@ def state_in_words(view: SessionView, now_s: float) -> tuple[str, str, str]:
 
 
 def coverage_in_words(fit: Estimated) -> str:
-    """Describe how well the orientations so far determine the result, beside its light."""
+    """Return how well the orientations so far determine the result."""
     words = ""
     for name, what in (("cond9", "condition"), ("cond_u1", "out of plane")):
         value, goal = getattr(fit, name), GREEN[name]
@@ -423,7 +423,7 @@ def coverage_in_words(fit: Estimated) -> str:
 
 
 def drift_so_far(view: SessionView) -> TextLine:
-    """Describe the drift of the bias since the first pose, as the fit has it or as the first pose measured again."""
+    """Return the drift of the bias since the first pose, from the fit or from the repeated first pose."""
     fit = view.estimated
     if view.drift is not None:
         words, bad = drift_in_words(view.drift)
@@ -446,7 +446,7 @@ def drift_so_far(view: SessionView) -> TextLine:
 
 
 def rounded_estimate(fit: Estimated | None, factor: float, name: str) -> tuple[list[str], str]:
-    """Return the values of an estimate times `factor`, and their largest sigma; nothing before there is a fit."""
+    """Return the values of an estimate times `factor`, and their largest sigma; empty before the first fit."""
     if fit is None or name not in fit.values:
         return [], ""
     value: ArrayLike = fit.values[name]

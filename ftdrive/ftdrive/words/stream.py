@@ -24,26 +24,26 @@ from ftdrive.stream.stream import RECOVER_S
 from ftdrivers.interfaces import NOT_REPORTED, Array
 
 _MOST_NOTES = 200
-# Events whose time the plots show; contact has a colour, and a change of frame clears them.
+# Events that plots mark; contacts have a colour, and a change of frame clears the plots.
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
-# Fewer sigmas may be noise, which has neither a direction nor a line of action.
+# Values below this number of sigmas may be noise, which has no direction and no line of action.
 _SIGNIFICANT = 4.0
-# A command whose output nothing takes does not read the stream; a busy computer stops it for less.
+# If a command's output is blocked for longer than this, s, it does not read the stream.
 _HELD_S = 2.0
 CONTACT, FREE, NOISE_UNKNOWN, WAITING = "contact", "free", "noise not known yet", "waiting for the first sample"
-"""What `state` returns."""
-# The scale of a still tool, so that noise looks like noise.
+"""Results of `state`."""
+# Smallest full scale in sigmas, so that the plot of a still tool shows noise as noise.
 _LEAST_FULL_SIGMA = 10.0
-# A larger test value is not shown. A larger limit follows from an estimate of the noise that is worth nothing yet.
+# Larger test values and limits are not shown: such a limit comes from an unusable noise estimate.
 _MOST_CHI2 = 1e5
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
-# A delay between the links that is less certain is still the assumed one.
+# Delay estimates with a larger sigma are shown as not measured, s.
 _MEASURED_S = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownWrench:
-    """The mean of the last 0.1 s of samples."""
+    """Mean of the samples of the last 0.1 s."""
 
     t_host_ns: int
     wrench: Array
@@ -51,47 +51,47 @@ class ShownWrench:
     raw: Array
     """(6,) N and N·m, sensor axes, about the sensor origin."""
     raw_in_frame: Array
-    """(6,) the same in `frame`."""
+    """(6,) the raw wrench in `frame`."""
     sigma: Array
-    """(6,) of `wrench`: noise, calibration, sensor under this contact; NaN until the noise is known."""
+    """(6,) sigma of `wrench`: noise, calibration and sensor under this contact; NaN until the noise is known."""
     rest_sigma: Array
-    """(6,) the same of a free tool."""
+    """(6,) sigma of the mean for a free tool."""
     sample_sigma: Array
-    """(6,) of one sample of a free tool."""
+    """(6,) sigma of one sample for a free tool."""
     chi2: float
     """Squared distance of the newest sample from a free tool."""
     in_contact: bool
     R_base_flange: Array
     p_base_flange_m: Array
-    """(3,) NaN where unknown."""
+    """(3,) position of the flange; NaN where unknown."""
     q_rad: Array
-    """(6,) NaN where unknown."""
+    """(6,) joint angles; NaN where unknown."""
     frame: WrenchFrame
     stages: Stages
 
     def size(self, first: int) -> tuple[float, float]:
-        """Return the size of the force (`first` 0) or the torque (3), and its sigma: that along its direction."""
+        """Return the norm of the force (`first` 0) or the torque (3), and sigma along its direction."""
         part, sigma = self.wrench[first : first + 3], self.sigma[first : first + 3]
         size = float(np.linalg.norm(part))
         return size, float(np.linalg.norm(part * sigma)) / size if size else float(sigma.max())
 
     def is_significant(self, first: int) -> bool:
-        """Whether the force (`first` 0) or the torque (3) is more than noise; it is not before the noise is known."""
+        """Whether the force (`first` 0) or the torque (3) exceeds the noise; False until the noise is known."""
         size, sigma = self.size(first)
         return size > _SIGNIFICANT * sigma
 
 
 @dataclass(slots=True, eq=False)
 class Peaks:
-    """Extremes since the last reset."""
+    """Extremes of the wrench since the last reset."""
 
     low: Array = field(default_factory=lambda: np.full(6, np.inf))
     high: Array = field(default_factory=lambda: np.full(6, -np.inf))
     sizes: Array = field(default_factory=lambda: np.zeros(2))
-    """(2,) of force and torque, N and N·m."""
+    """(2,) largest norms of force and torque, N and N·m."""
 
     def add(self, wrench: Array) -> None:
-        """Take samples (n, 6) into account."""
+        """Add samples (n, 6)."""
         np.minimum(self.low, wrench.min(axis=0), out=self.low)
         np.maximum(self.high, wrench.max(axis=0), out=self.high)
         np.maximum(self.sizes, np.linalg.norm(wrench.reshape(-1, 2, 3), axis=2).max(axis=0), out=self.sizes)
@@ -99,39 +99,39 @@ class Peaks:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """The state that the screen draws."""
+    """The state of a stream to show."""
 
     info: StreamInfo
     status: StreamStatus
     reading: ShownWrench | None
-    """None before the first sample."""
+    """Newest mean; None before the first sample."""
     silent: str
-    """Which device is silent, and what to do; empty while numbers are fresh."""
+    """The device without new samples, and what to do; empty while samples arrive."""
     peaks: Peaks
     contact_s: float
-    """Duration of the present contact."""
+    """Duration of the present contact, s."""
     notes: Sequence[FeedNote]
-    """Newest first."""
+    """Notes, newest first."""
     checks: Sequence[Check]
     columns: Callable[[int], PlotColumns]
-    """The recent past in that many columns."""
+    """Function that returns the recent past in a number of columns."""
     recording_s: float | None
-    """Duration of the recording; None without one."""
+    """Duration of the recording, s; None if none is running."""
     is_frozen: bool = False
     can_push: bool = False
-    """Whether the tool is emulated, so that a key can push it."""
+    """Whether a key can push the tool, because it is emulated."""
     replay: RecordingSource | None = None
     calibrated: Array | None = None
-    """(n, 3) directions of gravity in flange axes at the calibrated orientations, as unit vectors; None: unknown."""
+    """(n, 3) unit vectors of gravity in flange axes at the calibrated orientations; None if unknown."""
 
     @property
     def live(self) -> ShownWrench | None:
-        """The reading; None while a device is silent too, because an old number is never shown as live."""
+        """The newest mean; None while a device is silent, because an old value must not look current."""
         return None if self.silent else self.reading
 
     @property
     def used_range(self) -> tuple[float, str] | None:
-        """The largest used share of the sensor's range and its axis; None without a known range or a sample."""
+        """Largest used share of the sensor's range and its axis; None without a known range or a sample."""
         fact = self.info.sensor.facts.get("range")
         if fact is None or not isinstance(fact.value, tuple) or self.reading is None:
             return None
@@ -144,7 +144,7 @@ class View:
         return float(shares[worst]), AXES[worst]
 
     def in_line(self, *, timed: bool) -> str:
-        """Return the wrench with its axes, as measured without a calibration; `timed` adds time and contact."""
+        """Return the wrench, raw without a calibration, and its axes as a line; `timed` adds time and contact."""
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
         wrench = reading.raw_in_frame if is_raw else reading.wrench
@@ -154,7 +154,7 @@ class View:
         return f"{reading.t_host_ns * 1e-9:.1f} s   {line}{contact}" if timed else line
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what a program reads of a state with a reading; no wrench while a device is silent."""
+        """Return the state as JSON; without a wrench while a device is silent."""
         status, calibration, verification = self.status, self.info.result, self.info.verification
         reading, is_raw = self.reading, self.info.is_raw
         assert reading is not None  # noqa: S101 - there is one from the first sample on
@@ -189,9 +189,9 @@ class View:
 
 
 class StreamSummary:
-    """Sums up what a `Feed` has read, with findings to show.
+    """Summarises the data of a `Feed`, with `checks` to show.
 
-    `dataset` has the poses of the calibration, where they are known: the noise at rest is compared with theirs.
+    The noise at rest is compared with that in `dataset`, the poses of the calibration.
     """
 
     def __init__(self, feed: Feed, checks: Sequence[Check] = (), dataset: CalibrationDataset | None = None) -> None:
@@ -201,7 +201,7 @@ class StreamSummary:
         self._new_blocks, self._new_notes = feed.subscribe()
         self._found, self._checks = deque(checks), list[Check]()
         self._histories = {span_s: History(span_s) for span_s in SPANS_S}
-        # The samples of the mean.
+        # Samples of the newest mean.
         self._recent: Block | None = None
         self._peaks = Peaks()
         self._contact_since_ns = 0
@@ -212,11 +212,11 @@ class StreamSummary:
             self._calibrated = feed.stream.info.calibration.parameters.down @ dataset.R_base_flange
 
     def reset_peaks(self) -> None:
-        """Forget the extremes."""
+        """Reset the extremes."""
         self._peaks = Peaks()
 
     def view(self) -> View:
-        """Take what is new and return the state to draw."""
+        """Take new blocks and notes, and return the state to show."""
         feed = self._feed
         while self._found:
             self._checks.append(check := self._found.popleft())
@@ -250,7 +250,7 @@ class StreamSummary:
         )
 
     def views(self, *, raises: bool = False) -> Iterator[View]:
-        """Read, and yield each `MEAN_S` from when the noise is known; a failure raises at once, or if it lasts."""
+        """Read, and yield a view per `MEAN_S` once the noise is known; raise a failure at once, or after a time-out."""
         feed, stream = self._feed, self._feed.stream
         begin_ns: int | None = None
         is_known = False
@@ -271,7 +271,7 @@ class StreamSummary:
                     yield view
 
     def lines(self, *, once: bool, as_json: bool) -> Iterator[str]:
-        """Yield a line or a JSON object of each of the `views`; with `once` of the first only."""
+        """Yield each of the `views` as a line or JSON object; with `once` only the first."""
         for view in islice(self.views(raises=once), 1 if once else None):
             yield json.dumps(view.to_dict()) if as_json else view.in_line(timed=not once)
 
@@ -289,7 +289,11 @@ class StreamSummary:
             if link.error or link.age_s > STALE_S:
                 return f"{device.model}: {link.error or f'no sample for {link.age_s:.1f} s'}"
         waits_s = (feed.stream.clock.now_ns() - feed.turned_ns) * 1e-9
-        return f"nothing was read for {waits_s:.0f} s: does anything take what it prints?" if waits_s > _HELD_S else ""
+        return (
+            f"no samples were read for {waits_s:.0f} s, because the output is blocked: check its reader"
+            if waits_s > _HELD_S
+            else ""
+        )
 
     def _reading(self) -> ShownWrench | None:
         if (recent := self._recent) is None:
@@ -326,7 +330,7 @@ class StreamSummary:
                 for history in self._histories.values():
                     history.clear()
         rows = Block.concatenate([before, block]) if before is not None and goes_on else block
-        # A recording that has gone back has later samples before these.
+        # After a jump back in a recording, earlier samples have later times.
         since_ns = t_ns[-1] - round(MEAN_S * 1e9)
         self._recent = rows.rows((since_ns < rows.t_host_ns) & (rows.t_host_ns <= t_ns[-1]))
         self._peaks.add(block.wrench)
@@ -334,11 +338,11 @@ class StreamSummary:
             history.add(t_ns, block.wrench, in_contact)
 
 
-# ------------------------------------------------------------------------------------------------------------ in words
+# --------------------------------------------------------------------------------------------------------------- texts
 
 
 def state(view: View) -> tuple[str, str]:
-    """Name the state of a stream that delivers, with the test of contact; `View.silent` says why one does not."""
+    """Return the state of a stream with samples, and its contact test."""
     if (reading := view.reading) is None:
         return WAITING, ""
     if np.isnan(reading.chi2) or view.status.contact_limit > _MOST_CHI2:
@@ -348,7 +352,7 @@ def state(view: View) -> tuple[str, str]:
 
 
 def meaning(view: View) -> str:
-    """Return what is left in the wrench after the stages; nothing before the first sample."""
+    """Return what the wrench contains after the stages; empty before the first sample."""
     if view.reading is None:
         return ""
     stages = view.reading.stages
@@ -360,7 +364,7 @@ def meaning(view: View) -> str:
 
 
 def name_devices(info: StreamInfo) -> str:
-    """Name arm, sensor and tool."""
+    """Return the names of arm, sensor and tool."""
     serial = "" if info.sensor.serial == NOT_REPORTED else f" {info.sensor.serial}"
     return " · ".join(filter(None, [info.arm.model, info.sensor.model + serial, info.tool]))
 
@@ -377,7 +381,7 @@ def _point_name(frame: WrenchFrame) -> str:
 
 
 def direction(reading: ShownWrench, first: int) -> str:
-    """Return where the force (`first` 0) points to, or what the torque (3) turns about; empty for noise."""
+    """Return the direction of the force (`first` 0) or the axis of the torque (3); empty for noise."""
     if not reading.is_significant(first):
         return ""
     axes, vector = str(reading.frame).partition(", ")[0], reading.wrench[first : first + 3]
@@ -386,7 +390,7 @@ def direction(reading: ShownWrench, first: int) -> str:
 
 
 def line_of_force(reading: ShownWrench | None) -> str:
-    """Return where the line of the contact force passes the reference point; empty for noise."""
+    """Return where the line of action of the contact force passes the reference point; empty for noise."""
     if reading is None or not reading.in_contact or not reading.is_significant(0):
         return ""
     force, torque = reading.wrench[:3], reading.wrench[3:]
@@ -403,12 +407,12 @@ def _utc(info: StreamInfo, t_host_ns: int) -> datetime:
 
 
 def time_of_day(info: StreamInfo, t_host_ns: int) -> str:
-    """Return a time of the stream as that of a clock on the wall."""
+    """Return a time of the stream as local time of day."""
     return _utc(info, t_host_ns).astimezone().strftime("%H:%M:%S")
 
 
 def calibration_in_words(view: View) -> list[tuple[str, str]]:
-    """Return id, verdict, age and last verification of the calibration, each with "good", "warning", "bad" or none."""
+    """Return id, verdict, age and last verification of the calibration, each with "good", "warning", "bad" or ""."""
     calibration, found = view.info.result, view.info.verification
     if calibration is None:
         return [("sensor alone: no arm, no calibration", "warning")]
@@ -424,7 +428,7 @@ def calibration_in_words(view: View) -> list[tuple[str, str]]:
 
 
 def bias_in_words(view: View) -> list[str]:
-    """Return the tare, and the drift or what is tracked of bias and part."""
+    """Return the tare, and the drift or the tracked bias and part."""
     status, words = view.status, list[str]()
     if status.tare is not None and status.tare_t_host_ns is not None:
         force_N = float(np.linalg.norm(status.tare[:3]))
@@ -440,12 +444,12 @@ def bias_in_words(view: View) -> list[str]:
 
 
 def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
-    """Return rate, losses and age of a device's samples, and of the arm by how much the wrench is later."""
+    """Return rate, losses and age of a device's samples, and for the arm the delay of the wrench."""
     nominal = "" if np.isnan(link.nominal_rate_Hz) else f" of {link.nominal_rate_Hz:.0f}"
     age = f"{1e3 * link.age_s:.0f} ms" if link.age_s < 1 else f"{link.age_s:.1f} s"
     sigma_s, delay = view.status.delay_sigma_s, f"delay {1e3 * view.status.delay_s:.1f}"
     delay += f" ± {1e3 * sigma_s:.1f} ms" if sigma_s else " ms, set"
-    if link is view.status.sensor or view.replay is not None:  # a recording has no delay any more
+    if link is view.status.sensor or view.replay is not None:  # a recording is aligned already
         delay = ""
     elif sigma_s >= _MEASURED_S:
         delay = "delay not measured yet"
@@ -453,7 +457,7 @@ def link_in_words(view: View, link: LinkStatus) -> tuple[str, str, str, str]:
 
 
 def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
-    """Return the wrench with fewer stages and in other frames; None where a frame is not configured."""
+    """Return the wrench with fewer stages and in other frames; None where a frame needs a missing setting."""
     if (reading := view.reading) is None or view.info.is_raw:
         return []
     calibration, raw, R, now = view.info.calibration, reading.raw, reading.R_base_flange, reading.frame
@@ -471,7 +475,7 @@ def other_wrenches(view: View) -> list[tuple[str, Array | None]]:
 
 
 def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) -> float:
-    """Return a round full scale for three components: the recent extremes fit, and noise alone stays small."""
+    """Return a round full scale for three components that fits the recent extremes and keeps noise small."""
     rows = slice(first, first + 3)
     largest = np.abs([columns.low[rows], columns.high[rows]])
     sigma = np.zeros(3) if reading is None else np.nan_to_num(reading.sample_sigma[rows])

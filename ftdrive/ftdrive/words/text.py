@@ -1,4 +1,4 @@
-"""Text for any reader: names that cannot command a terminal, and commands as they are typed."""
+"""Texts that are safe on any terminal, and commands in the form to type."""
 
 import os
 import re
@@ -36,30 +36,30 @@ COMMANDS: Final[Mapping[str, str]] = {
     "transcript": "Record or play the bytes on a sensor's wire.",
     "completion": "Print the completion of a shell: bash, zsh or fish.",
 }
-"""A command, whose module is `ftdrive.commands.NAME`, and its line in the help."""
+"""Help line of each command, by the name of its module in `ftdrive.commands`."""
 _COMMAND = re.compile(rf"(?<![\w./-])(?<!uv run )ftdrive (?=(?:{'|'.join(COMMANDS)}|help)\b|--)")
 GLUE: Final = "\ue000"
-"""A space where no line of help or of a table ends: of private use, so no message has one."""
+"""A space at which lines of help or tables are not broken; a private-use character, so no message contains it."""
 
 
 def as_typed(text: str) -> str:
-    """Return a message whose commands begin with `uv run` if this program was started so: nothing else would work."""
+    """Return a message with `uv run` before its commands if this program was started by `uv run`."""
     return _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text  # uv run sets it
 
 
 def is_command(line: str) -> bool:
-    """Whether a line is a command and nothing else; it is never broken, so that it can be copied."""
+    """Whether a line is a command only; such a line is never broken, so that it can be copied."""
     return line.startswith(("ftdrive ", "uv run ftdrive "))
 
 
-# All but tab and the end of a line; with those that turn the direction of writing, and bytes that are no text.
+# Control characters except tab and newline, characters that change the writing direction, and undecodable bytes.
 _CONTROL = re.compile(
     "[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]|\r(?!\n)"
 )
 
 
 def visible(text: str) -> str:
-    r"""Return text with control characters as in a Python string, such as `\x1b`; safe on any screen.
+    r"""Return text with control characters escaped as in a Python string, such as `\x1b`.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def visible(text: str) -> str:
 
 
 def in_one_line(text: str) -> str:
-    r"""Return text with its newlines as `\n`, but for those before a command, so that a name cannot begin a line.
+    r"""Return text with newlines as `\n`, except before a command, so that a name cannot begin a line.
 
     Examples
     --------
@@ -84,10 +84,10 @@ def in_one_line(text: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class TextLine:
-    """A line of text."""
+    """A line of text with its style."""
 
     head: str
-    """A mark or indent; a folded line continues below the first word after it."""
+    """A mark or indent; a wrapped line continues below the first word after it."""
     words: str
     style: str = ""
-    """Style of rich, for a terminal with colour."""
+    """Style for rich, on a terminal with colour."""

@@ -1,4 +1,4 @@
-"""`ftdrive export`: plans and calibrations as files of other programs."""
+"""`ftdrive export`: write plans and calibrations for other programs."""
 
 from pathlib import Path
 
@@ -47,7 +47,12 @@ def _deliver(made: Made | None) -> None:
 )
 @_OUTPUT
 @click.option(
-    "--dwell", "dwell_s", type=Number(0, 600), default=4.0, show_default=True, help="Rest at each pose, s (urscript)."
+    "--dwell",
+    "dwell_s",
+    type=Number(0, 600),
+    default=4.0,
+    show_default=True,
+    help="Dwell time at each pose, s (urscript).",
 )
 @simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
 @JSON
@@ -65,7 +70,7 @@ def export_plan(
 
     check_simulate(simulate, real={"PLAN.json": path})
     if path is None and not simulate:
-        raise ConfigError("which plan? Give the file that `ftdrive plan --output` has written, or --simulate")
+        raise ConfigError("no plan: give a file of `ftdrive plan --output`, or --simulate")
     if path is not None:
         made = Plan.load(path)
     else:
@@ -77,16 +82,22 @@ def export_plan(
 
 
 @export_group.command()
-@click.option("--first", type=click.IntRange(24, 33), default=24, show_default=True, help="As `serve-load --first`.")
+@click.option(
+    "--first",
+    type=click.IntRange(24, 33),
+    default=24,
+    show_default=True,
+    help="First register, as for `serve-load --first`.",
+)
 @click.option("--example", is_flag=True, help="Append a program that weighs a part and sets the payload.")
 @_OUTPUT
-@simulate("Accepted for symmetry: the functions are the same.")
+@simulate("Accepted for consistency; the functions do not change.")
 @JSON
 def urscript(first: int, example: bool, output: Path | None, simulate: bool, as_json: bool) -> Made:  # noqa: ARG001
     """Write the functions with which a UR program uses `ftdrive serve-load`.
 
-    ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each waits with a time limit and
-    returns a state, never an old number.
+    The functions are ftd_zero, ftd_weigh, ftd_wrench, ftd_bias, ftd_alive, ftd_status and ftd_payload. Each has a
+    time-out and returns a state, never an old value.
     """
     from ftdrive.exports.urscript import functions
 

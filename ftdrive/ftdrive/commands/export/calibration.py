@@ -1,4 +1,4 @@
-"""`ftdrive export calibration`: the signs, units, order and frames of another program."""
+"""`ftdrive export calibration`: write a calibration with signs, units, order and frames of another program."""
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
@@ -15,7 +15,7 @@ from ftdrive.session.rehearsal import rehearsed_run
 from ftdrive.terminal.console import hanging, messages
 from ftdrive.terminal.screen import open_operator
 
-# Text, file to save it in, what stands before and after the file in the JSON, and whether to print that.
+# Text, new file, JSON before and after the file name, and whether to print JSON.
 Made = tuple[str, Path | None, Mapping[str, object], Mapping[str, object], bool]
 
 
@@ -36,7 +36,7 @@ def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
     metavar="NAME",
     required=True,
     type=click.Choice(list(FORMATS)),
-    help="Format, one of those that `ftdrive export formats` lists.",
+    help="Format, as listed by `ftdrive export formats`.",
 )
 @click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
 @_measured("--height", "height_mm", 500, "MM", "Height of the sensor's origin above the flange face.")
@@ -49,10 +49,10 @@ def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
 @_frame_option(
     "--base-frame",
     "base",
-    "Name of the controller's base frame; with base_link, vectors are turned by 180° about z, as in ROS.",
+    "Name of the controller's base frame; for base_link, vectors are turned by 180° about z, as in ROS.",
 )
 @_frame_option(
-    "--flange-frame", "tool0", "Name of the flange frame, z out; with flange, x points out, as in ROS-Industrial."
+    "--flange-frame", "tool0", "Name of the flange frame, with z out; for flange, x points out, as in ROS-Industrial."
 )
 @_frame_option("--sensor-frame", "ft_sensor", "Name of the sensor and its frame.")
 @_frame_option("--tool-frame", "tool", "Name of the tool and its frame.")
@@ -63,7 +63,7 @@ def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
     metavar="N",
     default=MAX_FORCE_ERROR_N,
     show_default=True,
-    help="Accept a target that cannot express everything if its force differs by no more, in any orientation.",
+    help="Largest accepted force error, in any orientation, of a target that cannot express everything.",
 )
 @FORCE
 @simulate("Export a calibration of an emulated cell.")
@@ -83,9 +83,9 @@ def calibration(
     as_json: bool,
     **frames: str,
 ) -> Made:
-    """Write a calibration for another program: RESULT is a calibration.json, RUN its folder.
+    """Write a calibration for another program; RESULT is a calibration.json, RUN its folder.
 
-    Signs, units, order and frames are those of the target. Notes on stderr say what must be set elsewhere, and what the
+    Signs, units, order and frames follow the target. Notes on stderr list what you must set elsewhere, and what the
     target cannot express. The text is not written if the force would be wrong by more than --max-force-error.
     """
     from ftdrive.exports import registry
@@ -95,7 +95,7 @@ def calibration(
 
     check_simulate(simulate, real={"RESULT": source}, emulated={"--sensor": sensor})
     if source is None and not simulate:
-        raise ConfigError("which calibration? Give a calibration.json or its run folder, or --simulate")
+        raise ConfigError("no calibration: give a calibration.json or its run folder, or --simulate")
     with rehearsed_run(open_operator(), sensor) if source is None else nullcontext(source) as path:
         result = read_calibration(path, accept_edited=force)
         recorded_height_mm, recorded_mass_kg = recorded_sensor(path, result)

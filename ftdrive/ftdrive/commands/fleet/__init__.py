@@ -1,1 +1,1 @@
-"""`ftdrive fleet`: many cells, from the store that all of them share."""
+"""`ftdrive fleet`: many cells, from the store that they share."""

@@ -1,4 +1,4 @@
-"""`ftdrive fleet add`, `remove` and `index`: which cells and runs the store has."""
+"""`ftdrive fleet add`, `remove` and `index`: the cells and runs in the store."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +21,9 @@ from ftdrive.terminal.console import answer, hanging, messages
 def add(file: Path, url: str | None) -> None:
     """Add the cells of CELLS.TOML to the store.
 
-    Cells of the same name are replaced. Each has a table [cells.NAME] with `config`, the path of its ftdrive.toml, and
-    `verify_every_days`. Its runs are found by the serial number of the arm (`arm_serial`, or [robot] serial), else by
-    [robot] host.
+    Existing cells with the same name are replaced. Each cell has a table [cells.NAME] with `config`, the path of its
+    ftdrive.toml, and `verify_every_days`. The runs of a cell are found by the serial number of the arm (`arm_serial`,
+    or [robot] serial), else by [robot] host.
     """
     found = open_store(url)
     cells = read_cells(file)
@@ -53,9 +53,9 @@ def remove(names: Sequence[str], url: str | None) -> None:
 @click.argument("folders", metavar="RUNS...", nargs=-1, required=True, type=FOLDER)
 @STORE
 def index(folders: Sequence[Path], url: str | None) -> None:
-    """Add the runs in the folders RUNS to the store. A run that is known is not read again.
+    """Add the runs in the folders RUNS to the store. Known runs are not read again.
 
-    If cells were added, arms that belong to none of them are listed.
+    If the store has cells, arms that belong to none of them are listed.
     """
     found = open_store(url)
     indexed = found.index(*folders)
@@ -67,7 +67,7 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     answer.print(f" {added} added to {found.name}")
     for folder in folders:
         if not record_paths([folder]):
-            messages.print(f" No results in {folder}: name a run folder, or the folder that contains run folders.")
+            messages.print(f" No results in {folder}: give a run folder, or the folder that contains run folders.")
     if cells := found.cells():
         owners = Owners(cells)
         strange = {one.arm_serial or one.robot_host or "?" for one in found.results() if owners.cell_of(one) is None}

@@ -1,4 +1,4 @@
-"""`ftdrive fleet solve`: many runs at once."""
+"""`ftdrive fleet solve`: solve many runs."""
 
 import re
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ _UNITS = {"d": timedelta(days=1), "h": timedelta(hours=1)}
 
 @click.command("solve")
 @click.argument("folders", metavar="[RUNS]...", nargs=-1, type=FOLDER)
-@click.option("--since", metavar="TIME", help="Only runs since then: 90d, 12h or a date (UTC).")
+@click.option("--since", metavar="TIME", help="Solve only runs since this age or date (UTC), such as 90d or 12h.")
 @click.option(
     "--workers", metavar="N", type=click.IntRange(min=1), help="Number of processes.  [default: one per core]"
 )
@@ -39,10 +39,10 @@ def fleet_solve(
 ) -> None:
     """Solve runs again with this version, and compare.
 
-    The results are compared with the calibrations of the runs. RUNS are run folders or folders of runs, by default all
-    runs that the store knows. Verifications are left out. Each result is written into its run folder as
-    solved-VERSION.json, and no other command uses it. A run that has this file is only compared, so an interrupted
-    command continues when it is repeated.
+    The results are compared with the calibrations of the runs. RUNS are run folders or folders of runs; the default is
+    all runs in the store. Verifications are left out. Each result is written to its run folder as solved-VERSION.json,
+    which no other command uses. Runs with this file are only compared, so that an interrupted command continues when
+    repeated.
 
     The exit code is 7 if a run could not be solved.
     """
@@ -51,7 +51,7 @@ def fleet_solve(
     after = None if since is None else _time(since)
     found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
     if not found:
-        messages.print("No runs: name their folders, or add them to the store with `ftdrive fleet index RUNS`.")
+        messages.print("No runs: give their folders, or add them to the store with `ftdrive fleet index RUNS`.")
     runs = runs_to_solve(found, after, messages.print)
     report = SolvedAgain(runs=len(runs), solved_before=sum(solved_path(run).exists() for run in runs))
     columns = (TextColumn("Solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -70,7 +70,7 @@ def fleet_solve(
 
 
 def _time(since: str) -> datetime:
-    """Return the time, UTC, of an age such as 90d or of a date; raises `ConfigError`."""
+    """Return the time in UTC for an age such as 90d or a date. Raises `ConfigError`."""
     try:
         if age := re.fullmatch(r"(\d+)([dh])", since):
             return datetime.now(UTC) - int(age[1]) * _UNITS[age[2]]

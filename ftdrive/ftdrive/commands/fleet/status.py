@@ -1,4 +1,4 @@
-"""`ftdrive fleet status` and `serve`: the state of all cells, once or always."""
+"""`ftdrive fleet status` and `serve`: the state of all cells, once or continuously."""
 
 import gc
 from contextlib import closing
@@ -27,20 +27,22 @@ _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due", "we
 
 @click.command()
 @STORE
-@click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
+@click.option(
+    "--html", "page_path", metavar="FILE", type=NewFile(), help="New file for a page with plots of the drift."
+)
 @JSON
 def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """List all cells: what is due, and what drifts.
 
-    The columns are the age of the calibration, that of the last verification, the drift of the bias in sigmas of a
-    verification, when the next one is due, and the last weighing if there is one. A cell has one line for each tool in
-    use. Below the list is what needs attention, with what to do. The exit code is 0 also then.
+    The columns are the age of the calibration and of the last verification, the drift of the bias in sigmas of a
+    verification, the due date of the next verification, and the last weighing if there is one. A cell has one line per
+    tool in use. Below the list are the problems with their fixes. The exit code is 0 even with problems.
 
     `ftdrive fleet add` adds cells, `ftdrive fleet index` adds runs from other computers.
     """
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
-    gc.freeze()  # or the imports are searched for garbage again and again: a tenth of the time
+    gc.freeze()  # without it, garbage collection of the imports takes a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)
@@ -71,7 +73,7 @@ def _status_row(one: CellState, now: datetime) -> tuple[str, ...]:
     return (one.cell, one.tool_in_words, one.verdict or "none", age, verified, drift, due, weighed)
 
 
-# Prometheus has assigned all ports from 9100 to 9999.
+# The ports from 9100 to 9999 are all assigned to Prometheus exporters.
 PORT = 10018
 MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
 
@@ -83,14 +85,14 @@ MONITORING = Path(__file__).parents[2] / "fleet" / "monitoring"
     metavar="HOST:PORT",
     default=f"127.0.0.1:{PORT}",
     show_default=True,
-    help="Address of /metrics; port 0 is a free one. A host that is not loopback is unprotected.",
+    help="Address of /metrics; port 0 selects a free one. A host other than loopback is unprotected.",
 )
 @STORE
 def fleet_serve(address: str, url: str | None) -> None:
     """Serve the state of all cells to Prometheus, and as a page.
 
-    The store is read every 60 s. If it cannot be read later, the last state stays, with its age. Alert rules and a
-    dashboard for Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
+    The store is read every 60 s. If reading fails, the last state stays, with its age. Alert rules and a dashboard for
+    Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
     """
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
     found = open_store(url)

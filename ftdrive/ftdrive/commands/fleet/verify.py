@@ -1,4 +1,4 @@
-"""`ftdrive fleet verify`: one cell after the other, each with an operator at it."""
+"""`ftdrive fleet verify`: verify one cell after the other, with an operator at each."""
 
 import sys
 from collections.abc import Sequence
@@ -30,17 +30,19 @@ from ftdrive.terminal.text import echo
 
 @click.command("verify")
 @click.argument("names", metavar="[CELL]...", nargs=-1)
-@click.option("--due", is_flag=True, help="Only the cells whose verification is due.")
+@click.option("--due", is_flag=True, help="Verify only the cells whose verification is due.")
 @STORE
 def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     """Verify cells one after the other, with an operator at each.
 
-    For each cell the command first asks whether an operator stands there with the emergency stop in reach. Only yes
-    starts the session of `ftdrive verify`, with its own plan, checks, questions and confirmation. Any other answer
-    skips the cell. No option answers these questions, and a terminal is required.
+    At each cell, the command first asks whether an operator is present with the emergency stop in reach. Only yes
+    starts the session of `ftdrive verify`, with its plan, checks, questions and confirmation. Any other answer skips
+    the cell. No option answers this question, and a terminal is required.
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError("fleet verify asks at every cell and never without a terminal: run it in one, at the cells")
+        raise ConfigError(
+            "fleet verify asks a question at every cell, and needs a terminal: run it in a terminal at the cells"
+        )
     refuse_variables()
     if names and due:
         raise ConfigError("CELL and --due exclude one another: leave one of them out")
@@ -74,11 +76,11 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     if failed:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
     if errors:
-        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its line is printed
+        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its message is printed
 
 
 def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
-    """Return the cells with these names in their order; all without names."""
+    """Return the cells with these names, in this order; all cells if there are no names."""
     if not cells:
         raise ConfigError("the store has no cells: add them with `ftdrive fleet add cells.toml`")
     known = {one.name: one for one in cells}
@@ -88,7 +90,7 @@ def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[Sto
 
 
 def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tuple[str, str]:
-    """Ask at a cell and verify it; return the outcome and why. Raises as `Verifying.take`."""
+    """Ask at a cell and verify it; return outcome and reason. Raises as `Verifying.take`."""
     cell = _read_cell(one)
     known = fleet.id_of(one.name, cell.tool.name) or ""
     paths = [Path(result.path) for result in store.find(known) if result.id == known] if known else []
@@ -104,7 +106,7 @@ def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tup
 
 
 def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
-    """Guide the operator through a verification, as `ftdrive verify` does without options."""
+    """Guide the operator through a verification, as `ftdrive verify` without options does."""
     task = Verifying.of(cell, path, options)
     with open_operator(command=task.command) as operator:
         verified = task.take(operator, NO_LIMITS, options)
@@ -128,7 +130,7 @@ def _read_cell(one: StoredCell) -> CellConfig:
 
 
 def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
-    """Ask whether an operator stands at the cell; only yes counts, and the end of the input does not."""
+    """Ask whether an operator stands at the cell; any answer other than yes, and the end of the input, mean no."""
     text = (
         f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: does an operator stand at this cell, with "
         "the emergency stop in reach? Only yes starts its verification, Enter skips it"
@@ -140,7 +142,7 @@ def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
 
 
 def _fixable_message(error: Exception) -> str:
-    """Return the message of an error that a user can fix; raises any other."""
+    """Return the message of an error that a user can fix; raise any other."""
     if exit_code(error) is None:
         raise error
     return in_a_sentence(error)

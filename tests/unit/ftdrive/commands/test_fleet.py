@@ -141,4 +141,4 @@ def test_a_folder_of_folders_of_runs_has_a_hint(run: Callable[..., Ran], tmp_pat
     result(0).save(new_run(tmp_path / "cells" / "runs", "one") / "calibration.json")
     code, out, err = run("index", tmp_path / "cells")
     assert (code, out.partition(" added")[0]) == (0, " 0 results and 0 verifications")
-    assert "name a run folder, or the folder that contains run folders" in " ".join(err.split())
+    assert "give a run folder, or the folder that contains run folders" in " ".join(err.split())

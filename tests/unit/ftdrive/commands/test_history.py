@@ -191,7 +191,7 @@ def test_a_result_whose_run_is_gone_is_compared_from_the_store(run: Callable[...
     ("text", "code", "words"),
     [
         ("nothing", 2, "neither a file nor an id"),
-        ("abc", 2, "4 digits or more"),
+        ("abc", 2, "at least 4 digits"),
         ("0000", 2, "has no result 0000"),
         ("notes.txt", 6, "not valid JSON"),
     ],

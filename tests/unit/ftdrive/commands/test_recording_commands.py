@@ -384,7 +384,7 @@ def test_kill_9_amid_a_write_leaves_all_blocks_before(
     assert cli.run(["convert", f"{target}.partial", f"kept{ending}", "--json"]) == 0
     out, err = capsys.readouterr()
     assert err.count(f"{target}.partial is incomplete") == 1
-    assert re.search(r"\): \d+\.\d s of it are saved\.", " ".join(err.split()))
+    assert re.search(r"\): \d+\.\d s are saved\.", " ".join(err.split()))
     Path(f"{target}.partial").unlink()
     assert cli.run(command) == 0
     kept, whole = load_recording(f"kept{ending}").rows, load_recording(target).rows
@@ -413,8 +413,8 @@ def test_parquet_without_its_end_is_made_again(recorded: Path, capsys: pytest.Ca
         (["a.mcap", "--wrench", "c.json"], "RECORDING does not go with --wrench"),
         (["a.mcap", "--delay", "auto"], "describe another program"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
-        (["a.mcap", "--wrench-topic", "/w"], "go with a bag of ROS"),
-        (["a.mcap", "--pose-topic", "/p"], "go with a bag of ROS"),
+        (["a.mcap", "--wrench-topic", "/w"], "are only for a ROS bag"),
+        (["a.mcap", "--pose-topic", "/p"], "are only for a ROS bag"),
         (
             ["--wrench", "c.json", "--orientation-file", "c.json", "--calibration", "c.json", "--delay", "x"],
             "--delay is",

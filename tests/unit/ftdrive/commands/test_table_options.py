@@ -121,7 +121,7 @@ def test_a_urdf_makes_poses_of_joint_angles(tmp_path: Path) -> None:
         (["--urdf", "none.urdf"], "--urdf none.urdf: none.urdf is not a URDF"),
         (["--urdf", "arm.urdf?flange=tip"], "has no link 'tip'"),
         (["--urdf", "arm.urdf"], "7 moving joints, not 6"),
-        (["--wrench-topic", "/ft"], "go with a bag of ROS"),
+        (["--wrench-topic", "/ft"], "are only for a ROS bag"),
     ],
 )
 def test_an_option_that_cannot_be_used_is_one_sentence(options: list[str], words: str, solved: Solved) -> None:

@@ -113,7 +113,7 @@ def test_the_end_of_a_recording_is_the_end_unless_another_one_is_given() -> None
 
 def test_a_sink_that_fails_is_ended_and_said_and_the_others_go_on() -> None:
     fails, goes_on = Output(source := Source("abcd"), fails=FULL), Output(source)
-    assert run(source, fails, goes_on) == ["output ended: [Errno 28] No space left on device"]
+    assert run(source, fails, goes_on) == ["output stopped with an error: [Errno 28] No space left on device"]
     assert (fails.got, fails.calls) == ("..", ["begin", "end"])
     assert goes_on.got == "....-"
 

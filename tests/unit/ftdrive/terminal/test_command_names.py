@@ -35,4 +35,4 @@ def test_with_uv_every_command_begins_with_it(words: str, typed: str) -> None:
 def test_errors_and_next_steps_name_commands_as_they_can_be_typed(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.run(["push"]) == 2
     assert cli.run(["history"]) == 0
-    assert "`uv run ftdrive calibrate` adds them" in capsys.readouterr().err
+    assert "with `uv run ftdrive calibrate`" in capsys.readouterr().err

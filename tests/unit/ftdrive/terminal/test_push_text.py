@@ -51,7 +51,7 @@ def test_a_restored_gravity_has_the_table_and_its_source() -> None:
     assert proposal_in_lines(push) == [
         "               controller    new                    change",
         "gravity, m/s²  not reported  (0.500, 0.000, 9.800)",
-        "The new values are the old ones of push.json.",
+        "The new values restore those before push.json.",
     ]
 
 

@@ -82,11 +82,11 @@ def test_a_failure_has_its_reason_and_what_helps(printed: Any) -> None:
     lines = printed(verified(changed, passed=False))
     assert lines[6].startswith("FAILED largest difference")
     assert lines[7] == "the difference has a reason"
-    assert lines[-2] == "No update makes up for the change: calibrate again."
+    assert lines[-2] == "No update corrects the change: calibrate again."
     helped = replace(changed, update=cast("Any", "bias"))
     assert printed(verified(helped, passed=False))[-2] == "? R03 was not steady"
     noisy = printed(verified(FOUND, passed=False))
-    assert noisy[-2].startswith("Nothing has changed: the differences agree with their sigma.")
+    assert noisy[-2].startswith("No significant change: the differences agree with their sigma.")
     assert "the difference has a reason" not in noisy
 
 
