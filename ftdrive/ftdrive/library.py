@@ -1,4 +1,4 @@
-"""The functions of `import ftdrive` that join several rooms: solve, open devices and streams, plan a tour."""
+"""The functions of `import ftdrive` that combine several packages: solve, open devices and streams, plan a tour."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import nullcontext
@@ -64,15 +64,15 @@ def solve(
     Parameters
     ----------
     source : str, Path, Run, DataFrame, mapping, pair of arrays, CalibrationDataset or Recording
-        What `read_dataset` takes and gives, such as a pair (R_base_flange, wrench) of shapes (n, 3, 3) and (n, 6). A
-        table whose rows follow one another quickly, a bag, a file of `ftdrive record` and what `read_recording` gives
-        are recordings in motion.
+        A source or result of `read_dataset`, such as a pair (R_base_flange, wrench) of shapes (n, 3, 3) and (n, 6). A
+        table with closely spaced rows, a bag, a file of `ftdrive record` and a result of `read_recording` are
+        recordings in motion.
     method : Method
         "ml": maximum likelihood, from 4 poses on; or one of the published methods, for comparison.
     table : TableOptions, optional
-        What a table does not say.
+        Description of a table, for what the table does not contain.
     drift, known, g_m_s2, setup, provenance, as_published
-        As for `ftcalib.solver.solve`. A recording in motion takes `known` and the up direction of `setup`.
+        As for `ftcalib.solver.solve`. For a recording in motion, only `known` and the up direction of `setup` are used.
 
     Raises
     ------
@@ -81,9 +81,9 @@ def solve(
     NotObservable
         The poses do not determine the parameters; the message names what is missing and what to add.
     ValueError
-        An unknown method, known values that the method cannot use, or `as_published` for another method.
+        The method is unknown, cannot use the known values, or does not support `as_published`.
     TypeError
-        The source is nothing of this; the message names the call that helps.
+        The source has another type; the message names the right call.
 
     Examples
     --------
@@ -123,26 +123,28 @@ def read_recording(
     calibration: CalibrationResult | None = None,
     table: TableOptions | None = None,
 ) -> Recording:
-    """Read a recording into memory, also the `.partial` of one that was interrupted.
+    """Read a recording into memory; also the `.partial` file of an interrupted one.
 
     Parameters
     ----------
     source : str, Path, DataFrame or mapping
-        A file of `ftdrive record`, whose ending names the format: .mcap, .csv or .parquet. Or another program's: a bag,
-        or a table with wrench and orientation, as text, as a DataFrame of pandas or Polars, or as arrays by name.
+        A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet. Or a recording of
+        another program: a bag, or a table with wrench and orientation as text, DataFrame of pandas or Polars, or arrays
+        by name.
     columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
+        Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
     calibration : CalibrationResult, optional
-        Of another program's recording, which has none; `raw` is the wrench as measured, `wrench` is 0.
+        Calibration for a recording of another program, which has none; `raw` is the measured wrench, `wrench` is 0.
     table : TableOptions, optional
-        What another program's table does not say.
+        Description of a table, for what the table does not contain.
 
     Raises
     ------
     ConfigError
-        Another ending, a missing package, or no calibration for another program's recording.
+        The suffix is unknown, a package is missing, or a recording of another program has no calibration.
     BadRecording, BadDataset
-        Damaged, without a sample, or of no known form. A file that was cut is read up to there; `cut` says so.
+        The file is damaged, has no sample or an unknown format. A truncated file is read to its end; `cut` gives the
+        reason.
     OSError
         The file does not exist or cannot be read.
 
@@ -161,9 +163,9 @@ def read_recording(
 
 
 def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableOptions | None) -> Recording:
-    """Read another program's recording. Raises `ConfigError` without a calibration, or `BadDataset`."""
+    """Read a recording of another program. Raises `ConfigError` without a calibration, or `BadDataset`."""
     if calibration is None:
-        raise ConfigError("the recording is another program's and has no calibration: give one as calibration=")
+        raise ConfigError("a recording of another program has no calibration: give one as calibration=")
     tables = tables_of(source, table)
     if tables is None:
         raise ConfigError(f"{source} is a recording of ftdrive: leave out table=")
@@ -175,12 +177,12 @@ _NOT_CONFIGURED = CellConfig(RobotConfig(""), SensorConfig(""))
 
 
 def open_sensor(url: str, *, sign: int = 1) -> ForceTorqueSensor:
-    """Open a sensor; `with` or `close` ends its stream.
+    """Open and return a sensor; `with` or `close` ends its stream.
 
     Parameters
     ----------
     url : str
-        Such as "ati-can://can0?bitrate=250000"; "emulated://" is an emulated ATI sensor on CAN.
+        Address such as "ati-can://can0?bitrate=250000"; "emulated://" is an emulated ATI sensor on CAN.
     sign : {1, -1}
         -1 for a sensor that reports the reaction.
 
@@ -205,16 +207,16 @@ def open_sensor(url: str, *, sign: int = 1) -> ForceTorqueSensor:
 
 
 def open_arm(host: str, *, model: str | None = None, driver: str = "ur") -> RobotArm:
-    """Open an arm for reading; `with` or `close` ends the connection. It is not moved.
+    """Open and return an arm for reading; `with` or `close` ends the connection. The arm is not moved.
 
     Parameters
     ----------
     host : str
         Name or address of the controller; "emulated://" is an emulated UR5e.
     model : str, optional
-        Such as "ur5e", for a controller that does not report it.
+        Model such as "ur5e", for a controller that does not report it.
     driver : str
-        "ur", or the entry point of an arm of another package.
+        "ur", or the entry point of a driver in another package.
 
     Raises
     ------
@@ -253,41 +255,41 @@ def open_stream(
     force: bool = False,
     track: Tracking = "off",
 ) -> Stream:
-    """Return the stream of compensated samples of a cell, for use with `with`. The arm is only read.
+    """Return the stream of compensated samples of a cell, for use in a `with` block. The arm is only read.
 
     Parameters
     ----------
     config : str, Path, CellConfig or Station, optional
-        A configuration file instead of ./ftdrive.toml, or the cell itself; an emulated one is started by the stream.
+        A configuration file instead of ./ftdrive.toml, or the cell itself; the stream starts an emulated cell.
     calibration : str, Path or CalibrationResult
         A calibration.json or its run folder.
     name : str
-        Name of a `CalibrationResult` in recordings and on screens; a file has its path.
+        Name of a `CalibrationResult` in recordings and on screens; default for a file: its path.
     tool : str
-        Instead of `calibration`: the newest accepted one of this tool on the devices and mount of the cell, from the
-        store and from the run folders in ./runs. `Stream.use_tool` switches to another one.
+        Use the newest accepted calibration of this tool for the devices and mount of the cell, from the store and the
+        run folders in ./runs, instead of `calibration`. `Stream.use_tool` switches to another tool.
     simulate : bool
-        An emulated cell instead of `config`: that of `calibration`, or the one that ./ftdrive.toml describes, which is
-        calibrated with six poses first, in about 10 s. `Stream.station` controls it.
+        Use an emulated cell instead of `config`: that of `calibration`, or the one described by ./ftdrive.toml,
+        calibrated first with six poses in about 10 s. `Stream.station` controls it.
     sensor, arm : ForceTorqueSensor, RobotArm, optional
-        Devices of your own, used in place of those in the configuration. With both no configuration is read.
+        Devices to use instead of those in the configuration. With both, no configuration is read.
     frame : WrenchFrame
         Axes and reference point of the wrench.
     stages : Stages
-        What is done to the raw wrench.
+        Processing steps between raw and compensated wrench.
     on_contact : callable
-        Called with each `Contact` when it has lasted 40 to 60 ms, and again when it is over (`contact.over`), by the
-        thread that reads. `Stream.on_contact` may be set at any time.
+        Called by the reading thread with each `Contact` after 40 to 60 ms, and again at its end (`contact.over`).
+        `Stream.on_contact` may be set at any time.
     force : bool
         Apply a calibration of another arm, sensor or mount, with a warning in `Stream.warnings`, or one that
         was edited by hand, with a mark in `StreamInfo.marks`.
     track : "off", "show" or "apply"
-        Follow bias and held part while the arm works: `stream.status().tracked`. Only `apply` corrects the wrench.
+        Track bias and held part while the arm works: `stream.status().tracked`. Only `apply` corrects the wrench.
 
     Raises
     ------
     UsageError
-        The configuration cannot be used, or there is not one of calibration and tool.
+        The configuration cannot be used, or not exactly one of calibration and tool is given.
     DataError, OSError
         The calibration cannot be read.
 
@@ -353,32 +355,32 @@ def plan_tour(
     mass_kg: float | None = None,
     posture_deg: Sequence[float] = tuple(np.degrees(USUAL_POSTURE_RAD[:3])),
 ) -> Plan:
-    """Plan a tour that is proven clear of the arm itself, the tool, planes and boxes. No robot is needed.
+    """Plan a tour that is proven clear of collisions with the arm, the tool, planes and boxes. No robot is needed.
 
     Parameters
     ----------
     model : str
-        Such as "ur5e".
+        Model of the arm, such as "ur5e".
     tool_mm : sequence of rows (from, to, diameter) or (from, to, diameter, x, y)
         Cylinders of tool and sensor, mm from the flange face; x, y is the offset of the axis.
     poses : {24, 12, 6}
     mounting : str
-        "floor", "wall", "ceiling", or the degrees by which the base leans towards its -x.
+        "floor", "wall", "ceiling", or the tilt of the base towards its -x in degrees.
     planes_mm : sequence of rows (nx, ny, nz, d)
         Walls: the arm stays where n·p >= d, base axes. The mounting surface is always included.
     boxes_mm : sequence of rows (x, y, z, x, y, z)
         Blocks, two corners each, base axes.
     mass_kg : float, optional
-        Of the tool, for the predicted accuracy; default 1.
+        Mass of the tool for the predicted accuracy; default 1.
     posture_deg : sequence of 3 floats
         Present angles of the first three joints.
 
     Raises
     ------
     UsageError
-        A shape is impossible, or there is no such model.
+        A shape is impossible, or the model is unknown.
     AcceptanceError
-        No tour is proven clear.
+        No tour could be proven clear of collisions.
 
     Examples
     --------
@@ -404,9 +406,9 @@ def plan_tour(
 
 
 def certifier_of(stream: Stream, replayed: Path | None, say: Callable[[str], object]) -> Certifier | None:
-    """Describe arm and tool of the cell of a stream, or of the run or recording that it replays.
+    """Return the certifier for arm and tool of a stream's cell, or of the replayed run or recording.
 
-    None for a table of another program, and where the cell does not describe them; `say` takes why.
+    None for a table of another program, and if the cell has no description of arm and tool; `say` receives the reason.
     """
     try:
         if replayed is None:
@@ -428,17 +430,17 @@ def _float_rows(rows: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...
     return tuple(tuple(map(float, row)) for row in rows)
 
 
-# So much of the load as known must show, for the reading to be that of it.
+# Smallest reading, as a share of the known load, that is taken for the load.
 _SHOWS = 0.5
 
 
 def check_known_load(
     stream: Stream, load: Load, poses: int, wait_s: float, *, replayed: bool
 ) -> tuple[LoadCheck, int, float]:
-    """Average the load at rest until enough poses are joined, or until a recording ends, and compare.
+    """Average the load at rest until enough poses are combined or a recording ends, and compare it with the known load.
 
-    A recording is tared by the last rest of the free tool before the load. Return also the number of poses, and how
-    many seconds before them the tool was tared.
+    A recording is tared by the last rest of the free tool before the load. Return the check, the number of poses, and
+    the time since the tare, s.
     """
     scale, refusal, best, due_ns = Scale(stream), CannotWeigh("samples"), None, 0
     end_s = stream.clock.now_s() + wait_s
@@ -459,7 +461,7 @@ def check_known_load(
         except CannotWeigh as error:
             refusal = error
     if best is None and refusal.code == "samples":
-        raise ConfigError(f"no load of about {load.mass_kg:g} kg hangs at rest: hang it, or check MASS (kg)")
+        raise ConfigError(f"no load of about {load.mass_kg:g} kg hangs at rest: hang the load, or check MASS (kg)")
     if best is None:
         raise refusal
     measured, reference, tare_age_s = best
@@ -471,10 +473,10 @@ def check_known_load(
 def solve_load_runs(
     paths: Sequence[Path], tool_mass: str | None, say: Callable[[str], object]
 ) -> tuple[LoadSolution, SensorMatrix]:
-    """Fit the matrix of a sensor to runs, the tool alone and with loads; also return what was known of it before.
+    """Fit the matrix of a sensor to runs with the tool alone and with loads; return the solution and the prior matrix.
 
-    `tool_mass` is the mass as weighed, such as "1.300±0.002", else that of the cells. `say` takes what was known.
-    Raises `ConfigError` for runs of different sensors, and what `read_source` raises.
+    `tool_mass` is the weighed mass, such as "1.300±0.002"; default: that of the cells. `say` receives the source of the
+    prior. Raises `ConfigError` for runs of different sensors, and as `read_source`.
     """
     read = [_run_of(path) for path in paths]
     identity, data = read[0][1:]
@@ -501,7 +503,7 @@ def solve_load_runs(
 
 
 def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
-    """Read one run with its load, the identity of its sensor, and what is known of its cell."""
+    """Return one run with its load, the identity of its sensor, and the description of its cell."""
     data = read_source(path, SolveOptions())
     origin = data.provenance if "devices" in data.provenance else data.dataset.meta
     return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), sensor_identity(origin), data
@@ -510,10 +512,10 @@ def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
 def _prior(
     data: RecordedData, identity: dict[str, Any], names: list[str], say: Callable[[str], object]
 ) -> SensorMatrix:
-    """Return what is known of the sensor before these runs: by earlier loads, its data sheet, or as usual."""
+    """Return the prior matrix of the sensor: from earlier loads, its data sheet, or typical errors."""
     for path in reversed(sensor_files()):
         known = SensorMatrix.load(path)
         if not identity_mismatch(known, identity) and not {*known.provenance.get("runs", ())} & {*names}:
-            say(f"Begins with {path.name} of {str(known.provenance.get('created_utc'))[:10]}.")
+            say(f"Starting from {path.name} of {str(known.provenance.get('created_utc'))[:10]}.")
             return known
     return SensorMatrix.declared(data.setup)

@@ -43,7 +43,7 @@ def test_a_cell_is_described(ftdrive: CommandLine, open_page: "Callable[..., Pag
         choose(page, f"Wall {wall} at", side)
         enter(page, "Distance", distance, wall)
     page.get_by_text("(-y 20 mm) is 0 mm from the arm's shoulder").wait_for()
-    page.get_by_text("Correct what is red: Wall 2").wait_for()
+    page.get_by_text("Correct the red fields: Wall 2").wait_for()
     assert page.get_by_role("button", name="Write ftdrive.toml").is_disabled()
     enter(page, "Distance", "60 cm", 2)
     page.get_by_role("button", name="Add box").click()

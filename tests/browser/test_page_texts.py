@@ -37,7 +37,7 @@ def test_on_the_form(ftdrive: CommandLine, open_page: "Callable[..., Page]") -> 
     for field in page.locator("input").all():
         field.fill(LONG[:9_990])
     page.get_by_text("which is not a number").first.wait_for()
-    page.get_by_text("Correct what is red").wait_for()
+    page.get_by_text("Correct the red fields").wait_for()
     shows_text(page)
     page.locator("input").last.fill("60")
     assert command.poll() is None

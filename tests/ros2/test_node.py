@@ -264,7 +264,7 @@ def test_of_two_nodes_the_second_needs_another_name(stack: ExitStack) -> None:
     Served(stack)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ftdrive.servers.ros2._DISCOVERY_S", 10.0)  # a busy computer
-        with pytest.raises(ConfigError, match=r"another node /ftdrive runs already: .* __node:=ftdrive_2"):
+        with pytest.raises(ConfigError, match=r"a node /ftdrive is already running: .* __node:=ftdrive_2"):
             Ros2Node()
     other = Ros2Node(("--ros-args", "-r", "__node:=ftdrive_2"))
     assert other.name == "/ftdrive_2"

@@ -1,4 +1,4 @@
-"""Recordings of a compensated stream: one definition, three file formats."""
+"""Recordings of a compensated stream: one data model, three file formats."""
 
 from ftdrive.recording.files import RecordingReader, load_recording, write_recording
 from ftdrive.recording.recorder import Recorder

@@ -1,4 +1,4 @@
-"""A recording of any length compensated in blocks, without a device."""
+"""Compensation of recordings of any length, in blocks and without a device."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
@@ -26,10 +26,10 @@ from ftdrive.stream.sources import Read, SampleSource
 from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
-# The noise is that of the beginning of a recording.
+# The noise is estimated from the beginning of a recording, s.
 _NOISE_S = 30.0
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
-# Events of a recording that hold for its compensated one too.
+# Events that are copied to the compensated recording.
 _KEPT = ("mark", "delay", "stale", "recovered")
 _READING_S = 0.1
 _OUTLIER_SIGMAS = 4.0
@@ -46,10 +46,10 @@ def source_to_compensate(
     everything: bool,
     say: Callable[[str], object],
 ) -> tuple[AnyRecording, dict[str, float] | None]:
-    """Return the recording with the calibration, and the delay of one of another program with one sigma.
+    """Return the recording with its calibration, and for one of another program the delay with its sigma.
 
-    `name` is that of the calibration, `delay_s` a number or "auto" or None. With `everything`, all columns are read.
-    `say` takes what was recognised in tables.
+    `name` names the calibration, `delay_s` is a number, "auto" or None. With `everything`, all columns are read. `say`
+    receives a text about what was recognised in tables.
     """
     try:
         tables = tables_of(path, options.table, options.pair, options.topics)
@@ -59,12 +59,12 @@ def source_to_compensate(
         raise
     if tables is None:
         if delay_s is not None or options.table is not None:
-            raise ConfigError("--delay and --columns describe another program's recording: leave them out")
+            raise ConfigError("--delay and --columns are for recordings of other programs: leave them out")
         reader = RecordingReader(path, ROW.names or () if everything else NEEDED)
         if calibration is not None:
             info = reader.header.info
             if others := compare_devices(calibration, {"arm": info.arm, "sensor": info.sensor}).others:
-                raise ConfigError(f"{path.name} is of other devices than the calibration: {others[0]}")
+                raise ConfigError(f"{path.name} and the calibration belong to different devices: {others[0]}")
             reader.header = with_calibration(reader.header, calibration, name)
         return reader, None
     if calibration is None:
@@ -83,20 +83,20 @@ def compensate_recording(
     estimate_bias: bool = False,
     show: Callable[[str], object] = lambda _: None,
 ) -> tuple[dict[str, Any], BaseException | None]:
-    """Compensate a recording of any length with the calibration of its header, bias and gravity subtracted.
+    """Compensate a recording with the calibration in its header; bias and gravity are subtracted.
 
-    It is read once, after its beginning was read for the noise; for `estimated_bias` it is read once more before.
-    `frame` is that of the result. `output` is a new recording for it, and for those events of the old one that still
-    hold. `show` gets what is done and how much of it, in words.
+    The recording is read once, after its beginning was read for the noise, and once more before that for
+    `estimated_bias`. The result is given in `frame`. `output` is a new recording for the result and the events that
+    still apply. `show` receives a text about the progress.
 
     Returns samples, duration_s, gaps; `raw` and `compensated` with root mean square and maximum of force in N and
     torque in N·m; `contacts` with time since the first sample in s, duration in s, peak in N and direction;
-    `bias_change`, if it was estimated; axes, about; calibration, the name, and its marks; `cut`, why it ends early;
-    `delay_s`, the last one that the recording names, with value and sigma. With them it returns what ended the
-    recording early, damage or Ctrl-C: the numbers and the file hold what was before.
+    `bias_change`, if estimated; axes, about; calibration (its name) and its marks; `cut`, why the recording ends early;
+    `delay_s`, the last delay in the recording, with value and sigma. The second value is the damage or Ctrl-C that
+    ended the recording early, or None: numbers and file then contain what was before.
 
-    Raises `ConfigError` for a frame that needs what is not configured, `BadDataset` for a recording that is too short
-    for an estimate, `BadRecording` if its first block is damaged, and `OSError` if the result cannot be written, which
+    Raises `ConfigError` for a frame that needs a missing setting, `BadDataset` for a recording that is too short for an
+    estimate, `BadRecording` if its first block is damaged, and `OSError` if the result cannot be written; its message
     names what was kept.
     """
     header, change = source.header, None
@@ -117,7 +117,7 @@ def compensate_recording(
         if not found.samples:
             raise
         failure = error
-        # a contact at the end is over
+        # a contact at the end ends with the recording
         stream.processor.restart()
         found.add(None, stream.take_events())
     failure = failure or blocks.failure
@@ -134,13 +134,13 @@ def compensate_recording(
 
 
 class _Blocks(SampleSource):
-    """A recording of any length, as fast as it is read, with those of its events that still hold."""
+    """A recording of any length as a source without waiting, with the events that still apply."""
 
     def __init__(self, recording: AnyRecording, info: StreamInfo, show: Callable[[str], object]) -> None:
         self.info, self._recording, self._show = info, recording, show
         self._newest: Paired | None = None
         self.failure: Exception | None = None
-        """What ended it early."""
+        """Error that ended the recording early."""
         self.delay_s: dict[str, Any] | None = None
 
     def open(self) -> None:
@@ -150,7 +150,7 @@ class _Blocks(SampleSource):
         self._coming.close()
 
     def beginning(self) -> Iterator[Paired]:
-        """Yield the first samples; damage behind them is left to the pass that follows."""
+        """Yield the first samples; damage after them is left to the next pass."""
         left = round(_NOISE_S * self.info.sensor_rate_Hz)
         with suppress(BadDataset, BadRecording):
             for block in self._recording.blocks():
@@ -168,7 +168,7 @@ class _Blocks(SampleSource):
                 raise
             self.failure = error
         if measured is None and self._newest is not None:
-            # what waits for later poses is due
+            # process the samples that wait for later poses
             self.has_ended = True
             return Read(self._newest.rows(slice(0)))
         elif measured is None:
@@ -185,7 +185,7 @@ class _Blocks(SampleSource):
 
 
 class _RunningSums(Sink):
-    """What is known of a result, block after block."""
+    """Statistics of the result, updated with each block."""
 
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
@@ -211,7 +211,7 @@ class _RunningSums(Sink):
                 self._contacts.append({"t_s": (event.t_host_ns - self._begin_ns) * 1e-9, **values})
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the numbers."""
+        """Return the statistics."""
         rms, largest = np.sqrt(self._squares / self.samples), np.sqrt(self._largest)
         raw, compensated = (
             {"force_rms_N": f_rms, "force_max_N": f_max, "torque_rms_Nm": t_rms, "torque_max_Nm": t_max}

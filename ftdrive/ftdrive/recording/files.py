@@ -1,4 +1,4 @@
-"""Recordings on disk: the file formats by their endings, read and written whole."""
+"""Recordings on disk: file formats by suffix; reading and writing of whole recordings."""
 
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import closing
@@ -17,7 +17,7 @@ from ftdrive.recording.table_files import CsvFile, ParquetFile, read_csv, read_p
 from ftdrivers.installation import missing_extra
 
 RecordingFile = McapFile | CsvFile | ParquetFile
-"""A new file of one format. Whatever happens, `samples` of those that were appended remain in the file."""
+"""A new file of one format. After any error, `samples` samples remain in the file."""
 
 
 class RecordingFormat(NamedTuple):
@@ -25,9 +25,9 @@ class RecordingFormat(NamedTuple):
 
     new: type[RecordingFile]
     read: Callable[[Path, Collection[str]], Generator[Piece, None, str]]
-    """Gives the header first, with a piece without samples."""
+    """Yields the header first, in a piece without samples."""
     package: str
-    """Needed for it."""
+    """Package that the format needs."""
 
 
 _FORMATS = {
@@ -39,7 +39,7 @@ ENDINGS = tuple(_FORMATS)
 
 
 def format_of(path: Path) -> RecordingFormat:
-    """Return the format of a recording, complete or not; raises `ConfigError` if it is unknown or lacks its package."""
+    """Return the format of a recording. Raises `ConfigError` if it is unknown or its package is missing."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending not in _FORMATS:
         raise ConfigError(f"{path} has no ending of a recording: name it .mcap, .csv or .parquet")
@@ -51,7 +51,7 @@ def format_of(path: Path) -> RecordingFormat:
 
 
 def grown_as(path: Path) -> Path:
-    """Return the file that a stream is written to: of a format that cannot be read before its end, first as MCAP."""
+    """Return the file that a stream is written to: MCAP first for formats that are unreadable until complete."""
     return path if format_of(path).new.grows else path.with_name(f"{path.name}.mcap")
 
 
@@ -65,21 +65,21 @@ def require_new_recordings(paths: Sequence[Path]) -> None:
 
 
 class RecordingReader:
-    """A recording on disk, read in blocks, also the `.partial` of one that was interrupted.
+    """A recording on disk, read in blocks; also the `.partial` of an interrupted one.
 
     Parameters
     ----------
     path : Path
-        Its ending names the format: .mcap, .csv or .parquet.
+        The suffix selects the format: .mcap, .csv or .parquet.
     columns : collection of str
-        Fields of `Recording.rows` that are needed. Others may be missing, which makes reading faster.
+        Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
 
     Raises
     ------
     ConfigError
-        Another ending, or the package for the format is missing.
+        The suffix is unknown, or the package for the format is missing.
     BadRecording
-        The header is damaged, or of another program.
+        The header is damaged, or another program wrote the file.
     OSError
         The file does not exist or cannot be read.
 
@@ -95,22 +95,24 @@ class RecordingReader:
 
     def __init__(self, path: Path, columns: Collection[str] = ROW.names or ()) -> None:
         self.path, self.cut = path, ""
-        """Why it ends early, once it was read; empty if it is complete."""
+        """Why the recording ends early, known after reading; empty if it is complete."""
         self._columns, self._read = columns, format_of(path).read
         with closing(self._pieces()) as pieces:
             self.header = next(pieces).header
 
     def pieces(self) -> Iterator[Piece]:
-        """Give the samples as stored. Raises `BadRecording` behind the last piece that is intact."""
+        """Yield the samples as stored. Raises `BadRecording` after the last intact piece."""
         count = 0
         for piece in self._pieces():
             count += len(piece.rows)
             yield piece
         if not count:
-            raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", self.path)
+            raise BadRecording(
+                "it contains no sample, because the file was cut or the stream ended at once: record again", self.path
+            )
 
     def blocks(self) -> Iterator[Measured]:
-        """Give the samples as measured: wrench and pose with their times. Raises as `pieces`."""
+        """Yield the samples as measured: wrench and pose with their times. Raises as `pieces`."""
         return in_blocks(piece.measured() for piece in self.pieces())
 
     def _pieces(self) -> Generator[Piece, None, None]:
@@ -123,29 +125,30 @@ class RecordingReader:
 def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording of `RecordingReader` into memory.
 
-    It raises for a damaged file or one without a sample. A file that was cut is read up to there; `cut` says so.
+    Raises for a damaged file and for one without a sample. A truncated file is read to its end; `cut` then gives the
+    reason.
     """
-    # A damaged file raises, because a caller in Python would not see a message.
+    # A damaged file raises, because a caller in Python would not see a printed message.
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
-    reduce(changed, events, reader.header)  # a stage of a newer version may begin later
+    reduce(changed, events, reader.header)  # raises for a stage of a newer version
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 
 def write_recording(path: str | Path, recording: Recording | RecordingReader) -> None:
-    """Write a new file with all of a recording, or none.
+    """Write a whole recording to a new file; after an error, no file remains.
 
     Parameters
     ----------
     path : str or Path
-        Its ending names the format: .mcap, .csv or .parquet.
+        The suffix selects the format: .mcap, .csv or .parquet.
     recording : Recording or RecordingReader
 
     Raises
     ------
     ConfigError
-        Another ending, or the package for the format is missing.
+        The suffix is unknown, or the package for the format is missing.
     OSError
         The file exists or cannot be written.
 

@@ -1,6 +1,6 @@
-"""Recordings of other programs: which files are, as tables, and wrench and pose of tables as one recording.
+"""Recordings of other programs: recognising and reading them as tables, and pairing wrench and pose.
 
-Tables are text, or bags of ROS 1 and ROS 2, which need the extra `ros2`.
+Tables are text files or ROS 1 and ROS 2 bags, which need the extra `ros2`.
 """
 
 import struct
@@ -40,24 +40,24 @@ if TYPE_CHECKING:
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _BAG: Final = b"#ROSBAG V2.0\n"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
-# Times in ns, and numbers.
+# Times in ns, and values.
 _Column = tuple[NDArray[np.int64], Array]
 # Time of receipt in ns, and content.
 _Message = tuple[int, bytes]
 
 T = TypeVar("T")
-# Seconds: the delay is estimated from all of a recording.
+# Window of the delay estimate, s: longer than any recording.
 _WHOLE = 10**6
 _MEAN_S = 0.008
-# Samples before and after a step that show whether it is a gap.
+# Number of samples before and after a step that decide whether it is a gap.
 _NEAR = 100
 _ROUNDS = 20
-# Largest distance of regular times from multiples of their period, in periods.
+# Largest deviation of regular times from multiples of the period, in periods.
 _REGULAR = 0.2
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a file is a recording of `ftdrive record`: by its ending, CSV by the first line, MCAP by its writer."""
+    """Whether `ftdrive record` wrote a file, from its suffix, the first line of CSV or the writer of MCAP."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending != ".csv":
         return ending in ENDINGS and not is_bag(path)
@@ -68,7 +68,7 @@ def is_recording(path: Path) -> bool:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a bag of ROS 1 or ROS 2: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
+    """Whether it is a ROS 1 or ROS 2 bag: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     if path.suffix in (".bag", ".db3"):
@@ -91,7 +91,7 @@ def tables_of(
     pair: tuple[Path, Path] | None = None,
     topics: tuple[str | None, str | None] = (None, None),
 ) -> tuple[Table, Table] | None:
-    """Return wrench and poses of another program, which may be one table; None for a recording of ours.
+    """Return the tables of wrench and poses, possibly the same table; None for a recording of ftdrive.
 
     `source` is a Path, a DataFrame or a mapping. Raises `BadDataset`, `ConfigError` or `OSError`.
     """
@@ -107,30 +107,30 @@ def tables_of(
 
 
 def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
-    """Return what `solve_recording` takes, a recording or two tables; None for poses at rest. Raises as `tables_of`."""
+    """Return the input of `solve_recording`; None for poses at rest. Raises as `tables_of`."""
     if options.pair is None and isinstance(source, Path):
-        # A run folder, or a dataset.
+        # A run folder or a dataset has poses at rest.
         has_poses = source.is_dir() or source.suffix == ".json"
         if has_poses and not is_bag(source):
             return None
     tables = tables_of(source, options.table, options.pair, options.topics)
     if tables is None:
         return Path(source)
-    # One table has both streams or poses at rest.
+    # A single table has either both streams or poses at rest.
     return tables if tables[0] is not tables[1] or tables[0].in_motion else None
 
 
 def table_words(tables: tuple[Table, Table]) -> str:
-    """Return what was recognised in the tables of a recording, in one line; empty for plain ones."""
+    """Return what was recognised in the tables of a recording as one line; empty for standard tables."""
     return "; ".join(dict.fromkeys(f"{one.name}: {one.words}" for one in tables if one.words))
 
 
 def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:
-    """Read wrench and pose; times are those of the headers, from the earliest of both.
+    """Read wrench and pose; the times are those of the headers, from the earliest time of both.
 
-    The topics, of WrenchStamped and PoseStamped, may be left out if there is only one. `pose_topic` may be as the
-    address of an arm: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
-    `ConfigError` if the package rosbags is missing or a topic has to be named, and `BadDataset`.
+    The topics of WrenchStamped and PoseStamped may be omitted if there is only one of each. `pose_topic` may also be
+    like the address of an arm: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
+    `ConfigError` if the package rosbags is missing or a topic must be given, and `BadDataset`.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -139,8 +139,8 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise ConfigError(missing_extra(path.name, "rosbags", "ros2")) from None
     if path.suffix == ".bag":
         with open_file(path) as file:
-            if file.read(len(_BAG)) != _BAG:  # rosbags would read up to the first end of a line
-                raise BadDataset(f"{path.name}: the first bytes are not those of a bag of ROS 1: record it again")
+            if file.read(len(_BAG)) != _BAG:  # rosbags would read a whole line
+                raise BadDataset(f"{path.name}: the first bytes are not those of a ROS 1 bag: record it again")
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")
@@ -152,8 +152,10 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise
     except ProtocolError as error:
         raise BadDataset(f"{path.name}: {error}") from error
-    except Exception as error:  # rosbags raises those of SQLite, zstd, YAML and its own
-        raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged, or of another version") from error
+    except Exception as error:  # of rosbags, SQLite, zstd or YAML
+        raise BadDataset(
+            f"{path.name} cannot be read ({error}): it is damaged or has another version. Record it again"
+        ) from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
     return (
         _time_ordered_table(path.name, wrench, origin_ns, CHANNELS),
@@ -162,7 +164,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
 
 
 def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Sequence[str]) -> Table:
-    """Return times and numbers as a table, in the order of the times."""
+    """Return times and values as a table, sorted by time."""
     t_ns, values = column
     order = np.argsort(t_ns, kind="stable")
     t_s = (t_ns - origin_ns)[order] * 1e-9
@@ -170,7 +172,7 @@ def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Seque
 
 
 def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
-    """Return the topic of a type that is named, or the only one. Raises `ConfigError`."""
+    """Return the given topic of a type, or the only one. Raises `ConfigError`."""
     of_kind = sorted({one.topic for one in reader.connections if one.msgtype == kind})
     if topic is not None and topic not in of_kind:
         known = ", ".join(of_kind) or "none"
@@ -192,21 +194,21 @@ def _read_topics(reader: "AnyReader", topics: Sequence[str]) -> dict[str, list[_
 
 
 def _number_column(reader: "AnyReader", topic: str, messages: Sequence[_Message], count: int) -> _Column:
-    """Return times (n,) in ns, of receipt if no message has a stamp, and numbers (n, count) behind the header."""
+    """Return times (n,) in ns, of receipt if no message has a stamp, and the numbers (n, count) after the header."""
     if not messages:
         raise BadDataset(f"{topic} has no message: give another topic")
     received_ns = np.array([received for received, _ in messages])
     data = [one for _, one in messages]
     if reader.is2 and data[0][:2] != b"\0\1":
         raise BadDataset(f"{topic} is not encoded as little-endian CDR: record it again with the default RMW")
-    # ROS 1 begins with a counter, ROS 2 with four bytes for the encoding; there numbers begin at multiples of 8.
+    # ROS 1 begins with a counter, ROS 2 with four bytes for the encoding. In ROS 2, numbers begin at multiples of 8.
     (length,) = struct.unpack_from("<I", data[0], 12)
     start = 4 + -(-(12 + length) // 8) * 8 if reader.is2 else 16 + length
     if {len(one) for one in data} != {len(data[0])} or len(data[0]) < start + 8 * count:
-        raise BadDataset(f"{topic}: the messages differ in their length, so in frame or type: give another topic")
+        raise BadDataset(f"{topic}: the messages differ in length, and therefore in frame or type: give another topic")
     rows = np.frombuffer(b"".join(data), np.uint8).reshape(len(data), len(data[0]))
     if (rows[:, 12 : 16 + length] != rows[0, 12 : 16 + length]).any():
-        raise BadDataset(f"{topic}: the frame changes within the bag: give a topic of one frame")
+        raise BadDataset(f"{topic}: the frame changes within the bag: give a topic with one frame")
     seconds, nanoseconds = (rows[:, i : i + 4].copy().view("<u4")[:, 0] for i in (4, 8))
     t_ns = seconds.astype(np.int64) * 1_000_000_000 + nanoseconds
     numbers = rows[:, start : start + 8 * count].copy().view("<f8")
@@ -218,12 +220,12 @@ def _checked_column(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Col
         raise BadDataset(f"{topic}: some messages have the stamp 0: set header.stamp in its driver and record again")
     if not np.isfinite(numbers).all():
         row = int(np.argmax(~np.isfinite(numbers).all(axis=1)))
-        raise BadDataset(f"{topic}: message {row + 1} has a number that is not finite: leave this topic out")
+        raise BadDataset(f"{topic}: message {row + 1} has a value that is not finite: give another topic")
     return t_ns, numbers
 
 
 def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
-    """Return what turns messages into poses. Raises `ConfigError` or `BadUrl`."""
+    """Return the reader that converts messages to poses. Raises `ConfigError` or `BadUrl`."""
     if pose_topic is None:
         return Poses(_chosen(reader, _POSES, None, "--pose-topic"))
     named = pose_reader_of(SCHEME + pose_topic.removeprefix(SCHEME))
@@ -236,7 +238,7 @@ def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
 
 
 def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, list[_Message]]) -> _Column:
-    """Return times (m,) in ns, and quaternions x, y, z, w and positions (m, 7)."""
+    """Return times (m,) in ns, and quaternions x, y, z, w with positions (m, 7)."""
     if isinstance(named, Poses):
         (topic,) = named.topics
         t_ns, numbers = _number_column(reader, topic, messages[topic], 7)
@@ -244,11 +246,11 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
         lengths = np.linalg.norm(quaternion, axis=1)
         if (np.abs(lengths - 1) > UNIT_TOLERANCE).any():
             wrong = lengths[np.argmax(np.abs(lengths - 1))]
-            raise BadDataset(f"{topic}: a quaternion has the length {wrong:.3g}: normalize it in its driver")
+            raise BadDataset(f"{topic}: a quaternion has the norm {wrong:.3g}: normalize it in its driver")
         return t_ns, np.hstack([quaternion, position])
     decoded: Iterator[tuple[str, Any]] = (
         (topic, reader.deserialize(data, named.topics[topic]))
-        # A bag may have latched ones late.
+        # Latched messages on /tf_static may be late in a bag, so they come first here.
         for topic in sorted(named.topics, key=lambda topic: topic != "/tf_static")
         for _, data in messages[topic]
     )
@@ -265,7 +267,7 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
         raise BadDataset(f"the bag has no pose: {named.missing()}")
     times, *columns = zip(*found, strict=True)
     if isinstance(named, Joints):
-        # All poses at once: one by one they take longer than the messages.
+        # All poses at once, because one by one they take longer than reading the messages.
         t_ns = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in times])
         R, p = named.chain.poses(dict(zip(named.chain.names, map(np.array, columns), strict=True)))
         (topic,) = named.topics
@@ -275,10 +277,10 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
 
 
 class TablePair:
-    """Two tables, or one with both, as one recording of any length; the devices are unknown.
+    """Two tables, or one with both streams, as one recording of any length; the devices are unknown.
 
-    `name` is that of the calibration, and `delay_s` that of the wrench after the orientation; None estimates it in a
-    pass of its own. Raises `BadDataset` if a table cannot be used, or the two have no time in common.
+    `name` names the calibration, and `delay_s` is the delay of the wrench after the orientation; None estimates it in a
+    separate pass. Raises `BadDataset` if a table cannot be used, or the tables do not overlap in time.
     """
 
     cut = ""
@@ -306,8 +308,8 @@ class TablePair:
         self.delay_s, self.delay_sigma_s = self._estimated_delay() if delay_s is None else (delay_s, 0.0)
 
     def blocks(self) -> Iterator[Measured]:
-        """Give the samples in blocks, each with its pose. Raises `BadDataset` behind the last valid one."""
-        # Each call reads from the beginning: a binary copy for a second pass would need 1.4 GB an hour.
+        """Yield the samples in blocks, each sample with its pose. Raises `BadDataset` after the last valid block."""
+        # Each call reads the files again, because a binary copy would need 1.4 GB per hour of samples.
         share = [0.0]
 
         def samples() -> Iterator[FtSamples]:
@@ -315,11 +317,11 @@ class TablePair:
                 yield from (block.rows(slice(i, i + PIECE_ROWS)) for i in range(0, len(block), PIECE_ROWS))
 
         paired = pair_blocks(samples(), _states_of(self._orientation), self.delay_s)
-        # As of other recordings, because the contact test goes in steps.
+        # Blocks of the same size as for other recordings, because the contact test proceeds block by block.
         return in_blocks(Measured(block, (), share[0]) for block in paired)
 
     def _estimated_delay(self) -> tuple[float, float]:
-        """Return the delay and its sigma, from means over `_MEAN_S`."""
+        """Return the delay and its sigma, estimated from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
         means = list(_before_a_fault(_mean_samples(self._wrench, size)))
@@ -329,7 +331,7 @@ class TablePair:
 
 
 def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
-    """Yield the parts before a fault, if there are any; the pass that follows reports it."""
+    """Yield the parts before a fault, if there are any; the next pass reports the fault."""
     count = 0
     try:
         for part in parts:
@@ -341,7 +343,7 @@ def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
 
 
 def _mean_samples(table: Table, size: int) -> Iterator[FtSamples]:
-    """Yield the mean wrench of each so many samples, numbered, at their mean time."""
+    """Yield the mean wrench of every `size` samples, numbered, at their mean time."""
     t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
     for rows in table.wrenches():
         t_s, wrench = np.concatenate([t_s, rows.t_s]), np.concatenate([wrench, rows.values])
@@ -363,7 +365,7 @@ def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
                 continue
         numbers = sample_numbers(t_s)
         numbers += number - numbers[max(known - 1, 0)]
-        # what follows shows whether a step is a gap
+        # the following samples show whether a step is a gap
         end = len(t_s) if rows is None else len(t_s) - _NEAR
         if end > known:
             yield FtSamples.of(_ns(t_s[known:end]), numbers[known:end], wrench[known:end]), place
@@ -373,10 +375,10 @@ def _numbered_samples(table: Table) -> Iterator[tuple[FtSamples, float]]:
 
 
 def sample_numbers(t_s: Array) -> NDArray[np.int64]:
-    """Number samples by their times (n,), so that a sample that is missing is a gap and a late one is not.
+    """Number samples by their times (n,), so that a missing sample is a gap and a late sample is not.
 
-    Where each time is near a multiple of the period, a longer step is a gap. Elsewhere, as with times of receipt or of
-    batches, a gap is a step after which the samples stay late by a period or more, by their median and by the earliest.
+    If all times are near multiples of the period, a longer step is a gap. Otherwise, as for times of receipt or of
+    batches, a gap is a step after which the samples stay late by at least a period, in the median and for the earliest.
     """
     steps_s = np.diff(t_s)
     if (step_s := float(np.median(steps_s))) > 0:
@@ -384,7 +386,7 @@ def sample_numbers(t_s: Array) -> NDArray[np.int64]:
         if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
             return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     number = np.arange(len(t_s))
-    # the period is that of all samples, the missing ones included
+    # the period is estimated from all samples, missing ones included
     for _ in range(_ROUNDS):
         before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
         if np.array_equal(number, before):
@@ -398,11 +400,11 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
         return number
     steps = np.diff(t_s) / period_s
     late = t_s / period_s - number
-    # of a sample and those before
+    # minimum over each sample and those before
     earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
-    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after it
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
-    # where the samples beside it are less late
+    # largest steps first
     for last in possible[np.argsort(-steps[possible])].tolist():
         near = slice(max(last + 1 - _NEAR, 0), last + 1), slice(last + 1, last + 1 + _NEAR)
         before, after = (t_s[rows] / period_s - number[rows] for rows in near)
@@ -412,7 +414,7 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
 
 
 def _states_of(table: Table) -> Iterator[ArmStates]:
-    """Give the orientations of the flange; positions and joints are NaN."""
+    """Yield the orientations of the flange; positions and joint angles are NaN."""
     for rows in table.poses():
         unknown = np.full((len(rows.t_s), 6), np.nan)
         R = rows.values[:, :9].reshape(-1, 3, 3)

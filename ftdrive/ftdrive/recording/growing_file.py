@@ -1,4 +1,4 @@
-"""A file that grows under its name with `.partial`, and gets its name when it is complete."""
+"""A file that grows as NAME.partial, and is renamed when it is complete."""
 
 import os
 from contextlib import suppress
@@ -9,10 +9,10 @@ from ftcalib.files import open_file, require_new
 
 
 class GrowingFile:
-    """A new file. Raises `OSError` if it or its `.partial` exists already, or the folder cannot be written."""
+    """A new file. Raises `OSError` if it or its `.partial` exists, or if the folder is not writable."""
 
     grows: ClassVar = True
-    """Whether a part of the file can be read."""
+    """Whether an incomplete file can be read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -22,11 +22,11 @@ class GrowingFile:
 
     @property
     def size(self) -> int:
-        """Bytes so far."""
+        """Size so far, bytes."""
         return self._file.tell()
 
     def add(self, content: bytes) -> int:
-        """Append; return where it begins. After an error the file holds what it held before."""
+        """Append bytes; return their offset. After an error the file is unchanged."""
         start = self._file.tell()
         left = memoryview(content)
         try:
@@ -39,10 +39,10 @@ class GrowingFile:
         return start
 
     def complete(self) -> None:
-        """Write the end, fsync the file and give it its name. Raises `OSError`, also if the name is taken."""
+        """Write the end, sync the file to disk and rename it. Raises `OSError`, also if the name exists."""
         try:
             self._write_end()
-            # While it is locked, because it may take seconds.
+            # Before the lock is released by closing, because this may take seconds.
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
@@ -50,7 +50,7 @@ class GrowingFile:
         self.partial.rename(self.path)
 
     def _write_end(self) -> None:
-        """Write what makes the file complete; here nothing."""
+        """Write the end of the format; here nothing."""
 
     def discard(self) -> None:
         """Delete the file."""
@@ -58,27 +58,27 @@ class GrowingFile:
         self.partial.unlink(missing_ok=True)
 
     def keep(self) -> None:
-        """Close the file as it is."""
+        """Close the incomplete file and keep it."""
         self._file.close()
 
 
 def _lock(file: IO[bytes]) -> bool:
-    """Lock a file until it is closed; False if it is locked already."""
+    """Lock a file until it is closed; return False if another process has locked it."""
     try:
         import fcntl
-    except ImportError:  # not on Windows, where no stream is recorded
+    except ImportError:  # Windows, where no stream is recorded
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # of a network drive without locks
+    except OSError:  # a network drive without locks
         return True
     return True
 
 
 def _holder(file: IO[bytes]) -> str:
-    """Return the process that locked a file, as proc_locks(5) lists it."""
+    """Return the process that locked a file, from /proc/locks, see proc_locks(5)."""
     with suppress(OSError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
             _, kind, *_, process, place, _, _ = line.split()
@@ -88,9 +88,9 @@ def _holder(file: IO[bytes]) -> str:
 
 
 def partial_of(path: Path, *, grows: bool) -> Path:
-    """Return the name until a file is complete; raises `OSError` if it or the file exists or the folder does not.
+    """Return the name of an incomplete file. Raises `OSError` if it or the file exists, or the folder does not.
 
-    A part of a file that `grows` can be read.
+    `grows` tells whether an incomplete file can be read.
     """
     partial = path.with_name(path.name + ".partial")
     require_new(path)

@@ -1,11 +1,11 @@
 """Recordings as MCAP, for Foxglove, Lichtblick, PlotJuggler and ROS 2 bags. Needs the extra `record`.
 
-Channels of CDR messages: those of `ftdrive.stream.ros2`, `/ft_sample` with the other columns, `/events`, and `/tf` for
-viewers. All times are UTC. The attachments `calibration.json` and `recording.json` hold the header. Each chunk, each
-attachment and the whole data section have a CRC-32.
+The channels have CDR messages: those of `ftdrive.stream.ros2`, `/ft_sample` with the other columns, `/events`, and
+`/tf` for viewers. All times are UTC. The attachments `calibration.json` and `recording.json` contain the header. Each
+chunk, each attachment and the data section have a CRC-32.
 
-Some thousand samples are packed as one array and become one chunk. The writer of the package `mcap` takes
-messages one by one, which costs half a core at 7 kHz. The format: https://mcap.dev/spec
+Several thousand samples are packed as one array into one chunk, because the writer of the package `mcap` takes messages
+one by one, which needs half a core at 7 kHz. Format: https://mcap.dev/spec
 """
 
 import io
@@ -57,7 +57,7 @@ _SCHEMAS: Final[Mapping[str, ros2.Schema]] = {
 }
 _CHANNELS: Final = {topic: number for number, topic in enumerate(_SCHEMAS, 1)}
 _SAMPLE: Final = [("t_device_s", "<f8"), ("chi2", "<f8"), ("seq", "<i8"), ("status", "<u4"), ("in_contact", "?")]
-# The columns in the messages of a channel, and the number of bytes behind them.
+# Columns in the messages of a channel, and the number of bytes after them.
 _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.RAW]: (np.dtype([("raw", "<f8", 6)]), 0),
     _CHANNELS[ros2.COMPENSATED]: (np.dtype([("wrench", "<f8", 6)]), 0),
@@ -65,26 +65,26 @@ _COLUMNS: Final[Mapping[int, tuple[Any, int]]] = {
     _CHANNELS[ros2.JOINTS]: (np.dtype([("q_rad", "<f8", 6)]), 8),
     _CHANNELS[SAMPLE]: (np.dtype(_SAMPLE), 0),
 }
-# Between two messages on /tf: no screen shows more.
+# Time between two messages on /tf, ns: no screen shows more.
 _TRANSFORMS_STEP_NS: Final = 16_666_667
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _ATTACHMENT, _DATA_END = 3, 4, 5, 6, 7, 9, 15
-# Stands behind the last record of a file that was cut; no record has it.
+# Marks the end of a truncated file; not an opcode of MCAP.
 _CUT = 0
-# What precedes the body of a message.
+# Layout before the body of a message.
 _HEAD: Final = np.dtype(
     [("opcode", "u1"), ("length", "<u8"), ("channel", "<u2"), ("sequence", "<u4"), ("log", "<u8"), ("publish", "<u8")]
 )
 _NONE: Final = np.zeros(0, np.int64)
 
 
-# Times (n,), sequence numbers, and for each topic its n messages; those of one time follow one another.
+# Times (n,), sequence numbers, and for each topic its n messages; messages of one time are consecutive.
 _Group = tuple[NDArray[np.int64], ArrayLike, Mapping[str, ros2.Messages]]
 
 
 class McapFile(GrowingFile):
-    """A new recording."""
+    """A new recording as MCAP."""
 
     def __init__(self, path: Path, header: Header) -> None:
         from mcap.records import Attachment, AttachmentIndex, Channel, Schema
@@ -113,7 +113,7 @@ class McapFile(GrowingFile):
             self._attachments.append(AttachmentIndex(place, len(record), 0, 0, len(data), name, "application/json"))
 
     def _add(self, content: bytes) -> int:
-        """Append to the data section; return where it begins."""
+        """Append to the data section; return the offset."""
         place = self.add(content)
         self._crc = zlib.crc32(content, self._crc)
         return place
@@ -167,7 +167,7 @@ class McapFile(GrowingFile):
                     yield np.array([event.t_host_ns + offset_ns]), 0, {topic: np.frombuffer(packed, f"V{len(packed)}")}
 
     def _messages(self, groups: Sequence[_Group]) -> tuple[memoryview, dict[int, NDArray[np.uint64]]]:
-        """Return the messages of a chunk, until the next call; for each channel (n, 2) times and places in it."""
+        """Return the messages of a chunk, valid until the next call, and per channel their times and offsets (n, 2)."""
         widths = [sum(_HEAD.itemsize + body.itemsize for body in bodies.values()) for *_, bodies in groups]
         messages = self._room(sum(len(t_ns) * width for (t_ns, *_), width in zip(groups, widths, strict=True)))
         tables, place = defaultdict(list), 0
@@ -187,7 +187,7 @@ class McapFile(GrowingFile):
         return messages.data, {number: np.concatenate(parts).astype("<u8") for number, parts in tables.items()}
 
     def _room(self, size: int) -> NDArray[np.uint8]:
-        """Return the first bytes of memory that stays: new one for each chunk takes a third of the time."""
+        """Return the first bytes of a reused buffer: allocating one per chunk takes a third of the time."""
         if size > len(self._memory):
             self._memory = np.concatenate([self._memory, np.empty(2 * size - len(self._memory), np.uint8)])
         return self._memory[:size]
@@ -231,7 +231,7 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
 
 
 def _log(event: StreamEvent, offset_ns: int) -> bytes:
-    """Pack an event as Log: its kind is the name, its values stand in `function` as JSON."""
+    """Pack an event as Log: the kind as name, the values in `function` as JSON."""
     stamp = divmod(event.t_host_ns + offset_ns, 1_000_000_000)
     packed = struct.pack("<iIB3x", *stamp, 30 if event.kind in ros2.WARNINGS else 20)
     for text in (event.kind, event.text, "", json.dumps(dict(event.values))):
@@ -241,14 +241,14 @@ def _log(event: StreamEvent, offset_ns: int) -> bytes:
 
 
 def _pack_load(event: StreamEvent) -> bytes:
-    """Pack a weighing, which the events have too; what is not known is NaN."""
+    """Pack a weighing, which is also among the events; unknown values are NaN."""
     values, nowhere = event.values, [np.nan] * 3
     com_m, sigma_m = values["p_sensor_com_m"] or nowhere, values["p_sensor_com_sigma_m"] or nowhere
     return struct.pack("<8d", values["mass_kg"], values["mass_sigma_kg"], *com_m, *sigma_m)
 
 
 def _tracked(event: StreamEvent) -> bytes:
-    """Pack bias and part as followed; an age that is not known is infinite."""
+    """Pack tracked bias and part; an unknown age is infinite."""
     values = event.values
     age_s = np.inf if values["last_seen_s"] is None else values["last_seen_s"]
     part = values["part_kg"], values["part_sigma_kg"], age_s, values["part_known"]
@@ -296,7 +296,7 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
                 if opcode == _INDEX:
                     content.indexes.append(data)
                 elif opcode == _CUT:
-                    # The last chunk of an interrupted file may lack the end of its index.
+                    # The last chunk of an interrupted file may lack some indexes.
                     with suppress(ValueError):
                         content.close_chunk()
                     yield content.piece(1.0)
@@ -329,9 +329,9 @@ def _mcap_header(documents: Mapping[str, Any]) -> Header:
 
 
 def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
-    """Give the records of the data section that are complete, and `_CUT` where its end is missing.
+    """Yield the complete records of the data section, and `_CUT` if its end is missing.
 
-    Raises `ValueError` if its CRC does not fit them, or the file was completed without that end.
+    Raises `ValueError` if the CRC does not match, or if the file was completed without the end of the data.
     """
     crc = zlib.crc32(MAGIC)
     while len(start := file.read(9)) == 9:
@@ -354,13 +354,13 @@ def _data_section(file: IO[bytes]) -> Iterator[tuple[int, bytes]]:
 
 
 def _require_crc(crc: int, stored: bytes) -> None:
-    """Raise `ValueError` unless a CRC-32 is the stored one; 0 is none, as other programs write."""
+    """Raise `ValueError` unless the CRC-32 equals the stored one; 0 means no CRC, as other programs write."""
     if struct.unpack("<I", stored) not in ((0,), (crc,)):
         raise ValueError("its bytes differ from their checksum")
 
 
 class _Content:
-    """What the last chunk has added: columns and events, with the times of the cell."""
+    """Columns and events of the chunks since the last piece, with times of the cell's clock."""
 
     def __init__(self, header: Header, columns: Collection[str]) -> None:
         self._header = header
@@ -369,7 +369,7 @@ class _Content:
         self._events: list[StreamEvent] = []
         self._messages = b""
         self.indexes: list[bytes] = []
-        """Of the channels in the chunk; other programs may have divided the file into other chunks."""
+        """Indexes of the channels in the chunk; other programs may have divided the file into other chunks."""
 
     def open_chunk(self, data: bytes) -> None:
         """Unpack the messages of a chunk, and check their CRC."""
@@ -381,9 +381,9 @@ class _Content:
         self._messages = stream.read(size)
 
     def close_chunk(self) -> bool:
-        """Take the messages of the chunk; return whether there is one. Raises `ValueError` unless all are indexed.
+        """Take the messages of the chunk; return whether there are any. Raises `ValueError` unless all are indexed.
 
-        The CRC of a chunk covers its messages, not their indexes.
+        The indexes are checked, because the CRC of a chunk covers only its messages.
         """
         messages, indexes, self._messages, self.indexes = self._messages, self.indexes, b"", []
         found = [_indexed(messages, index) for index in indexes]
@@ -407,7 +407,7 @@ class _Content:
         return bool(messages)
 
     def piece(self, share: float) -> Piece:
-        """Return the samples that are complete and the events; samples whose columns still lack some wait for these."""
+        """Return the complete samples and the events; samples with missing columns wait for the next chunk."""
         columns = {name: np.concatenate([np.empty(0, ROW[name]), *parts]) for name, parts in self._columns.items()}
         rows = np.empty(min(map(len, columns.values())), self._kind)
         for name, column in columns.items():
@@ -419,7 +419,7 @@ class _Content:
 
 
 def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the channel of an index, and times, begins and ends (n,) of its messages; checks them against these."""
+    """Return the channel of an index, and times, begins and ends (n,) of its messages, after comparing it with them."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
     heads = _gather(messages, places, _HEAD)
@@ -429,8 +429,8 @@ def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDA
 
 
 def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[np.int64]) -> None:
-    """Raise `ValueError` unless there is nothing but schemas and channels between the indexed messages."""
-    # that of each channel is in order
+    """Raise `ValueError` if there is anything but schemas and channels between the indexed messages."""
+    # only the offsets of each channel are in order
     order = np.argsort(places, kind="stable")
     begins, stops = np.append(places[order], len(messages)), np.insert(ends[order], 0, 0)
     for stop, begin in zip(stops[stops != begins].tolist(), begins[stops != begins].tolist(), strict=True):
@@ -441,13 +441,13 @@ def _require_complete(messages: bytes, places: NDArray[np.int64], ends: NDArray[
                 break
             place += 9 + length
         if place != begin:
-            raise ValueError("a chunk has a message that no index names")
+            raise ValueError("a chunk has a message without an index entry")
 
 
 def _gather(data: bytes, places: NDArray[np.int64], kind: np.dtype[Any]) -> NDArray[Any]:
-    """Return the values at these places; without a copy if they are equally far apart."""
+    """Return the values at these offsets; without a copy if the offsets are equidistant."""
     if len(places) and (places.min() < 0 or places.max() + kind.itemsize > len(data)):
-        raise ValueError("an index points out of its chunk")
+        raise ValueError("an index points outside its chunk")
     steps = np.diff(places)
     if len(steps) and (steps == steps[0]).all():
         return np.ndarray(len(places), kind, data, int(places[0]), (int(steps[0]),))

@@ -1,4 +1,4 @@
-"""Writers of recordings: files that grow together, a stream or raw readings recorded, and a recording converted."""
+"""Writers of recordings: files written together, recorders of a stream and of raw readings, and conversion."""
 
 import signal
 import threading
@@ -26,18 +26,18 @@ from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, 
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
-# Writing takes a few ms, in which the stream waits.
+# The stream waits for a few ms while this much is written.
 _FLUSH_NS = 200_000_000
 
 
 class RecordingFiles:
-    """New files that grow together, each with all samples. Raises as `Recorder`."""
+    """New files that are written together, each with all samples. Raises as `Recorder`."""
 
     def __init__(self, paths: Sequence[Path], header: Header) -> None:
         self.saved: list[Path] = []
-        """Files that are complete."""
+        """Completed files."""
         self.partial: dict[Path, int] = {}
-        """Files that could not be completed, and how many samples each of them keeps."""
+        """Files that could not be completed, with the number of samples in each."""
         self._paths, self._files = paths, list[RecordingFile]()
         with ExitStack() as stack:
             stack.callback(self.discard)
@@ -46,9 +46,9 @@ class RecordingFiles:
             stack.pop_all()
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples of one frame, and the events since the samples before.
+        """Write samples of one frame, and the events since the previous samples.
 
-        Raises `OSError`. Then no file will be completed, and the error names what remains in which `.partial`.
+        Raises `OSError`; then no file is completed, and the message names what each `.partial` contains.
         """
         with _uninterrupted():
             try:
@@ -63,13 +63,14 @@ class RecordingFiles:
                 raise
 
     def complete(self) -> None:
-        """Complete all files that hold every sample.
+        """Complete all files with every sample.
 
-        Raises `OSError` if one could not be completed; the others were. It names what remains in which `.partial`.
+        Raises `OSError` if a file could not be completed; the others are. The message names what each `.partial`
+        contains.
         """
         files, self._files, failure = self._files, [], None
         with _uninterrupted():
-            # after an error there is no file
+            # after an error there are no files
             for path, file in zip(self._paths, files, strict=False):
                 try:
                     file.complete()
@@ -81,13 +82,13 @@ class RecordingFiles:
             raise self._named(failure)
 
     def discard(self) -> None:
-        """Delete what was written and is not complete."""
+        """Delete the incomplete files."""
         for file in self._files:
             file.discard()
         self._files = []
 
     def _keep(self, file: RecordingFile) -> None:
-        """End a file without completing it; one without samples that can be read is deleted."""
+        """Close a file without completing it; delete it if it contains no readable samples."""
         file.keep()
         if file.samples:
             self.partial[file.partial] = file.samples
@@ -95,21 +96,21 @@ class RecordingFiles:
             file.discard()
 
     def _named(self, error: OSError) -> OSError:
-        """Return an error of the same kind that names what is safe."""
-        kept = " and ".join(f"{path} keeps {samples} samples" for path, samples in self.partial.items())
+        """Return an error of the same type that names the kept samples."""
+        kept = " and ".join(f"{path} contains {samples} samples" for path, samples in self.partial.items())
         kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample is kept"
         return type(error)(f"{error.strerror or error}: {kept}")
 
 
 class Recorder(Sink):
-    """Writes a stream to new files, .mcap, .csv or .parquet by their endings, with everything since the first sample.
+    """Writes a stream to new files, .mcap, .csv or .parquet by suffix, from the first sample on.
 
-    Changes of frame and stages become events with the time of the first sample after them. Parquet cannot be read
-    before its end: `x.parquet` is recorded as `x.parquet.mcap`, and converted at the end. If the stream is
-    `repeatable`, as one from a file, Parquet is written at once. `configuration` is that of the cell, for the header.
-    `duration_s` and `count` are limits of the recording, which then `is_complete`.
+    Changes of frame and stages become events with the time of the first sample after them. An incomplete Parquet file
+    cannot be read, so `x.parquet` is recorded as `x.parquet.mcap` and converted at the end. If the stream is
+    `repeatable`, such as a recording, Parquet is written directly. `configuration` of the cell is stored in the header.
+    `duration_s` and `count` limit the recording; at the limit, `is_complete` is true.
 
-    Raises `ConfigError` for an unknown ending or a missing package, `OSError` for a file that exists or has no folder.
+    Raises `ConfigError` for an unknown suffix or a missing package, `OSError` for an existing file or a missing folder.
     """
 
     label, keeps_all = "recording", True
@@ -130,7 +131,7 @@ class Recorder(Sink):
         self.samples, self.gaps, self.lost = 0, 0, 0
         self.first_ns = self.last_ns = 0
         self.show: Callable[[str], object] = lambda _: None
-        """Gets in words what is done, because a conversion at the end may take a minute for each hour of samples."""
+        """Receives the progress as text, because the final conversion may take a minute per hour of samples."""
         require_new_recordings(paths)
         self._info, self._configuration = info, configuration
         self._grown = {path if repeatable else grown_as(path): path for path in paths}
@@ -141,30 +142,30 @@ class Recorder(Sink):
 
     @property
     def saved(self) -> Sequence[Path]:
-        """Files that are complete."""
+        """Completed files."""
         return [path for path in self._grown.values() if self._files and path in self._files.saved]
 
     @property
     def partial(self) -> Mapping[Path, int]:
-        """Files that could not be completed, and how many samples each of them keeps."""
+        """Files that could not be completed, with the number of samples in each."""
         return self._files.partial if self._files else {}
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """Time from the first to the last sample, s."""
         return (self.last_ns - self.first_ns) * 1e-9
 
     @property
     def rate_Hz(self) -> float:
-        """Mean rate of all samples; 0 if there is only one."""
+        """Mean rate of all samples; 0 for a single sample."""
         return (self.samples - 1) / self.duration_s if self.duration_s else 0.0
 
     def begin(self, stream: Stream) -> None:
-        """Remember the stream, whose delay is recorded at the end; a recording has its own events."""
+        """Keep the stream, whose delay is recorded at the end; a recording has its own delay events."""
         self._stream = None if self._is_repeatable else stream
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Record what is within the limits. Raises as `RecordingFiles.append`."""
+        """Record the samples within the limits. Raises as `RecordingFiles.append`."""
         if block:
             left = len(block) if self._count is None else self._count - self.samples
             if self._duration_s is not None:
@@ -178,7 +179,7 @@ class Recorder(Sink):
             if event.kind == "gap":
                 self.gaps += 1
                 self.lost += int(event.values.get("lost", 0))
-        # `_follow` finds the first sample of each
+        # changes of frame and stages are recorded by `_follow`, with the first sample after them
         self._events += [event for event in events if event.kind not in ("frame", "stages")]
         if block:
             self._follow(block)
@@ -191,12 +192,12 @@ class Recorder(Sink):
             self.is_complete |= self.samples == self._count
 
     def end(self) -> None:
-        """Complete the files; without a sample there is none. Raises as `RecordingFiles.complete`."""
+        """Complete the files; without a sample there are none. Raises as `RecordingFiles.complete`."""
         if self._stream is not None:
             status = self._stream.status()
             values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
             delay_ms = with_sigma(1e3 * status.delay_s, 1e3 * status.delay_sigma_s)
-            text = f"the wrench is {delay_ms} ms (1 sigma) after the pose"
+            text = f"delay of the wrench after the pose: {delay_ms} ms (1 sigma)"
             self._events.append(StreamEvent(self.last_ns, "delay", text, values))
         self._flush()
         if self._files:
@@ -209,7 +210,7 @@ class Recorder(Sink):
                         self._convert(self._files, grown, path)
 
     def _convert(self, files: RecordingFiles, grown: Path, path: Path) -> None:
-        """Write a complete recording in another format, and delete it. After an error it remains. Raises `OSError`."""
+        """Convert a complete recording to another format and delete it; after an error it remains. Raises `OSError`."""
         files.saved.remove(grown)
         try:
             write_recording(path, RecordingReader(grown))
@@ -217,19 +218,19 @@ class Recorder(Sink):
             files.partial[grown] = self.samples
             kind = type(error) if isinstance(error, OSError) else OSError
             raise kind(
-                f"{path} was not written ({error or 'interrupted'}): {grown} keeps {self.samples} samples, which "
-                f"`ftdrive convert {grown} {path}` saves"
+                f"{path} was not written ({error or 'interrupted'}): {grown} contains {self.samples} samples. Use "
+                f"`ftdrive convert {grown} {path}`"
             ) from error
         grown.unlink()
         files.saved.append(path)
 
     def discard(self) -> None:
-        """Delete what was written."""
+        """Delete the incomplete files."""
         if self._files:
             self._files.discard()
 
     def _follow(self, block: Block) -> None:
-        """Begin with the first block; record a change of frame or stages."""
+        """Create the files with the first block; record a change of frame or stages."""
         t_ns = int(block.t_host_ns[0])
         if self._header is None:
             self._header, self.first_ns = Header(self._info, block.frame, block.stages, self._configuration), t_ns
@@ -241,7 +242,7 @@ class Recorder(Sink):
         if block.stages != self._header.stages:
             changes.append(StreamEvent(t_ns, "stages", f"The stages are {block.stages}", asdict(block.stages)))
         if changes:
-            # the samples of one flush are in one frame
+            # all samples of one flush are in one frame
             self._flush()
             self._events += changes
             self._header = replace(self._header, frame=block.frame, stages=block.stages)
@@ -257,9 +258,9 @@ _RAW_ROW: Final = "{:.6f}," + ",".join(["{:.7g}"] * 6) + "\n"
 
 
 class RawTable(Sink):
-    """A new .csv: time in UTC seconds, then the raw wrench in N and N·m, sensor axes, about the sensor origin.
+    """A new .csv file: time in UTC seconds, then the raw wrench in N and N·m, sensor axes, about the sensor origin.
 
-    A tare is not subtracted. A text table has no place for events. Raises as `GrowingFile`.
+    Tares are not subtracted, and events are not stored. Raises as `GrowingFile`.
     """
 
     label, keeps_all = "recording", True
@@ -283,10 +284,10 @@ class RawTable(Sink):
 def converted(
     reader: RecordingReader, target: Path, show: Callable[[str], object] = lambda _: None
 ) -> tuple[dict[str, Any], BaseException | None]:
-    """Write a recording of any length as a new file, and return samples, duration_s and gaps.
+    """Convert a recording of any length to a new file; return samples, duration_s and gaps, and what ended it early.
 
-    Damage and Ctrl-C end the file behind the last valid piece, and are returned too. Raises `BadRecording` if the first
-    piece is damaged, and `OSError` as `RecordingFiles`. `show` gets in words how much is done.
+    Damage and Ctrl-C end the file after the last valid piece. Raises `BadRecording` if the first piece is damaged, and
+    `OSError` as `RecordingFiles`. `show` receives a text about the progress.
     """
     files = RecordingFiles([target], reader.header)
     failure: BaseException | None = None
@@ -313,7 +314,7 @@ def converted(
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Let Ctrl-C, `kill` and a closing terminal wait, so that each file gets all of a piece."""
+    """Delay Ctrl-C, `kill` and a closing terminal, so that each file gets the whole piece."""
     waiting: list[tuple[Any, Any, Any]] = []
     handlers = {}
     if threading.current_thread() is threading.main_thread():

@@ -1,6 +1,6 @@
-"""A recording: the columns, the header and the events that every file format stores.
+"""Data model of a recording: columns, header and events, stored by every file format.
 
-The pose is stored as a quaternion, so that all formats hold the same bits.
+The orientation is stored as a quaternion, so that all formats contain the same bits.
 """
 
 import json
@@ -37,11 +37,11 @@ T = TypeVar("T")
 FORMAT: Final = "ftdrive.recording/1"
 
 Rows = NDArray[np.void]
-"""(n,) records of the type `ROW`."""
+"""(n,) records of type `ROW`."""
 PIECE_ROWS: Final = 1 << 13
-"""Samples of a piece, which stay in the cache."""
+"""Number of samples in a piece, which fits the cache."""
 ZSTD_LEVEL: Final = -5
-"""Level of zstd: numbers with noise in their last digits hardly shrink, at any level."""
+"""Compression level of zstd: values with noise in their last digits hardly shrink at any level."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
 _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
@@ -60,20 +60,20 @@ _GROUPS: Mapping[str, tuple[str, Sequence[str]]] = {
 ROW: Final = np.dtype(
     [(name, kind, (len(names),)) if names else (name, kind) for name, (kind, names) in _GROUPS.items()]
 )
-"""One sample, fields as in `Block`; the quaternion is x, y, z, w."""
+"""One sample, with fields as in `Block`; the quaternion is x, y, z, w."""
 NEEDED: Final = ("t_host_ns", "seq", "raw", "p_base_flange_m", "quaternion_base_flange")
-"""Columns without which there is no compensation."""
+"""Columns required for compensation."""
 NUMBERS: Final = {name: names or (name,) for name, (_, names) in _GROUPS.items()}
-"""The columns of the table formats, by the field of `ROW` that holds them."""
+"""Columns of the table formats for each field of `ROW`."""
 
 
 def flat_layout(kind: np.dtype[Any]) -> np.dtype[Any]:
-    """Return the layout of the bytes of `ROW`, or of some of its fields, with one field a number."""
+    """Return the layout of `ROW`, or of some of its fields, with one field per number."""
     return np.dtype([(one, kind[name].base) for name in kind.names or () for one in NUMBERS[name]])
 
 
 COLUMNS: Final = flat_layout(ROW)
-"""The columns of the table formats."""
+"""Columns of the table formats."""
 
 
 def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray[Any]]:
@@ -87,16 +87,16 @@ def table_of(rows: Rows, start_ns: int, utc_offset_ns: int) -> dict[str, NDArray
 
 
 def places_of(events: Sequence[StreamEvent], rows: Rows) -> list[int]:
-    """Return for each event the number of samples before it: of a frame or stages those before its time, else up to it.
+    """Return for each event the number of samples before it.
 
-    The order of the events stays.
+    Samples at the time of an event come before it, except for changes of frame or stages. The order of events is kept.
     """
     after_ns = [event.t_host_ns + (event.kind not in ("frame", "stages")) for event in events]
     return list(accumulate(np.searchsorted(rows["t_host_ns"], after_ns).tolist(), max))
 
 
 def to_records(samples: Block | Paired) -> Rows:
-    """Return samples as records; what paired samples do not have is 0."""
+    """Return samples as records; fields that paired samples lack are 0."""
     rows = np.zeros(len(samples), ROW)
     for name in _GROUPS:
         if hasattr(samples, name):
@@ -107,7 +107,7 @@ def to_records(samples: Block | Paired) -> Rows:
 
 
 def _paired_of(rows: Rows) -> Paired:
-    """Return samples as measured, each with its pose; columns that were not read are 0."""
+    """Return samples as measured, with their poses; columns that were not read are 0."""
 
     def column(name: str) -> NDArray[Any]:
         if name in (rows.dtype.names or ()):
@@ -120,17 +120,17 @@ def _paired_of(rows: Rows) -> Paired:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Header:
-    """What does not change within a recording, and the frame and stages of its first sample."""
+    """Constant description of a recording, with the frame and stages of its first sample."""
 
     info: StreamInfo
     frame: WrenchFrame
     stages: Stages
     configuration: Mapping[str, JSON] = field(default_factory=dict)
-    """Configuration of the cell, as `ftdrive config show --json` prints it."""
+    """Configuration of the cell, as printed by `ftdrive config show --json`."""
 
     @property
     def words(self) -> str:
-        """What the wrench columns hold, for people."""
+        """Description of the wrench columns as text."""
         words = (
             "raw_fx..raw_tz as measured, sensor axes, about the sensor origin; "
             f"fx..tz compensated, {self.frame}; N, N·m, m, rad"
@@ -139,7 +139,7 @@ class Header:
         return f"{words}; {state}" if state else words
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the header as JSON; numbers that are not finite are null."""
+        """Return the header as JSON; values that are not finite are null."""
         info = self.info
         values: dict[str, Any] = {item.name: getattr(info, item.name) for item in fields(StreamInfo)}
         for name in _ARRAYS:
@@ -154,10 +154,10 @@ class Header:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
+        """Build the header from the content of a file; unknown fields are ignored. Raises `BadRecording`."""
         check_format(document, FORMAT, BadRecording)
         try:
-            # files of earlier versions lack fields that have defaults
+            # files of earlier versions lack the fields with defaults
             newer = {item.name: item.default for item in fields(StreamInfo) if item.default is not MISSING}
             known = {**newer, "result": None, **document}
             values = {item.name: known[item.name] for item in fields(StreamInfo)}
@@ -186,17 +186,19 @@ def _device_info(document: Mapping[str, Any]) -> DeviceInfo:
 
 
 def frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
-    """Build a frame from `WrenchFrame.to_dict`."""
+    """Build a frame from the result of `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
 
 
 def _stages_of(values: Mapping[str, Any]) -> Stages:
-    """Build stages from a header or an event. One that is not named there did not exist yet, so it was off."""
+    """Build stages from a header or an event; a stage that is not named did not exist, and was therefore off."""
     usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
     off = {name: None if value is None else type(value)() for name, value in usual.items()}
     if newer := [name for name, value in dict(values).items() if value and name not in off]:
-        raise BadRecording(f"the stage {newer[0]} was on, which this version does not have: use a newer ftdrive")
+        raise BadRecording(
+            f"the recording uses the stage {newer[0]}, which this version does not have: use a newer ftdrive"
+        )
     return Stages(**{name: values.get(name, value) for name, value in off.items()})
 
 
@@ -207,7 +209,7 @@ def event_text(event: StreamEvent) -> str:
 
 
 def event_of(text: str) -> StreamEvent:
-    """Build an event from `event_text`. Raises `ValueError`."""
+    """Build an event from the result of `event_text`. Raises `ValueError`."""
     try:
         values = parsed_json(text)
         return StreamEvent(values["t_host_ns"], values["kind"], values["text"], values["values"])
@@ -216,12 +218,12 @@ def event_of(text: str) -> StreamEvent:
 
 
 class Piece(NamedTuple):
-    """Consecutive samples of a recording, as they are stored."""
+    """Consecutive samples of a recording, as stored."""
 
     header: Header
     rows: Rows
     events: Sequence[StreamEvent]
-    """Since the piece before."""
+    """Events since the previous piece."""
     share: float
     """Share of the recording up to the end of this piece, 0 to 1."""
 
@@ -236,7 +238,7 @@ class Measured(NamedTuple):
     samples: Paired
     events: Sequence[StreamEvent]
     share: float
-    """As in `Piece`."""
+    """Share of the recording up to the end of these samples, 0 to 1."""
 
 
 class AnyRecording(Protocol):
@@ -248,10 +250,10 @@ class AnyRecording(Protocol):
 
     @property
     def cut(self) -> str:
-        """Why it ends early, once it was read; empty if it is complete."""
+        """Why the recording ends early, known after reading; empty if it is complete."""
 
     def blocks(self) -> Iterator[Measured]:
-        """Give all samples in blocks; each call begins again. Raises `BadRecording` behind the last valid block."""
+        """Yield all samples in blocks; each call starts again. Raises `BadRecording` after the last valid block."""
 
 
 def with_calibration(header: Header, calibration: CalibrationResult, name: str) -> Header:
@@ -266,7 +268,7 @@ def with_calibration(header: Header, calibration: CalibrationResult, name: str) 
 class Recording(Displayed):
     """A recording in memory.
 
-    An event of the kind "frame" or "stages" stands where those of the samples change; `values` holds the new ones.
+    Events of the kinds "frame" and "stages" mark where these change in the samples; `values` has the new ones.
     """
 
     header: Header
@@ -277,16 +279,16 @@ class Recording(Displayed):
 
     @property
     def table(self) -> NDArray[np.void]:
-        """(n,) the samples, one named field a number, as `pandas.DataFrame` takes them; names as in the CSV format."""
+        """(n,) samples with one named field per number, for `pandas.DataFrame`; names as in the CSV format."""
         return self.rows.view(flat_layout(self.rows.dtype))
 
     def to_frame(self) -> Any:
-        """Return the samples as a DataFrame of pandas, else of Polars.
+        """Return the samples as a DataFrame of pandas, or of Polars if pandas is missing.
 
         Returns
         -------
         DataFrame
-            The columns of the CSV format: `t_s` from the first sample, `t_utc_s` since 1970, then those of `table`.
+            Columns of the CSV format: `t_s` since the first sample, `t_utc_s` since 1970, then those of `table`.
 
         Raises
         ------
@@ -315,20 +317,20 @@ class Recording(Displayed):
 
     @property
     def duration_s(self) -> float:
-        """From the first sample to the last."""
+        """Time from the first to the last sample, s."""
         return float(np.ptp(self.rows["t_host_ns"])) * 1e-9 if len(self.rows) else 0.0
 
     @property
     def gaps(self) -> int:
-        """Number of places where samples are missing."""
+        """Number of gaps in the samples."""
         return int(np.count_nonzero(np.diff(self.rows["seq"]) != 1))
 
     def paired(self) -> Paired:
-        """Return the samples as measured, each with its pose; columns that were not read are 0."""
+        """Return the samples as measured, with their poses; columns that were not read are 0."""
         return _paired_of(self.rows)
 
     def pieces(self) -> Iterator[Piece]:
-        """Give samples in pieces of one frame, the events since the piece before, and the header that holds there."""
+        """Yield samples in pieces of one frame, with the events since the previous piece and the header valid there."""
         header = self.header
         for rows, events in divided(Piece(header, self.rows, self.events, 1.0)):
             for event in events:
@@ -336,19 +338,19 @@ class Recording(Displayed):
             yield Piece(header, rows, events, 1.0)
 
     def blocks(self) -> Iterator[Measured]:
-        """Give the samples as measured, in blocks."""
+        """Yield the samples as measured, in blocks."""
         return in_blocks(piece.measured() for piece in self.pieces())
 
 
 def changed(header: Header, event: StreamEvent) -> Header:
-    """Return the header that holds after an event. Raises `BadRecording` for a stage of a newer version."""
+    """Return the header valid after an event. Raises `BadRecording` for a stage of a newer version."""
     if event.kind == "frame":
         return replace(header, frame=frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 
 def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
-    """Divide samples where frame or stages change, and into `PIECE_ROWS`; events stay in front of what follows them."""
+    """Divide samples at changes of frame or stages, and after `PIECE_ROWS`; events stay before the next samples."""
     n = len(piece.rows)
     events = sorted(piece.events, key=lambda event: event.t_host_ns)
     at = places_of(events, piece.rows)
@@ -362,8 +364,8 @@ def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
 
 
 def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
-    """Give items of which a thread always makes the next one; errors come in their place."""
-    # One thread reads and one processes, and only the main thread writes: errors and Ctrl-C keep their order.
+    """Yield items while a thread makes the next one; its errors are raised in order."""
+    # One thread reads and one processes. Only the main thread writes, so that errors and Ctrl-C keep their order.
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(next, items, None)
         while (item := following.result()) is not None:
@@ -372,7 +374,7 @@ def read_ahead(items: Iterator[T]) -> Generator[T, None, None]:
 
 
 def in_blocks(parts: Iterable[Measured]) -> Iterator[Measured]:
-    """Give samples in blocks of `PIECE_ROWS`, however they come, up to an error."""
+    """Yield samples in blocks of `PIECE_ROWS`, for parts of any size, up to an error."""
     waiting, count, events, share, failure = list[Paired](), 0, list[StreamEvent](), 0.0, None
     try:
         for part in parts:

@@ -1,4 +1,4 @@
-"""A run, a recording or a table of another program, replayed as a stream."""
+"""Replay of a run, a recording or a table of another program as a stream."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -23,7 +23,7 @@ from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 
 
 def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
-    """Replay a run folder, a recording with its own calibration unless another one is given, or another program's.
+    """Open the stream of a run folder, a recording (by default with its own calibration) or a table of another program.
 
     Raises `ConfigError` without a calibration, and `DataError` or `OSError` for a file that cannot be used.
     """
@@ -49,14 +49,14 @@ def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed:
 
 
 def is_run_folder(path: Path) -> bool:
-    """Whether it is a folder of a run, and no recording that was interrupted."""
+    """Whether the path is a run folder, and not an interrupted recording."""
     return path.is_dir() and path.suffix != ".partial"
 
 
 def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> RecordingSource:
-    """Give the poses of a guided run, one after the other; the moves between them were not recorded.
+    """Return the poses of a guided run as a source, one after the other; the moves between them were not recorded.
 
-    `name` is that of the calibration. Raises `BadDataset` for a run that is damaged or has no pose.
+    `name` names the calibration. Raises `BadDataset` for a damaged run or a run without poses.
     """
     header, records = run.header(), run.records()
     if not records:
@@ -71,7 +71,7 @@ def source_of_run(run: Run, calibration: CalibrationResult, name: str = "") -> R
             Paired(
                 t_host_ns=np.empty(n, np.int64),
                 t_device_s=samples.t_device_s,
-                # lost samples stay visible
+                # keep gaps of lost samples
                 seq=samples.seq - samples.seq[0] + count,
                 status=samples.status,
                 raw=samples.wrench,

@@ -1,22 +1,22 @@
-"""Recordings as tables, whose columns are those of `table_of`; header and events are JSON.
+"""Recordings as tables with the columns of `table_of`; header and events are JSON.
 
-CSV, which everything reads:
+CSV, for any program:
 
-    # ftdrive.recording/1: what the columns hold
+    # ftdrive.recording/1: description of the columns
     # header {...}
     t_s,t_utc_s,t_host_ns,...
     # crc32 1a2b3c4d       of everything before this line
     ...
-    # event {...}          where it happened
+    # event {...}          at its time
     # crc32 5e6f7a8b
     # end
 
-A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`, finds a plain table. A file whose
-checksum does not fit is refused. Of a file without its end, samples count up to the last checksum, which follows at
-least every second.
+A reader that skips lines with `#`, such as `pandas.read_csv(path, comment="#")`, reads a plain table. A file whose
+checksum does not match is refused. In a file without its end, samples are valid up to the last checksum; there is one
+at least every second.
 
-Parquet, the fastest to read, for pandas, Polars, DuckDB and MATLAB. It needs the extra `record`. The footer has
-`header` and `events`, and the CRC-32 of these two. Each page has a CRC-32 too.
+Parquet, for pandas, Polars, DuckDB and MATLAB, is fastest to read. It needs the extra `record`. The footer has
+`header` and `events`, and their CRC-32. Each page has a CRC-32 too.
 """
 
 import csv
@@ -53,7 +53,7 @@ from ftdrive.recording.recording import (
 from ftdrive.stream.samples import StreamEvent
 
 FIRST_BYTES = f"# {FORMAT.partition('/')[0]}/".encode()
-"""A file that begins with these is a recording of some version."""
+"""First bytes of a recording of any version."""
 _HEADER, _EVENT, _CRC, _END = "# header ", "# event ", "# crc32 ", "# end"
 _GROUP_ROWS: Final = 1 << 14
 _PARQUET_END: Final = b"PAR1"
@@ -83,7 +83,7 @@ class CsvFile(_TableFile):
         self._add(f"# {FORMAT}: {header.words}\n{_HEADER}{json.dumps(header.to_dict())}\n{names}\n")
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Write samples, and each event where it happened. Raises `OSError`."""
+        """Write samples, and each event at its time. Raises `OSError`."""
         text = io.StringIO()
         table = csv.writer(text, lineterminator="\n")
         lines = list(self._lines(rows)) if len(rows) else []
@@ -147,7 +147,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
                     if len(lines) >= PIECE_ROWS:
                         yield piece()
                         lines, events = [], []
-            except BadRecording as error:  # what was checked before counts
+            except BadRecording as error:  # the lines before it are valid
                 failure = error
             yield piece()
         except ValueError as error:
@@ -158,7 +158,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
 
 
 def _checked_lines(file: BufferedReader) -> Iterator[list[str]]:
-    """Give the lines of each checksum that fits them, and the end."""
+    """Yield the lines before each matching checksum, and the end."""
     crc, waiting, begin = 0, list[str](), 0
     for number, line in enumerate(read_lines(file, BadRecording), 1):
         if file.tell() - begin > MOST_BYTES:
@@ -191,11 +191,11 @@ def _parse_document(text: str) -> dict[str, object]:
 
 
 class ParquetFile(_TableFile):
-    """A new Parquet file. Nothing of it can be read before it is complete, so `samples` stays 0."""
+    """A new Parquet file. It cannot be read before it is complete, so `samples` stays 0."""
 
     grows = False
     closed = False
-    """For pyarrow, which writes to it as to a file."""
+    """Attribute that pyarrow expects of a file."""
 
     def __init__(self, path: Path, header: Header) -> None:
         from pyarrow import PythonFile, parquet
@@ -215,12 +215,12 @@ class ParquetFile(_TableFile):
         )
 
     def write(self, content: bytes) -> None:
-        """Append what pyarrow has encoded. Raises `OSError`."""
-        if not self._file.closed:  # pyarrow ends each file, also one that was given up
+        """Append bytes encoded by pyarrow. Raises `OSError`."""
+        if not self._file.closed:  # pyarrow also ends a discarded file
             self.add(content)
 
     def append(self, rows: Rows, events: Sequence[StreamEvent]) -> None:
-        """Keep samples and events; write a row group when there are enough. Raises `OSError`."""
+        """Buffer samples and events; write a row group when there are enough. Raises `OSError`."""
         self._waiting += [rows] if len(rows) else []
         self._events += map(event_text, events)
         if sum(map(len, self._waiting)) >= _GROUP_ROWS:
@@ -242,7 +242,7 @@ class ParquetFile(_TableFile):
         for field in _arrow_schema():
             column = columns[field.name]
             plain = np.packbits(column, bitorder="little") if column.dtype == bool else np.ascontiguousarray(column)
-            # To take an array of numpy, pyarrow would import pandas, for a second.
+            # Converting a numpy array directly would make pyarrow import pandas, which takes a second.
             arrays.append(Array.from_buffers(field.type, len(rows), [None, py_buffer(plain)]))
         self._writer.write_table(table(arrays, schema=_arrow_schema()))
 
@@ -260,7 +260,7 @@ def _text_crc(texts: Mapping[bytes, bytes]) -> str:
 
 
 def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None, str]:
-    """Read a recording in pieces; return why it ends early: never. Raises `BadRecording` or `OSError`."""
+    """Read a recording in pieces; return "", because a truncated Parquet file is not readable. Raises as `read_csv`."""
     from pyarrow import ArrowException, parquet
 
     with open_file(path) as raw:
@@ -271,7 +271,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 "interrupted, repeat it. If `record` of an earlier ftdrive was, convert the file with that version"
             )
     try:
-        # With a buffer, a column of a large row group is not read at once.
+        # With a buffer, the columns of a large row group are not read at once.
         with parquet.ParquetFile(path, page_checksum_verification=True, buffer_size=1 << 20) as file:
             texts, total = file.metadata.metadata or {}, file.metadata.num_rows
             if not {b"header", b"events"} <= texts.keys():
@@ -287,10 +287,10 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
             numbers = flat_layout(kind)
             yield Piece(header, np.zeros(0, kind), [], 0.0)
             names, count = {*(numbers.names or ()), "t_host_ns"}, 0
-            for number in range(file.num_row_groups):  # one by one, because a reader of all keeps what it has read
+            for number in range(file.num_row_groups):  # one by one, because a reader of all keeps its data
                 group = file.metadata.row_group(number)
                 if len({group.column(i).compression for i in range(group.num_columns)}) > 1:
-                    raise BadRecording("its footer contradicts itself: the file is damaged")  # it has no checksum
+                    raise BadRecording("its footer is inconsistent: the file is damaged")  # it has no checksum
                 for batch in file.iter_batches(2 * _GROUP_ROWS, [number], sorted(names), use_threads=False):
                     rows = np.empty(len(batch), numbers)
                     for name in numbers.names or ():
@@ -305,7 +305,7 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
                 raise BadRecording(f"it has {count} of its {total} samples: the file is damaged")
             yield Piece(header, np.zeros(0, kind), events, 1.0)
     except (ArrowException, MemoryError, OSError, TypeError, ValueError) as error:
-        if getattr(error, "errno", None) is not None:  # of the disk; those of pyarrow have none
+        if getattr(error, "errno", None) is not None:  # an error of the disk; pyarrow sets no errno
             raise
         why = next(iter(str(error).splitlines()), type(error).__name__)
         raise BadRecording(f"it cannot be read ({why}): the file is damaged") from error

@@ -1,8 +1,9 @@
-"""The stream for Foxglove, Lichtblick and PlotJuggler: one WebSocket server, its parameters and its scene.
+"""Server of the stream for Foxglove, Lichtblick and PlotJuggler: WebSocket, parameters and scene.
 
-Wrenches, poses, joint angles and frames are ROS 2 messages, because the viewers know no other wrench and PlotJuggler no
-other encoding. Arrows and events are Foxglove's own. A program can tare, and set frame and stages. A page in a
-browser is served from a short list of origins, and can do so if control is allowed: see `http_gate`.
+Wrenches, poses, joint angles and frames are ROS 2 messages, because the viewers have no other wrench type and
+PlotJuggler no other encoding. Arrows and events have types of Foxglove. Programs can tare, and set frame and stages.
+Pages in a browser are accepted from a short list of origins, and have these rights if control is allowed, see
+`http_gate`.
 """
 
 import json
@@ -50,7 +51,7 @@ from foxglove.channels import LogChannel, SceneUpdateChannel
 from foxglove.websocket import Capability, Client, ServerListener, StatusLevel
 
 FORCE_M_N, TORQUE_M_NM = 0.01, 0.1
-"""Lengths of the arrows: 10 N and 1 N·m are 100 mm."""
+"""Lengths of the arrows per N and per N·m: 10 N and 1 N·m are 100 mm."""
 _ORANGE, _BLUE = messages.Color(r=1.0, g=0.5, b=0.0, a=1.0), messages.Color(r=0.1, g=0.4, b=1.0, a=1.0)
 _HEAD_M = 0.02
 
@@ -60,7 +61,7 @@ def _stamp(t_utc_ns: int) -> messages.Timestamp:
 
 
 def _arrows(block: Block, t_utc_ns: int) -> messages.SceneUpdate:
-    """Return force (orange) and torque (blue) of the last sample, in the frame of the wrench, from its point."""
+    """Return arrows of force (orange) and torque (blue) of the newest sample, in the wrench frame."""
     force_N, torque_Nm = block.wrench[-1, :3], block.wrench[-1, 3:]
     entity = messages.SceneEntity(
         timestamp=_stamp(t_utc_ns),
@@ -74,7 +75,7 @@ def _arrows(block: Block, t_utc_ns: int) -> messages.SceneUpdate:
 
 def _arrow_primitive(vector_m: Array, color: messages.Color) -> messages.ArrowPrimitive:
     length_m = float(np.linalg.norm(vector_m))
-    # An arrow points along x. Half a turn about the bisector of x and a direction swaps the two.
+    # An arrow points along x. A half turn about the bisector of x and the vector swaps the two directions.
     bisector = np.array([1.0, 0.0, 0.0]) + (vector_m / length_m if length_m > 0 else 0.0)
     half_turn = bisector / norm if (norm := np.linalg.norm(bisector)) > 1e-9 else np.array([0.0, 0.0, 1.0])
     orientation = messages.Quaternion(**dict(zip("xyz", half_turn.tolist(), strict=True)), w=0.0)
@@ -94,18 +95,18 @@ ARROWS, EVENTS, STATUS = "/wrench_arrows", "/events", "/stream_status"
 VIEWERS: Final = (
     "https://app.foxglove.dev",
     "https://studio.foxglove.dev",
-    # the desktop programs; a browser sends it or null for pages of a disk
+    # sent by the desktop programs; browsers send it or null for local pages
     "file://",
-    # Lichtblick's container
+    # the container of Lichtblick
     "http://localhost:8080",
 )
-"""Origins of Foxglove and Lichtblick."""
+"""Origins of the pages of Foxglove and Lichtblick."""
 
 SCENE_HZ = 60.0
-"""Rate of frames and arrows: no screen shows more."""
+"""Rate of frames and arrows, Hz: no screen shows more."""
 STATUS_HZ = 2.0
 BACKLOG = 1 << 15
-"""Messages kept for a client that falls behind: two seconds at 7 kHz. Then the oldest are dropped."""
+"""Number of messages queued per slow client, two seconds at 7 kHz; then the oldest are dropped."""
 
 _log = logging.getLogger(__name__)
 
@@ -113,20 +114,21 @@ _log = logging.getLogger(__name__)
 class FoxgloveServer(Sink, ServerListener):
     """Sends a stream to any number of clients.
 
-    No client delays the stream. Messages wait in a queue for each client; the SDK drops the oldest when it is full and
-    does not count them. Therefore `STATUS` has how many messages of each topic were sent: a client that received fewer
-    since the status before has lost the others. The SDK names a slow client at most every 30 s; that is logged.
+    No client delays the stream. Messages wait in one queue per client; the SDK drops the oldest from a full queue
+    without counting them. Therefore `STATUS` contains the number of messages sent per topic: a client that received
+    fewer since the previous status has lost the others. The SDK reports a slow client at most every 30 s, which is
+    logged.
 
-    What a client requests is done in a thread of the SDK.
+    Requests of clients are handled in a thread of the SDK.
 
     Parameters
     ----------
     port : int
-        0 lets the system choose; see `port`.
+        Port of the server; 0 lets the system choose, see `port`.
     origins : collection of str
-        Of pages that are served, beside `VIEWERS`.
+        Origins of pages accepted in addition to `VIEWERS`.
     allow_control : bool
-        Pages may tare and set parameters too. Programs always may.
+        Whether pages may tare and set parameters, as programs can.
 
     Raises
     ------
@@ -155,7 +157,7 @@ class FoxgloveServer(Sink, ServerListener):
                 message_encoding="cdr",
                 schema=Schema(name=schema.name, encoding="ros2msg", data=schema.text.encode()),
                 context=context,
-            ).base  # checks no types, 15 000 times a second
+            ).base  # no type checks, 15 000 times per second
             for topic, schema in (ros2.SCHEMAS | {ros2.TRANSFORMS: ros2.TRANSFORMS_SCHEMA}).items()
         } | {
             ARROWS: SceneUpdateChannel(ARROWS, context=context),
@@ -179,7 +181,7 @@ class FoxgloveServer(Sink, ServerListener):
             services=[self._service("tare", stream.tare), self._service("undo_tare", stream.undo_tare)],
             server_listener=self,
         )
-        # the SDK sees no Origin, so its rights are those of a server
+        # a second server without control, because the SDK sees no Origin and all its clients have the same rights
         self._read_only = sdk.start_server(**options)
         self._servers = self._control, self._read_only
         for server in self._servers:
@@ -199,17 +201,17 @@ class FoxgloveServer(Sink, ServerListener):
 
     @property
     def port(self) -> int:
-        """The port on which it listens."""
+        """Port of the server."""
         return self._gate.port
 
     @property
     def app_url(self) -> str:
-        """The address of Foxglove in a browser, with this server as its source."""
+        """Address of Foxglove in a browser, with this server as its source."""
         source = {"ds": "foxglove-websocket", "ds.url": f"ws://127.0.0.1:{self.port}"}
         return f"https://app.foxglove.dev?{urlencode(source)}"
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Send samples and events; never waits."""
+        """Send samples and events without waiting."""
         offset_ns = self._info.utc_offset_ns
         if block:
             self._send_block(block, block.t_host_ns + offset_ns)
@@ -223,7 +225,7 @@ class FoxgloveServer(Sink, ServerListener):
         frame = block.frame.id
         self._send(ros2.RAW, t_ns, lambda: ros2.pack_wrenches(t_ns, block.raw, "sensor").tolist())
         self._send(ros2.COMPENSATED, t_ns, lambda: ros2.pack_wrenches(t_ns, block.wrench, frame).tolist())
-        # the poses between are interpolated
+        # poses at the rate of the arm, because those between are interpolated
         if (rows := self._arm.rows(t_ns)).any():
             poses, t_arm_ns = block.rows(rows), t_ns[rows]
             p_m, R = poses.p_base_flange_m, poses.R_base_flange
@@ -267,21 +269,21 @@ class FoxgloveServer(Sink, ServerListener):
             "status": asdict(self._stream.status()),
             "sent": self._sent,
         }
-        # JSON has neither arrays nor NaN
+        # replace arrays and NaN, which JSON does not have
         text = json.dumps(state, default=np.ndarray.tolist)
         return json.dumps(json.loads(text, parse_constant=lambda _: None)).encode()
 
     def on_get_parameters(
         self, _client: Client, param_names: list[str], _request: str | None = None
     ) -> list[Parameter]:
-        """Return parameters with these names; all if there are no names. Called in a thread of the SDK."""
+        """Return the parameters with these names, or all without names. Called in a thread of the SDK."""
         values = parameters_of(self._stream.frame, self._stream.stages)
         return [Parameter(name, value=value) for name, value in values.items() if name in (param_names or values)]
 
     def on_set_parameters(
         self, client: Client, parameters: list[Parameter], _request: str | None = None
     ) -> list[Parameter]:
-        """Set all or, with a warning, none; return all as they are then. Called in a thread of the SDK."""
+        """Set all parameters, or none with a warning; return the resulting values. Called in a thread of the SDK."""
         stream, changes = self._stream, [(one.name, one.get_value()) for one in parameters]
         try:
             change(stream, *with_changes(stream.frame, stream.stages, changes))
@@ -294,7 +296,7 @@ class FoxgloveServer(Sink, ServerListener):
             event = action()
             return json.dumps({"success": event.kind != "tare-refused", "message": event.text}).encode()
 
-        # Like the type of the same name in ROS 2, as JSON.
+        # The ROS 2 type of this name, as JSON.
         empty = b'{"type": "object", "properties": {}}'
         result = b'{"type": "object", "properties": {"success": {"type": "boolean"}, "message": {"type": "string"}}}'
         request, response = (
@@ -306,9 +308,10 @@ class FoxgloveServer(Sink, ServerListener):
 
 
 def _send_at_once(port: int) -> None:
-    """Set TCP_NODELAY on the socket that listens on a port of this process; its connections inherit the option.
+    """Set TCP_NODELAY on the socket of this process that listens on a port; its connections inherit the option.
 
-    The SDK does not set it. Without it a message waits until the client confirms the one before, for up to 40 ms.
+    The SDK does not set the option. Without it, a message waits up to 40 ms for the acknowledgement of the previous
+    one.
     """
     folder = Path("/dev/fd")  # Windows has none
     for name in [path.name for path in folder.iterdir()] if folder.is_dir() else []:
@@ -321,7 +324,7 @@ def _send_at_once(port: int) -> None:
 
 
 class _SlowClients(logging.Handler):
-    """Logs the clients that the SDK names as slow, in our words."""
+    """Logs the slow clients that the SDK reports, with their addresses."""
 
     def __init__(self, with_clients: Callable[[str], str]) -> None:
         super().__init__(logging.INFO)
@@ -334,11 +337,11 @@ class _SlowClients(logging.Handler):
         self._source.addHandler(self)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a report."""
+        """Log a report of the SDK."""
         report = self._with_clients(record.getMessage())
         _log.warning("a client reads too slowly, so its oldest messages are dropped (%s)", report)
 
     def close(self) -> None:
-        """Stop."""
+        """Stop logging."""
         self._source.removeHandler(self)
         super().close()

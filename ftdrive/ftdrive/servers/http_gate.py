@@ -1,6 +1,6 @@
-"""Addresses of our servers, and a gate that refuses web pages of others by `Host` and `Origin` of a request.
+"""Addresses of the servers, and a gate that refuses foreign web pages by the `Host` and `Origin` of a request.
 
-A browser sends both, and a page cannot change them. Without the gate, any page that an operator opens could use a
+Browsers send both headers, and a page cannot change them. Without the gate, any page that an operator opens could use a
 server on this computer. Programs send no `Origin`.
 """
 
@@ -30,9 +30,10 @@ Address = tuple[str, int]
 _HEAD_S: Final = 10.0
 _HEAD_BYTES: Final = 1 << 14
 _PIECE: Final = 1 << 16
-# Most connections without a head yet. One more closes the oldest, so that idle ones use up no descriptors.
+# Largest number of connections without a complete head. A further one closes the oldest, so that idle connections do
+# not use up all descriptors.
 _WAITING: Final = 500
-# Number of refused requests that are logged. Further ones must not fill the terminal of a session.
+# Number of refused requests that are logged; more would fill the terminal of a session.
 _LOGGED: Final = 5
 
 _HOST: Final = re.compile(r"(\[(?P<v6>[0-9a-fA-F:.]+)\]|(?P<name>[\w.-]+))(:\d{1,5})?", re.ASCII)
@@ -41,25 +42,25 @@ _log = logging.getLogger(__name__)
 
 
 def refusal_reason(headers: Mapping[str, str] | HTTPMessage, bound: str, origins: Collection[str] | None = None) -> str:
-    """Return why a request is refused; empty if it is served.
+    """Return the reason to refuse a request; empty if it is accepted.
 
     Parameters
     ----------
     headers : HTTPMessage or mapping
-        Of the request.
+        Headers of the request.
     bound : str
-        The address at which the server listens; `0.0.0.0` and `::` are all addresses of this computer.
+        Address of the server; `0.0.0.0` and `::` mean all addresses of this computer.
     origins : collection of str
-        Of foreign pages that `ftdrive stream` serves, such as `https://app.foxglove.dev`; None of a server that serves
-        only its own pages.
+        Origins of accepted foreign pages, such as `https://app.foxglove.dev`; None for a server that accepts only its
+        own pages.
     """
     host = headers.get("Host", "")
     if not _is_bound(host, bound):
-        return f"the server is not {host or 'named in the request'}: use its address"
+        return f"the server has another address than {host or 'the empty one in the request'}: use its address"
     origin = headers.get("Origin")
     if origin is None or origin in (origins or ()):
         return ""
-    with suppress(ValueError):  # no address
+    with suppress(ValueError):  # not an address
         if urlsplit(origin).netloc == host:
             return ""
     fix = "open the page of this server" if origins is None else f"`ftdrive stream --allow-origin {origin}` serves them"
@@ -81,15 +82,15 @@ def _is_bound(host: str, bound: str) -> bool:
 
 
 def hidden_host() -> str:
-    """Return an address of this computer for a server behind a gate, which no page can guess."""
-    if sys.platform == "darwin":  # has only one; devices are not supported there
+    """Return an address of this computer for a server behind a gate, which a page cannot guess."""
+    if sys.platform == "darwin":  # has one loopback address only
         return "127.0.0.1"
     return "127." + ".".join(str(random.SystemRandom().randint(1, 254)) for _ in range(3))
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """The head of a permitted request, and what follows it."""
+    """A permitted request: its head, and the connection."""
 
     method: str
     target: str
@@ -101,19 +102,19 @@ class Request:
     async def answer(
         self, status: HTTPStatus, body: bytes = b"", content: str = "text/plain; charset=utf-8", *more: str
     ) -> None:
-        """Send a whole answer; `more` are lines of its head."""
+        """Send a complete answer; `more` are header lines."""
         head = [f"HTTP/1.1 {status} {status.phrase}", f"Content-Type: {content}", *more]
         head += [f"Content-Length: {len(body)}", "X-Content-Type-Options: nosniff", "Connection: close"]
         self.writer.write("\r\n".join([*head, "", ""]).encode() + (b"" if self.method == "HEAD" else body))
         await self.writer.drain()
 
     async def refuse(self, status: HTTPStatus, why: str) -> None:
-        """Answer with one sentence."""
+        """Answer with a status and one sentence."""
         await self.answer(status, f"{why}\n".encode())
 
 
 class Gate:
-    """Listens for HTTP, refuses foreign requests, and calls `serve` for each of the others in a thread of its own.
+    """Listens for HTTP, refuses foreign requests, and calls `serve` for each permitted one.
 
     Port 0 lets the system choose, see `port`; `origins` as in `refusal_reason`. Raises `OSError` for an address that
     cannot be used.
@@ -136,7 +137,7 @@ class Gate:
         self._thread.start()
 
     def close(self) -> None:
-        """Disconnect all."""
+        """Disconnect all clients."""
         asyncio.run_coroutine_threadsafe(self._end(), self.loop).result()
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join()
@@ -161,7 +162,7 @@ class Gate:
                 method, target, _ = head.partition(b"\r\n")[0].decode("ascii").split(" ")
             except (TimeoutError, ValueError, EOFError, asyncio.LimitOverrunError, HTTPException):
                 nothing = Request("", "", HTTPMessage(), b"", reader, writer)
-                await nothing.refuse(HTTPStatus.BAD_REQUEST, "this is no HTTP request")
+                await nothing.refuse(HTTPStatus.BAD_REQUEST, "this is not an HTTP request")
             else:
                 self._waiting.pop(writer, None)
                 request = Request(method, target, headers, head, reader, writer)
@@ -177,19 +178,19 @@ class Gate:
         writer.close()
 
     async def serve(self, request: Request) -> None:
-        """Answer a permitted request; its connection is closed afterwards."""
+        """Answer a permitted request; the connection is closed afterwards."""
         raise NotImplementedError
 
 
 class PassingGate(Gate):
-    """Passes the bytes of a permitted request, also of a WebSocket, to another server.
+    """Passes the bytes of permitted requests, including WebSockets, to another server.
 
     Parameters
     ----------
     bound, origins
-        Those of `Gate`.
+        As for `Gate`.
     behind : callable
-        Returns the address of the server for an `Origin`; None is that of a program.
+        Returns the address of the server for an `Origin`, which is None for a program.
     """
 
     def __init__(
@@ -200,13 +201,13 @@ class PassingGate(Gate):
         super().__init__(bound, origins)
 
     def with_clients(self, log: str) -> str:
-        """Return lines of the server's log with the addresses of the clients, for which it sees those of the gate."""
+        """Return a log of the server with the addresses of the clients in place of those of the gate."""
         for seen, client in list(self._clients.items()):
             log = log.replace(seen, client)
         return log
 
     async def serve(self, request: Request) -> None:
-        """Copy both directions until one ends."""
+        """Copy both directions until one of them ends."""
         back_reader, back_writer = await asyncio.open_connection(*self._behind(request.headers.get("Origin")))
         seen = _name(back_writer.get_extra_info("sockname"))
         self._clients[seen] = _name(request.writer.get_extra_info("peername"))
@@ -228,7 +229,7 @@ class PassingGate(Gate):
 
 
 async def _head(reader: asyncio.StreamReader) -> tuple[bytes, HTTPMessage]:
-    """Read a request up to its body; a plain one asks the server to close, so that each request passes the gate."""
+    """Read the head of a request; add "Connection: close" to plain ones, so that each request passes the gate."""
     head = await reader.readuntil(b"\r\n\r\n")
     request, _, rest = head.partition(b"\r\n")
     headers = parse_headers(BytesIO(rest))
@@ -253,7 +254,7 @@ async def _copy(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> tuple[str, int]:
-    """Read HOST:PORT, with brackets round an IPv6 address; raises `ConfigError`."""
+    """Parse HOST:PORT, with brackets around an IPv6 address. Raises `ConfigError`."""
     host, _, port = text.rpartition(":")
     if not host or not (port.isascii() and port.isdecimal()) or not lowest <= int(port) < 65536:
         raise ConfigError(f"{option} is '{text}': give HOST:PORT, such as {example}")
@@ -261,7 +262,7 @@ def host_and_port(option: str, text: str, example: str, *, lowest: int = 1) -> t
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this computer reaches an address."""
+    """Whether an address can only be reached from this computer."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -269,5 +270,5 @@ def is_loopback(host: str) -> bool:
 
 
 def with_port(host: str, port: int) -> str:
-    """Write HOST:PORT, with brackets round an IPv6 address."""
+    """Return HOST:PORT, with brackets around an IPv6 address."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"

@@ -1,4 +1,4 @@
-"""What clients may set of a stream, whichever protocol brings it, and the parameters of the node of ROS 2."""
+"""Stream parameters that clients may set, for all protocols, and the parameters of the ROS 2 node."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -20,7 +20,7 @@ _FRAME: Final = {
     "about": "Reference point of the torque of ~/wrench: sensor, flange, tcp, or [x, y, z] in m from the flange.",
 }
 STAGE_TEXTS: Final[Mapping[str, str]] = {item.name: item.metadata["text"] for item in fields(Stages)}
-"""What each setting of the stages does."""
+"""Description of each setting of the stages."""
 _KINDS: Final[dict[str, type]] = {item.name: type(item.default) for item in fields(Stages)}
 _EXPECTED: Final = {
     "axes": f"set one of {', '.join(get_args(Axes))}",
@@ -34,7 +34,7 @@ _EXPECTED: Final = {
 
 
 def checked_value(name: str, value: Any) -> JSON:
-    """Return the value as the frame or the stages have it; raises `ConfigError`."""
+    """Return the value in the type of frame or stages. Raises `ConfigError`."""
     kind = _KINDS.get(name)
     named = {"axes": get_args(Axes), "about": get_args(Point)}.get(name, ())
     if value in named or (kind is bool and isinstance(value, bool)):
@@ -48,12 +48,12 @@ def checked_value(name: str, value: Any) -> JSON:
 
 
 def parameters_of(frame: WrenchFrame, stages: Stages) -> dict[str, JSON]:
-    """Return all parameters of a stream. None can be no parameter, so a filter that is off has 0 Hz."""
+    """Return all parameters of a stream; a filter that is off has 0 Hz, because a parameter cannot be None."""
     return frame.to_dict() | {name: 0.0 if value is None else value for name, value in asdict(stages).items()}
 
 
 def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str, Any]]) -> tuple[WrenchFrame, Stages]:
-    """Return frame and stages with other values of parameters; raises `ConfigError`."""
+    """Return frame and stages with changed parameters. Raises `ConfigError`."""
     of_frame, of_stages = asdict(frame), asdict(stages)
     for name, value in changes:
         (of_frame if name in of_frame else of_stages)[name] = checked_value(name, value)
@@ -61,7 +61,7 @@ def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str
 
 
 def change(stream: "Stream", frame: WrenchFrame, stages: Stages, then: Callable[[], object] = lambda: None) -> None:
-    """Set frame and stages of a stream, and act; if one of the three raises `ConfigError`, the stream is as before."""
+    """Set frame and stages of a stream, and call `then`; after a `ConfigError` of these the stream is unchanged."""
     before = stream.frame, stream.stages
     try:
         stream.frame, stream.stages = frame, stages
@@ -80,19 +80,21 @@ def _described_parameter(default: Any, text: str) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """Parameters that a running node does not change. Raises `ConfigError` for values that cannot be used."""
+    """Parameters that are fixed while a node runs. Raises `ConfigError` for values that cannot be used."""
 
     rate: float = _described_parameter(
         500.0, "Highest rate of the wrench topics in Hz. A message is the mean of the samples of one interval."
     )
     reliable: bool = _described_parameter(
-        False, "Reliable delivery. Otherwise best effort, depth 5, of which a reliable subscriber receives nothing."
+        False, "Reliable delivery. Otherwise best effort with depth 5, which a reliable subscriber cannot receive."
     )
-    base_frame: str = _described_parameter("base", "Frame of the controller's base: base of a UR, not base_link.")
-    flange_frame: str = _described_parameter("tool0", "Frame of the flange, z out of it: tool0 of a UR, not flange.")
-    sensor_frame: str = _described_parameter("ft_sensor", "Frame of the sensor, which ~/wrench_raw has.")
+    base_frame: str = _described_parameter("base", "Name of the controller's base frame: base for a UR, not base_link.")
+    flange_frame: str = _described_parameter(
+        "tool0", "Name of the flange frame with z out: tool0 for a UR, not flange."
+    )
+    sensor_frame: str = _described_parameter("ft_sensor", "Name of the sensor frame, used by ~/wrench_raw.")
     publish_base_tf: bool = _described_parameter(
-        False, "Also publish base to flange on /tf, which a driver of the arm usually does."
+        False, "Also publish base to flange on /tf, which the arm's driver usually does."
     )
 
     def __post_init__(self) -> None:
@@ -110,20 +112,20 @@ _FIXED: Final[Mapping[str, str]] = {item.name: item.metadata["text"] for item in
 _TEXTS: Final = {
     **_FRAME,
     **STAGE_TEXTS,
-    "tool": "Name of the tool whose newest accepted calibration is applied; empty: the calibration of the start.",
+    "tool": "Name of the tool whose newest accepted calibration is applied; empty for the initial calibration.",
     **_FIXED,
 }
 
 
 class NodeParameters:
-    """Declares the parameters on a node of rclpy, and applies what clients set.
+    """Declares the parameters on an rclpy node, and applies changes by clients.
 
-    The arguments of ROS replace `frame` and `tool`. Raises `ConfigError` if a value of theirs cannot be used.
+    ROS arguments replace `frame` and `tool`. Raises `ConfigError` if one of their values cannot be used.
     """
 
     def __init__(self, node: Any, frame: WrenchFrame, tool: str) -> None:
         self.apply: Callable[[WrenchFrame, Stages, str], None] = lambda *_: None
-        """Applies what is set, or raises `ConfigError`."""
+        """Applies frame, stages and tool, or raises `ConfigError`."""
         defaults = parameters_of(frame, Stages()) | {"tool": tool} | asdict(Fixed())
         messages = ros2_module("rcl_interfaces.msg")
         given = {}
@@ -131,7 +133,7 @@ class NodeParameters:
             descriptor = messages.ParameterDescriptor(
                 description=_TEXTS[name],
                 read_only=name in _FIXED,
-                # 20 and 20.0 are both a frequency; what cannot be used is rejected with a reason
+                # 20 and 20.0 are both valid frequencies; invalid values are rejected with a reason
                 dynamic_typing=True,
             )
             given[name] = _as_builtin(node.declare_parameter(name, value, descriptor).value)
@@ -141,9 +143,9 @@ class NodeParameters:
         node.add_on_set_parameters_callback(self._set)
 
     def _set(self, changes: Sequence[Any]) -> Any:
-        """Apply all changes or none; called in the thread of the node."""
+        """Apply all changes or none. Called in the thread of the node."""
         result = ros2_module("rcl_interfaces.msg").SetParametersResult
-        # others, such as use_sim_time, are those of rclpy
+        # other parameters, such as use_sim_time, belong to rclpy
         given = {one.name: _as_builtin(one.value) for one in changes if one.name in _TEXTS.keys() - _FIXED.keys()}
         try:
             tool = _checked_tool(given.pop("tool", self.tool))
@@ -156,7 +158,7 @@ class NodeParameters:
 
 
 def _as_builtin(value: Any) -> Any:
-    """Return a value of rclpy, which has arrays, as checks and messages have it."""
+    """Return a value of rclpy as a builtin type: arrays as lists."""
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 

@@ -1,8 +1,8 @@
-"""Give weight and contact wrench to the program that runs on the controller, through registers.
+"""Weight and contact wrench for the program on the controller, through registers.
 
-The program sets a request, the service answers: docs/reference/program-registers.md has the table. The live counter
-advances with each new wrench, and stands still when there is none: a register keeps its last value for ever, so a
-program must look at the counter and never at a number alone.
+The program writes a request, and the service answers: see the table in docs/reference/program-registers.md. A register
+keeps its last value when the service stops. Therefore the live counter advances with each new wrench, and a program
+must check the counter before it uses a value.
 """
 
 import math
@@ -27,62 +27,63 @@ DOUBLES: Final = (
     *("mass", "mass_sigma", "least_mass"),
     *("com_x", "com_y", "com_z", "com_sigma_x", "com_sigma_y", "com_sigma_z"),
 )
-"""What the input registers hold from the first one on, of each kind."""
+"""Contents of the input registers of each kind, from the first register on."""
 TRACKED: Final = ("bias_fx", "bias_fy", "bias_fz", "bias_tx", "bias_ty", "bias_tz", "bias_age")
-"""Further doubles where bias and part are followed. Where `tracking` is 0, they are not those of the service."""
+"""Further double registers if bias and part are tracked. If `tracking` is 0, the service does not write them."""
 
 STALE_S: Final = 0.05
-"""Without a sample for so long the wrench counts as stale."""
+"""The wrench is stale after this time without a sample, s."""
 PATIENCE_S: Final = 1.0
-"""So long a request waits for rest before it is refused; a weighing at rest takes `WEIGH_S`."""
+"""A request is refused after waiting this long for rest, s; a weighing at rest takes `WEIGH_S`."""
 _TRY_NS: Final = 20_000_000
 _WAITS: Final = ("samples", "moving", "unsteady")
-# A load differs from a push by the direction of its force, which is so near to gravity.
+# Largest angle between force and gravity at which a contact is taken for an unknown load.
 _ALIKE_RAD: Final = 0.1
 _COUNT_LIMIT: Final = 2**30
 
 
 class ServiceCommand(IntEnum):
-    """What a program may request."""
+    """Request of a program."""
 
     WEIGH, ZERO, STATUS = 1, 2, 3
 
 
 class ServiceState(IntEnum):
-    """State of the service, and of the last request while `number` is its number."""
+    """State of the service, or of the last request while `number` is its number."""
 
     STOPPED, READY, BUSY, REFUSED = range(4)
 
 
 class Condition(IntEnum):
-    """What the wrench is. Whatever it is, the wrench is valid only while the live counter advances."""
+    """Condition of the wrench; the wrench is valid only while the live counter advances."""
 
     FREE, CONTACT, UNKNOWN_LOAD, STALE = range(4)
 
 
 _REASONS: Final = "samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "command"
 CODES: Final = {"": 0} | {reason: number for number, reason in enumerate(_REASONS, 1)}
-"""Why a request was refused. Programs on arms know the numbers, so a new reason goes to the end."""
+"""Code of each reason to refuse a request. Programs on arms use the numbers, so add new reasons at the end."""
 
 
 def doubles_of(track: Tracking) -> tuple[str, ...]:
-    """Return what the double registers hold."""
+    """Return the contents of the double registers."""
     return DOUBLES if track == "off" else DOUBLES + TRACKED
 
 
 class ProgramService(Sink):
-    """Answers one program.
+    """Answers the requests of one program.
 
     Parameters
     ----------
     stream : Stream
-        Open, in the frame that the program gets; read here. With `stream.track` the program gets the tracked bias too.
+        An open stream in the frame for the program, read by `run`. With `stream.track`, the program also gets the
+        tracked bias.
     connect : callable
-        Opens the registers, as many as `INTEGERS` and `doubles_of(stream.track)`; called again after they were lost.
+        Opens registers for `INTEGERS` and `doubles_of(stream.track)`; called again after a loss of the connection.
     say : callable
-        Takes a sentence for the operator, from any thread.
+        Receives sentences for the operator, from any thread.
     keep : callable
-        Takes each weighing, and each refusal of one; see `WeighingLog.keep`.
+        Receives each weighing and each refused one; see `WeighingLog.keep`.
     """
 
     label, keeps_all = "registers", True
@@ -99,7 +100,7 @@ class ProgramService(Sink):
         self._scale = Scale(stream)
         self._lock = threading.Lock()
         self._live = 0
-        # Of the last request; None until the first was read, which may be that of a program before us.
+        # Number of the last request; None until the first one is read, which may belong to an earlier program.
         self._number: int | None = None
         self._command, self._since_ns, self._due_ns = 0, 0, 0
         self._state, self._code, self._condition = ServiceState.READY, 0, Condition.FREE
@@ -109,24 +110,24 @@ class ProgramService(Sink):
         self._watching = threading.Thread(target=self._watch, daemon=True)
 
     def run(self) -> None:
-        """Serve until an exception; a failed device or a lost controller is waited for."""
+        """Serve until an exception; wait while a device or the controller does not answer."""
         stream, clock = self._stream, self._stream.clock
         end_s = clock.now_s() + WEIGH_S
         for _ in pump(stream, until=lambda: clock.now_s() >= end_s, patience_s=0.0):
             pass
         self._scale.warm_up()
-        # an emulated controller must not wait for a busy computer
+        # an emulated controller must keep up on a busy computer
         with clock.keeping_up():
             meanwhile = "The program sees a stale wrench."
             for _ in pump(stream, [self], patience_s=math.inf, say=self._say, meanwhile=meanwhile):
                 pass
 
     def begin(self, _: Stream) -> None:
-        """Watch for samples and for the controller."""
+        """Start the thread that watches samples and controller."""
         self._watching.start()
 
     def add(self, block: Block | None, _: Sequence[StreamEvent]) -> None:
-        """Write the newest sample of a block, and work on a request."""
+        """Write the newest sample of a block, and continue a request."""
         if not block:
             return
         t_ns = int(block.t_host_ns[-1])
@@ -135,13 +136,13 @@ class ProgramService(Sink):
             self._wrench = block.wrench[-1].tolist()
             self._condition = self._judge(block)
             self._work(t_ns)
-            # In contact too, because a program must be able to react to a contact force.
+            # Also in contact, because a program must be able to react to a contact force.
             self._live = (self._live + 1) % _COUNT_LIMIT
             self._write()
 
     def end(self) -> None:
-        """Write that the service has ended, and close."""
-        # Ctrl-C may come while the thread starts: it must not outlive the cell.
+        """Write that the service has stopped, and close the registers."""
+        # Ctrl-C may come while the thread starts, which must end before the cell.
         self._ends.set()
         if self._watching.ident is not None:
             self._watching.join()
@@ -152,7 +153,7 @@ class ProgramService(Sink):
                 self._registers.close()
 
     def _watch(self) -> None:
-        """Write that the wrench is stale when no sample comes, and reconnect to the controller."""
+        """Mark the wrench as stale when no samples arrive, and reconnect to the controller."""
         clock = self._stream.clock
         while not self._ends.wait(0.02):
             with self._lock:
@@ -180,7 +181,7 @@ class ProgramService(Sink):
         integers = [self._state, self._code, self._condition, self._number or 0, self._live, tracking]
         tracked = self._tracked() if tracking else []
         try:
-            # All inputs go in one package, so that a program never reads half of an answer.
+            # All inputs go in one package, so that a program never reads part of an answer.
             self._registers.write(integers, [*self._wrench, *self._weight, *tracked])
         except DeviceError as error:
             if self._state is not ServiceState.STOPPED:
@@ -189,14 +190,14 @@ class ProgramService(Sink):
             self._registers = None
 
     def _tracked(self) -> list[float]:
-        """Return the tracked change of the bias since the calibration, and the age of the last look or -1."""
+        """Return the tracked change of the bias since the calibration, and the age of its last observation or -1."""
         tracked = self._stream.processor.monitor.tracked
         if tracked is None or not np.isfinite(tracked.last_seen_s):
             return [*[0.0] * 6, -1.0]
         return [*tracked.bias.tolist(), tracked.last_seen_s + max(self._newest_ns * 1e-9 - tracked.t_s, 0.0)]
 
     def _judge(self, block: Block) -> Condition:
-        """Return what touches the tool; a load that is not known pulls along gravity."""
+        """Return the condition of the tool; a force along gravity is an unknown load."""
         if not block.in_contact[-1]:
             return Condition.FREE
         R_base_sensor = block.R_base_flange[-1] @ self._stream.info.calibration.R_flange_sensor
@@ -210,7 +211,7 @@ class ProgramService(Sink):
         try:
             request = None if self._registers is None else self._registers.request
         except DeviceError:
-            # the next write finds it too
+            # the next write reports the lost connection
             request = None
         if request is not None and self._number is None:
             self._number = request[0]

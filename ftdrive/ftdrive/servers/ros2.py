@@ -1,7 +1,8 @@
-"""The node of `ftdrive ros2`: a compensated stream as topics, transforms, services and diagnostics.
+"""Node of `ftdrive ros2`: a compensated stream as topics, transforms, services and diagnostics.
 
-Conventions are those of REP 103, 105 and 107: SI units, a `frame_id` whose axes and origin a wrench has, stamps of the
-time of measurement. A fault is a missing message and a diagnostic, never an old or a zero wrench.
+The node follows REP 103, 105 and 107: SI units, `frame_id` for axes and origin of a wrench, stamps with the time of
+measurement. During a fault, no wrench is published and a diagnostic gives the reason; old or zero wrenches are never
+published.
 """
 
 import math
@@ -33,9 +34,9 @@ _TF_HZ: Final = 50.0
 
 
 class TransformPublisher:
-    """Publishes sensor and tcp in the flange once, and on request what moves: base to flange.
+    """Publishes sensor and tcp in the flange once, and with each block the moving frames.
 
-    A frame of base axes about another point also moves, because the flange turns in the base. It is published too.
+    A frame with base axes about another point moves in the flange and is published too; base to flange only on request.
     """
 
     def __init__(self, node: Any, fixed: Fixed) -> None:
@@ -57,17 +58,17 @@ class TransformPublisher:
         self._moving = node.create_publisher(message, "/tf", 100)
 
     def named(self, frame_id: str) -> str:
-        """Return the name of axes and point of a frame, in the names of the parameters."""
+        """Return the name of a frame with the parameters' names for axes and point."""
         return "_at_".join(self._names.get(part, part) for part in frame_id.split("_at_"))
 
     def use(self, info: StreamInfo) -> None:
-        """Publish where sensor and tcp are, unless the height of the sensor is unknown."""
+        """Publish the transforms of sensor and tcp, unless the height of the sensor is unknown."""
         if np.isfinite(info.p_flange_sensor_m).all():
             _, *fixed = transforms_of(WrenchFrame(), info, np.eye(3), np.zeros(3))
             self._send(self._static, fixed, self._node.get_clock().now().nanoseconds)
 
     def publish(self, block: Block, info: StreamInfo, t_ns: int) -> None:
-        """Publish what moves, at the time of the newest sample of a block."""
+        """Publish the moving frames at the time of the newest sample of a block."""
         if not self._picked.rows(np.array([t_ns])).any():
             return
         p_m = block.p_base_flange_m[-1]
@@ -84,31 +85,31 @@ class TransformPublisher:
 
 
 class Averaged:
-    """Means over as many consecutive sample numbers as give at most `rate_Hz`; a single sample stays as it is.
+    """Means over the number of consecutive samples that gives at most `rate_Hz`; a single sample is not changed.
 
-    A lost sample leaves the mean of the others. Samples of an interval that an interruption cut are dropped, because
-    their mean would come late.
+    With lost samples, the mean is that of the others. Samples of an interval cut by an interruption are dropped,
+    because their mean would be late.
     """
 
     def __init__(self, sensor_rate_Hz: float, rate_Hz: float) -> None:
-        # a rate is known to about 0.3 %
+        # the rate is known to about 0.3 %
         self.count = max(1, int(np.ceil(0.99 * sensor_rate_Hz / rate_Hz)))
-        """Samples of one mean."""
+        """Number of samples per mean."""
         self._longest_ns = 2e9 * self.count / sensor_rate_Hz
         self._waiting: Block | None = None
 
     def restart(self) -> None:
-        """Drop the samples of an interval that is not complete."""
+        """Drop the samples of the incomplete interval."""
         self._waiting = None
 
     def add(self, block: Block) -> Block:
-        """Return the means that are complete with this block; what else they have is that of their first samples."""
+        """Return the means completed by this block; other columns come from the first sample of each."""
         waiting, self._waiting = self._waiting, None
         if waiting is not None and self._continues(waiting, block):
             block = Block.concatenate([waiting, block])
         interval = block.seq // self.count
         is_first = np.diff(interval, prepend=interval[0] - 1) != 0
-        # more of the last interval are to come
+        # the last interval is incomplete
         if (block.seq[-1] + 1) % self.count:
             last = int(np.flatnonzero(is_first)[-1])
             self._waiting = block.rows(slice(last, None))
@@ -137,7 +138,7 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartState:
-    """One part of the node: "stream", "sensor", "arm" or "calibration"."""
+    """State of one part of the node: "stream", "sensor", "arm" or "calibration"."""
 
     part: str
     level: Level
@@ -146,7 +147,7 @@ class PartState:
     hardware: str = ""
 
     def message(self, node: str) -> Any:
-        """Return a DiagnosticStatus."""
+        """Return the state as a DiagnosticStatus."""
         messages = ros2_module("diagnostic_msgs.msg")
         return messages.DiagnosticStatus(
             level=bytes([self.level]),
@@ -158,7 +159,7 @@ class PartState:
 
 
 def reports_of(stream: Stream, lost_before: int, sent: int) -> list[PartState]:
-    """Report an open stream; `lost_before` is the number of lost samples at the report before."""
+    """Return the states of an open stream; `lost_before` is the number of lost samples at the previous report."""
     status, info = stream.status(), stream.info
     verdict, stages = info.calibration.verdict, stages_in_words(stream.stages)
     values = {
@@ -191,7 +192,7 @@ def _link_state(part: str, link: LinkStatus, device: Any, lost: int) -> PartStat
     if link.error:
         level, text = Level.ERROR, link.error
     elif lost > 0:
-        level, text = Level.WARN, f"{lost} samples lost since the report before"
+        level, text = Level.WARN, f"{lost} samples lost since the last report"
     else:
         level, text = Level.OK, f"{link.rate_Hz:.0f} Hz"
     return PartState(part, level, text, values, f"{device.model} {device.serial}")
@@ -199,39 +200,39 @@ def _link_state(part: str, link: LinkStatus, device: Any, lost: int) -> PartStat
 
 NAME: Final = "ftdrive"
 REPORT_S: Final = 0.4
-"""Between two reports; a fault is reported at once."""
-# Samples of so long are processed at once: a message is that late at most, and half as many blocks are processed.
+"""Time between two reports, s; a fault is reported at once."""
+# Samples are processed in blocks of this duration, s, which is the delay of a message at most.
 _BLOCK_S: Final = 0.008
 _CONTACT_S: Final = 0.1
-# Until the nodes of this computer and its network are known.
+# Time until the other nodes of this computer and network are discovered, s.
 _DISCOVERY_S: Final = 1.0
-# After a device did not open.
+# Wait after a device did not open, s.
 _RETRY_S: Final = 2.0
-# After the calibration did not fit: a person has to calibrate, or to choose another tool.
+# Wait after the calibration did not fit, s: the operator must calibrate or select another tool.
 _RETRY_CONFIG_S: Final = 10.0
-# History of a reliable topic, because Fast DDS asks for what was lost every 3 s.
+# History of a reliable topic, s, because Fast DDS requests lost messages every 3 s.
 _HISTORY_S: Final = 10.0
 _TOOL_S: Final = 5.0
 
 
 class Ros2Node(Sink):
-    """Publishes a stream until it is closed.
+    """Node that publishes a stream until it is closed.
 
     Parameters
     ----------
     arguments : sequence of str
-        Of ROS, such as ``("--ros-args", "-r", "__ns:=/cell_1", "-p", "axes:=base")``.
+        ROS arguments, such as ``("--ros-args", "-r", "__ns:=/cell_1", "-p", "axes:=base")``.
     frame : WrenchFrame
-        Of `~/wrench`, if the arguments of ROS set no other one.
+        Frame of `~/wrench`, unless the ROS arguments set another one.
     tool : str
-        Name of the tool; empty if a calibration is given.
+        Name of the tool; empty with a given calibration.
 
     Raises
     ------
     NoRos2
         rclpy cannot be imported, or does not understand the arguments.
     ConfigError
-        A parameter cannot be used, or another node of this name runs.
+        A parameter cannot be used, or a node with this name is already running.
     """
 
     label, keeps_all = "node", True
@@ -242,7 +243,7 @@ class Ros2Node(Sink):
         self._bool = ros2_module("std_msgs.msg").Bool
         self._diagnostics = ros2_module("diagnostic_msgs.msg")
         self._stream: Stream | None = None
-        # Tools that clients request, with their decision.
+        # Tools requested by clients, with the future of the decision.
         self._wanted = SimpleQueue[tuple[str, Future[None]]]()
         self._failure, self._reported, self._reported_s, self._lost = "", list[PartState](), 0.0, 0
         self._in_contact, self._contact_s, self.sent = False, 0.0, 0
@@ -272,9 +273,9 @@ class Ros2Node(Sink):
             stack.pop_all()
 
     def _require_alone(self) -> None:
-        """Raise `ConfigError` if another node of this name reports; one that was killed may still be listed."""
+        """Raise `ConfigError` if another node with this name sends reports."""
         received = Event()
-        # A killed node stays in the list of nodes for up to 20 s, so a second one is found by its reports.
+        # A killed node stays in the list of nodes for up to 20 s, so a running one is recognised by its reports.
         subscription = self.node.create_subscription(
             self._diagnostics.DiagnosticStatus, "~/status", lambda _: received.set(), 10
         )
@@ -286,26 +287,26 @@ class Ros2Node(Sink):
         self.node.destroy_subscription(subscription)
         if received.is_set():
             raise ConfigError(
-                f"another node {self.name} runs already: stop it, or give this one a name: "
+                f"a node {self.name} is already running: stop it, or give this one another name: "
                 f"--ros-args -r __node:={NAME}_2"
             )
 
     @property
     def name(self) -> str:
-        """With its namespace."""
+        """Name of the node with its namespace."""
         return str(self.node.get_fully_qualified_name())
 
     def close(self) -> None:
-        """Leave the graph of ROS."""
+        """Leave the ROS graph."""
         self._ros.close()
 
     # -------------------------------------------------------------------------------------------------------- serving
 
     def serve(self, open_stream: Callable[[], AbstractContextManager[Stream]]) -> None:
-        """Open the stream and publish it, again after each failure, until an exception such as Ctrl-C ends it."""
+        """Open and publish the stream, again after each failure, until an exception such as Ctrl-C."""
         while True:
             try:
-                self._report([PartState("stream", Level.STALE, "the devices are being opened")])
+                self._report([PartState("stream", Level.STALE, "opening the devices")])
                 with open_stream() as stream:
                     for _ in pump(stream, [self], patience_s=math.inf):
                         self._ros.check()
@@ -330,11 +331,11 @@ class Ros2Node(Sink):
             self._log.info("The devices are open.")
 
     def end(self) -> None:
-        """Publish no stream."""
+        """Stop publishing the stream."""
         self._stream = None
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Publish samples or the failure of a device, and log events."""
+        """Publish samples or a device failure, and log events."""
         if (stream := self._stream) is not None and block:
             self._failure = ""
             self._publish(block, stream.info)
@@ -343,14 +344,14 @@ class Ros2Node(Sink):
             self._fail(failure)
             self.report()
         for event in events:
-            # rclpy raises ValueError if one call has two severities
+            # two calls, because rclpy raises ValueError if one call has two severities
             if event.kind in WARNINGS:
                 self._log.warning(event.text)
             else:
                 self._log.info(event.text)
 
     def _publish(self, block: Block, info: StreamInfo) -> None:
-        """Publish the means that are complete with a block."""
+        """Publish the means completed by a block."""
         means, now_s = self._averaged.add(block), time.monotonic()
         if means:
             t_ns = means.t_host_ns + info.utc_offset_ns
@@ -374,7 +375,7 @@ class Ros2Node(Sink):
     # ------------------------------------------------------------------------------------------------------- reporting
 
     def _fail(self, text: str) -> None:
-        """Log a failure once, however often it is tried again."""
+        """Log a failure once, even if it repeats."""
         if text != self._failure:
             self._failure = text
             self._log.error(text)
@@ -398,12 +399,12 @@ class Ros2Node(Sink):
         self._overall.publish(array)
         self._status.publish(messages[0])
 
-    # ---------------------------------------------------------------------------------------- what clients may request
+    # ------------------------------------------------------------------------------------------------------- requests
 
     def _answer(self, action: Callable[[Stream], StreamEvent], _: Any, response: Any) -> Any:
         stream = self._stream
         if stream is None or self._failure:
-            why = self._failure or "the devices are being opened"
+            why = self._failure or "the node is still opening the devices"
             response.success, response.message = False, f"refused: {why}"
         else:
             event = action(stream)
@@ -411,7 +412,7 @@ class Ros2Node(Sink):
         return response
 
     def _apply(self, frame: WrenchFrame, stages: Stages, tool: str) -> None:
-        """Apply parameters, in the thread of the node. Raises `ConfigError`; then none has changed."""
+        """Apply parameters in the thread of the node. Raises `ConfigError` and then changes none."""
         if self._stream is not None:
             change(self._stream, frame, stages, partial(self._request_tool, tool))
 
@@ -425,11 +426,11 @@ class Ros2Node(Sink):
         try:
             decided.result(_TOOL_S)
         except TimeoutError:
-            why = f"tool {tool!r} was not applied within {_TOOL_S:g} s, because no samples arrive"
+            why = f"tool {tool!r} was not applied within {_TOOL_S:g} s, because no samples arrive: check the devices"
             raise ConfigError(why) from None
 
     def _change_tool(self, stream: Stream) -> None:
-        """Change to the tool that a client requests, between two reads."""
+        """Change to a tool requested by a client, between two reads."""
         try:
             tool, decided = self._wanted.get_nowait()
         except Empty:

@@ -1,4 +1,4 @@
-"""JSON over UDP, for PlotJuggler before 3.16."""
+"""JSON over UDP for PlotJuggler before 3.16."""
 
 import json
 import socket
@@ -11,17 +11,18 @@ from ftdrive.stream.samples import Block, Picked, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink
 
 RATE_HZ = 200.0
-"""A plot of 5 s is about 1000 pixels wide: a higher rate is not visible. PlotJuggler parses datagrams in the thread of
-its window, and the system drops without a count what it does not read in time."""
+"""Sending rate, Hz: a plot of 5 s is about 1000 pixels wide, so a higher rate is not visible. PlotJuggler parses
+datagrams in the thread of its window, and the system drops datagrams that are not read in time.
+"""
 
 
 class UdpSender(Sink):
-    """Sends raw and compensated wrench at `RATE_HZ`, one sample a datagram, with the UTC in seconds as `timestamp`.
+    """Sends raw and compensated wrench at `RATE_HZ`, one sample per datagram, with UTC seconds as `timestamp`.
 
     Parameters
     ----------
     host, port : str, int
-        PlotJuggler listens on port 9870.
+        Address of the receiver; PlotJuggler listens on port 9870.
 
     Raises
     ------
@@ -43,7 +44,7 @@ class UdpSender(Sink):
         self._picked = Picked(RATE_HZ)
 
     def add(self, block: Block | None, _events: Sequence[StreamEvent]) -> None:
-        """Send what is due of a block, and no events: PlotJuggler plots numbers. Never waits."""
+        """Send the selected samples of a block without waiting; PlotJuggler only plots numbers, so no events."""
         if not block:
             return
         few = block.rows(self._picked.rows(block.t_host_ns))
@@ -56,7 +57,7 @@ class UdpSender(Sink):
                 "chi2": chi2 if isfinite(chi2 := float(few.chi2[i])) else None,
                 "in_contact": int(few.in_contact[i]),
             }
-            with suppress(OSError):  # no room, or no way there at the moment: the next one is soon
+            with suppress(OSError):  # buffer full or no route: the next one follows soon
                 self._socket.sendto(json.dumps(values).encode(), self._address)
 
     def end(self) -> None:

@@ -400,4 +400,4 @@ def pair_blocks(samples: Iterable[FtSamples], states: Iterable[ArmStates], delay
             found = True
             yield _paired_with(poses, t_ns[inside], block.rows(inside))
     if not found:
-        raise BadDataset("wrench and pose have no common time: give files of the same recording, with one clock")
+        raise BadDataset("wrench and pose have no time in common: give files of the same recording, with one clock")

@@ -462,7 +462,7 @@ def _sensor_from(frame: WrenchFrame, info: StreamInfo) -> Array:
         return np.zeros(3)
     if not np.isfinite(info.p_flange_sensor_m).all():
         raise ConfigError(
-            f"a torque {str(frame).partition(', ')[2]} needs the position of the sensor. Set [sensor] height_mm, "
+            f"a torque {str(frame).partition(', ')[2]} needs the position of the sensor: set [sensor] height_mm, "
             "the height of its origin above the flange face, or choose --about sensor"
         )
     if frame.about == "tcp":

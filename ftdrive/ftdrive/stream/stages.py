@@ -111,7 +111,7 @@ class _InertialWrench(Stage):
             return None
         if not np.isfinite(info.p_flange_sensor_m).all():
             raise ConfigError(
-                "the inertia stage needs the position of the sensor. Set [sensor] height_mm, the height of its "
+                "the inertia stage needs the position of the sensor: set [sensor] height_mm, the height of its "
                 "origin above the flange face"
             )
         return cls()

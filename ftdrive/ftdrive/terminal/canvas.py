@@ -1,4 +1,4 @@
-"""The whole terminal as lines of text, drawn ten times a second: what the screens of `live` and `weigh` share."""
+"""Full-screen terminal display of text lines, drawn ten times per second; base of the `live` and `weigh` screens."""
 
 import os
 import select
@@ -24,23 +24,23 @@ from ftdrive.terminal.lines import FAINT, STRONG, Line
 from ftdrive.terminal.supervisor import Supervisor
 
 REFRESH_S = 0.1
-# A write of more bytes could wait for a terminal that has room for some of them.
+# A longer write could block on a terminal with room for only part of it.
 _CHUNK = 256
 
 
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    `address` is that of the page in the browser, whose QR code the key `v` shows; empty without a page.
+    `address` of the page in the browser is shown as a QR code by the key `v`; empty without a page.
     """
 
     is_over = False
     failure: BaseException | None = None
-    """What has ended the reading."""
+    """Error that ended reading."""
     cover: Sequence[Line] = ()
-    """Shown instead of the drawing until a key is pressed."""
+    """Lines shown instead of the drawing until a key is pressed."""
     entry: tuple[Callable[[str], object], str, str] | None = None
-    """What takes the text that is typed in the last line, its hint, and the text so far."""
+    """Function that takes the text typed in the last line, hint, and text so far."""
 
     def __init__(self, address: str = "") -> None:
         self._address = address
@@ -49,22 +49,22 @@ class Canvas(ABC):
 
     @abstractmethod
     def draw(self, width: int, height: int) -> Sequence[Line]:
-        """Return the lines; those that are missing stay empty. What it raises ends the screen."""
+        """Return the lines to show; missing lines stay empty. An error ends the screen."""
 
     @abstractmethod
     def turns(self) -> Iterable[object]:
-        """Read a stream turn after turn, until the screen `is_over`."""
+        """Read a stream in turns until the screen `is_over`."""
 
     @abstractmethod
     def act(self, key: str) -> None:
-        """Do what a key stands for."""
+        """Do the action of a key."""
 
     def page(self) -> Line | None:
-        """Return the address of the page in the browser and its key; None without a page."""
+        """Return a line with the address of the page in the browser and its key; None without a page."""
         return Line("─ ", FAINT).add(self._address).add("  v", STRONG).add(" QR code", FAINT) if self._address else None
 
     def lines(self, width: int, height: int) -> list[Line]:
-        """Return what the terminal shows: `height` lines of `width` cells; raises what has ended the reading."""
+        """Return `height` lines of `width` cells to show; raise the error that ended reading."""
         if self.failure is not None:
             raise self.failure
         shown = self.draw(width, height)
@@ -72,13 +72,13 @@ class Canvas(ABC):
         lines += [Line().to(width)] * (height - len(lines))
         if self.entry is not None:
             _, hint, text = self.entry
-            # of a long text the end
+            # show the end of a long text
             line = Line(" ").add(text[-max(width - 3, 0) :]).add(" ", "reverse")
             lines[-1:] = [line.add("" if text else hint, FAINT).fit(width)]
         return lines
 
     def press(self, key: str) -> None:
-        """Do what a stroke of the keyboard stands for."""
+        """Handle a keystroke."""
         if self.entry is not None:
             take, hint, text = self.entry
             if len(key) == 1 or key == "backspace":
@@ -93,19 +93,23 @@ class Canvas(ABC):
             self.is_over = True
         elif key == "v" and self._address:
             is_ours = is_loopback(urlsplit(self._address).hostname or "")
-            words = "of this computer only: a tablet needs --view-address" if is_ours else "who has it sees the page"
+            words = (
+                "for this computer only: for a tablet, use --view-address"
+                if is_ours
+                else "anyone with it sees the page"
+            )
             code = [Line(" ").add(row, "white on black") for row in qr_code(self._address)]
             self.cover = [Line(f" {self._address}"), Line(f" {words}"), *code, Line(" Any key returns.")]
         else:
             self.act(key)
 
     def run(self, keys: TextIO | None = None, output: TextIO | None = None) -> None:
-        """Show the screen until `q` or Ctrl-C, then restore the terminal and show what was printed on stderr meanwhile.
+        """Show the screen until `q` or Ctrl-C, then restore the terminal and print what stderr received meanwhile.
 
         Raises
         ------
         SupervisorGone
-            The terminal was closed. Of SIGHUP and SIGTERM the handlers of before raise.
+            The terminal was closed. For SIGHUP and SIGTERM, the previous handlers raise.
         """
         keys, output = keys or sys.stdin, output or sys.stderr
         supervisor = Supervisor(keys, output, "standard error")
@@ -117,7 +121,7 @@ class Canvas(ABC):
             stack.enter_context(redirect_stderr(held))
             stack.enter_context(console.screen())
             keyboard = stack.enter_context(Keyboard(keys.fileno()))
-            # the last, because a terminal that is blocked may keep the others waiting
+            # last, because a blocked terminal may delay the others
             stack.enter_context(self.reading())
             while not self.is_over:
                 rest = _sent(fd, rest or self._changes(console, fd))
@@ -128,7 +132,7 @@ class Canvas(ABC):
 
     @contextmanager
     def reading(self) -> Iterator[None]:
-        """Read in another thread while the screen is shown, because drawing must not keep a stream waiting."""
+        """Read in another thread while the screen is shown, so that drawing does not delay the stream."""
         thread = threading.Thread(target=self._read, name="reading", daemon=True)
         thread.start()
         try:
@@ -146,9 +150,9 @@ class Canvas(ABC):
 
     @contextmanager
     def _signals_end_it(self) -> Iterator[None]:
-        """Let signals end the screen, because what a handler raises could break the restoration of the terminal off.
+        """Let signals end the screen, because an exception in a handler could prevent the terminal's restoration.
 
-        They are repeated afterwards, but for Ctrl-C, which ends the screen as `q` does.
+        The signals are raised again afterwards, except for Ctrl-C, which ends the screen like `q`.
         """
         received = list[int]()
 
@@ -165,9 +169,9 @@ class Canvas(ABC):
             signal.raise_signal(number)
 
     def _changes(self, console: CommandConsole, fd: int) -> bytes:
-        """Return what draws the lines that changed, or all of them on a terminal of another size."""
+        """Return the bytes that draw the changed lines, or all lines after a change of the terminal's size."""
         size = os.get_terminal_size(fd)
-        # a terminal that does not know its size
+        # some terminals do not know their size
         width, height = size.columns or 80, size.lines or 24
         lines = self.lines(width, height)
         with console.capture() as captured:
@@ -183,7 +187,7 @@ class Canvas(ABC):
 
 
 def _sent(fd: int, rest: bytes) -> bytes:
-    """Send what the terminal takes until the next drawing is due, and return what is left: keys never wait for it."""
+    """Send bytes that the terminal accepts until the next drawing is due; return the rest, so that keys do not wait."""
     due_s = time.monotonic() + REFRESH_S
     while rest and (left_s := due_s - time.monotonic()) > 0 and select.select([], [fd], [], left_s)[1]:
         rest = rest[os.write(fd, rest[:_CHUNK]) :]

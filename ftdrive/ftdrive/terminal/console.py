@@ -1,4 +1,4 @@
-"""Two consoles: `answer` prints what a command was asked for on stdout, `messages` all else on stderr."""
+"""Two consoles: `answer` prints results on stdout, `messages` prints everything else on stderr."""
 
 import os
 import sys
@@ -16,37 +16,37 @@ from rich.text import Text
 from ftdrive.terminal.text import NARROWEST, glued, unglued
 from ftdrive.words.text import as_typed, is_command, visible
 
-# A command that takes longer says at what it works, also in a pipe.
+# A slower command prints what it is doing, even to a pipe.
 _PATIENCE_S: Final = 2.0
 
 
 class CommandConsole(Console):
-    """A console that knows whether details are wanted (`-v`); `quiet` is the console's own."""
+    """A console with a setting for details (`-v`); `quiet` belongs to the base class."""
 
     verbose = False
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
-        """Render with control characters made visible, whatever file, device or network they come from."""
+        """Render with control characters made visible, because text may come from files, devices or the network."""
         for one in super().render(renderable, options):
             yield one if one.control else Segment(visible(one.text), one.style)
 
     def on_broken_pipe(self) -> None:
-        """Leave a closed pipe to `ftdrive.cli.run`."""
+        """Leave the closed pipe to `ftdrive.cli.run`."""
         raise BrokenPipeError
 
     def print(self, *objects: Any, **options: Any) -> None:
-        """Print; a command in a text stands there as the user can type it."""
+        """Print with commands in the form to type."""
         super().print(*(as_typed(one) if isinstance(one, str) else one for one in objects), **options)
 
     def print_next(self, *commands: str) -> None:
-        """Print what the user can do next: commands, each with why behind it."""
+        """Print the next steps: commands, each with a reason after it."""
         if commands:
             self.print("Next", style="bold cyan")
         for command in commands:
             self.print(self._next(command), soft_wrap=True)
 
     def _next(self, text: str) -> str:
-        r"""Fold a command as a shell reads it, with \ before its last option, and what stands behind it."""
+        r"""Return a command, folded with \ before its last option if it is too long, and the text after it."""
         command, _, why = as_typed(text).partition("   ")
         shown = f"   {command}"
         if not self.soft_wrap and len(shown) > self.width:
@@ -56,41 +56,43 @@ class CommandConsole(Console):
 
 
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-"""Folds between words in a terminal, never in a file. Prints brackets and colons as they are: paths contain them."""
+"""Folds between words on a terminal, but not in a file. Brackets and colons are printed unchanged, because paths
+contain them.
+"""
 
 answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
-"""On stdout: results, verdicts and where they were saved. `-q` does not silence it, `--json` replaces it."""
+"""Console on stdout for results, verdicts and names of saved files. `-q` does not silence it; `--json` replaces it."""
 
 
 def has_screen() -> bool:
-    """Whether a screen can cover the terminal: a person reads and types there, and its cursor can be placed."""
+    """Whether a screen can cover the terminal: input and output are a terminal with cursor control."""
     are_terminals = all(one.isatty() for one in (sys.stdin, sys.stdout, sys.stderr))
     return are_terminals and os.name == "posix" and not messages.is_dumb_terminal
 
 
 def beside(as_json: bool) -> CommandConsole:
-    """Return where words about an answer go: to stdout, or to stderr if `--json` has its object there."""
+    """Return the console for messages about a result: stdout, or stderr if `--json` writes to stdout."""
     return messages if as_json else answer
 
 
 def print_address(words: str, address: str) -> None:
-    """Print an address behind words, or below if the line is too short; never broken, and as a link where it can."""
+    """Print an address after a text, or below it if the line is too short; never broken, and as a link if possible."""
     if not messages.soft_wrap and len(words + address) > messages.width >= len(f"   {address}"):
         words = f"{words.rstrip()}\n   "
     messages.print(Text.assemble(words, (address, Style(link=address))), soft_wrap=True)
 
 
 def print_page(url: str, *, shared: bool) -> None:
-    """Print the address of a page, for other devices also as a QR code."""
+    """Print the address of a page, also as a QR code for other devices."""
     print_address("The page is shown until this command ends, at ", url)
     if shared:
         for row in qr_code(url):
             messages.print(row)
-        messages.print("Who has this address sees the page and can press its buttons. There is no encryption.")
+        messages.print("Anyone with this address can see the page and press its buttons. There is no encryption.")
 
 
 def qr_code(address: str) -> list[str]:
-    """Return the rows of the QR code of an address, light on dark; needs the extra viz, as the page does."""
+    """Return the rows of the QR code of an address, light on dark; this needs the extra viz, like the page."""
     import segno
 
     code = StringIO()
@@ -99,9 +101,9 @@ def qr_code(address: str) -> list[str]:
 
 
 def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
-    """Put words behind a head; on a terminal too narrow for them the next lines begin under the first word.
+    """Return the words after a head; on a narrow terminal the next lines are indented to the first word.
 
-    Print it with `soft_wrap`: a line that is a command stays whole.
+    Print the text with `soft_wrap`, so that a line with a command stays whole.
     """
     first = Text.assemble(head)
     words, width = as_typed(words), console.width - first.cell_len
@@ -117,9 +119,9 @@ def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
 
 @contextmanager
 def working(words: str) -> Iterator[Callable[[str], None]]:
-    """Show on a terminal that a command works, and at what; a pipe gets one line after 2 s.
+    """Show on a terminal what a command is doing; a pipe gets one line after 2 s.
 
-    Yields a function for other words.
+    Yields a function that changes the text.
     """
     if not messages.is_terminal:
         line = Timer(_PATIENCE_S, messages.print, [f" {words} …"])

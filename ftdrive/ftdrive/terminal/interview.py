@@ -1,4 +1,4 @@
-"""The questions of `ftdrive init` in a terminal, about what is not answered yet."""
+"""The questions of `ftdrive init` in a terminal, for values that are not known yet."""
 
 import sys
 from collections.abc import Callable
@@ -28,32 +28,32 @@ from ftdrivers.errors import DeviceError
 
 
 class _Back(Exception):
-    """The operator wants the question before."""
+    """Raised if the operator wants the previous question."""
 
 
 class Interview:
-    """Asks in the terminal for what is not answered yet; `draft` is None with --yes, which takes the usual answers."""
+    """Asks for missing answers in the terminal; `draft` is None with --yes, which uses the default answers."""
 
     def __init__(self, described: Description, draft: Path | None, again: str) -> None:
         self._described, self._draft, self._again = described, draft, again
         self._addresses: dict[str, str] = {}
 
     def take_draft(self, *, asked: bool) -> None:
-        """Take the answers of a draft; if `asked`, only after a yes."""
+        """Use the answers of a draft; if `asked`, only after confirmation."""
         if self._draft is None or not self._draft.exists():
             return
         when = saved_at(self._draft)
         if asked:
-            words = f"Go on with the answers of {when}? [yes/no]: "
+            words = f"Continue with the answers of {when}? [yes/no]: "
             if self._until(words, None, "an answer", _yes_or_no, back=False).strip().lower() == "no":
                 self._draft.unlink()
                 return
         self._described.load(self._draft)
         if not asked:
-            say(f"The answers of {when} are filled in from {self._draft}. Delete it to begin without them.")
+            say(f"The answers of {when} are filled in from {self._draft}. Delete the file to start without them.")
 
     def take_options(self, given: dict[str, Any]) -> None:
-        """Take the answers that options give; raises `ConfigError` for those that cannot be used."""
+        """Use the answers given by options. Raises `ConfigError` for invalid ones."""
         for question in QUESTIONS:
             if not (option := given.get(question.name)):
                 continue
@@ -69,13 +69,13 @@ class Interview:
                 self._described.answered.add(question.key)
 
     def look(self, key: str, text: str) -> None:
-        """Read a device, and print what it reports; raises as `Description.look`."""
+        """Read a device, and print its report. Raises as `Description.look`."""
         say(self._described.look(key, text), "  ✔ ")
 
     def run(self) -> None:
-        """Ask until everything is answered, and confirmed in a summary."""
+        """Ask until everything is answered and the summary is confirmed."""
         if self._draft is not None:
-            say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the question before.")
+            say("Numbers may have a unit, such as 3.3 cm or 450 g. Enter 'back' for the previous question.")
         while True:
             questions = self._described.questions
             at = next((i for i, one in enumerate(questions) if one.key not in self._described.answered), len(questions))
@@ -112,7 +112,7 @@ class Interview:
         return texts[0] if texts else self._described.usual(question)
 
     def _answer_rows(self, question: CellQuestion) -> None:
-        """Ask for rows until an empty answer; "back" removes the last one."""
+        """Ask for rows until an empty answer; "back" removes the last row."""
         described = self._described
         rows = described.texts.setdefault(question.key, [])
         if question.key == WALLS and self._draft is not None:
@@ -136,7 +136,7 @@ class Interview:
             self._save()
 
     def _find(self, question: CellQuestion) -> None:
-        """Ask for the address of a device until one answers; the operator may keep one that does not."""
+        """Ask for the address of a device until one answers; the operator may keep an address that does not answer."""
         described, key = self._described, question.key
         text = self._addresses.pop(key, None)
         usual = self._former(question)
@@ -168,9 +168,9 @@ class Interview:
             text = None
 
     def _confirmed(self) -> bool:
-        """Show all answers; return whether they are to be written, False after a number, whose question is open again.
+        """Show all answers; return whether to write them, False after a number that reopens a question.
 
-        Raises `_Back` if the last question is to be asked again.
+        Raises `_Back` to repeat the last question.
         """
         described = self._described
         questions = described.questions
@@ -191,7 +191,7 @@ class Interview:
         return not number
 
     def _ask(self, question: CellQuestion, words: str, usual: str | None) -> str:
-        """Return an answer that can be used, "" for no more rows; Enter and --yes take `usual`."""
+        """Return a valid answer, "" for no more rows; Enter and --yes use the default `usual`."""
 
         def accept(text: str) -> None:
             if question.repeats and not text:
@@ -210,7 +210,7 @@ class Interview:
     def _until(
         self, words: str, usual: str | None, what: str, accept: Callable[[str], None], *, back: bool = True
     ) -> str:
-        """Ask until an answer is accepted; raises as `_prompt`, and `_Back` for an answer that wants it."""
+        """Ask until an answer is accepted. Raises as `_prompt`, and `_Back` for "back"."""
         while True:
             answer = self._prompt(words, usual, what)
             if back and answer.strip().lower() == "back":
@@ -223,16 +223,16 @@ class Interview:
                 return answer
 
     def _prompt(self, words: str, usual: str | None, what: str) -> str:
-        """Ask once; raises `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
+        """Ask once. Raises `ConfigError` at the end of the input, and `click.Abort` after Ctrl-C."""
         shown = in_whole_words(words, sys.stderr)
         try:
             return str(click.prompt(visible(shown), default=usual, show_default=False, prompt_suffix="", err=True))
         except click.Abort as abort:
-            # The next message begins a line.
+            # start a new line for the next message
             echo(err=True)
             kept = ""
             if self._draft is not None and self._draft.exists():
-                kept = f"the answers so far are kept in {self._draft}, go on with them:\n{self._again}"
+                kept = f"the answers so far are kept in {self._draft}; continue with\n{self._again}"
             if isinstance(abort.__context__, EOFError):
                 raise ConfigError(f"the input ended before {what} was given" + (kept and f"; {kept}")) from abort
             if kept:
@@ -246,5 +246,5 @@ def _yes_or_no(answer: str) -> None:
 
 
 def say(words: str, head: str = "") -> None:
-    """Print on stderr; further lines continue below the first word after the head."""
+    """Print on stderr; further lines are indented to the first word after the head."""
     messages.print(hanging(head, words), soft_wrap=True)

@@ -14,36 +14,37 @@ from typing import Self
 
 from ftdrive.session.events import Key
 
-# Arrows and function keys arrive as escape, then letters that would be read as keys.
+# Arrows and function keys arrive as escape sequences, whose letters would be read as keys.
 _ESCAPE = re.compile(r"\x1b(?:\[[0-?]*[ -/]*[@-~]|O.|.)?")
 _STROKE = re.compile(f"{_ESCAPE.pattern}|[^\x1b]")
 _NAMES = {"\x1b": "escape", "\n": "enter", "\r": "enter", "\x7f": "backspace", "\b": "backspace"}
 _NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C", "right"), ("D", "left"))}
 _KEYS = {key.value: key for key in Key}
-# A letter within this time of another belongs to a word, such as an answer typed too late.
+# A letter within this time of another one belongs to a word, such as a late answer, s.
 _WORD_S = 0.3
-# Read within a word too: an unnecessary stop does no harm. What else a word contains is another key.
+# These keys also count within a word, because an unnecessary stop is harmless. Other letters in a word become
+# `Key.OTHER`.
 _ALWAYS = {Key.PAUSE, Key.STOP}
 
 
 class Keyboard:
-    """Keys of a screen, read by a thread. The terminal settings are restored on every exit from the context.
+    """Keys of a terminal, read by a thread. The terminal settings are restored on every exit from the context.
 
-    A session takes requests (`pressed`), which letters of a word are not. Other screens take each stroke (`stroke`).
-    `fd` is that of a terminal, see `usable`.
+    A session reads requests (`pressed`), which exclude letters of words. Other screens read each keystroke (`stroke`).
+    `fd` is the descriptor of a terminal, see `usable`.
     """
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._keys: deque[Key] = deque()
-        self._strokes: deque[str] = deque(maxlen=1000)  # a session takes none
+        self._strokes: deque[str] = deque(maxlen=1000)  # a session does not read them
         self._before: list[int | list[bytes | int]] | None = None
         self._thread: Thread | None = None
         self._wake = -1
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Whether this is a terminal in the foreground, whose keys can be read: not a pipe, not a background job.
+        """Whether the keys of a descriptor can be read: a terminal in the foreground, no pipe and no background job.
 
         False on Windows, which has no `termios`.
         """
@@ -62,21 +63,21 @@ class Keyboard:
         self._stop()
 
     def pressed(self) -> Key | None:
-        """Take the oldest key that was not yet taken."""
+        """Return the oldest unread request; None without one."""
         return self._keys.popleft() if self._keys else None
 
     def stroke(self) -> str | None:
-        """Take the oldest stroke that was not yet taken: a character, or the name of a key such as "left"."""
+        """Return the oldest unread keystroke, a character or a name such as "left"; None without one."""
         return self._strokes.popleft() if self._strokes else None
 
     @property
     def waiting(self) -> tuple[Key, ...]:
-        """Keys that were pressed and not yet taken."""
+        """Unread requests."""
         return tuple(self._keys)
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Restore the terminal for a typed answer and discard the keys pressed before."""
+        """Restore the terminal for a typed answer, and discard earlier keys."""
         self._stop()
         try:
             yield
@@ -89,12 +90,12 @@ class Keyboard:
 
         try:
             self._before = termios.tcgetattr(self._fd)
-        except termios.error:  # a terminal that was closed has no keys
+        except termios.error:  # a closed terminal has no keys
             return
         atexit.register(self._restore)
         tty.setcbreak(self._fd, termios.TCSANOW)
         mode = termios.tcgetattr(self._fd)
-        # Ctrl-S would freeze the screen beside a moving arm
+        # Ctrl-S would freeze the screen while the arm moves
         mode[0] &= ~termios.IXON
         # Ctrl-Z would suspend the guards, and Ctrl-\ end them
         for name in (termios.VSUSP, termios.VQUIT):
@@ -107,7 +108,7 @@ class Keyboard:
     def _stop(self) -> None:
         thread, self._thread = self._thread, None
         if thread is not None:
-            # before the terminal discards what was typed: a read of a key that is discarded would never end
+            # before the terminal discards typed input: a read of a discarded key would never return
             os.close(self._wake)
             thread.join()
         self._restore()
@@ -119,9 +120,9 @@ class Keyboard:
             return
         import termios
 
-        # a terminal that was closed needs nothing
+        # a closed terminal needs no restoration
         with suppress(termios.error):
-            # at once: draining waits for Ctrl-Q after Ctrl-S
+            # at once, because draining would wait for Ctrl-Q after Ctrl-S
             termios.tcsetattr(self._fd, termios.TCSANOW, self._before)
             termios.tcflush(self._fd, termios.TCIFLUSH)
         self._before = None
@@ -152,7 +153,7 @@ class Keyboard:
                 self._keys += found or ([] if held_down else [Key.OTHER])
                 word += letters or "\x1b"
         except OSError:
-            # the terminal is gone: the supervisor reports it
+            # the terminal is closed: the supervisor reports it
             return
         finally:
             os.close(wake)

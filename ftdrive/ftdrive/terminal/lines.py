@@ -1,4 +1,4 @@
-"""What screens are drawn with: lines of styled text, and plots of Braille characters."""
+"""Lines of styled text, and plots of Braille characters."""
 
 from collections.abc import Sequence
 from itertools import groupby
@@ -17,14 +17,14 @@ TRACE, CONTACT, FAINT, STRONG = "green", "magenta", "dim", "bold"
 
 
 class Part(NamedTuple):
-    """A piece of a line."""
+    """A piece of a line with one style."""
 
     text: str
     style: str = ""
 
 
 class Line:
-    """A line under construction."""
+    """A line of styled text, built piece by piece."""
 
     def __init__(self, text: str = "", style: str = "") -> None:
         self.parts: list[Part] = []
@@ -42,7 +42,7 @@ class Line:
         return self
 
     def to(self, column: int) -> Self:
-        """Append blanks up to a column."""
+        """Append spaces up to a column."""
         return self.add(" " * (column - self.width))
 
     def join(self, other: "Line") -> Self:
@@ -52,7 +52,7 @@ class Line:
         return self
 
     def fit(self, width: int) -> "Line":
-        """Return this line padded to `width` cells, or the words that fit and an ellipsis."""
+        """Return this line padded to `width` cells, or as many whole words as fit with an ellipsis."""
         if self.width <= width:
             return self.to(width)
         fitted = Line()
@@ -60,7 +60,7 @@ class Line:
             room = width - 1 - fitted.width
             if cell_len(part.text) > room:
                 text = set_cell_size(part.text, max(room, 0))
-                # a whole word or none of it
+                # only whole words
                 if not part.text.startswith(" ", len(text)):
                     text = text[: text.rfind(" ") + 1]
                 fitted.add(text, part.style)
@@ -70,14 +70,14 @@ class Line:
 
     @classmethod
     def of_cells(cls, text: Sequence[str], styles: Sequence[str]) -> Self:
-        """Build a line of characters, each with its own style."""
+        """Return a line of characters, each with its style."""
         line = cls()
         for style, alike in groupby(zip(text, styles, strict=True), key=lambda cell: cell[1]):
             line.add("".join(character for character, _ in alike), style)
         return line
 
     def as_text(self) -> Text:
-        """Return this line for rich."""
+        """Return this line as a text of rich."""
         return Text.assemble(*self.parts, no_wrap=True)
 
     def __str__(self) -> str:
@@ -91,10 +91,10 @@ _BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]], np.ui
 
 
 def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
-    """Draw the range from `low` to `high` (n,) in each column of dots (4 rows, n), without a gap between neighbours.
+    """Return dots (4 rows, n) for the ranges from `low` to `high` (n,), without gaps between neighbours.
 
-    A column with a NaN stays empty. The upper edge is at `full` and the lower at minus this; larger values are drawn
-    on the edge.
+    A column with NaN stays empty. The upper edge is `full`, the lower edge -`full`; larger values are drawn at the
+    edge.
     """
     low, high = low.copy(), high.copy()
     joined = np.isfinite(low[1:]) & np.isfinite(low[:-1])
@@ -109,7 +109,7 @@ def envelope(low: Array, high: Array, rows: int, full: float) -> Dots:
 
 
 def characters(dots: Dots) -> NDArray[np.str_]:
-    """Pack dots (4 m, 2 n) into characters (m, n), blank where no dot is set."""
+    """Return dots (4 m, 2 n) packed into characters (m, n), blank without dots."""
     rows, columns = len(dots) // 4, dots.shape[1] // 2
     codes = np.einsum("ribj,ij->rb", dots.reshape(rows, 4, columns, 2).astype(np.uint32), _BITS)
     return np.where(codes, 0x2800 + codes, ord(" ")).astype(np.uint32).view("U1")
@@ -118,7 +118,7 @@ def characters(dots: Dots) -> NDArray[np.str_]:
 def plot(
     low: Array, high: Array, rows: int, full: float, in_contact: NDArray[np.bool_], under: Dots | None = None
 ) -> list[Line]:
-    """Draw an `envelope` (n,) in lines of n / 2 characters, before the dots `under` it; contact has its own colour."""
+    """Return an `envelope` as lines of n / 2 characters, over the dots `under`; contacts have their own colour."""
     ink = characters(envelope(low, high, rows, full))
     drawn, cells = ink != " ", ink if under is None else np.where(ink != " ", ink, characters(under))
     styles = np.where(drawn, np.where(in_contact, CONTACT, TRACE), FAINT)
@@ -126,5 +126,5 @@ def plot(
 
 
 def _dot(value: Array, rows: int, full: float) -> Array:
-    """Return the row of dots of values, from 0 at the top; values about zero share the row below the middle."""
+    """Return the rows of dots for values, 0 at the top; values near zero are in the row below the middle."""
     return np.floor((1 - value / full) * 2 * rows + 0.5)

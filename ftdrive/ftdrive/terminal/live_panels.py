@@ -1,4 +1,4 @@
-"""The parts of the live screen as lines of text, each a function of the `View` and the width."""
+"""Panels of the live screen as lines of text: functions of the `View` and the width."""
 
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
@@ -21,16 +21,16 @@ from ftdrive.words import stream as words
 from ftdrive.words.stream import ShownWrench, View
 from ftdrivers.interfaces import Array
 
-# Width of the numbers of the table.
+# Width of the numbers in the table.
 _NUMBERS = 37
 _ARROWS = "→↗↑↖←↙↓↘"
-# Number of the first stage that readings of a sensor alone can have.
+# Number of the first stage that applies to a sensor alone.
 _LOWPASS = 4
-# Width of a half sphere.
+# Width of a hemisphere.
 _DISC = 16
 _STATE = {"ok": ("✔", GOOD), "warning": ("!", WARNING), "failed": ("✘", BAD), "skipped": ("-", FAINT)}
 _TONES = {"good": GOOD, "warning": WARNING, "bad": BAD}
-# Styles of notes, by their kind.
+# Styles of notes by kind.
 _NOTES = {"contact": CONTACT, "mark": STRONG}
 _NOTES |= dict.fromkeys(("tare", "recovered"), GOOD) | dict.fromkeys(("drift", "warning"), WARNING)
 _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
@@ -40,7 +40,7 @@ _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
 
 
 def head(view: View, width: int, page: Line | None = None) -> list[Line]:
-    """Name devices, stages, calibration, and in the last line what is silent, or the page in the browser."""
+    """Return the lines with devices, stages, calibration, and the device without samples or the page in the browser."""
     rule = Line() if page is None else page.add(" ")
     rule.add("─" * (width - rule.width), FAINT)
     if view.silent:
@@ -97,7 +97,7 @@ def _provenance(view: View, width: int) -> Line:
 
 
 def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
-    """List each component with sigma, extremes, a bar and, if there is room, a trace."""
+    """Return the table of components with sigma, extremes, a bar and, if there is room, a trace."""
     trace_cells = width - _NUMBERS - 23 - 4 if with_trace else 0
     if trace_cells < 8:
         trace_cells = 0
@@ -133,19 +133,19 @@ def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
 
 
 def format_component(reading: ShownWrench, i: int) -> tuple[str, str]:
-    """Return the value of a component and its sigma, which have the same decimals."""
+    """Return the value of a component and its sigma, with the same number of decimals."""
     places = _decimals(reading, i // 3 * 3)
     return _fixed(reading.wrench[i], places, 8), _digits(reading.sigma[i], places)
 
 
 def _decimals(reading: ShownWrench | None, first: int) -> int:
-    """Return how many decimals three components need to show their standard deviations without contact."""
+    """Return the number of decimals that shows the sigmas of three components without contact."""
     usual = 3 if first else 2
     return usual if reading is None or not reading.rest_sigma[first : first + 3].max() < 0.5 * 10**-usual else usual + 1
 
 
 def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> Line:
-    """Show a name, the present value with its sigma, and the extremes; an old value is not shown as live."""
+    """Return a line with name, present value, sigma and extremes; an old value is not shown as current."""
     line = Line(name, STRONG)
     if view.live is None:
         return line.add(f"{'--.--':>8}", BAD if view.silent else FAINT).add(f"{'--':>8}", FAINT).add(peaks)
@@ -154,7 +154,7 @@ def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> L
 
 
 def _at_rest(view: View) -> Line:
-    """Show the sigma of a free tool, below that of the present contact."""
+    """Return a line with the sigma of a free tool."""
     if (reading := view.live) is None:
         return Line()
     force, torque = (_digits(float(reading.rest_sigma[i : i + 3].max()), _decimals(reading, i)) for i in (0, 3))
@@ -162,12 +162,12 @@ def _at_rest(view: View) -> Line:
 
 
 def _digits(sigma: float, places: int) -> str:
-    """Return a standard deviation, NaN until the noise is known, in fixed digits: no column jumps on a screen."""
+    """Return a standard deviation with fixed decimals, so that columns stay aligned; "--" if NaN."""
     return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 
 def _fixed(value: float, places: int, width: int) -> str:
-    """Return a number in `width` cells at most; raw readings of some sensors are so large that decimals must go."""
+    """Return a number in at most `width` cells; decimals are dropped for large raw readings."""
     while places and len(f"{value:+z.{places}f}") > width:
         places -= 1
     return f"{value:+z.{places}f}"
@@ -208,7 +208,7 @@ def _contact_line(view: View) -> Line:
 
 
 def links(view: View) -> list[Line]:
-    """Show down in tool axes, the raw wrench, the used range, both links and the controller's payload."""
+    """Return lines with the direction of gravity in tool axes, raw wrench, used range, links and payload."""
     if view.info.is_raw:
         return [_raw(view), _range(view), _link_line(view, "sensor", view.status.sensor)]
     dial = [""] * 5
@@ -269,7 +269,7 @@ def _check_line(check: Check) -> Line:
 
 
 def others(view: View) -> list[Line]:
-    """Show the wrench with fewer stages, and in other frames."""
+    """Return lines with the wrench after fewer stages, and in other frames."""
     if view.reading is None or not (rows := words.other_wrenches(view)):
         return []
     lines = [Line(f" in {words.short_frame(view.reading.frame)}", FAINT).to(21)]
@@ -287,7 +287,7 @@ def others(view: View) -> list[Line]:
 
 
 def sphere(view: View) -> list[Line]:
-    """Draw gravity in flange axes on two half spheres, with the calibrated orientations and the error expected here."""
+    """Return a drawing of gravity in flange axes on two hemispheres, with calibrated orientations and sigma."""
     reading = view.reading
     if reading is None or view.info.is_raw:
         return []
@@ -310,7 +310,7 @@ def sphere(view: View) -> list[Line]:
 
 
 def _half_sphere(known: Array, down: Array) -> list[Line]:
-    """Draw one half of the sphere, seen along z, and directions (n, 3); the distance from the middle is the angle."""
+    """Draw one hemisphere, seen along z, with directions (n, 3); the distance from the centre is the angle."""
     rows, angle = _DISC // 2, np.linspace(0, 2 * np.pi, 200)
     dots = np.zeros((4 * rows, 2 * _DISC), np.bool_)
     for radius in (0.5, 1.0):
@@ -328,14 +328,14 @@ def _half_sphere(known: Array, down: Array) -> list[Line]:
 
 
 def identity(view: View, width: int) -> list[Line]:
-    """Name the devices with serial numbers, the calibration and the checks shared with `doctor`."""
+    """Return lines with devices and serial numbers, calibration, and the checks shared with `doctor`."""
     info = view.info
     lines = [Line(" sensor    ", FAINT).add(who(info.sensor))]
     if not info.is_raw:
         lines.insert(0, Line(" arm       ", FAINT).add(who(info.arm)))
         lines.append(Line(" cal       ", FAINT).add(info.calibration_name))
     for check in view.checks:
-        # stands beside the links
+        # shown next to the links
         if check.name == "robot.payload" and check.state == "ok":
             continue
         mark, *found = _check_line(check).parts
@@ -344,7 +344,7 @@ def identity(view: View, width: int) -> list[Line]:
 
 
 def events(view: View, width: int, rows: int) -> list[Line]:
-    """List the newest events first; where few lines are left, several in a line."""
+    """Return lines with the newest events first; with few lines, several events per line."""
     lines = list[Line]()
     for note in view.notes:
         if len(lines) > rows:
@@ -358,7 +358,7 @@ def events(view: View, width: int, rows: int) -> list[Line]:
 
 
 def newest_rows(view: View, width: int) -> int:
-    """Return how many lines the newest event takes."""
+    """Return the number of lines of the newest event."""
     return next((len(_event_lines(view, note, width)) for note in view.notes), 0)
 
 
@@ -370,7 +370,7 @@ def _event_lines(view: View, note: FeedNote, width: int) -> list[Line]:
 
 
 def _hanging(head: Line, parts: Sequence[Part], width: int) -> list[Line]:
-    """Put words behind a head; the next lines begin under the first word."""
+    """Return lines with words after a head; further lines are indented to the first word."""
     lines, indent = [head], head.width
     for part in parts:
         for i, word in enumerate(part.text.split(" ")):
@@ -383,7 +383,7 @@ def _hanging(head: Line, parts: Sequence[Part], width: int) -> list[Line]:
 
 
 def keys(view: View, width: int) -> Line:
-    """List the keys."""
+    """Return a line with the keys."""
     names = ["t tare", "u undo", "x axes", "a about", "1-4 stage", "z freeze", "b mark", "r rec", "p peak", "g span"]
     if view.info.is_raw:
         names = ["t tare", "u undo", "4 low-pass", "z freeze", "b mark", "r rec", "p peak", "g span"]
@@ -402,10 +402,10 @@ def keys(view: View, width: int) -> Line:
 
 
 def show_table(views: Iterable[View]) -> None:
-    """Draw a table of each view, without keys and events, until they or the operator end it."""
+    """Show a table of each view, without keys and events, until the views or the operator end it."""
     shown = Group()
     with (
-        # Enter would break the screen
+        # the echo of Enter would break the screen
         Keyboard(0) if Keyboard.usable(0) else nullcontext(),
         Live(console=answer, refresh_per_second=10) as screen,
     ):

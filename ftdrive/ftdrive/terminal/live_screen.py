@@ -1,7 +1,7 @@
 """The live screen: the compensated wrench in a terminal, with keys.
 
-`Feed` reads the stream in a thread. Ten times a second `Summary` takes what is new, and `frame` draws its `View` as
-lines.
+`Feed` reads the stream in a thread. Ten times per second, `StreamSummary` takes the new data, and `draw_live` draws its
+`View` as lines.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,24 +24,24 @@ from ftdrive.terminal.lines import CONTACT, FAINT, STRONG, Line, envelope, plot
 from ftdrive.words.stream import StreamSummary, View, full_scale
 
 _HELP = """\
- ftdrive live: the wrench on the tool, ten times a second
+ ftdrive live: the wrench on the tool, ten times per second
 
  now      mean of the last 0.1 s
  ± σ      one sigma of that mean: noise and calibration
  peak     extremes since p
- bars     their scale follows the recent extremes
+ bars     scaled to the recent extremes
 
  t tare: change the bias so that a free tool reads zero        u undo the tare
  x axes: sensor, flange, base, tcp     a reference point: sensor, flange, tcp
  1 2 3 4 stages: bias, gravity, inertia, low-pass
- z freeze the screen; a recording goes on
+ z freeze the screen; a recording continues
  b mark: text for recording and plots  r start or complete a recording
  p reset the peaks                     g span of the plots: 2, 10, 60, 600 s
 
  Emulated cell: f push the tool with 8 N for 1 s
  Replay: space pause    ← → seek 5 s    . next samples    + - speed
  Sensor alone (--raw): t subtracts the present mean; r saves a .csv
- Page in the browser (--view): v its QR code
+ Page in the browser (--view): v shows its QR code
 
  Plots: smallest and largest value of each column; dotted lines at 0 and at
         ± 1 sigma of a sample; ━ contact, ◆ mark, tare or change of stages
@@ -50,9 +50,9 @@ _HELP = """\
 
 
 def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> None:
-    """Read and show the open stream of a feed until the user quits, with findings that the stream does not know.
+    """Read and show the open stream of a feed until the user quits; `checks` are findings from outside the stream.
 
-    `address` is that of the page in the browser, if there is one. Raises `DeviceError` if the stream had failed when
+    `address` is the address of the page in the browser, or empty. Raises `DeviceError` if the stream had failed when
     the user quit, and `SupervisorGone` if the terminal was closed.
     """
     info = feed.stream.info
@@ -71,7 +71,7 @@ def run_live(feed: Feed, checks: Sequence[Check] = (), address: str = "") -> Non
 
 
 class LiveScreen(Canvas):
-    """Draws what a `Feed` knows."""
+    """Full-screen display of a `Feed`."""
 
     def __init__(self, feed: Feed, summary: StreamSummary, address: str = "") -> None:
         super().__init__(address)
@@ -82,11 +82,11 @@ class LiveScreen(Canvas):
         return draw_live(self._summary.view(), width, height, self.page())
 
     def turns(self) -> Iterator[object]:
-        """Read for the screen and the page."""
+        """Read the stream for the screen and the page."""
         return self._feed.turns(until=lambda: self.is_over)
 
     def act(self, key: str) -> None:
-        """Do what a key stands for."""
+        """Do the action of a key."""
         if key == "?":
             self.cover = [Line(text) for text in _HELP.split("\n")]
         elif key == "z":
@@ -97,7 +97,11 @@ class LiveScreen(Canvas):
             self._summary.span_s = SPANS_S[(SPANS_S.index(self._summary.span_s) + 1) % len(SPANS_S)]
         elif key == "b":
             mark = self._feed.stream.mark
-            self.entry = lambda text: self._feed.do(partial(mark, text)), "text of the mark, then Enter; Esc leaves", ""
+            self.entry = (
+                lambda text: self._feed.do(partial(mark, text)),
+                "text of the mark, then Enter; Esc cancels",
+                "",
+            )
         elif (action := _actions(self._feed).get(key)) is not None:
             self._feed.do(action)
 
@@ -106,7 +110,7 @@ _SEEK_S = 5.0
 
 
 def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
-    """Return what each key does between two reads."""
+    """Return the action of each key that runs between two reads."""
     stream = feed.stream
     found: dict[str, Callable[[], object]] = {
         "x": partial(feed.next_frame, "axes", get_args(Axes)),
@@ -116,7 +120,7 @@ def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
         "3": partial(feed.switch_stage, "inertia"),
     }
     if stream.info.is_raw:
-        words = "raw readings have neither stages nor other axes: start with --calibration for these"
+        words = "raw readings have no stages and no other axes: start with --calibration to get them"
         found = dict.fromkeys(found, partial(feed.note, words))
     found |= {"t": stream.tare, "u": stream.undo_tare, "4": partial(feed.switch_stage, "lowpass_Hz")}
     found |= {"r": feed.switch_recording, "f": feed.push_tool}
@@ -132,16 +136,16 @@ def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
     return found
 
 
-# From this width on the plots stand beside the table.
+# From this width on, the plots are drawn to the right of the table.
 _WIDE = 120
 _LEFT = 78
-# Columns for the scale of a plot.
+# Width of the scale of a plot.
 _GUTTER = 7
 _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 
 def draw_live(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
-    """Draw the screen as `height` lines of `width` cells, with the address of a page in the browser."""
+    """Return the screen as `height` lines of `width` cells; `page` is the line with the address of a page."""
     head = live_panels.head(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
@@ -156,7 +160,7 @@ def _narrow_layout(view: View, width: int, rows: int) -> list[Line]:
         plot_rows = min(7, (rows - len(body) - 10) // 3)
         body += _plots(view, width, 3 * plot_rows, across=2)
     links = [separator, *live_panels.links(view)]
-    # a refusal is read to its end
+    # leave room for a whole refusal
     if rows - len(body) - len(links) - 1 >= max(1, live_panels.newest_rows(view, width)):
         body += links
     if rows - len(body) >= 20:
@@ -183,7 +187,7 @@ def _wide(view: View, width: int, rows: int) -> list[Line]:
 
 
 def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
-    """Draw all six plots in `rows` lines, the last of which is the time axis."""
+    """Return all six plots in `rows` lines, the last of which is the time axis."""
     each, cells = (rows - 1) // (6 // across), width // across - _GUTTER - 1
     if each < 2 or cells < 8:
         return []
@@ -203,9 +207,9 @@ def _plots(view: View, width: int, rows: int, *, across: int) -> list[Line]:
 
 
 def _plot_lines(view: View, columns: PlotColumns, i: int, full: float, rows: int, *, with_value: bool) -> list[Line]:
-    """Draw one component: a line with contacts, marks and perhaps the value, then `rows` - 1 lines of Braille.
+    """Return the plot of one component: a line with contacts, marks and optional value, then lines of Braille.
 
-    The envelope of the samples stands before the zero line and the band of ±1 sigma of a sample about it.
+    The envelope of the samples is drawn over the zero line and its band of ±1 sigma of a sample.
     """
     reading, unit = view.reading, "N" if i < 3 else "N·m"
     head = Line(f"{AXES[i]:>{_GUTTER - 1}} ", STRONG)

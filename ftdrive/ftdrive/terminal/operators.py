@@ -1,4 +1,4 @@
-"""Operators without a screen: JSON for a script, plain lines for a log, a pipe or a dumb terminal."""
+"""Operators without a screen: JSON for scripts, plain lines for logs, pipes and dumb terminals."""
 
 import json
 import sys
@@ -14,14 +14,14 @@ from ftdrive.terminal.text import in_whole_words
 from ftdrive.words.session import SessionText
 from ftdrive.words.text import TextLine, visible
 
-# Letters and words of one meaning in every question. s and r stand for no word that moves an arm.
+# Letters and words with one meaning in every question; s and r never mean a word that moves an arm.
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
 
 
 def match(question: Question, typed: str) -> str | None:
-    """Find the answer that was typed; None for no answer.
+    """Return the answer that was typed; None if it is not an answer.
 
-    A word that must be typed exactly can be refused with no, which raises `Declined`.
+    If a word must be typed exactly, "no" raises `Declined`.
     """
     typed = typed.strip()
     if typed in question.answers:
@@ -42,7 +42,7 @@ def prompt(question: Question) -> str:
 
 
 def not_an_answer(question: Question, typed: str) -> str:
-    """Return why a line is no answer, and what to type; a key of the screen stands for no word that moves an arm."""
+    """Return why a line is not an answer, and what to type; a key never means a word that moves an arm."""
     word = typed.strip()
     named = [answer for answer in question.answers if answer]
     if len(question.answers) == 1 and word.lower() == named[0].lower():
@@ -50,18 +50,18 @@ def not_an_answer(question: Question, typed: str) -> str:
     other = [f"'{answer}'" for answer in named] + ["Enter"] * ("" in question.answers)
     choice = " or ".join(filter(None, [", ".join(other[:-1]), other[-1]]))
     full = [answer for answer in named if word and len(word) < len(answer) and answer.startswith(word.lower())]
-    return f"'{word}' is no answer here: type {full[0] + ' in full' if len(full) == 1 else choice}."
+    return f"'{word}' is not an answer here: type {full[0] + ' in full' if len(full) == 1 else choice}."
 
 
 def read_answer(supervisor: Supervisor, question: Question) -> str:
-    """Read one line; raises as `Supervisor.read_line`."""
+    """Read one line. Raises as `Supervisor.read_line`."""
     return supervisor.read_line(
-        f"no answer to '{prompt(question).strip()}': run it in a terminal, or put the answer on standard input"
+        f"no answer to '{prompt(question).strip()}': run it in a terminal, or send the answer to standard input"
     )
 
 
 class _Keyless:
-    """An operator without keys: SIGINT stops a session."""
+    """An operator without keys; SIGINT stops the session."""
 
     has_keys = False
     pressed_by = "the operator"
@@ -75,10 +75,10 @@ class _Keyless:
 
 
 class JsonOperator(_Keyless):
-    """One JSON object a line on stdout: every event, and every question before it is answered from stdin.
+    """Writes one JSON object per line to stdout for every event and question; answers come from stdin.
 
     A question is the object `{"event": "question", "text", "answers", "error"}`. The next line of stdin is its answer.
-    `error` says why the previous line was rejected, or is null.
+    `error` is the reason why the previous line was rejected, or null.
     """
 
     def __init__(self, *, stdin: TextIO | None = None, stdout: TextIO | None = None) -> None:
@@ -91,7 +91,7 @@ class JsonOperator(_Keyless):
         self._write(event.to_dict())
 
     def ask(self, question: Question) -> str:
-        """Answer from stdin; raises `Declined` at its end."""
+        """Return the answer from stdin. Raises `Declined` at its end."""
         self.supervisor.expect_answer()
         error = None
         while True:
@@ -117,9 +117,9 @@ class JsonOperator(_Keyless):
 
 
 class PlainOperator(_Keyless):
-    """Plain lines on stderr, without colour and without keys; `verbose` is that of `SessionText`.
+    """Plain lines on stderr, without colour and without keys; `verbose` as for `SessionText`.
 
-    If `quiet`, lines are printed only before a question, which may refer to them.
+    With `quiet`, lines are only printed before a question that may refer to them.
     """
 
     def __init__(
@@ -135,24 +135,24 @@ class PlainOperator(_Keyless):
     def show(self, event: Event) -> None:
         """Write the lines of the event."""
         if isinstance(event, Asked) and event.question == self._asked:
-            # the question and its answer are printed already
+            # question and answer are printed already
             return
         self._write_lines(self._text.lines(event))
 
     def ask(self, question: Question) -> str:
-        """Answer from stdin, without what was typed before the question; raises `Declined` at its end."""
+        """Return the answer from stdin, ignoring input before the question. Raises `Declined` at its end."""
         self.supervisor.expect_answer()
         self._asked = question.text
         self.finish()
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []
         self._write_lines(withheld)
         self._quiet = quiet
-        # What was typed before the question could confirm a motion unread.
+        # Input from before the question could confirm a motion unread.
         if self._stdin.isatty():
-            # Windows has none: an answer typed too early must not count, so none is read there
+            # Windows cannot discard early input, so no answer is read there
             import termios
 
-            # a closed terminal: reading raises the error
+            # for a closed terminal, reading raises the error
             with suppress(termios.error):
                 termios.tcflush(self._stdin.fileno(), termios.TCIFLUSH)
         while True:
@@ -170,7 +170,7 @@ class PlainOperator(_Keyless):
             self._write(not_an_answer(question, typed) + "\n")
 
     def finish(self) -> None:
-        """Write the checks that wait for others on their line."""
+        """Write the line of passed checks that waits for further ones."""
         self._write_lines(self._text.pending())
 
     def _write_lines(self, lines: Sequence[TextLine]) -> None:

@@ -1,4 +1,4 @@
-"""A result and a verification as text."""
+"""Printed tables of results and verifications."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,22 +34,22 @@ def print_result(
     saved: Path | None = None,
     every: bool = False,
 ) -> None:
-    """Print estimates with one sigma, the verdict with the compensation error, hints, and the path of the file.
+    """Print estimates with sigma, the verdict with the compensation error, hints, and the name of the file.
 
     Parameters
     ----------
     result : CalibrationResult
     truth : mapping, optional
-        Same keys as the result: truth and error are printed beside the estimates.
+        Truth with the keys of the result; truth and error are printed next to the estimates.
     drift : DriftCheck, optional
     records : sequence of PoseRecord
-        Of the result's dataset: poses are named by their orientation, and bad fits are explained.
+        Records of the dataset, for the names of poses and the explanation of bad fits.
     hinted : bool
-        Print what a user should check in the cell.
+        Print hints on what to check in the cell.
     saved : Path, optional
-        The calibration file, printed in the last line.
+        Name of the calibration file, printed in the last line.
     every : bool
-        Print also what needs no action: all findings, residuals, what sigma includes. `-v` implies it.
+        Print everything: all findings, residuals, contents of sigma. `-v` implies this.
     """
     every |= messages.verbose
     amount = f"{result.n_poses} poses" if result.motion is None else f"{100 * result.motion.used_share:.0f} % used"
@@ -73,7 +73,9 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
     table = Table(box=None, padding=(0, 1))
     for title in ("", "truth", "estimate", "± 1 sigma", "error / sigma"):
         if truth is not None or title not in {"truth", "error / sigma"}:
-            table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))  # names may be folded
+            table.add_column(
+                title, justify="right" if title else "left", no_wrap=bool(title)
+            )  # only names may be folded
     for key, axis, *texts in estimate_rows(data, truth):
         if key in _DERIVED and not every:
             continue
@@ -86,12 +88,12 @@ def _result_table(result: CalibrationResult, truth: Mapping[str, Any] | None, *,
 
 
 def _error_style(error_sigma: float) -> str:
-    """Colour of an error: one in 20 is above 2 sigma, one in 16,000 above 4."""
+    """Return the colour of an error: 1 of 20 exceeds 2 sigma, 1 of 16,000 exceeds 4 sigma."""
     return "green" if abs(error_sigma) < 2 else "yellow" if abs(error_sigma) < 4 else "bold red"
 
 
 def print_comparison(compared: Sequence[MethodResult]) -> None:
-    """Print all methods side by side without cutting a number: a narrow terminal gets no vectors, a pipe long lines."""
+    """Print a comparison of all methods, without vectors on a narrow terminal; numbers are never cut."""
     table = _comparison_table(compared, vectors=True)
     if answer.is_terminal and table.width is not None and table.width > answer.width:
         table = _comparison_table(compared, vectors=False)
@@ -102,10 +104,10 @@ def print_comparison(compared: Sequence[MethodResult]) -> None:
 
 
 def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], MethodResult]], heading: str) -> None:
-    """Print the columns of Yu's Table III: the largest errors on a test set, and those of weight and centre of mass.
+    """Print Yu's Table III: the largest errors on a test set, and the errors of weight and centre of mass.
 
-    `titles` head the names of a row: the method, or the case, its method and its sets. `heading` says what the methods
-    were tested on, and what they are compared with.
+    `titles` head the first columns: the method, or case, method and sets. `heading` names the test set and the
+    reference.
     """
     answer.print(hanging(" ", heading, answer))
     table = Table(box=None, padding=(0, 0, 0, 1), pad_edge=True)
@@ -122,7 +124,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
-    """Print Yu's Table III; `known` says that the errors of weight and centre are those from an emulated truth."""
+    """Print Yu's Table III; `known` tells whether errors of weight and centre refer to an emulated truth."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)
@@ -131,7 +133,7 @@ def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: b
 
 
 def _to_digits(value: float) -> str:
-    """Write a positive number with three digits, at most three of them after the point; NaN as "-"."""
+    """Return a positive number with three digits, at most three of them decimals; NaN as "-"."""
     if np.isnan(value):
         return "-"
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"
@@ -162,7 +164,7 @@ def _comparison_table(compared: Sequence[MethodResult], *, vectors: bool) -> Tab
 
 
 def print_verification(verified: Verified) -> None:
-    """Print measured and predicted wrench of each pose, the verdict with its limits, what has changed, and the file."""
+    """Print measured and predicted wrench per pose, the verdict with its limits, the changes, and the file."""
     count = counted(len(verified.records), "pose")
     answer.print(Text.assemble(("Verification", "bold cyan"), f"  {count}, calibration {verified.calibration.id[:6]}"))
     for mark in verified.marks:

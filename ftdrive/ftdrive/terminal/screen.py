@@ -1,4 +1,4 @@
-"""The live screen of a session: state, progress, estimates, coverage, keys."""
+"""The screen of a session: state, progress, estimates, coverage, keys."""
 
 import os
 import sys
@@ -63,9 +63,9 @@ _NARROWEST_BAR = 8
 
 
 def draw_session(view: SessionView, now_s: float, *, width: int = 80, height: int = 24) -> Group:
-    """Draw the screen: never wider than `width`, never higher than `height` less one line for the cursor.
+    """Return the screen, at most `width` wide and `height` high, with one line left for the cursor.
 
-    If there is not enough room, blocks are omitted, the highest rank first. Blocks of rank 0 stay.
+    If there is not enough room, blocks are omitted, highest rank first. Blocks of rank 0 stay.
     """
     wide = width >= _TABLE_WIDTH + 1 + _CUBE_WIDTH
     blocks: list[tuple[int, list[Text]]] = [
@@ -127,7 +127,7 @@ def _last(view: SessionView) -> list[Text]:
     if view.compared:
         return [line]
     if fit is None or fit.residual_sigma is None:
-        return [line, Text("     residual: no fit before it", "dim")]
+        return [line, Text("     residual: no previous fit", "dim")]
     off = fit.residual_sigma > OFF_SIGMA
     residual = Text(f"     residual {residual_in_words(fit)}", "bold yellow" if off else "")
     return [line, residual.append(" OUT OF LINE: press r to redo" if off else "")]
@@ -175,7 +175,7 @@ def _estimate_text(fit: Estimated | None, label: str, factor: float, name: str) 
 
 
 def _cube(counts: Sequence[int], newest: Array | None) -> list[str]:
-    """Draw the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
+    """Return the unfolded cube of the flange axes, with the number of poses that had gravity along each."""
     face = None
     if newest is not None:
         axis = int(np.abs(newest).argmax())
@@ -204,13 +204,13 @@ def _coverage_rows(view: SessionView, width: int) -> list[tuple[int, list[Text]]
 
 
 def _keys(view: SessionView) -> list[Text]:
-    end = "Ctrl-C ends, poses are kept" if view.resume else "Ctrl-C ends"
+    end = "Ctrl-C ends; the poses are kept" if view.resume else "Ctrl-C ends"
     if view.keys != "live":
         return [Text(f"Enter sends the answer; {end}", "dim")] if view.keys == "asking" else []
-    # before and after the poses no key is read
+    # keys are only read between the first and the last pose
     useful: set[Key] = set()
     if view.now is not None and view.now.stop is not None:
-        # by hand there is no last one
+        # by hand, the number of poses is open
         useful = set(KEYS) if view.now.stops is None else set(KEYS) - {Key.KEEP}
     line = Text()
     for key, word in KEYS.items():
@@ -224,8 +224,8 @@ def _keys(view: SessionView) -> list[Text]:
 
 def _saved_lines(view: SessionView, width: int) -> list[Text]:
     if not view.folder:
-        return [] if view.taken else [Text("nothing is kept yet: there is no run", "dim")]
-    resume = as_typed(view.resume) or "starts again: a recording in motion is not continued"
+        return [] if view.taken else [Text("nothing is stored yet: there is no run", "dim")]
+    resume = as_typed(view.resume) or "start again: a recording in motion cannot be continued"
     return [Text("kept in " + _end_of(view.folder, width - 8)), Text("resume  " + _end_of(resume, width - 8))]
 
 
@@ -239,15 +239,15 @@ def _folded(view: SessionView, text: str, width: int, style: str = "") -> list[T
 
 
 def _end_of(text: str, width: int) -> str:
-    """Shorten a path at its beginning: its end distinguishes runs."""
+    """Shorten a path at its beginning, because its end distinguishes runs."""
     return text if len(text) <= width else "…" + text[len(text) - width + 1 :]
 
 
 class Screen:
-    """An operator at a terminal: messages scroll above a frame, questions are asked below it.
+    """An operator at a terminal: messages scroll above a frame, and questions appear below it.
 
-    Without a keyboard there are no keys; questions are still answered by lines. If verbose, every check, the table of
-    the plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
+    Without a keyboard there are no keys, and questions are answered by lines. If verbose, each check, the table of the
+    plan and each pose appear above the frame. `command` is the task, "calibrate" or "verify".
     """
 
     pressed_by = "the operator"
@@ -281,11 +281,11 @@ class Screen:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._view.keys = "over"
-        # nothing is drawn any more
+        # nothing is drawn on a closed terminal
         gone = suppress(OSError) if self.supervisor.absence() else nullcontext()
         with gone, self._stack:
             self._print(self._text.pending())
-            # after an error the frame stays: it has the command to resume
+            # after an error, the frame stays, because it contains the command to resume
             self._live.transient = kind is None
             self._live.stop()
         if kind is None and self._view.folder:
@@ -301,7 +301,7 @@ class Screen:
             self._print(self._text.lines(event) if _history(event, self._view) else self._text.pending())
 
     def ask(self, question: Question) -> str:
-        """Ask below the frame, which is not redrawn until the answer is there."""
+        """Ask below the frame, which is redrawn after the answer."""
         self.supervisor.expect_answer()
         suspended = self._keyboard.suspended() if self._keyboard is not None else nullcontext()
         with self.supervisor.writing():
@@ -311,13 +311,13 @@ class Screen:
             with suspended:
                 answer = self._answer(question)
         self._view.keys = "live"
-        # the old one would erase the lines of its last frame
+        # the old display would erase the lines of its last frame
         self._live = self._new_live()
         self._live.start(refresh=True)
         return answer
 
     def absence(self) -> str | None:
-        """Return why the session is not followed any more; see `Operator`."""
+        """Return why the session is no longer followed; see `Operator`."""
         return self.supervisor.absence()
 
     @property
@@ -338,7 +338,7 @@ class Screen:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
 
     def _answer(self, question: Question) -> str:
-        """Ask until there is an answer, then erase question and frame: the next frame is drawn in their place."""
+        """Ask until there is an answer, then erase question and frame, where the next frame is drawn."""
         used = len(self._frame().renderables)
         while True:
             width = self._console.width
@@ -369,7 +369,7 @@ class Screen:
 
 
 def _history(event: Event, view: SessionView) -> bool:
-    """Whether an event is printed above the frame, where the frame does not show it already."""
+    """Whether an event is printed above the frame, because the frame does not show it."""
     match event:
         case StateChanged():
             return event.state is State.HOLD and not view.tripped
@@ -383,9 +383,9 @@ def _history(event: Event, view: SessionView) -> bool:
 
 @contextmanager
 def open_operator(*, as_json: bool = False, command: str = "calibrate", live: bool = True) -> Iterator[Operator]:
-    """Choose the operator of a task: JSON if requested, a live screen in a terminal, otherwise plain lines.
+    """Return the operator for a task: JSON on request, a live screen on a terminal, else plain lines.
 
-    The screen is drawn on stderr. A dumb terminal, `-q` and tasks that are not `live` get plain lines.
+    The screen is drawn on stderr. A dumb terminal, `-q` and tasks without `live` get plain lines.
     """
     if as_json:
         scripted = JsonOperator()

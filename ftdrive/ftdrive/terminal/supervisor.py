@@ -1,4 +1,4 @@
-"""Whether an operator, or a program in their place, still follows a session through its streams and its terminal."""
+"""Check whether an operator, or a program in their place, still follows a session through its streams and terminal."""
 
 import os
 import select
@@ -10,22 +10,22 @@ from typing import IO, Any, Final, Self, TextIO
 
 from ftdrive.errors import Declined, SupervisorGone
 
-# Period of the looks while an answer is awaited.
+# Period of the checks while waiting for an answer, ms.
 _LOOK_MS: Final = 50
 
 
 class Supervisor:
-    """The far ends of the streams of a session. Only `read_line` reads, never beyond its line.
+    """The other ends of the streams of a session. Only `read_line` reads, and never beyond its line.
 
-    Within its `with` block the hang-up of the terminal (SIGHUP) is noticed too, unless it is ignored, as under `nohup`.
-    The end of an input matters only if its writer was there when a question was asked: answers that were all prepared
-    before, and an input that no question is read from, may end. `name` is that of the output, for messages.
+    Inside a `with` block, a hang-up of the terminal (SIGHUP) is detected too, unless it is ignored, as with `nohup`.
+    The end of the input counts only if its writer was connected when a question was asked, because prepared answers may
+    end before. `name` is the name of the output in messages.
     """
 
     def __init__(self, stdin: TextIO, output: IO[str], name: str) -> None:
         self._stdin, self._input, self._output, self._name = stdin, _descriptor(stdin), _descriptor(output), name
         self._terminals = [fd for fd in (self._input, self._output) if fd is not None and os.isatty(fd)]
-        # whether a writer was there when a question was asked
+        # whether a writer was connected when a question was asked
         self._answers = False
         self._hung_up = False
         self._handler_before: Any = None
@@ -46,12 +46,12 @@ class Supervisor:
         self._hung_up = True
 
     def absence(self) -> str | None:
-        """Return why the session is not followed any more; see `Operator`."""
+        """Return why the session is no longer followed; see `Operator`."""
         if self._hung_up or any(map(_is_closed, self._terminals)):
             return "the terminal was closed"
         if self._output is not None and _is_closed(self._output):
-            return f"the reader of {self._name} is gone"
-        # The end of the input counts only from a question on, because `printf 'yes' | ftdrive calibrate` ends at once.
+            return f"the reader of {self._name} has ended"
+        # The end of the input counts only after a question, because `printf 'yes' | ftdrive calibrate` ends at once.
         if self._answers and self._input is not None and _is_closed(self._input, reading=True):
             return "standard input, from which answers come, was closed"
         return None
@@ -67,18 +67,18 @@ class Supervisor:
             raise
 
     def expect_answer(self) -> None:
-        """Note whether a writer of answers is there; called before a question is shown, to which it may leave."""
+        """Record whether a writer of answers is connected; call it before a question is shown."""
         if self._input is not None and self._input not in self._terminals:
             self._answers |= hasattr(select, "poll") and not _is_closed(self._input, reading=True)
 
     def read_line(self, unanswered: str) -> str:
-        """Read one line; raises `SupervisorGone`, or `Declined` with `unanswered` if the input has ended before."""
+        """Read one line. Raises `SupervisorGone`, or `Declined` with `unanswered` at the end of the input."""
         fd = self._input
         if fd is None or not hasattr(select, "poll"):
             line = self._stdin.readline()
         else:
             self.expect_answer()
-            # Byte by byte, so that nothing behind the line is taken from the input and its end is seen.
+            # Byte by byte, so that nothing after the line is read, and the end of the input is detected.
             line = self._read_bytes(fd).decode(self._stdin.encoding or "utf-8", errors="replace")
         if not line:
             if why := self.absence():
@@ -87,7 +87,7 @@ class Supervisor:
         return line
 
     def _read_bytes(self, fd: int) -> bytes:
-        """Read one byte after another, as a shell does: what is left stays in the stream, where its end is seen."""
+        """Read byte by byte, as a shell does, so that the rest stays in the stream."""
         poller, line = select.poll(), b""
         poller.register(fd, select.POLLIN)
         while not line.endswith(b"\n"):
@@ -114,11 +114,11 @@ def _descriptor(stream: IO[str]) -> int | None:
 
 
 def _is_closed(fd: int, *, reading: bool = False) -> bool:
-    """Whether the far end of a pipe, socket or terminal was closed; never of a file. Reads nothing."""
+    """Whether the other end of a pipe, socket or terminal is closed; False for a file. Reads nothing."""
     if not hasattr(select, "poll"):  # Windows
         return False
     poller = select.poll()
-    # A socket reports only this if its far end sends no more; a terminal or a pipe reports POLLHUP.
+    # A socket reports this event if the other end sends no more; a terminal or a pipe reports POLLHUP.
     half_closed = getattr(select, "POLLRDHUP", 0) if reading else 0
     poller.register(fd, half_closed)
     return any(events & (select.POLLERR | select.POLLHUP | half_closed) for _, events in poller.poll(0))

@@ -1,4 +1,4 @@
-"""Text before it reaches a terminal: whole words in lines, help, and tables."""
+"""Text for a terminal: line breaks between words, help, and tables."""
 
 import os
 import re
@@ -14,17 +14,17 @@ import click
 
 from ftdrive.words.text import GLUE, as_typed, is_command, visible
 
-# In help, which click would break at a hyphen.
+# Replaces hyphens in help, because click would break lines at them.
 _HYPHEN: Final = "\ue001"
-# More letters than a sentence has.
+# Longer than any sentence.
 _WHOLE: Final = 1000
 _QUOTED = re.compile(r"`[^`\n]+`")
 
 
 def glued(text: str, width: int | None = None) -> str:
-    """Return text whose commands in backticks are one word each, unless they are wider than a line of `width` columns.
+    """Return text in which each command in backticks is one word, unless wider than a line of `width` columns.
 
-    Fold it, then print it `unglued`.
+    Fold the text, and print it `unglued`.
 
     Examples
     --------
@@ -37,19 +37,19 @@ def glued(text: str, width: int | None = None) -> str:
 
 
 def unglued(text: str) -> str:
-    """Return folded text with the spaces of its commands."""
+    """Return folded text with the spaces of its commands restored."""
     return text.replace(GLUE, " ")
 
 
 class WholeWords(click.HelpFormatter):
-    """Help whose addresses, options and commands in backticks are never broken, so that they can be copied."""
+    """Help in which addresses, options and commands in backticks are never broken, so that they can be copied."""
 
     def write_text(self, text: str) -> None:
         """Write a paragraph."""
         super().write_text(self._whole(text))
 
     def write_dl(self, rows: Iterable[tuple[str, str]], col_max: int = 30, col_spacing: int = 2) -> None:
-        """Write options or commands, each with its words."""
+        """Write options or commands with their descriptions."""
         super().write_dl([(term, self._whole(words)) for term, words in rows], col_max, col_spacing)
 
     def getvalue(self) -> str:
@@ -62,7 +62,7 @@ class WholeWords(click.HelpFormatter):
 
 
 class Group(click.Group):
-    """A command with commands, whose help has each of their first sentences whole."""
+    """A command group whose help shows the whole first sentence of each command."""
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the list of commands."""
@@ -72,21 +72,21 @@ class Group(click.Group):
 
 
 NARROWEST: Final = 20
-"""Columns behind a head: with fewer, lines begin at the left."""
+"""Smallest number of columns after a head; with fewer, lines are not indented."""
 
 
 def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
-    """Break lines between words where they are longer than the terminal is wide, but not for a file or pipe.
+    """Return text with lines broken between words for a terminal; unchanged for a file or pipe.
 
-    Control characters become visible. A word that is longer by itself, such as a path, stays whole, and so does a
-    command in backticks. Where `head` is what the text begins with, its lines go on behind it, as in `hanging`.
+    Control characters become visible. A longer word, such as a path, and a command in backticks stay whole. If the text
+    begins with `head`, further lines are indented to it, as in `hanging`.
     """
     text = visible(as_typed(text))
     try:
         width = os.get_terminal_size(file.fileno()).columns
-    except (OSError, ValueError):  # no terminal; nothing of the system
+    except (OSError, ValueError):  # not a terminal
         return text
-    # a terminal that does not know
+    # some terminals do not know their size
     if width == 0:
         return text
     fold = textwrap.TextWrapper(
@@ -98,15 +98,15 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
     )
     return "\n".join(
         line if is_command(line.strip()) else unglued(fold.fill(glued(line))) + line[len(line.rstrip()) :]
-        # a prompt ends with a space
+        # keep the trailing space of a prompt
         for line in text.split("\n")
     )
 
 
 def echo(text: str = "", *, bold: str = "", err: bool = False, nl: bool = True, fold: bool = True) -> None:
-    """Print text on stdout, or stderr with `err`; `bold` is printed before it.
+    """Print text on stdout, or stderr with `err`, after the bold text `bold`.
 
-    A terminal gets whole words, and every reader commands that can be typed; with `fold=False` the text is data.
+    On a terminal, lines break between words. Commands are printed in the form to type. With `fold=False`, text is data.
     """
 
     def shown(text: str) -> str:
@@ -120,13 +120,13 @@ GAP = "  "
 
 
 def print_table(titles: Sequence[str], rows: Sequence[Sequence[str]], folding: Collection[str]) -> None:
-    """Print a table; a file or pipe has one line a row, and so has a terminal that is wide enough.
+    """Print a table; files, pipes and wide terminals get one line per row.
 
-    `folding` has the titles of the columns whose texts may be folded.
+    `folding` contains the titles of columns that may be folded.
     """
     rows = [[visible(cell) for cell in row] for row in rows]
     widths = [max(map(len, column)) for column in zip(titles, *rows, strict=True)]
-    # columns; the others are on a line of their own
+    # number of columns in the first line of a row; the others follow on a line of their own
     beside = len(titles)
     if sys.stdout.isatty():
         least = [
@@ -148,7 +148,7 @@ def _width(widths: Sequence[int]) -> int:
 
 
 def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[str]:
-    """Fold the texts of a row; those that stand on a line of their own keep their widths."""
+    """Return the lines of a row with folded texts; columns on the second line are not folded."""
     texts = zip(row[:beside], widths, strict=False)
     folded = [wrap(text, width, break_long_words=False, break_on_hyphens=False) for text, width in texts]
     for parts in zip_longest(*folded, fillvalue=""):

@@ -12,7 +12,7 @@ from ftdrive.words.stream import name_devices
 from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
-# Three rows of each figure, three characters wide.
+# Three rows per figure, three characters wide.
 _ROWS = (
     "█▀█ ▀█  ▀▀█ ▀▀█ █ █ █▀▀ █▀▀ ▀▀█ █▀█ █▀█",
     "█ █  █  █▀▀ ▀▀█ ▀▀█ ▀▀█ █▀█   █ █▀█ ▀▀█ ▀▀▀",
@@ -21,9 +21,9 @@ _ROWS = (
 
 
 class WeighScreen(Canvas):
-    """The scale. What ends its reading ends the screen: an error of a device, or of the recording.
+    """Screen of a scale; an error of a device or of the recording ends it.
 
-    `turns` reads the stream that it weighs, see `pump`; `address` is that of the page in the browser, if there is one.
+    `turns` reads the stream, see `pump`; `address` is the address of the page in the browser, or empty.
     """
 
     def __init__(self, weighing: Weighing, turns: Iterable[object], address: str = "") -> None:
@@ -38,10 +38,10 @@ class WeighScreen(Canvas):
             mass = f"{to_place_of(weight.mass_kg, weight.mass_sigma_kg, ' z')} kg"
             beside = [worth_of(weight)] if shown.count is None else [counted(shown.count, "part"), worth_of(weight)]
             if self._weighing.joins:
-                beside.append(f"{counted(weight.poses, 'pose')} joined, turn the tool for more")
+                beside.append(f"{counted(weight.poses, 'pose')} combined, turn the tool for more")
             zero, helps = zero_in_words(self._weighing)
             beside += [zero] if helps else []
-        keys = "" if self._weighing.moving else "z zero the empty gripper   p join poses of one load   "
+        keys = "" if self._weighing.moving else "z zero the empty gripper   p combine poses of one load   "
         title = "   ".join(["ftdrive weigh", name_devices(info), *info.marks])
         lines = [Line(f"  {title}"), self.page() or Line(), Line()]
         lines += [Line(f"  {row}", STRONG) for row in large(mass)]
@@ -54,7 +54,7 @@ class WeighScreen(Canvas):
         return takewhile(lambda _: not self.is_over, self._turns)
 
     def act(self, key: str) -> None:
-        """Tare the empty gripper, or begin or stop to join the poses of one load."""
+        """Tare the empty gripper, or start or stop to combine the poses of one load."""
         if key == "z" and not self._weighing.moving:
             self._weighing.request_zero()
         elif key == "p" and not self._weighing.moving:
@@ -62,7 +62,7 @@ class WeighScreen(Canvas):
 
 
 def large(text: str) -> list[str]:
-    """Return figures as three rows of block characters; letters keep their size, in the last row."""
+    """Return figures as three rows of block characters; other characters are in the last row."""
     rows = ["", "", ""]
     for one in text:
         at = 4 * _FIGURES.find(one)

@@ -1,5 +1,5 @@
-"""The page of a command in the browser: one server, one address, one page. It looks and may stop an arm; it moves none.
+"""The page of a command in the browser. It shows the command and may stop an arm, but never moves one.
 
-`page` has the parts and controls of a page, `site` serves them to browsers, `parts` and `scene` make them, and `shell`
-is what a browser loads. Each other module fills the page of one command.
+`page` holds the parts and controls of a page, `site` serves them to browsers, `parts` and `scene` create them, and
+`shell` contains the files for the browser. Each other module fills the page of one command.
 """

@@ -1,4 +1,4 @@
-"""The page of `ftdrive init`: its questions as a form, beside the cell that the answers describe."""
+"""The page of `ftdrive init`: its questions as a form, next to a view of the described cell."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -25,25 +25,25 @@ from ftdrivers.errors import DeviceError
 from ftdrivers.ur.kinematics import model_named
 
 _ROWS: Final = {TOOL: ("Cylinder", "Cylinders"), WALLS: ("Wall", "Walls and tables"), BOXES: ("Box", "Boxes")}
-# Parts of the form: sections of the configuration, and questions that are answered by rows.
+# Parts of the form: sections of the configuration, and questions with several rows.
 _PARTS: Final = ("robot", "sensor", "tool", TOOL, "workcell", WALLS, BOXES)
-# Rows of one kind, and uses of controls that wait while a device is read.
+# Largest number of rows of one kind, and of uses of controls that wait while a device is read.
 _MOST_ROWS, _MOST_USES = 30, 100
-# Entries of the dropdowns that are no answer by themselves.
+# Entries of the drop-down lists that need a typed value.
 _TYPED: Final = {WALLS: "slanting", MODEL: "choose", "workcell.mounting": "degrees"}
-# Until a tool is described, the arm is drawn with this.
+# Tool with which the arm is drawn until a tool is described.
 _NO_TOOL: Final = ((0.0, 5.0, 60.0),)
 _LEGEND: Final = legend(
     ("arm", "body", "arm in its usual posture"),
     ("tool", "body", "sensor and tool"),
     ("obstacle", "body", "mounting surface, walls, boxes"),
-    ("bad", "body", "too near, or to be corrected"),
+    ("bad", "body", "too close, or to be corrected"),
 )
 
 
 @dataclass(eq=False, slots=True)
 class _Field:
-    """One answer in the form: what is chosen, what is typed, what it means, and words about it below."""
+    """One answer in the form: selection, typed text, value, and message below it."""
 
     key: str
     name: str
@@ -56,13 +56,13 @@ class _Field:
 
     @property
     def text(self) -> str:
-        """The answer, as the terminal takes it."""
+        """The answer, in the form for the terminal."""
         typed = self.typed.strip()
         chosen = typed and f"{self.choice} {typed}" if self.key == WALLS else self.choice
         return typed if self.choice in ("", _TYPED.get(self.key)) else chosen
 
     def controls(self) -> list[Part]:
-        """Return what is chosen, what is typed, and the removal of a row."""
+        """Return the controls: selection, text field, and button to remove a row."""
         found, is_wall = [], self.key == WALLS
         if self.options:
             found += [choice(f"{self.name} choice", self.label + " at" * is_wall, self.choice, self.options)]
@@ -74,16 +74,16 @@ class _Field:
 
 
 class InitPage:
-    """Fills a page with the form, and fills in a description from it; `draft` keeps the answers after each change.
+    """Fills a page with the form, and a description from its answers; `draft` stores the answers after each change.
 
-    `say` takes what a device reports, with a mark to stand before it.
+    `say` receives the report of a device, with a mark for the start of the line.
     """
 
     def __init__(
         self, page: Page, described: Description, draft: Path, name: str, say: Callable[[str, str], object]
     ) -> None:
         self._page, self._described, self._draft, self._name, self._say = page, described, draft, name, say
-        # Only the thread of `run` changes anything: the server's thread puts here what a viewer has done.
+        # Only the thread of `run` changes anything: the thread of the server queues the actions of viewers here.
         self._todo: SimpleQueue[Callable[[], object]] = SimpleQueue()
         self._asked: dict[str, None] = {}
         self._fields: dict[str, _Field] = {}
@@ -100,21 +100,21 @@ class InitPage:
         self._read()
         self._saved = dict(described.texts)
 
-    # Numbers may be too large to be multiplied: what comes of them is judged.
+    # large numbers may overflow, and are then judged as invalid
     @np.errstate(all="ignore")
     def run(self) -> None:
-        """Show and judge the answers until they are to be written."""
+        """Show and judge the answers until the file is to be written."""
         while not self._refresh() or "write" not in self._asked:
             if "look" in self._asked:
                 self._look()
                 self._refresh()
             self._asked.clear()
-            # What was typed meanwhile is judged together.
+            # judge everything typed meanwhile together
             for _ in range(max(1, self._todo.qsize())):
                 self._todo.get()()
 
     def conclude(self, *words: str) -> None:
-        """Show at the top, and where Write was pressed, that the file is written."""
+        """Show at the top and at the Write button that the file is written."""
         written = lines(*words, head="Written", tone=GOOD)
         self._page.put({"result": written, "form/words": written, "form/write": None})
 
@@ -127,7 +127,7 @@ class InitPage:
         self._page.on(name, put)
 
     def _add(self, key: str, text: str | None = None) -> None:
-        """Add a field, a row with a new number."""
+        """Add a field; for rows, with a new number."""
         number = f" {next(self._numbers[key])}" if key in _ROWS else ""
         name, label, text = f"{key}{number}", _ROWS.get(key, [BY_KEY[key].label])[0] + number, text or ""
         options, choice, typed = (*BY_KEY[key].choices,), model_named(text, controller_major=0) or text, ""
@@ -142,7 +142,7 @@ class InitPage:
         self._on(f"{name} remove", partial(self._fields.pop, name))
 
     def _refresh(self) -> bool:
-        """Judge all answers, show what is wrong, draw the cell and keep the draft; return whether it is complete."""
+        """Judge all answers, show errors, draw the cell and save the draft; return whether the form is complete."""
         described, near = self._described, ""
         self._read()
         wrong = [field for field in self._fields.values() if not self._judge(field)]
@@ -164,7 +164,7 @@ class InitPage:
         return bool(words["tone"] == GOOD)
 
     def _part(self, part: str) -> Part | None:
-        """Return one part of the form; None where all of it is known."""
+        """Return one part of the form; None if all its values are known."""
         asked = {one.key: one.key if one.repeats else one.key.split(".")[0] for one in self._described.questions}
         fields = [field for field in self._fields.values() if asked.get(field.key) == part]
         shown, head, note = [control for field in fields for control in field.controls()], part.capitalize(), ""
@@ -179,7 +179,7 @@ class InitPage:
         return controls(*shown, head=head, note=note) if shown else None
 
     def _read(self) -> None:
-        """Take the answers out of the fields; another address has reported nothing yet."""
+        """Copy the answers from the fields; the report of a changed address is discarded."""
         described = self._described
         for key, question in BY_KEY.items():
             texts = [field.text for field in self._fields.values() if field.key == key and field.text]
@@ -191,7 +191,7 @@ class InitPage:
                 described.texts |= {key: texts} if texts else {}
 
     def _judge(self, field: _Field) -> bool:
-        """Set value and words of a field; return whether it can be used, or is empty."""
+        """Set value and message of a field; return whether it is valid or empty."""
         described, question = self._described, BY_KEY[field.key]
         said = self._found.get(field.key, ("" if question.repeats else question.how, QUIET))
         field.value = None
@@ -207,19 +207,19 @@ class InitPage:
     def _require_complete(self, wrong: Collection[_Field]) -> None:
         """Raise `ConfigError` if the file cannot be written yet."""
         if wrong:
-            raise ConfigError(f"Correct what is red: {', '.join(field.label for field in wrong)}.")
+            raise ConfigError(f"Correct the red fields: {', '.join(field.label for field in wrong)}.")
         self._described.judge_rows(BY_KEY[TOOL])
         empty = [one.label for one in self._described.missing if not one.repeats]
         empty += [field.label for field in self._fields.values() if field.key in _ROWS and not field.text]
         if empty:
-            raise ConfigError(f"Still empty: {', '.join(empty)}.")
+            raise ConfigError(f"Fill in the empty fields: {', '.join(empty)}.")
         self._described.cell()
 
     def _look(self) -> None:
-        """Read robot and sensor, and show what they report here and in the terminal."""
+        """Read robot and sensor, and show their reports here and in the terminal."""
         for field in [one for one in self._fields.values() if one.name in (ROBOT, SENSOR) and one.text]:
             self._page.put({"form/words": lines(f"Reading {field.text} …", tone=ASK)})
-            # Ctrl-C does not interrupt the lookup of a name, which may take 10 s, but it interrupts this wait.
+            # Ctrl-C cannot interrupt a host name lookup, which may take 10 s, but it interrupts this wait.
             ended: SimpleQueue[Exception | None] = SimpleQueue()
             Thread(target=self._look_at, args=(field, ended.put), daemon=True).start()
             if (error := ended.get()) is not None:
@@ -228,7 +228,7 @@ class InitPage:
             self._say(words[2:], f"  {words[:2]}")
 
     def _look_at(self, field: _Field, end: Callable[[Exception | None], object]) -> None:
-        """Read one device; then call `end` with an error that no device raises, or with None."""
+        """Read one device, then call `end` with an unexpected error, or with None."""
         failure = None
         try:
             self._found[field.name] = f"✔ {self._described.look(field.name, field.text)}", GOOD
@@ -241,7 +241,7 @@ class InitPage:
         end(failure)
 
     def _draw(self, wrong: Collection[_Field]) -> str:
-        """Draw the cell, red what is refused or in the way; return what is nearer to the arm than allowed."""
+        """Draw the cell, with invalid and obstructing parts in red; return what is closer to the arm than allowed."""
         rows = {key: [one for one in self._fields.values() if one.key == key and one.value] for key in _ROWS}
         tool, planes, boxes = (tuple(field.value for field in rows[key]) for key in _ROWS)
         workcell = WorkcellConfig(planes_mm=planes, boxes_mm=boxes)
@@ -262,5 +262,5 @@ class InitPage:
         labels = {"plane 1": "the mounting surface"} | {name: field.label for name, field in names.items()}
         near = {other: ", ".join(dict.fromkeys(one for one, thing in found if thing == other)) for _, other in found}
         pairs = "; ".join(f"{ones} to {labels.get(other, other)}" for other, ones in near.items())
-        words = f"In its usual posture the arm is nearer than allowed: {pairs}."
+        words = f"In its usual posture the arm is closer than allowed: {pairs}."
         return words if pairs else self._described.without_shape

@@ -1,4 +1,4 @@
-"""The pages of a stream: the live wrench with the tool, its arrows and six plots; and the scale with its mass."""
+"""The pages of a stream: the live wrench with tool, arrows and six plots; and the scale with the mass."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -27,9 +27,9 @@ from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 
-# Plots follow each so many drawings of the rest. A plot is about 250 pixels wide, so a column has two of them.
+# Plots are redrawn less often than the rest, by this factor. A plot is about 250 pixels wide, two per column.
 _PLOT_EACH, _COLUMNS, _EVENTS = 5, 128, 30
-# An arm that moves less is not drawn again.
+# An arm that has moved less is not redrawn.
 _STILL_RAD = 1e-4
 _SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 _M_PER_N, _M_PER_NM = 0.01, 0.1
@@ -39,20 +39,20 @@ _LEGEND = (
     ("force", "line", "line of action of the force"),
     *((axis, "line", f"{axis} of base and flange") for axis in "xyz"),
 )
-_FOR_ALL = "Axes and point change for all viewers, in the terminal, and in what it prints and records."
+_FOR_ALL = "Axes and point change for all viewers, in the terminal, and in printed and recorded data."
 _PLOTS = "blue: smallest to largest value, grey: ± 1 sigma of a free tool, orange: contact"
 # Noise has no arrow, see `ShownWrench.is_significant`.
 _TONES = {words.CONTACT: parts.WARN, words.FREE: parts.GOOD}
 _ROWS = (("State", "", "large"), ("Force on the tool", "N", "huge"), ("Torque", "N·m", "large"))
-# Keeps the place of a line that is empty at times, so that no button moves under a finger.
+# Reserves the place of a line that may be empty, so that buttons do not move.
 _BLANK = "\u00a0"
 
 
 class LivePage:
-    """Fills a page with what a `Feed` reads.
+    """Fills a page with the data of a `Feed`.
 
-    Without a `certifier` only the axes of base and flange are drawn. With `controls` viewers may tare, and choose axes
-    and point, which ends a contact and is recorded.
+    Without a `certifier`, only the axes of base and flange are drawn. With `controls`, viewers may tare, and choose
+    axes and reference point, which ends a contact and is recorded.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class LivePage:
             raise ValueError(str(error)) from error
 
     def draw(self) -> None:
-        """Take what is new, and show it if there is a viewer."""
+        """Take new data, and show them if there is a viewer."""
         view = self._summary.view()
         if not self._page.viewers:
             self._drawn = 0
@@ -131,7 +131,7 @@ class LivePage:
 
 
 def _still(certifier: Certifier | None) -> dict[str, Part | None]:
-    """Return what does not move: base, surroundings, legend, and where the camera begins."""
+    """Return the static parts: base, surroundings, legend and initial camera."""
     shown: dict[str, Part | None] = {"scene/base": scene.axes(0.25, named=True)}
     rows, size_m = [*_LEGEND], 2.0
     if certifier is not None:
@@ -151,7 +151,7 @@ def _in_base(reading: ShownWrench, info: StreamInfo, p_base_flange_m: Array) -> 
 
 
 def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
-    """Return a silent device, contact, force and torque, what they are, and events."""
+    """Return the silent device, contact, force and torque with their description, and events."""
     what, (state, _), info = words.WAITING, words.state(view), view.info
     rows = [parts.reading(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
     if reading is not None:
@@ -174,7 +174,7 @@ def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
 
 
 def _devices(info: StreamInfo) -> Part:
-    """Name arm, sensor and tool, and what every output says of the cell, such as that it is emulated."""
+    """Return arm, sensor and tool, and the marks of cell and calibration, such as EMULATED."""
     texts = " · ".join([words.name_devices(info), *info.marks])
     return parts.lines(texts, tone=parts.WARN if info.marks else parts.QUIET)
 
@@ -188,7 +188,7 @@ def _size(view: View, reading: ShownWrench, first: int) -> Part:
 
 
 def plots(view: View, reading: ShownWrench) -> Part:
-    """Return a plot of each component, with its present value as heading."""
+    """Return a plot of each component, with the present value as heading."""
     past, found, full = view.columns(_COLUMNS), list[Part](), dict[str, float]()
     low, high, sigma = (
         parts.rounded_list(past.low, 3),
@@ -204,9 +204,9 @@ def plots(view: View, reading: ShownWrench) -> Part:
 
 
 class WeighPage:
-    """Fills a page with a scale: the mass and what it is worth, or why there is none, and the age of the zero.
+    """Fills a page with a scale: the mass with its sigma, or the reason why there is none, and the age of the zero.
 
-    With `controls` viewers may tare the empty gripper.
+    With `controls`, viewers may tare the empty gripper.
     """
 
     def __init__(self, page: Page, weighing: Weighing, *, controls: bool) -> None:
@@ -216,7 +216,7 @@ class WeighPage:
             page.put({"controls": parts.controls(parts.button("zero", "Zero the empty gripper"))})
 
     def draw(self) -> None:
-        """Show mass, count and age of the zero, or why there is no mass, if there is a viewer."""
+        """Show mass, count and age of the zero, or the reason why there is no mass, if there is a viewer."""
         if not self._page.viewers:
             return
         weighing, shown = self._weighing, self._weighing.shown

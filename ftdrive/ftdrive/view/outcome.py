@@ -1,4 +1,4 @@
-"""How a session appears on a page, and how a calibration or a verification ends there."""
+"""How a session is shown on a page, and how a calibration or a verification ends there."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ from ftdrive.view.session_page import SessionPage, conclude
 from ftdrive.words.result import conclusion, verification_in_lines
 from ftdrive.words.text import in_one_line
 
-# Estimates that the page shows at the end.
+# Estimates shown on the page at the end.
 _SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 
 
@@ -27,9 +27,9 @@ _SHOWN: Final = {"mass_kg", "p_sensor_com_m", "R_flange_sensor"}
 def on_page(
     page: Page | None, operator: Operator, options: SessionOptions, command: str = "calibrate"
 ) -> Iterator[tuple[Operator, SessionOptions]]:
-    """Show a session on a page while the block runs, if there is one; yields the operator and options to use.
+    """Show a session on a page, if there is one, while the block runs; yields the operator and options to use.
 
-    If the block raises, the page shows what the terminal prints about it.
+    If the block raises, the page shows the message printed in the terminal.
     """
     if page is None:
         yield operator, options
@@ -45,14 +45,14 @@ def on_page(
 
 
 def _last_line(error: BaseException) -> str:
-    """Return the line that the terminal prints when an error ends a session."""
+    """Return the line printed in the terminal when an error ends a session."""
     if isinstance(error, Declined):
         return str(error)
     return "interrupted" if isinstance(error, KeyboardInterrupt) else f"error: {in_one_line(in_a_sentence(error))}"
 
 
 def conclude_calibration(page: Page | None, result: CalibrationResult, commands: Sequence[str]) -> None:
-    """Show verdict, estimates and findings, and the commands to type next, if there is a page."""
+    """Show verdict, estimates, findings and next commands, if there is a page."""
     if page is None:
         return
     figures = []
@@ -67,7 +67,7 @@ def conclude_calibration(page: Page | None, result: CalibrationResult, commands:
 
 
 def conclude_verification(page: Page | None, verified: Verified, *following: str) -> None:
-    """Show the outcome and the largest differences, and the commands to type next, if there is a page."""
+    """Show the outcome, the largest differences and the next commands, if there is a page."""
     if page is None:
         return
     found, figures = verified.verification, []

@@ -1,4 +1,4 @@
-"""A page of a command: named parts that browsers show, controls that they use, and the loop that draws it."""
+"""A page of a command: named parts shown by browsers, controls used by viewers, and the loop that draws the page."""
 
 import json
 import logging
@@ -13,23 +13,23 @@ from ftdrive.view.parts import Part, button, controls
 
 log = logging.getLogger(__name__)
 
-# A busy computer, which is late at times, still draws 20 times a second.
+# On a busy computer with delays, this period still gives 20 drawings per second.
 _PERIOD_S: Final = 0.045
-# Drawing that takes longer hangs.
+# A drawing that takes longer hangs.
 HUNG_S: Final = 5.0
 _TEXT: Final = 10_000
 
 
 class Page:
-    """What all browsers that show the page see, and what they may ask for."""
+    """The content of a page, common to all browsers, and the actions that viewers may request."""
 
     def __init__(self, title: str) -> None:
         self.url = ""
-        """With the token, without which nothing is served."""
+        """Address with the token, which is required."""
         self.viewers = 0
         """Number of browsers that show the page."""
         self._lock = threading.Lock()
-        # A part with its text and the version of the page that brought it.
+        # Each part with its JSON text and the version of the page that changed it.
         self._parts: dict[str, tuple[Part | None, str, int]] = {}
         self._version = 0
         self._acts: dict[str, Callable[[str, Any], object]] = {}
@@ -37,9 +37,9 @@ class Page:
         self.put({"title": {"kind": "title", "text": title}})
 
     def put(self, parts: Mapping[str, Part | None]) -> None:
-        """Show parts, all together, by their names; None takes one away. What has not changed is not sent again.
+        """Show parts by name, all at once; None removes a part. Unchanged parts are not sent again.
 
-        The name before a slash is that of a place in `page.html`, such as `state`, or `scene`.
+        The name before a slash is the name of a place in `page.html`, such as `state`, or `scene`.
         """
         texts = {name: json.dumps(part, allow_nan=False, separators=(",", ":")) for name, part in parts.items()}
         with self._lock:
@@ -49,43 +49,45 @@ class Page:
                     self._parts[name] = parts[name], text, self._version
 
     def on(self, name: str, act: Callable[[str, Any], object]) -> None:
-        """Call `act` when a viewer uses the control of this name that is shown, with viewer and valid value.
+        """Call `act` with viewer and valid value when a viewer uses the visible control of this name.
 
-        It is called in the thread of the server, so it must not wait; a `ValueError` is shown to the viewer.
+        `act` is called in the thread of the server and must not wait; its `ValueError` is shown to the viewer.
         """
         self._acts[name] = act
 
     def add_stop(self, stop: Callable[[str], object]) -> None:
-        """Show a Stop button; `stop` is called in another thread, with the name of the viewer who pressed it."""
-        self.put({"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. It is no emergency stop.")})
+        """Show a Stop button; `stop` is called in another thread, with the name of the viewer."""
+        self.put(
+            {"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. This is not an emergency stop.")}
+        )
         self.on("stop", lambda viewer, _: stop(viewer))
 
     def act(self, viewer: str, name: object, value: object) -> None:
-        """Use a control for a viewer; raises `ValueError` if it is not shown or the value is not one of its values."""
+        """Use a control for a viewer. Raises `ValueError` if the control is not visible or the value is invalid."""
         with self._lock:
             shown = [part["controls"] for part, _, _ in self._parts.values() if part and part["kind"] == "controls"]
         found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)
         if found is None or found["name"] not in self._acts:
-            raise ValueError("this page has no such control now")
+            raise ValueError("this page does not have this control now")
         self._acts[found["name"]](viewer, _valid(found, value))
 
     def since(self, version: int) -> tuple[int, str]:
-        """Return the present version, and as JSON the parts that are newer than another one; empty if none is."""
+        """Return the present version, and the parts newer than `version` as JSON; empty if there are none."""
         with self._lock:
             newer = [f"{json.dumps(name)}:{text}" for name, (_, text, at) in self._parts.items() if at > version]
             return self._version, f"{{{','.join(newer)}}}" if newer else ""
 
     def beat(self) -> None:
-        """Say that the page is drawn; from then on it counts as stale whenever it is not drawn again."""
+        """Mark the page as drawn now; from then on the page is stale if it is not drawn again."""
         self._drawn_s = monotonic()
 
     def rest(self) -> None:
-        """Say that the page is drawn only when something happens from now on, as before the first `beat`."""
+        """Mark the page as drawn on events only, as before the first `beat`."""
         self._drawn_s = None
 
     @property
     def stale_s(self) -> float:
-        """Seconds since the page was drawn; 0 of a page that is drawn when something happens."""
+        """Time since the page was drawn, s; 0 for a page that is drawn on events only."""
         return 0.0 if self._drawn_s is None else monotonic() - self._drawn_s
 
 
@@ -107,26 +109,26 @@ def _valid(control: Part, value: object) -> object:
 
 @contextmanager
 def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] = log.error) -> Iterator[None]:
-    """Call `draw` 22 times a second in a thread of its own while the block runs; `say` takes what ends it."""
+    """Call `draw` 22 times per second in another thread while the block runs; `say` receives an error that ends it."""
     ended = threading.Event()
 
     def run() -> None:
         due_s = monotonic()
         try:
-            # after a pause of the computer nothing is made up for
+            # after a pause of the computer, no drawing is made up for
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()
                 page.beat()
-        except Exception as error:  # only a picture: the stream goes on
+        except Exception as error:  # only a display: the stream continues
             log.debug("the drawing has failed", exc_info=True)
-            say(f"The page is not drawn any more, the command goes on: {error!r}")
+            say(f"The page is no longer updated, the command continues: {error!r}")
             ended.set()
 
     def watch() -> None:
         while not ended.wait(1.0):
             if page.stale_s > HUNG_S:
-                say(f"The page has not been drawn for {HUNG_S:.0f} s, the command goes on.")
+                say(f"The page has not been updated for {HUNG_S:.0f} s, the command continues.")
                 return
 
     page.beat()

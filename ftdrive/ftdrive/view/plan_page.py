@@ -1,4 +1,4 @@
-"""The page of a plan: the tour in motion, what it sweeps over, and its largest move."""
+"""The page of a plan: the tour in motion, its swept volume, and its largest move."""
 
 import threading
 from time import monotonic
@@ -21,16 +21,16 @@ PLAN_LEGEND: Final = (
     *((scene.ARM, "body", "arm"), (scene.TOOL, "body", "tool"), (scene.PATH, "line", "path of the tool tip")),
     *((scene.GHOST, "ball", "ball to keep free"), (scene.OBSTACLE, "body", "surroundings")),
 )
-"""What `plan_parts` and an arm are."""
+"""Legend of `plan_parts` and an arm."""
 
 
 class PlanTimeline:
-    """A plan over time at its speeds, after the approach (k + 1, 6) to its first pose if there is one."""
+    """A plan over time at its speeds, after the approach `way_rad` (k + 1, 6) to its first pose, if any."""
 
     def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
         self.plan, way, tour = plan, np.reshape(way_rad, (-1, 6)), [step.q_rad for step in plan.steps]
         slow, turns_rad = Speeds.first_run(), np.abs(np.diff(way, axis=0)).max(axis=1)
-        # The last leg of the approach has no length: that of a resumed run ends at another pose than the first.
+        # The last segment of the approach has no duration: for a resumed run it ends at another pose than the first.
         approach_s = [*move_duration_s(turns_rad, slow.joint_rad_s, slow.joint_rad_s2), *([0.0] if len(way) else [])]
         self._nodes_rad = np.array([*way, *tour, tour[0]])
         self._t_s = np.cumsum([0.0, *approach_s, *(step.duration_s for step in plan.steps)])
@@ -44,18 +44,18 @@ class PlanTimeline:
         )
 
     def move(self, t_s: float) -> int:
-        """Return the move at a time; -1 in the approach."""
+        """Return the index of the move at a time; -1 during the approach."""
         return int(np.searchsorted(self.begins_s, t_s, side="right")) - 1
 
     def slider(self, t_s: float) -> Part:
-        """Return the slider `along` at a time, with pose and seconds in words."""
+        """Return the slider `along` at a time, with a text for pose and time."""
         pose = f"pose {self.move(t_s) + 1} of {len(self.begins_s)}, " if self.move(t_s) >= 0 else "approach, "
         words = f"{'' if self.plan.sweep else pose}{t_s:.0f} of {self.end_s:.0f} s"
         return slider("along", "Along the plan", round(t_s, 1), round(self.end_s, 1), step=0.1, text=words)
 
 
 class PlanPage:
-    """Fills a page with a plan; `certifier` is that of the same arm, tool and scene."""
+    """Fills a page with a plan; `certifier` belongs to the same arm, tool and scene."""
 
     def __init__(self, page: Page, plan: Plan, certifier: Certifier) -> None:
         self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, PlanTimeline(plan)
@@ -82,7 +82,7 @@ class PlanPage:
                 self._chosen[name] = not self._chosen["play"] if name == "play" else value
 
     def draw(self) -> None:
-        """Show browsers what has changed."""
+        """Show changes to browsers."""
         with self._lock:
             chosen = dict(self._chosen)
         if chosen == self._drawn:
@@ -104,7 +104,7 @@ class PlanPage:
         self._page.put({**scene.arm_parts(self._arm, self._tour.at(t_s)), **volumes, **parts})
 
     def play(self, ended: threading.Event) -> None:
-        """Draw what viewers choose, and the arm in motion along the tour, until the event."""
+        """Draw the choices of viewers, and the arm in motion along the tour, until the event."""
         then_s = monotonic()
         while not ended.wait(_FRAME_S):
             passed_s, then_s = monotonic() - then_s, monotonic()
@@ -116,7 +116,7 @@ class PlanPage:
 
 
 def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | None]:
-    """Return cell, free ball, the path of the tool's tip, and the camera."""
+    """Return cell, free ball, path of the tool tip, and camera."""
     arm, size_m, plan = certifier.arm, scene.size_of(certifier), tour.plan
     farthest = int(np.argmax([part.to_m for part in arm.tool]))
     look_at = 0.7 * arm.frames(tour.q_rad[:1]).wrist_m[0]
@@ -129,7 +129,7 @@ def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | Non
 
 
 def _swept(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
-    """Return the tool at joint vectors (n, 6), one part for each of its cylinders."""
+    """Return the tool at joint vectors (n, 6), one part per cylinder."""
     bodies = certifier.arm.bodies(q_rad[:: max(1, len(q_rad) // 250)])
     copies = np.concatenate([bodies.centre_m, scene.turned_up(bodies.axis)], axis=-1)
     sizes = zip(bodies.half_length_m, bodies.radius_m, bodies.rounding_m, strict=True)
@@ -138,7 +138,7 @@ def _swept(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
 
 
 def describe(plan: Plan, move: int) -> tuple[str, str, str]:
-    """Return a move, its least distance, and the room to keep free, in words."""
+    """Return texts about a move, its smallest distance, and the space to keep free."""
     if move < 0:
         return "From the present posture to the first pose", "This approach is confirmed separately.", ""
     step, following = plan.steps[move], plan.steps[(move + 1) % len(plan.steps)]

@@ -1,4 +1,4 @@
-"""The cell in three dimensions as parts of a page, which `shell/scene.js` draws. Metres, base axes."""
+"""The cell in three dimensions as parts of a page, drawn by `shell/scene.js`. Metres, base axes."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final
@@ -12,15 +12,16 @@ from ftdrive.planning.geometry.scene import Scene
 from ftdrive.view.parts import Part, rounded_list
 from ftdrivers.ur.kinematics import Array
 
-# Names of colours; `shell/page.css` has them for light and dark.
+# Names of colours, defined in `shell/page.css` for light and dark.
 ARM, TOOL, GHOST, OBSTACLE, BAD = "arm", "tool", "ghost", "obstacle", "bad"
 FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 
 
 def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, **more: Any) -> Part:
-    """A cylinder along z with rounded edges; a capsule where its radius is zero, a ball where its length is too.
+    """Return a cylinder along z with rounded edges: a capsule for radius 0, a ball for radius and length 0.
 
-    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), places and quaternions.
+    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), positions and
+    quaternions.
     """
     shape = rounded_list([half_length_m, radius_m, rounding_m])
     return {"kind": "body", "shape": shape, "colour": colour} | {
@@ -29,44 +30,44 @@ def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, 
 
 
 def ball(radius_m: float, colour: str, **more: Any) -> Part:
-    """A ball; `more` as for `body`."""
+    """Return a ball; `more` as for `body`."""
     return body(0.0, 0.0, radius_m, colour, **more)
 
 
 def box(size_m: ArrayLike, colour: str, **more: Any) -> Part:
-    """A box about its middle; `more` as for `body`."""
+    """Return a box about its centre; `more` as for `body`."""
     return {"kind": "box", "size": rounded_list(size_m), "colour": colour} | {
         name: rounded_list(one) for name, one in more.items()
     }
 
 
 def path(points_m: Array, colour: str) -> Part:
-    """A line through points (n, 3)."""
+    """Return a line through points (n, 3)."""
     return {"kind": "path", "points": rounded_list(points_m), "colour": colour}
 
 
 def dots(points_m: ArrayLike, colours: Sequence[str], at: ArrayLike) -> Part:
-    """Round dots at points (n, 3) from `at`, of one size on every screen."""
+    """Return round dots at points (n, 3) relative to `at`, with one size on every screen."""
     return {"kind": "dots", "points": rounded_list(points_m), "colours": list(colours), "at": rounded_list(at)}
 
 
 def axes(length_m: float, at: ArrayLike = (0, 0, 0), turn: ArrayLike = (1, 0, 0, 0), *, named: bool = False) -> Part:
-    """Axes x, y, z in red, green and blue, with their names."""
+    """Return axes x, y, z in red, green and blue, with names on request."""
     return {"kind": "axes", "length": length_m, "at": rounded_list(at), "turn": rounded_list(turn), "named": named}
 
 
 def label(text: str, at: ArrayLike) -> Part:
-    """A text at a point (3,), always in front."""
+    """Return a text at a point (3,), always in front."""
     return {"kind": "label", "text": text, "at": rounded_list(at)}
 
 
 def camera(at_m: ArrayLike, from_m: ArrayLike) -> Part:
-    """Where browsers look at first, and from where; (3,) each."""
+    """Return the initial point of view: the point (3,) looked at, and the position (3,) of the camera."""
     return {"kind": "camera", "at": rounded_list(at_m), "from": rounded_list(from_m)}
 
 
 def legend(*rows: tuple[str, str, str]) -> Part:
-    """What things of the scene are: colour, mark (`body`, `ball`, `line` or `arrow`) and words each."""
+    """Return a legend with colour, mark (`body`, `ball`, `line` or `arrow`) and text per row."""
     return {"kind": "legend", "rows": [list(row) for row in rows]}
 
 
@@ -79,10 +80,10 @@ def arm_parts(
     clear: bool = False,
     bad: Collection[str] = (),
 ) -> dict[str, Part | None]:
-    """Return an arm with its tool at joint angles (6,); without them what takes it away.
+    """Return an arm with its tool at joint angles (6,); without angles, the removal of the arm.
 
-    A `ghost` is transparent: where the arm will be. With `clear` the tool is, so that a wrench inside it is seen.
-    Bodies named in `bad` are red.
+    A `ghost` is transparent and shows where the arm will be. With `clear`, the tool is transparent, so that a wrench
+    inside it is visible. Bodies named in `bad` are red.
     """
     names = [f"scene/{name}/{i}" for i in range(len(arm.names))]
     if q_rad is None:
@@ -97,7 +98,7 @@ def arm_parts(
         shape = bodies.half_length_m[i], bodies.radius_m[i], bodies.rounding_m[i]
         parts[key] = body(*shape, colour, at=bodies.centre_m[0, i], turn=turns[i], alpha=alpha)
     if not ghost:
-        # The preset "along the tool" looks from the last body towards the flange.
+        # The view "along the tool" looks from the last body towards the flange.
         parts[f"scene/{name}/along"] = {
             "kind": "along",
             "at": rounded_list(bodies.centre_m[0, -1]),
@@ -107,7 +108,7 @@ def arm_parts(
 
 
 def carried(arm: ArmModel) -> range:
-    """Return the bodies beyond the flange by their place in `names`: the tool, and a load that hangs from it."""
+    """Return the indices of the bodies beyond the flange: the tool, and a load that hangs from it."""
     return range(arm.names.index("tool 1"), len(arm.names))
 
 
@@ -128,7 +129,7 @@ def surroundings(scene: Scene, size_m: float, bad: Collection[str] = ()) -> dict
 def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: float) -> dict[str, Part | None]:
     """Return force and torque as arrows, and the line of action of the force.
 
-    The wrench (6,) acts about a point (3,), N and N·m, base axes; a force or a torque of zero is not drawn.
+    The wrench (6,), N and N·m, acts about a point (3,), base axes; zero force or torque is not drawn.
     """
     parts: dict[str, Part | None] = dict.fromkeys(NO_WRENCH)
     for name, vector, m in (("force", wrench_base[:3], m_per_N), ("torque", wrench_base[3:], m_per_Nm)):
@@ -137,24 +138,24 @@ def wrench_parts(p_base_m: Array, wrench_base: Array, m_per_N: float, m_per_Nm: 
             parts[f"scene/{name}"] = {"kind": "arrow", "ends": ends, "colour": name}
     force, torque = wrench_base[:3], wrench_base[3:]
     if squared := float(force @ force):
-        # Along this line the force alone explains the torque, as far as one can.
+        # Along this line, the force alone explains as much of the torque as possible.
         foot, along = p_base_m + np.cross(force, torque) / squared, 0.5 * force / np.sqrt(squared)
         parts["scene/line of action"] = path(np.array([foot - along, foot + along]), FORCE)
     return parts
 
 
 NO_WRENCH: Final[dict[str, Part | None]] = {"scene/force": None, "scene/torque": None, "scene/line of action": None}
-"""What takes the arrows of a wrench away."""
+"""Removal of the arrows of a wrench."""
 
 
 def size_of(certifier: Certifier) -> float:
-    """Return twice the reach of an arm, metres: planes are drawn so large."""
+    """Return twice the reach of an arm, m, the size at which planes are drawn."""
     arm = certifier.arm
     return 2 * (arm.ball_m + float(np.linalg.norm(arm.kinematics.links_m[1:3], axis=1).sum()))
 
 
 def turned_up(axis: Array) -> Array:
-    """Quaternions (..., 4), w first, that turn z into these directions (..., 3)."""
+    """Return quaternions (..., 4), w first, that rotate z into these directions (..., 3)."""
     half = axis + np.array([0.0, 0.0, 1.0])
     length = np.linalg.norm(half, axis=-1, keepdims=True)
     down = length < 1e-6

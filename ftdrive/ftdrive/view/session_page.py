@@ -1,4 +1,4 @@
-"""The page of a session: state, question, forces and estimates beside the scene; Stop; and at the end the result."""
+"""The page of a session: state, question, forces and estimates next to the scene; Stop; the result at the end."""
 
 import logging
 import threading
@@ -38,45 +38,48 @@ log = logging.getLogger(__name__)
 Parts = dict[str, Part | None]
 
 _FRAME_S: Final = 0.05
-# Guards that have not looked for so long rest.
+# Guards that have not looked for this time are at rest, s.
 _REST_S: Final = 0.5
-# From this share of a limit on, a bar is a warning.
+# From this share of a limit on, a bar has the colour of a warning.
 _NEAR: Final = 0.8
-# Colour of a pose by the largest residual that still has it, in sigmas.
+# Colour of a pose by the largest residual for this colour, in sigmas.
 _COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
 _POSES: Final = [
     (name, "ball", f"pose, {words}") for _, name, words in (*_COLOURS, (0, scene.UNKNOWN, "no residual yet"))
 ]
 _SPHERE_M: Final = 0.18
-# By hand there is no arm in the scene.
+# In a hand-guided session, the scene has no arm.
 _ALONE: Final[Parts] = {"scene/camera": scene.camera([0, 0, 0], [0.5, 0.5, 0.3]), "scene/legend": scene.legend(*_POSES)}
-# In these states the stop is not reached yet.
+# States before the arm has reached its stop.
 _TOWARDS: Final = frozenset({State.APPROACH, State.MOVE})
-# What is true only while the session runs, and is taken away at its end.
+# Parts that are valid only while the session runs, and are removed at its end.
 _LIVE: Final = ("stop", "alert", "question", "question/along", "state/progress", "state/note", "bars", "bars/guards")
 _ENDED: Final[Parts] = {**dict.fromkeys(_LIVE), "state": lines(head="ended")}
 
 
 class Onlooker(Guard):
-    """Keeps the newest look of the guards; it never trips."""
+    """Guard that keeps the newest observation, and never trips."""
 
     def __init__(self) -> None:
         self.seen: Seen | None = None
         self.fresh_s = self.age_s = self.looked_s = 0.0
-        """When the newest sample was first seen, by `Seen.t_s`; since when; the last look, by the computer's clock."""
+        """Time at which the newest sample was first seen, its age, and the time of the last look on the computer's
+        clock.
+        """
 
     def look(self, seen: Seen) -> None:
-        """Keep it."""
+        """Keep the observation."""
         if self.seen is None or seen.sample != self.seen.sample:
             self.fresh_s = seen.t_s
         self.seen, self.age_s, self.looked_s = seen, seen.t_s - self.fresh_s, time.monotonic()
 
 
 class SessionPage:
-    """An operator that shows the session of another one on a page, where any viewer may stop it.
+    """An operator that shows the session of another operator on a page, on which any viewer may stop it.
 
-    Questions are answered by the other operator. A thread draws the newest state while the page is open in a browser,
-    so that no browser delays the session. If that thread fails or hangs, the session goes on and `pressed` reports it.
+    The other operator answers the questions. A thread draws the newest state while the page is open in a browser, so
+    that browsers do not delay the session. If the thread fails or hangs, the session continues and `pressed` reports
+    the failure.
     """
 
     def __init__(self, page: Page, operator: Operator, command: str) -> None:
@@ -86,8 +89,8 @@ class SessionPage:
         self._question: Question | None = None
         self._stopped_by = self._note = self._failure = ""
         self._is_reported = False
-        self._stop = 1  # the last one: a hold has none
-        # Largest residual by stop, in sigmas.
+        self._stop = 1  # the last stop, because a hold has none
+        # Largest residual per stop, in sigmas.
         self._residuals: dict[int, float | None] = {}
         self._plan: events.Planned | None = None
         self._cell: tuple[Certifier, RangeGuard] | None = None
@@ -110,16 +113,16 @@ class SessionPage:
         self._page.put(_ENDED)
 
     def stop(self, viewer: str) -> None:
-        """Stop the session in the name of a viewer, as the key q does; for good, so only the first one counts."""
+        """Stop the session for a viewer, as the key q does. Only the first request counts."""
         self._stopped_by = self._stopped_by or viewer
 
     def watch(self, certifier: Certifier, load: RangeGuard) -> Onlooker:
-        """Draw this cell from now on, as the result sees it among the guards. See `SessionOptions.watch`."""
+        """Draw this cell from now on, with the returned guard as observer. See `SessionOptions.watch`."""
         self._cell = certifier, load
         return self._onlooker
 
     def show(self, event: Event) -> None:
-        """Keep what the page draws, and show the event."""
+        """Store what the page draws, and show the event."""
         with self._lock:
             self._view.update(event, time.monotonic())
             match event:
@@ -140,7 +143,7 @@ class SessionPage:
         self._operator.show(event)
 
     def ask(self, question: Question) -> str:
-        """Ask in the terminal; raises `Declined` too if a viewer has stopped the session."""
+        """Ask in the terminal. Raises `Declined` also if a viewer has stopped the session."""
         self._report_failure()
         self._require_unstopped()
         self._question, self._view.keys = question, "asking"
@@ -152,7 +155,7 @@ class SessionPage:
         return answer
 
     def absence(self) -> str | None:
-        """As `Operator.absence`: the viewers of the page do not count."""
+        """As `Operator.absence`; viewers of the page do not count."""
         return self._operator.absence()
 
     @property
@@ -161,18 +164,18 @@ class SessionPage:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return `Key.STOP` from when a viewer has pressed Stop, else the key of the terminal."""
+        """Return `Key.STOP` after a viewer has pressed Stop, else the key of the terminal."""
         self._report_failure()
         return Key.STOP if self._stopped_by else self._operator.pressed()
 
     @property
     def pressed_by(self) -> str:
-        """Who pressed it."""
+        """Name of the viewer or operator who pressed the key."""
         return self._stopped_by or self._operator.pressed_by
 
     @property
     def kept(self) -> Sequence[str]:
-        """Lines of the last note if there is a run: after an early end, what is kept and how to continue."""
+        """Lines of the last note if there is a run; after an early end, what is stored and how to continue."""
         return self._note.split("\n") if self._view.folder else ()
 
     def _require_unstopped(self) -> None:
@@ -183,8 +186,8 @@ class SessionPage:
         hung = f"drawing has hung for {HUNG_S:.0f} s" if self._page.stale_s > HUNG_S else ""
         if (why := self._failure or hung) and not self._is_reported:
             self._is_reported = True
-            words = f"The page cannot be drawn: {why}. The session goes on. Stop on the page still works."
-            with suppress(SupervisorGone):  # a guard reports it
+            words = f"The page cannot be updated: {why}. The session continues. Stop on the page still works."
+            with suppress(SupervisorGone):  # reported by a guard
                 self._operator.show(events.Noted(words=words, warning=True))
 
     def _look_at(self, _: str, t_s: float) -> None:
@@ -199,12 +202,12 @@ class SessionPage:
                 if self._page.viewers or ended:
                     self.draw()
                 self._page.beat()
-        except Exception as error:  # only a picture: the session goes on
+        except Exception as error:  # only a display: the session continues
             self._failure = repr(error)
             log.debug("the page cannot be drawn", exc_info=True)
 
     def draw(self) -> None:
-        """Show browsers the newest state."""
+        """Show the newest state to browsers."""
         with self._lock:
             view = replace(self._view, taken=dict(self._view.taken), compared=dict(self._view.compared))
             residuals, note = dict(self._residuals), self._note
@@ -219,13 +222,13 @@ class SessionPage:
             parts |= self._forces(seen, self._cell[1])
         downs = [(pose.gravity_flange, residuals.get(stop)) for stop, (pose, _) in view.taken.items()]
         parts |= _gravity_sphere(downs, None if self._scene is None else self._scene.sphere_m)
-        # Drawing that has hung may go on after the end.
+        # a drawing that hung may continue after the end
         self._page.put(parts | (_ENDED if self._ended.is_set() else {}))
 
     def _forces(self, seen: Seen, load: RangeGuard) -> Parts:
-        """Return force and torque beside the limits of their guard, and how fast and how old what the guards see is."""
+        """Return force and torque with the limits of their guard, and speed and age of the guards' data."""
         if time.monotonic() - self._onlooker.looked_s > _REST_S:
-            rest = "The guards rest: the arm is drawn where they saw it last."
+            rest = "The guards are at rest: the arm is drawn at their last observation."
             return {"bars": lines(rest, tone=QUIET), "bars/guards": None}
         limits = np.full(6, np.inf) if load.range is None else load.limits.saturation * load.range
         rows = []
@@ -236,7 +239,7 @@ class SessionPage:
         head = "Force and torque, since the start" if load.zero.any() else "Force and torque"
         speed_deg_s, age_ms = np.degrees(np.abs(seen.state.qd_rad_s).max()), 1e3 * self._onlooker.age_s
         guards = text_table([("joint speed", f"{speed_deg_s:.0f} °/s"), ("age of the sample", f"{age_ms:.0f} ms")])
-        if load.range is None:  # there is nothing to draw a bar to
+        if load.range is None:  # without limits there are no bars
             forces = [(row["label"], row["text"]) for row in rows]
             return {"bars": text_table(forces, head=f"{head}; range not known"), "bars/guards": guards}
         return {"bars": bars(*rows, head=head), "bars/guards": guards}
@@ -249,10 +252,10 @@ class _Cell:
         self._tour, self._arm = PlanTimeline(planned.plan, planned.way_rad), certifier.arm
         self._asked: Question | None = None
         self.chosen_s = 0.0
-        """Place of the plan that is shown while a question waits."""
+        """Position along the plan shown during a question."""
         wrist_m, size_m = self._arm.frames(self._tour.q_rad[:1]).wrist_m[0], scene.size_of(certifier)
         self.sphere_m = wrist_m + np.array([0.0, 0.0, 0.25 * size_m])
-        # Arm and sphere are in view.
+        # Arm and sphere are visible.
         look_at = 0.65 * self.sphere_m
         camera = scene.camera(look_at, look_at + 0.7 * size_m * np.array([1.0, 1.0, 0.4]))
         rows = *PLAN_LEGEND, (scene.GHOST, "body", "next pose"), *_POSES
@@ -261,7 +264,7 @@ class _Cell:
     def parts(
         self, now: events.StateChanged | None, stop: int, seen: Seen | None, question: Question | None, *, ended: bool
     ) -> Parts:
-        """Return the arm where it was seen, its goal, and while a question waits the slider along the plan."""
+        """Return the arm as last seen, its goal, and during a question the slider along the plan."""
         nodes, goal_rad, along = self._tour.plan.nodes_rad, None, None
         if question is not None:
             if question is not self._asked:
@@ -282,12 +285,12 @@ class _Cell:
 
 
 def asked(question: Question | None) -> Part | None:
-    """Return what waits in the terminal."""
+    """Return the question that waits in the terminal."""
     return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 
 
 def _state_panel(view: SessionView, note: str, stopped_by: str) -> Parts:
-    """Return state, progress and time left, as the terminal says them, the last note, and what has stopped the arm."""
+    """Return state, progress and remaining time, the last note, and what has stopped the arm."""
     now, last, now_s = view.now, view.last, time.monotonic()
     where, state, words = state_in_words(view, now_s)
     stopped = now is not None and now.state in {State.STOP, State.HOLD}
@@ -307,7 +310,7 @@ def _state_panel(view: SessionView, note: str, stopped_by: str) -> Parts:
 
 
 def _results(view: SessionView) -> Parts:
-    """Return the running estimates, and in a verification the poses compared."""
+    """Return the current estimates, and in a verification the compared poses."""
     parts: Parts = {}
     if (fit := view.estimated) is not None:
         found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
@@ -322,7 +325,7 @@ def _results(view: SessionView) -> Parts:
 
 
 def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array | None) -> Parts:
-    """Return the directions of gravity so far on a sphere, above the arm where there is one."""
+    """Return the directions of gravity so far on a sphere, above the arm if there is one."""
     if not downs:
         return {}
     colours = [
@@ -341,7 +344,7 @@ def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array 
 def conclude(
     page: Page, head: str, *words: str, tone: str = "", figures: Sequence[Part] = (), following: Sequence[str] = ()
 ) -> None:
-    """Show how a session has ended; `figures` are made by `number`, `following` are the commands of the line Next."""
+    """Show how a session ended; `figures` are made by `reading`, `following` are the next commands."""
     page.put(
         {
             "result": lines(head=head, tone=tone),

@@ -1,4 +1,4 @@
-"""The HTTP side of a page: its address, who may open it, its files, its stream of parts, requests of its controls."""
+"""The HTTP side of a page: address, access, files, stream of parts, and requests of controls."""
 
 import asyncio
 import hmac
@@ -26,19 +26,19 @@ from ftdrive.servers.http_gate import Address, Gate, Request, is_loopback, with_
 from ftdrive.view.page import Page
 from ftdrivers.installation import missing_extra
 
-# Only this computer can open the page.
+# By default, only this computer can open the page.
 _LOCAL: Final[Address] = ("127.0.0.1", 8080)
-# A busy computer, which is late at times, still sends 20 times a second.
+# On a busy computer with delays, this period still gives 20 updates per second.
 _PERIOD_S: Final = 0.045
-# A browser takes a page for stale when it has received nothing for some of these.
+# Period of heartbeats, s. A browser that misses several of them shows the page as stale.
 _BEAT_S: Final = 1.0
-# A viewer whose buffer is not empty receives nothing more; after this time it is disconnected.
+# A viewer with a non-empty buffer receives no more data, and is disconnected after this time, s.
 _SUSPENDED_S: Final = 30.0
 _VIEWERS: Final = 300
-# Of a request: largest body and time-out.
+# Largest body of a request, and its time-out, s.
 _BODY_BYTES: Final = 1 << 15
 _BODY_S: Final = 5.0
-# Nothing from elsewhere, no inline script, no other page around this one. uPlot sets styles of elements.
+# Nothing from other sites, no inline script, no embedding in other pages. uPlot sets styles of elements.
 _SAFE: Final = (
     "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -53,17 +53,17 @@ _log = logging.getLogger(__name__)
 
 
 class Site(Gate):
-    """Serves a page to browsers that have opened its address with the token once, and keep it as a cookie.
+    """Serves a page to browsers that have opened its address with the token, which they keep as a cookie.
 
-    A port of 0 lets the system choose, see `port`. Raises `ConfigError` if the extra `viz` is not installed, and
-    `OSError` for an address that cannot be used.
+    Port 0 lets the system choose, see `port`. Raises `ConfigError` if the extra `viz` is not installed, and `OSError`
+    for an address that cannot be used.
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
-        _files()  # raises before the port is taken
+        _files()  # raises before the port is opened
         self.token = secrets.token_urlsafe(18)
         self._page = page
-        # The version of the page that each viewer has, and when it last had taken all that was sent.
+        # For each viewer, its version of the page, and the time at which its buffer was last empty.
         self._viewers: dict[asyncio.StreamWriter, tuple[int, float]] = {}
         self._opened = 0
         super().__init__(bound)
@@ -76,38 +76,39 @@ class Site(Gate):
         if path == "/" and request.method == "GET" and query.startswith("token="):
             await self._open(request, query.removeprefix("token="), number)
         elif number is None:
-            await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
+            await request.refuse(HTTPStatus.FORBIDDEN, "open the complete address that the command printed")
         elif request.headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin"):
-            await request.refuse(HTTPStatus.FORBIDDEN, "pages of others are not served")
+            await request.refuse(HTTPStatus.FORBIDDEN, "requests of other pages are not accepted")
         elif request.method == "POST" and path == "/do":
             await self._act(request, f"viewer {number}")
         elif request.method != "GET":
-            await request.refuse(HTTPStatus.METHOD_NOT_ALLOWED, "this address is only read")
+            await request.refuse(HTTPStatus.METHOD_NOT_ALLOWED, "this address accepts only GET")
         elif path == "/parts":
             await self._follow(request, number)
         elif (file := _files().get(path)) is not None:
             await request.answer(HTTPStatus.OK, file.read_bytes(), f"{_TYPES[file.suffix]}; charset=utf-8", *_SAFE)
         else:
-            await request.refuse(HTTPStatus.NOT_FOUND, "there is no such page")
+            await request.refuse(HTTPStatus.NOT_FOUND, "this page does not exist")
 
     def end(self) -> None:
-        """Send browsers the last state, and that the program has ended; they keep it."""
+        """Send the last state and the end of the program to browsers, which keep showing it."""
         with suppress(TimeoutError):
             asyncio.run_coroutine_threadsafe(self._end_viewers(), self.loop).result(1.0)
 
     async def _open(self, request: Request, token: str, number: int | None) -> None:
         if not hmac.compare_digest(token.encode(), self.token.encode()):
-            await request.refuse(HTTPStatus.FORBIDDEN, "open the whole address that the command has printed")
+            await request.refuse(HTTPStatus.FORBIDDEN, "open the complete address that the command printed")
             return
         if number is None:
             number, self._opened = self._opened, self._opened + 1
-        # Browsers send the cookies of one port to all ports of a host. The page opens itself: after a redirect from
-        # another page, such as the file of `announced`, they would keep a strict cookie back.
+        # Browsers send the cookies of one port to all ports of a host, so the name contains the port. The page reloads
+        # itself, because after a redirect from another page, such as the file of `announced`, browsers would not send a
+        # strict cookie.
         cookie = f"Set-Cookie: ftdrive-{self.port}={self.token}.{number}; HttpOnly; SameSite=Strict; Path=/"
         await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
 
     def _viewer_of(self, cookies: str) -> int | None:
-        """Return the number of the viewer that has a cookie of this page."""
+        """Return the number of the viewer with a cookie of this page."""
         for cookie in cookies.split("; "):
             name, _, value = cookie.partition("=")
             token, _, number = value.rpartition(".")
@@ -116,7 +117,7 @@ class Site(Gate):
         return None
 
     async def _act(self, request: Request, viewer: str) -> None:
-        """Pass a request of a control on to the page; a foreign page cannot send this type without asking first."""
+        """Pass a request of a control to the page; foreign pages cannot send this type without a preflight request."""
         headers = request.headers
         length = headers.get("Content-Length", "")
         if headers.get("Origin") is None or headers.get("Content-Type") != "application/json":
@@ -139,7 +140,7 @@ class Site(Gate):
                     await request.answer(HTTPStatus.NO_CONTENT)
 
     async def _follow(self, request: Request, number: int) -> None:
-        """Send parts as server-sent events until the browser disconnects; bytes that it sends are dropped."""
+        """Send parts as server-sent events until the browser disconnects; bytes from the browser are ignored."""
         if len(self._viewers) >= _VIEWERS:
             await request.refuse(HTTPStatus.SERVICE_UNAVAILABLE, f"{_VIEWERS} viewers at most")
             return
@@ -156,7 +157,7 @@ class Site(Gate):
             self._page.viewers = len(self._viewers)
 
     async def _send_all(self) -> None:
-        """Send each viewer what has changed for it; one that does not read receives the newest state later."""
+        """Send each viewer the changes since its version; a viewer that does not read gets the newest state later."""
         beat_s = 0.0
         while True:
             await asyncio.sleep(_PERIOD_S)
@@ -193,9 +194,9 @@ class Site(Gate):
 
 @contextmanager
 def serve_page(title: str, address: Address | None = None) -> Iterator[Page]:
-    """Serve a page while the block runs. Raises `ConfigError` if the address is not usable or the extra `viz` missing.
+    """Serve a page while the block runs. Raises `ConfigError` for an unusable address or without the extra `viz`.
 
-    Without an address only this computer is served: at port 8080, or another one if that is taken.
+    Without an address, only this computer is served, at port 8080 or, if that is taken, at another one.
     """
     page = Page(title)
     try:
@@ -213,11 +214,11 @@ def serve_page(title: str, address: Address | None = None) -> Iterator[Page]:
 
 
 def _reached_at(host: str) -> str:
-    """Return the address by which others reach a server that listens at `host`: a tablet may not know our name."""
+    """Return the address at which others reach a server at `host`; a tablet may not know the host name."""
     if host not in ("0.0.0.0", "::"):
         return host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):
-        # Sends nothing: an address for documentation chooses the interface.
+        # This sends nothing: an address for documentation selects the interface.
         probe.connect(("192.0.2.1", 9))
         return str(probe.getsockname()[0])
     return socket.gethostname()
@@ -225,13 +226,14 @@ def _reached_at(host: str) -> str:
 
 @contextmanager
 def announced(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
-    """Print the address of a page, also for other devices if it is `shared`; else open it if there is a screen."""
+    """Print the address of a page, with a QR code for other devices if shared; else open it if there is a screen."""
     shared = address is not None and not is_loopback(address[0])
     print_page(page.url, shared=shared)
     if shared or (sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
         yield
         return
-    # As an argument of the browser, `ps` would show the address to every user. Only its owner may enter the folder.
+    # As an argument of the browser, the address would be visible to every user in `ps`. Only the owner may enter the
+    # folder.
     with TemporaryDirectory(prefix="ftdrive-", ignore_cleanup_errors=True) as folder:
         file = Path(folder, "page.html")
         file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(page.url)}">')
@@ -241,7 +243,7 @@ def announced(page: Page, address: Address | None, print_page: Callable[..., obj
 
 @cache
 def _files() -> dict[str, Path]:
-    """Return the files of a page by their address: our shell, and uPlot from its package, which is not imported."""
+    """Return the files of a page by their address: the shell, and those of the package uPlot, which is not imported."""
     shell = Path(__file__).parent / "shell"
     files: dict[str, Path] = {f"/{file.name}": file for file in shell.iterdir() if file.suffix in _TYPES}
     files["/"] = files.pop("/page.html")

@@ -26,8 +26,8 @@ _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
 # Values below this are rounding errors, N, N·m or share of a mass.
 _ROUNDING = 1e-9
 SIGMA_OF_THE_TOOL = (
-    "sigma of mounting, weight and centre of mass includes errors of sensor, arm and mounts; the "
-    "compensation error does not include them, because they cancel there"
+    "that of mounting, weight and centre of mass includes errors of sensor, arm and mounts; the "
+    "compensation error does not, because there they cancel"
 )
 
 

@@ -76,7 +76,7 @@ def test_later_loads_begin_with_the_earlier_matrix_and_can_be_dropped(sensor: Lo
     assert run("solve", "tool.json", "tip.json").exception is None
     tool, side, _ = sensor.runs(PROTOCOLS["hung, side and tip"])
     save([replace(tool, name="again"), side])
-    assert "Begins with sensor.json" in run("solve", "again.json", "side.json").output
+    assert "Starting from sensor.json" in run("solve", "again.json", "side.json").output
     assert [path.name for path in sensor_files()] == ["sensor.json", "sensor-2.json"]
     assert next_sensor_file().name == "sensor-3.json"
     assert "Deleted sensor-2.json" in run("drop", "--yes").output

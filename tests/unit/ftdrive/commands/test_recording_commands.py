@@ -160,7 +160,7 @@ def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, m
     assert "Saved" not in err
     assert answer["partial"].keys() == {"a.mcap.partial", "a.csv.partial"}
     for path, samples in answer["partial"].items():
-        assert f"{path} keeps {samples} samples" in err
+        assert f"{path} contains {samples} samples" in err
         assert len(load_recording(Path(path)).rows) == samples > 0
     assert not Path("a.mcap").exists()
     assert not Path("a.csv").exists()
@@ -411,7 +411,7 @@ def test_parquet_without_its_end_is_made_again(recorded: Path, capsys: pytest.Ca
         ([], "RECORDING"),
         (["--wrench", "c.json"], "c.json is a calibration, which --wrench does not take"),
         (["a.mcap", "--wrench", "c.json"], "RECORDING does not go with --wrench"),
-        (["a.mcap", "--delay", "auto"], "describe another program"),
+        (["a.mcap", "--delay", "auto"], "are for recordings of other programs"),
         (["a.mcap", "--about", "here"], "--about is 'here'"),
         (["a.mcap", "--wrench-topic", "/w"], "are only for a ROS bag"),
         (["a.mcap", "--pose-topic", "/p"], "are only for a ROS bag"),

@@ -282,7 +282,7 @@ def test_a_bag_that_cannot_be_used_is_one_sentence(
 
 def test_a_file_that_is_no_bag_of_ros_1_is_not_read_to_the_end_of_its_line(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_bytes(bytes(1000))
-    with pytest.raises(BadDataset, match=r"^a\.bag: the first bytes are not those of a bag of ROS 1"):
+    with pytest.raises(BadDataset, match=r"^a\.bag: the first bytes are not those of a ROS 1 bag"):
         read_bag(tmp_path / "a.bag", None, None)
 
 

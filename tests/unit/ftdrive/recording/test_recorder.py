@@ -74,7 +74,7 @@ def test_a_full_disk_leaves_partial_files_that_say_what_is_safe(
     assert not other.exists()
     assert recorder.saved == []
     for path, samples in recorder.partial.items():
-        assert f"{path} keeps {samples} samples" in str(failure.value)
+        assert f"{path} contains {samples} samples" in str(failure.value)
         found = load_recording(path)
         assert found.cut
         assert 0 < len(found.rows) == samples < 5000
@@ -94,7 +94,7 @@ def test_without_room_for_the_end_the_partial_file_is_readable(
     fill_disk(size)
     recorder = Recorder([path], info(), {})
     recorder.add(block(1100), [])
-    with pytest.raises(OSError, match=r"No space left .*\.partial keeps 1100 samples"):
+    with pytest.raises(OSError, match=r"No space left .*\.partial contains 1100 samples"):
         recorder.end()
     assert not path.exists()
     partial = tmp_path / f"a{ending}.partial"
@@ -197,7 +197,7 @@ def test_an_error_of_one_file_completes_the_others(tmp_path: Path) -> None:
     recorder = Recorder([tmp_path / "a.csv", tmp_path / "b.csv"], info(), {})
     recorder.add(block(3), [])
     (tmp_path / "a.csv").touch()
-    with pytest.raises(FileExistsError, match=r"a\.csv\.partial keeps 3 samples"):
+    with pytest.raises(FileExistsError, match=r"a\.csv\.partial contains 3 samples"):
         recorder.end()
     assert recorder.saved == [tmp_path / "b.csv"]
     assert len(load_recording(tmp_path / "b.csv").rows) == 3

@@ -52,7 +52,7 @@ def test_a_healthy_stream_reports_its_state() -> None:
 
 
 def test_what_is_wrong_has_its_level() -> None:
-    assert reports(lost_before=4)[1].text == "3 samples lost since the report before"
+    assert reports(lost_before=4)[1].text == "3 samples lost since the last report"
     assert reports(lost_before=6)[1].level is Level.WARN
     assert [one.level for one in reports(lost_before=4)] == [Level.OK, Level.WARN, Level.OK, Level.OK]
     silent = reports(arm=replace(LINK, error="no state for 0.3 s"))

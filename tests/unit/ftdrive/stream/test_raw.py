@@ -88,7 +88,7 @@ def test_the_screen_shows_readings_and_nothing_unknown(sensor: Sensor) -> None:
         assert {len(line) for line in lines} == {size[0]}
         assert "sensor alone: no arm, no calibration  tare" in lines[2]
         assert "minus tare" in lines[1]
-        assert "raw readings have neither stages nor other axes" in text
+        assert "raw readings have no stages and no other axes" in text
         for word in ("GOOD", "cal ", "robot", "payload", "drift", "free ", "CONTACT", "bias", "noise not known"):
             assert word not in text, word
 

@@ -104,7 +104,7 @@ def test_the_number_ends_where_its_sigma_does() -> None:
     assert scale.mass == mass("0.8123 kg")
     assert scale.sigma == "3 parts   sigma 1.2 g, smallest mass 4.8 g"
     assert scale.line == "3 parts, 0.8123 ± 0.0012 kg at (10.0 ± 2.0, -20.0 ± 3.0, 150 ± 100) mm from the sensor origin"
-    assert scale.keys == "z zero the empty gripper   p join poses of one load   q quit"
+    assert scale.keys == "z zero the empty gripper   p combine poses of one load   q quit"
     assert Scale(FakeWeighing(ScaleState(PART, None, 1))).line.startswith("1 part, 0.8123")
 
 
@@ -135,7 +135,7 @@ def test_what_is_not_weighed_has_no_number_but_a_mass_that_cannot_be_counted(
 
 def test_poses_are_joined_until_the_key_is_pressed_again() -> None:
     weighing = FakeWeighing(ScaleState(PART, None))
-    assert Scale(weighing, "p").sigma.endswith("4.8 g   1 pose joined, turn the tool for more")
+    assert Scale(weighing, "p").sigma.endswith("4.8 g   1 pose combined, turn the tool for more")
     assert weighing.joins
     Scale(weighing, "p")
     assert not weighing.joins

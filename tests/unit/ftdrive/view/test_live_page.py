@@ -275,7 +275,7 @@ def test_viewers_tare_and_choose_the_frame_only_if_that_is_allowed() -> None:
     shown = Shown(FakeStream())
     assert names_of(shown.run(3)) == ["span"]
     for name in ("tare", "undo", "axes", "seek"):
-        with pytest.raises(ValueError, match="no such control"):
+        with pytest.raises(ValueError, match="does not have this control"):
             shown.act(name)
     shown = Shown(FakeStream(), controls=True)
     assert names_of(shown.run(3)) == ["tare", "undo", "span", "axes", "about"]
@@ -350,7 +350,7 @@ def test_a_failed_drawing_is_said_once_and_ends_nothing_else(monkeypatch: pytest
             time.sleep(0.001)
         shown.feed.step()
     (words,) = said
-    assert words == "The page is not drawn any more, the command goes on: ZeroDivisionError('division by zero')"
+    assert words == "The page is no longer updated, the command continues: ZeroDivisionError('division by zero')"
     assert "\n" not in words
 
 
@@ -417,7 +417,7 @@ def test_a_page_asks_for_a_zero_where_it_helps(least_kg: float, moving: bool) ->
 def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
     for controls, moving in ((False, False), (True, True)):
         _, page, weighing = weighed(ScaleState(PART, None), controls=controls, moving=moving)
-        with pytest.raises(ValueError, match="no such control"):
+        with pytest.raises(ValueError, match="does not have this control"):
             page.act("viewer 2", "zero", None)
         assert not weighing.is_zeroing
     _, page, weighing = weighed(ScaleState(PART, None), controls=True)

@@ -215,7 +215,7 @@ def test_while_a_question_waits_a_slider_shows_the_plan(lab: Lab, page: Page) ->
     assert chosen["question/along"]["controls"][0]["text"].startswith("approach, 0 of ")
     np.testing.assert_allclose(places(chosen, "ghost"), places(chosen), atol=1e-4)
     assert "question/along" not in shown(watched)
-    with pytest.raises(ValueError, match="no such control now"):
+    with pytest.raises(ValueError, match="does not have this control now"):
         page.act("viewer 0", "along", 0.0)
 
 
@@ -280,7 +280,7 @@ def test_force_and_torque_stand_beside_the_limits_of_their_guard(watched: Sessio
     assert parts["bars/guards"]["rows"] == [["joint speed", "30 °/s"], ["age of the sample", "20 ms"]]
     onlooker.looked_s -= 1
     parts = shown(watched)
-    assert "The guards rest" in texts(parts["bars"])
+    assert "The guards are at rest" in texts(parts["bars"])
     assert "bars/guards" not in parts
 
 
@@ -395,7 +395,7 @@ def test_a_session_whose_page_cannot_be_drawn_goes_on_and_says_so_once(
         watched.show(Noted(words="a note"))
     notes = list(filter(is_failure, lab.operator.of(Noted)))
     assert [note.words for note in notes] == [
-        "The page cannot be drawn: RuntimeError('no memory'). The session goes on. Stop on the page still works."
+        "The page cannot be updated: RuntimeError('no memory'). The session continues. Stop on the page still works."
     ]
     assert notes[0].warning
     assert threads == {threading.current_thread()}
@@ -472,7 +472,7 @@ def test_at_the_end_nothing_looks_live(lab: Lab, page: Page) -> None:
     assert not set(gone) & set(parts)
     assert "result" not in parts  # it is not known yet
     assert parts["scene/gravity/poses"]["points"]
-    with pytest.raises(ValueError, match="no such control now"):
+    with pytest.raises(ValueError, match="does not have this control now"):
         page.act("viewer 0", "stop", None)
 
 
