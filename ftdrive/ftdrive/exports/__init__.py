@@ -1,1 +1,1 @@
-"""Exports to other programs: one module per target, each from an object of ftdrive to the text of a file."""
+"""Exports to other programs: functions that return the text of a file."""

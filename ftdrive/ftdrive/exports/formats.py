@@ -1,32 +1,33 @@
 """The formats of an exported calibration as data: keys, units, signs and frames of each target.
 
-Without numpy, because help and completion must be fast. `registry.py` has what a row names, and writes it.
+This module does not import numpy, because help and completion must be fast. `registry.py` computes the values named in
+a row, and writes it.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
-# What a calibration has: leaning base; turned sensor; gain and cross-talk of the sensor.
+# Properties of a calibration: tilted base; rotated sensor; gain and cross-talk of the sensor.
 Property = Literal["tilt", "rotation", "response"]
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
-# By which the force of a target may differ from ours because it cannot express everything.
+# Largest accepted force error of a target that cannot express everything, N.
 MAX_FORCE_ERROR_N: Final = 0.1
-# mc_rtc/constants.h. The force must be right, so the mass for this gravity differs from ours by up to 0.3 %.
+# From mc_rtc/constants.h. The force must be right, so the mass for this gravity differs by up to 0.3 %.
 MC_RTC_G_M_S2: Final = 9.80665
 
 _SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
 
 
 def plain_ascii(text: str) -> str:
-    """Reduce a text to printable ASCII without quotes and backslashes, because URScript strings have no escapes."""
+    """Return text as printable ASCII without quotes and backslashes: URScript strings have no escapes."""
     return "".join(c if " " <= c <= "~" and c not in "\"'\\" else "?" for c in text.translate(_SPELLED))
 
 
 @dataclass(frozen=True, slots=True)
 class ExportFormat:
-    """One target."""
+    """Format of one target program."""
 
     description: str
     file: str
@@ -34,31 +35,33 @@ class ExportFormat:
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
     """What the target subtracts from the reading."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
-    """What the target has of the calibration, in the file or where it reads it; response: see `has_own_reading`."""
+    """Properties of the calibration that the target can express, in the file or elsewhere; response: see
+    `has_own_reading`."""
     comment: Comment = "#"
-    """How the header is written."""
+    """Form of the header comment."""
     content: Any = None
-    """Of the file: a document that is written as YAML, or a text with values in braces; None for the complete result.
+    """Content of the file: a document that is written as YAML, or a text with values in braces; None for the complete
+    result.
 
-    In a document, "$name" stands for a value, and "*name" in a list for the numbers of a vector. A name is that of a
-    field of calibration or settings, or one of `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
-    components as ROS messages have them; `registry.py` has the other ends of names.
+    In a document, "$name" stands for a value, and "*name" in a list for the components of a vector. A name is a field
+    of calibration or settings, or defined in `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
+    components as in ROS messages; `registry.py` defines the other suffixes.
     """
     notes: tuple[str, ...] = ()
     """Sentences for the user of the target, with values in braces."""
     elsewhere: Mapping[str, str] = field(default_factory=dict)
-    """What the target reads from another place, by its name there, with "$name" as in `content`."""
+    """Values that the target reads from another place, by their names there, with "$name" as in `content`."""
 
     @property
     def has_own_reading(self) -> bool:
-        """Whether the target reads another sensor, or none, so that neither bias nor response of ours matter."""
+        """Whether the target reads another sensor or none, so that bias and response of this sensor do not matter."""
         return "bias" not in self.subtracts and "response" in self.expresses
 
 
-# A target that looks up frames trusts the robot model, so the note has the angles that it must have.
+# A target that looks up frames relies on the robot model, so the note contains the required angles.
 _FRAMES: Final = (
     "The robot model must turn {sensor_frame} against {flange_frame} by roll, pitch, yaw = ({rpy_rad_words}) rad: the "
-    "formats urdf and static-transform write it. {base_frame} must have the axes of {base_axes}."
+    "formats urdf and static-transform write this. {base_frame} must have the axes of {base_axes}."
 )
 # Parameters of ft_estimation_node, ft_tools/src/ft_estimation_node_parameters.yaml.
 _FT_ESTIMATION: Final = {
@@ -93,7 +96,7 @@ _OFFSET: Final = (
 _WORLD: Final = "Gravity is in axes of {base_frame}, {base_axes}: turn it if those of the world differ."
 _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 
-# By name, as `--format` takes it; above each row project, file and version of its reader, and the reader's formula.
+# By name, as in `--format`. Above each row: project, file and version of the reader, and its formula.
 FORMATS: Mapping[str, ExportFormat] = {
     # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
     # gravity_compensation.cpp, master since pull request 18 (2021-05). With a the acceleration that its IMU reports,
@@ -401,7 +404,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
         "--x {origin_m[0]!r} --y {origin_m[1]!r} --z {origin_m[2]!r} "
         "--qx {quaternion[0]!r} --qy {quaternion[1]!r} --qz {quaternion[2]!r} --qw {quaternion[3]!r} "
         "--frame-id {flange_frame} --child-frame-id {sensor_frame}\n",
-        notes=("It has the place of the sensor only, no bias and no weight.",),
+        notes=("The transform contains only the position of the sensor, no bias and no weight.",),
     ),
     "json": ExportFormat(
         "JSON with everything that compensation needs", "ft.json", expresses=_OWN_READING, comment="none"

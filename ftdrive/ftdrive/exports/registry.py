@@ -1,4 +1,4 @@
-"""Writes the rows of `formats.py`, the complete JSON and YAML, and says how far a target is from the calibration."""
+"""Writer of the formats in `formats.py` and of the complete JSON and YAML; it also computes the error of a target."""
 
 import json
 import re
@@ -30,41 +30,41 @@ from ftdrive.stream.samples import sensor_origin_m
 
 FORMAT = "ftdrive.export/1"
 
-# Named and defined as in a calibration file.
+# Fields with the names and definitions of a calibration file.
 _FIELDS = (
     *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
 )
 
 
-# Also inside a comment of XML, where `--` is an error.
+# Valid inside a comment of XML too, where `--` is an error.
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
-# ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z.
-# ROS users have base_link; without the turn a tilt would be wrong without a message.
+# From ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z. ROS users have base_link;
+# without this rotation a tilt would be wrong without a message.
 _R_BASE_LINK_BASE = np.diag([-1.0, -1.0, 1.0])
-# ur_description/urdf/ur_macro.xacro, joint flange-tool0: rpy = (π/2, 0, π/2). x of `flange` points out.
+# From ur_description/urdf/ur_macro.xacro, joint flange-tool0: rpy = (π/2, 0, π/2). x of `flange` points out.
 _R_FLANGE_TOOL0 = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Names and measured values; None where not measured. Raises `ConfigError` for a name that files cannot take."""
+    """Names and measured values; None if not measured. Raises `ConfigError` for a name that is invalid in files."""
 
     base_frame: str = "base"
-    """The controller's base, or the `base_link` of a UR in ROS, with any prefix."""
+    """Frame of the controller's base, or `base_link` of a UR in ROS, with any prefix."""
     flange_frame: str = "tool0"
-    """With z out of the flange, or the `flange` of ROS-Industrial with x out, with any prefix."""
+    """Frame of the flange with z out, or `flange` of ROS-Industrial with x out, with any prefix."""
     sensor_frame: str = "ft_sensor"
-    """Also the name of the sensor, where a target has one."""
+    """Frame of the sensor, also used as the name of the sensor."""
     tool_frame: str = "tool"
     height_mm: float | None = None
-    """Height of the sensor's origin above the flange face."""
+    """Height of the sensor's origin above the flange face, mm."""
     sensor_mass_kg: float | None = None
-    """Mass of sensor and adapter."""
+    """Mass of sensor and adapter, kg."""
     sensor_com_mm: tuple[float, ...] | None = None
-    """Centre of mass of sensor and adapter, from the flange, in flange axes; None: half way up on the flange axis."""
+    """Centre of mass of sensor and adapter from the flange, flange axes, mm; None: half way up on the flange axis."""
     verification: VerificationRecord | None = None
-    """The last one of the calibration; None if there is none."""
+    """Last verification of the calibration; None if there is none."""
 
     def __post_init__(self) -> None:
         for field_name in ("base_frame", "flange_frame", "sensor_frame", "tool_frame"):
@@ -79,7 +79,7 @@ class Settings:
 
 
 def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float | None, float | None]:
-    """Return height (mm) and mass (kg) of the sensor as configured at a calibration, file or run; None if unknown."""
+    """Return height (mm) and mass (kg) of the sensor configured for a calibration, file or run; None if unknown."""
     folder = path if path.is_dir() else path.resolve().parent
     if path.is_dir() or (folder.name == calibration.provenance.get("run") and is_run(folder)):
         sensor = Run(folder).header().get("config", {}).get("sensor", {})
@@ -90,16 +90,16 @@ def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float |
 
 
 def _yaml(document: Any) -> str:
-    """Return YAML that keeps every bit of a float and the order of the keys."""
-    # YAML 1.1 reads 1e-05 as a text and yes as true; PyYAML quotes what must be quoted.
+    """Return YAML that keeps every bit of a float and the order of keys."""
+    # YAML 1.1 reads 1e-05 as text and yes as true; PyYAML quotes such texts.
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
 
 @dataclass(frozen=True, slots=True)
 class _Values:
-    """The values of one export by name: of `_VALUES`, of the calibration and of the settings, in the unit of the name.
+    """Values of an export by name: from `_VALUES`, the calibration or the settings, in the unit of the name.
 
-    Raises `ConfigError` for one that was not measured.
+    Raises `ConfigError` for a value that was not measured.
     """
 
     target: str
@@ -116,11 +116,11 @@ class _Values:
             value = -np.array(self[name.removeprefix("minus_")])
         else:
             value = getattr(self.calibration if hasattr(self.calibration, name) else self.settings, name)
-        # No file has a negative zero.
+        # avoid negative zeros in files
         return (np.ravel(value) + 0.0).tolist() if isinstance(value, np.ndarray) else value
 
     def filled(self, node: Any) -> Any:
-        """Return a part of a row with its values."""
+        """Return a part of a row with its values filled in."""
         if isinstance(node, Mapping):
             return {key: self.filled(value) for key, value in node.items()}
         if isinstance(node, list):
@@ -129,12 +129,12 @@ class _Values:
 
     @property
     def is_turned(self) -> bool:
-        """Whether the base frame is that of ROS."""
+        """Whether the base frame is base_link of ROS."""
         return self.settings.base_frame.endswith("base_link")
 
     @property
     def R_frame_flange(self) -> Array:
-        """Orientation (3, 3) of the flange, z out, in the frame of that name."""
+        """Orientation (3, 3) of the flange, z out, in the flange frame of this name."""
         return _R_FLANGE_TOOL0 if self.settings.flange_frame.endswith("flange") else np.eye(3)
 
     @property
@@ -144,14 +144,14 @@ class _Values:
 
     @property
     def gravity_base_m_s2(self) -> Array:
-        """(3,), axes of the controller's base, pointing down; along -z if nothing hangs."""
+        """Gravity (3,), axes of the controller's base, pointing down; along -z for a tool without mass."""
         if self.calibration.mass_kg == 0.0:
             return np.array([0.0, 0.0, -self.calibration.g_m_s2])
         return self.calibration.gravity_force_base_N / self.calibration.mass_kg
 
     @property
     def p_flange_sensor_m(self) -> Array:
-        """(3,), the sensor's origin in the flange."""
+        """Position (3,) of the sensor's origin in the flange."""
         if self.settings.height_mm is None:
             raise ConfigError(
                 f"{self.target} needs the height of the sensor's origin above the flange face, which gravity cannot "
@@ -161,7 +161,7 @@ class _Values:
 
     @property
     def payload(self) -> FlangeLoad:
-        """All that the flange carries."""
+        """Everything that the flange carries."""
         height_m = float(self.p_flange_sensor_m[2])
         if self.settings.sensor_mass_kg is None:
             raise ConfigError(
@@ -174,36 +174,36 @@ class _Values:
 
     @property
     def inertia_kg_m2(self) -> Array | None:
-        """(3, 3) of the tool about its centre of mass, sensor axes; None if motion did not identify that of a body."""
+        """Inertia (3, 3) of the tool about its centre of mass, sensor axes; None if not identified, or not physical."""
         if self.calibration.motion is None:
             return None
         J = self.calibration.motion.inertia_kg_m2
-        # A body has positive moments, none larger than the sum of the others.
+        # The moments of a rigid body are positive, and none is larger than the sum of the others.
         low, middle, high = np.linalg.eigvalsh(J)
         return J if low > 0 and high <= low + middle else None
 
 
 def _rpy_rad(v: _Values) -> Array:
-    """Orientation of the sensor as URDF has it: roll, pitch, yaw with R = Rz(yaw) Ry(pitch) Rx(roll)."""
+    """Return roll, pitch, yaw of the sensor as in URDF: R = Rz(yaw) Ry(pitch) Rx(roll)."""
     with warnings.catch_warnings():
-        # At a pitch of 90 degrees roll is set to zero.
+        # at a pitch of 90 degrees, roll is set to zero
         warnings.simplefilter("ignore")
         return Rotation.from_matrix(v.R_frame_sensor).as_euler("xyz")
 
 
 def _quaternion(v: _Values) -> Array:
-    """Orientation of the sensor, scalar last and not negative."""
+    """Return the orientation of the sensor as a quaternion, scalar last and not negative."""
     return Rotation.from_matrix(v.R_frame_sensor).as_quat(canonical=True)
 
 
 def _payload_inertia(v: _Values) -> str:
-    """Inertia of all that the flange carries, about its centre of mass, flange axes; the sensor itself is a point."""
+    """Return the inertia of everything on the flange about its centre of mass, flange axes; the sensor is a point."""
     if (J := v.inertia_kg_m2) is None:
         return "0, 0, 0, 0, 0, 0"
     payload, Q, (tool_kg, p_sensor_com_m) = v.payload, v.calibration.R_flange_sensor, true_tool(v.calibration)
     tool_m = v.p_flange_sensor_m + Q @ p_sensor_com_m - payload.p_flange_com_m
     sensor_kg = payload.mass_kg - tool_kg
-    # The moments of the two points about their common centre.
+    # Moments of the two points about their common centre.
     reduced_kg = tool_kg + (tool_kg**2 / sensor_kg if sensor_kg > 0 else 0.0)
     total = Q @ J @ Q.T + reduced_kg * (tool_m @ tool_m * np.eye(3) - np.outer(tool_m, tool_m))
     return str(_FORMS["fixed"](total[_DIAGONAL_FIRST]))
@@ -219,14 +219,14 @@ def _inertia_note(v: _Values) -> str:
 
 
 def _point_mass(v: _Values, what: str) -> str:
-    """Return a comment of XML and the start of its next line, or nothing if the inertia was identified."""
+    """Return a comment of XML and the start of its next line; empty if the inertia was identified."""
     if v.inertia_kg_m2 is not None:
         return ""
     return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
 
 
 def _assumed(v: _Values) -> str:
-    """Note about the centre of mass of the sensor; empty if it was measured."""
+    """Return a note about the centre of mass of the sensor; empty if it was measured."""
     if not v.settings.sensor_mass_kg or v.settings.sensor_com_mm is not None:
         return ""
     return (
@@ -236,7 +236,7 @@ def _assumed(v: _Values) -> str:
 
 
 _DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-# How a name ends that stands for a value in a certain form.
+# Suffixes of names for values in a certain form.
 _FORMS: Mapping[str, Callable[[Any], Any]] = {
     "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as ROS messages have a vector
     "words": lambda value: ", ".join(map(str, value)),
@@ -276,29 +276,29 @@ _VALUES: Mapping[str, Callable[[_Values], Any]] = {
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """The text of one target, and what must be known with it."""
+    """The text for one target, with what its user must know."""
 
     text: str
     notes: tuple[str, ...]
-    """What the user of the target must know; sentences."""
+    """Sentences for the user of the target."""
     elsewhere: Mapping[str, JSON]
-    """What the target reads from another place, by its name there."""
+    """Values that the target reads from another place, by their names there."""
     max_force_error_N: float
-    """Largest difference to `CalibrationResult.compensate` of a free tool over all orientations."""
+    """Largest difference to `CalibrationResult.compensate` of a free tool over all orientations, N."""
     max_torque_error_Nm: float
 
 
 def _compensation_document(calibration: CalibrationResult, settings: Settings) -> dict[str, JSON]:
-    """Return all that compensation needs, for a program of the user.
+    """Return everything that compensation needs, for a program of the user.
 
-    With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros where
-    there is no `response`:
+    With u = R_flange_sensor^T R_base_flange^T gravity_force_base_N, the weight in the sensor frame, and zeros without
+    `response`:
 
         force = raw - force_bias_N - u - force_gain u
         torque = raw - torque_bias_Nm - p_sensor_com_m x u - cross_talk_m u
         contact = decoder (force, torque)
 
-    `decoder` (6 x 6) is null where no error of the sensor's matrix is known. Then the contact is (force, torque).
+    `decoder` (6 x 6) is null if no error of the sensor matrix is known. Then the contact is (force, torque).
     """
     result = calibration.to_dict()
     response, decoder = calibration.response, calibration.contact.decoder
@@ -323,15 +323,15 @@ def _compensation_document(calibration: CalibrationResult, settings: Settings) -
 
 
 _STEPS = 500
-# Relative gain of a step, at the start that gains most.
+# Relative increase per step, over all starts, below which the ascent has converged.
 _CONVERGED = 1e-12
 
 
 def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tuple[Compensator, Compensator]:
-    """Return our compensation of a free tool, and that of a target that expresses all but what its `expresses` lacks.
+    """Return the compensation of a free tool by ftdrive, and by a target that lacks what its `expresses` does not list.
 
-    Without tilt, gravity points along -z of the base. Without rotation, the sensor's axes are those of the flange.
-    Where the target has another sensor, or none, neither has the response of ours.
+    Without tilt, gravity points along -z of the base. Without rotation, the sensor axes equal the flange axes. If the
+    target reads another sensor or none, the response of this sensor is left out of both.
     """
     parameters = calibration.parameters
     response = None if target.has_own_reading else calibration.response
@@ -344,9 +344,9 @@ def _compensations(calibration: CalibrationResult, target: ExportFormat) -> tupl
 
 
 def _largest_norm(matrix: Array, offset: Array) -> float:
-    """Maximise |matrix @ vec(R) + offset| over rotations R.
+    """Return the maximum of |matrix @ vec(R) + offset| over rotations R.
 
-    The square is convex in R, so that the rotation which is best for its tangent never lowers it. Ascent from the 60
+    The square is convex in R, so the rotation that maximises its tangent never decreases it. Ascent from the 60
     rotations of the icosahedron reaches every maximum.
     """
     R = Rotation.create_group("I").as_matrix()
@@ -363,10 +363,11 @@ def _largest_norm(matrix: Array, offset: Array) -> float:
 def export_calibration(
     calibration: CalibrationResult, name: str, settings: Settings, *, max_force_error_N: float = MAX_FORCE_ERROR_N
 ) -> Exported:
-    """Write a calibration for the target of this name in `FORMATS`.
+    """Return a calibration as text for the target of this name in `FORMATS`.
 
-    In any orientation it may differ from `CalibrationResult.compensate` by `max_force_error_N`. Raises `ConfigError` if
-    a value was not measured, and `NotAccepted` if the calibration is rejected or the target would differ by more.
+    In any orientation, the target may differ from `CalibrationResult.compensate` by `max_force_error_N`. Raises
+    `ConfigError` if a value was not measured, and `NotAccepted` if the calibration is rejected or the target differs by
+    more.
     """
     if calibration.verdict == "rejected":
         raise NotAccepted(
@@ -400,7 +401,7 @@ def export_calibration(
     if target.subtracts and "response" not in target.expresses:
         notes += _undecoded(name, calibration)
     elsewhere = values.filled(target.elsewhere)
-    # The file has every digit.
+    # The header in the file has all digits.
     shown, exact = (
         [*notes, *(f"Also set {place} = {_describe_value(value, form)}." for place, value in elsewhere.items())]
         for form in (".6g", "")
@@ -410,13 +411,13 @@ def export_calibration(
 
 
 def _above(value: float) -> str:
-    """Write the next larger number of two digits."""
+    """Return the next larger number with two digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return f"{np.ceil(value / step) * step:.2g}"
 
 
 def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
-    """Name what the calibration has and the target cannot express, beyond rounding."""
+    """Yield the properties of the calibration that the target cannot express, beyond rounding."""
     tilt_rad = angle_between_vectors(np.array([0.0, 0.0, -1.0]), calibration.gravity_force_base_N)
     turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
     if "tilt" not in target.expresses and tilt_rad > 1e-9:
@@ -428,7 +429,7 @@ def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]
 
 
 def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
-    """State the largest error of a contact where the target does not decode it."""
+    """Yield a note with the largest error of a contact if the target does not decode it."""
     if (decoder := calibration.contact.decoder) is None:
         return
     at_tool = np.concatenate([np.eye(3), skew(calibration.p_sensor_com_m)])
@@ -441,7 +442,7 @@ def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
 
 
 def _lossless(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
-    """Name the formats that lose nothing, subtract as much, and read our sensor if the target does."""
+    """Yield the formats that lose nothing, subtract as much, and read this sensor if the target does."""
     for name, other in FORMATS.items():
         as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
         if as_much and not list(_lost(calibration, other)):
@@ -457,7 +458,7 @@ def _describe_value(value: JSON, form: str) -> str:
 
 
 def _made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
-    """Say which calibration this is, when it was made and last verified, and by which version."""
+    """Return a line with id, date, last verification and version of the calibration."""
     made = calibration.provenance.get("created_utc")
     date = made if isinstance(made, str) else "at an unknown time"
     verified = "not verified"
@@ -469,7 +470,7 @@ def _made_by(calibration: CalibrationResult, verification: VerificationRecord | 
 
 
 def _with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
-    """Add comment lines, reduced to printable ASCII."""
+    """Return the text with comment lines, reduced to printable ASCII."""
     clean = [plain_ascii(line) for line in lines]
     if comment == "none":
         return text

@@ -1,4 +1,4 @@
-"""A plan as a URScript program, to run the tour from the pendant, or as a table; and functions for `serve-load`.
+"""Plans as URScript programs for the pendant, or as tables; and URScript functions for `serve-load`.
 
 Ref: Universal Robots, "The URScript Programming Language", SW 5: movej, get_actual_joint_positions, popup, textmsg,
 read_input_integer_register, read_input_float_register, write_output_integer_register, read_output_integer_register,
@@ -23,7 +23,7 @@ _FASTEST_RAD_S, _FASTEST_RAD_S2 = pi + 1e-9, radians(300) + 1e-9
 
 
 def plan_table(plan: Plan) -> str:
-    """Write one line per pose, with speed, acceleration and clearance of the move to the next (last: first).
+    """Return one line per pose, with speed, acceleration and clearance of the move to the next (last: first).
 
     The first line is a comment with the format, the plan's hash, the model, and whether the cell was emulated.
     """
@@ -40,9 +40,9 @@ APPROACH_RAD_S, APPROACH_RAD_S2 = radians(10), radians(20)
 
 
 def program(plan: Plan, *, dwell_s: float) -> str:
-    """Write a function that visits the poses of a plan, rests for `dwell_s` at each, and returns to the first.
+    """Return a function that visits the poses of a plan, stops for `dwell_s` at each, and returns to the first.
 
-    Raises `PlanRefused` if a move is not proven clear, or no arm can follow a value in the plan.
+    Raises `PlanRefused` if a move is not proven clear, or if no arm can reach a value in the plan.
     """
     _require_exportable(plan)
     return "".join(
@@ -135,11 +135,11 @@ def _joint_row(q_rad: tuple[float, ...]) -> str:
 
 
 def _scene(scene: dict[str, Any]) -> Iterator[str]:
-    """Describe the surroundings; planes and boxes in the form of `--plane` and `--box`."""
+    """Yield the surroundings as text; planes and boxes in the form of `--plane` and `--box`."""
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
     yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"
-    # The first one is what the base is bolted to.
+    # The first plane is the mounting surface.
     for plane in scene["planes"]:
         normal = ":".join(f"{value:.6g}" for value in plane["normal"])
         place_mm = 1e3 * float(plane["offset_m"])
@@ -157,8 +157,8 @@ def _cylinder(part: dict[str, Any]) -> str:
 
 
 def _require_exportable(plan: Plan) -> None:
-    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can follow."""
-    # The text of an export carries no verdict, so a rejected calibration is not exported.
+    """Raise `PlanRefused` for sweeps, placeholders, moves that are not proven clear, and values no arm can reach."""
+    # The exported text contains no verdict, so plans that are not proven are not exported.
     if plan.sweep is not None:
         raise PlanRefused("this plan is a sweep, which no other program can follow: export the plan of a tour")
     if not plan.measured:
@@ -167,7 +167,7 @@ def _require_exportable(plan: Plan) -> None:
             "measure them, set measured = true in [workcell], and make a new plan"
         )
     if not plan.certified:
-        raise PlanRefused("a move of the plan is not proven clear: it is not exported")
+        raise PlanRefused("a move of the plan is not proven clear, so the plan is not exported: make a new plan")
     angles = [angle for step in plan.steps for angle in step.q_rad]
     if (
         any(len(step.q_rad) != 6 for step in plan.steps)
@@ -175,20 +175,23 @@ def _require_exportable(plan: Plan) -> None:
         or not all(0 < step.speed_rad_s <= _FASTEST_RAD_S for step in plan.steps)
         or not 0 < plan.acceleration_rad_s2 <= _FASTEST_RAD_S2
     ):
-        raise PlanRefused("the plan holds a joint angle, speed or acceleration that no arm can follow: make a new plan")
+        raise PlanRefused(
+            "the plan contains a joint angle, speed or acceleration that no arm can reach: make a new plan"
+        )
 
 
-# Without a new live counter for so long the service is gone; the states below 0 have no other meaning.
+# The service is taken as stopped without a change of the live counter for this time, s. The states below 0 are
+# otherwise unused.
 STALE_S: Final = 0.06
-# So long a request may take.
+# Time-out of a request, s.
 LIMIT_S: Final = 2.0
 GONE, LATE, UNSEEN = -1, -2, -3
 
 
 def functions(first: int, *, example: bool = False) -> str:
-    """Write the functions for registers from `first` on, as of `serve-load --first`.
+    """Return the functions for registers from `first` on, as in `serve-load --first`.
 
-    With `example`, a program that weighs a part and sets the payload follows.
+    With `example`, append a program that weighs a part and sets the payload.
     """
     integers = {name: f"read_input_integer_register({first + i})" for i, name in enumerate(INTEGERS)}
     doubles = {name: f"read_input_float_register({first + i})" for i, name in enumerate(DOUBLES + TRACKED)}

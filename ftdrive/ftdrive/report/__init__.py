@@ -1,1 +1,1 @@
-"""The report of a calibration: facts first, then the same facts as a page or as JSON."""
+"""The report of a calibration: facts, and their presentation as a page or as JSON."""

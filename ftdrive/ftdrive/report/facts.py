@@ -1,4 +1,4 @@
-"""All facts of a report as one JSON object; every format shows only what is here."""
+"""All facts of a report as one JSON object, from which every format is written."""
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
@@ -45,17 +45,17 @@ _LABELS = {
 
 
 def label_of(parameter: str) -> str:
-    """Name an error coordinate or its vector, such as "force bias x" for "force_bias_N.x"."""
+    """Return the name of an error coordinate or of its vector, such as "force bias x" for "force_bias_N.x"."""
     name, _, axis = parameter.partition(".")
     return f"{_LABELS[name]} {axis}".strip()
 
 
 def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
-    """Compare a result with an earlier one of other data.
+    """Return the comparison of a result with an earlier one from other data.
 
-    `sensors` says on what the errors of the sensor rest, before and now. `parameters` have for each error coordinate
-    its `name`, `change` (rad, N, m, N·m) and `sigmas`, null if it was known exactly in both. `groups` are tests. With
-    `same_data` both rest on one dataset, so that the tests do not apply.
+    `sensors` are the sources of the sensor errors, before and now. `parameters` have for each error coordinate its
+    `name`, `change` (rad, N, m, N·m) and `sigmas`, null if exactly known in both. `groups` are tests. `same_data` means
+    that both use one dataset, so that the tests do not apply.
     """
     found = difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
@@ -77,15 +77,15 @@ def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, 
     }
 
 
-# Forces at the tip whose sigma is drawn, N.
+# Forces at the tip for which sigma is drawn, N.
 FORCES_N = np.arange(0.0, 101.0, 5.0)
 
 
 def contact_error(result: CalibrationResult) -> dict[str, Any]:
-    """Return the sigma of a force at the tip, as the length of its error over all directions.
+    """Return the sigma of a force at the tip, as the norm of its error over all directions.
 
-    `tip_m` (3,) is from the sensor origin, sensor axes. Where no loads are known, the sigma `without_loads_N` (n,) and
-    the `tool` without errors of the sensor are null.
+    `tip_m` (3,) is relative to the sensor origin, sensor axes. Without known loads, the sigma `without_loads_N` (n,)
+    and the `tool` without sensor errors are null.
     """
     without, tool = None, None
     if result.known_contact is not None:
@@ -104,7 +104,7 @@ def contact_error(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _error_map(result: CalibrationResult) -> dict[str, Any]:
-    """Return the error over the directions of the tool axis, with the worst one in words."""
+    """Return the error over the directions of the tool axis, with the worst direction as text."""
     found = error_map(result)
     for one in (found["force_N"], found["torque_Nm"]):
         one["axes"] = _along_axes(direction := np.array(one["worst_direction"]))
@@ -113,43 +113,42 @@ def _error_map(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _along_axes(direction: Array) -> str:
-    """Name the axis along which a unit vector (3,) points, or the two or three between which it does."""
+    """Return the axis along a unit vector (3,), or the two or three axes between which it points."""
     names = axes_along(direction)
     return f"along {names[0]}" if len(names) == 1 else f"between {' and '.join(names)}"
 
 
 def _direction_in_words(direction: Array, frame: str) -> str:
-    """Name the direction of a unit vector (3,) in a frame."""
+    """Return the direction of a unit vector (3,) in a frame as text."""
     return f"{_along_axes(direction)} of the {frame}"
 
 
 FORMAT = "ftdrive.report/1"
 NEXT_STEP = {
-    "good": "Use it, and verify it on new poses with `ftdrive verify`, now and from time to time.",
+    "good": "Use the calibration, and verify it on new poses with `ftdrive verify`, now and regularly.",
     "usable": (
-        "Compensate with it if the error below is small enough. To improve it, work through the findings in their "
+        "Use the calibration if the error below is small enough. To improve it, work through the findings in "
         "order, then calibrate again."
     ),
     "rejected": (
-        "Do not compensate with it. Fix the first finding, then calibrate again: later ones are often its consequences."
+        "Do not use the calibration. Fix the first finding, because it often causes the others; then calibrate again."
     ),
     "failed": (
-        "Its last verification failed. Run `ftdrive verify` again and accept the update that it proposes, or "
-        "calibrate again."
+        "The last verification failed. Run `ftdrive verify` again and accept the proposed update, or calibrate again."
     ),
 }
 NOTABLE_CORRELATION = 0.7
-# Parts of a plan that the report leaves out.
+# Parts of a plan that the report omits.
 _LONG = ("steps", "made_for", "description")
 
 
 def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Collect the facts; sections that the source has no data for are null.
+    """Return the facts; sections without data are null.
 
-    Units are those of the names: rad, m, N, N·m, s. `result` is the content of the calibration file, and `trust` its
-    age and last verification, from `ftdrive.report.subject`.
+    The names contain the units: rad, m, N, N·m, s. `result` is the content of the calibration file, and `trust` its age
+    and last verification, from `ftdrive.report.subject`.
     """
-    # All formats are written from these facts, so they cannot disagree.
+    # All formats are written from these facts, so that they agree.
     result, dataset = subject.result, subject.dataset
     sweep = _planned_sweep(subject.run)
     R_base_flange = dataset.R_base_flange if dataset is not None else None if sweep is None else sweep.R_base_flange
@@ -196,7 +195,7 @@ def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[s
 
 
 def _about_of(result: CalibrationResult) -> str:
-    """Name arm, sensor, tool and time of a calibration, as far as it knows them."""
+    """Return arm, sensor, tool and time of a calibration, as far as recorded."""
     known = result.provenance
     setup, devices = known.get("setup") or {}, known.get("devices") or {}
     named = [
@@ -211,7 +210,7 @@ def _about_of(result: CalibrationResult) -> str:
 
 def _correlation_facts(covariance: Array) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(covariance))
-    sigma[sigma == 0] = np.inf  # known exactly: correlated with nothing
+    sigma[sigma == 0] = np.inf  # exactly known parameters have no correlation
     return {
         "names": list(PARAMETER_NAMES),
         "matrix": np.clip(covariance / np.outer(sigma, sigma), -1, 1).tolist(),
@@ -222,7 +221,7 @@ def _correlation_facts(covariance: Array) -> dict[str, Any]:
 def _cross_validation(subject: Subject) -> dict[str, Any]:
     quality = subject.result.quality
     methods: list[Any] = []
-    reason = "The source holds no poses to compare methods on."
+    reason = "The source contains no poses for a comparison of methods."
     if subject.dataset is not None:
         try:
             methods, reason = [one.to_dict() for one in compare(subject.dataset, **subject.solved_with)], ""
@@ -237,7 +236,7 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
 
 
 def _pose_facts(subject: Subject) -> list[dict[str, Any]]:
-    """List the poses: residual (6,), its size in sigma as the other poses predict it, and whether the pose was used."""
+    """Return the poses: residual (6,), its size in sigmas predicted by the others, and whether the pose was used."""
     result, dataset = subject.result, subject.dataset
     names = pose_names(subject.records) or [str(row + 1) for row in range(result.n_poses)]
     spread = result.quality.get("residual_sigma") or [None] * result.n_poses
@@ -269,7 +268,7 @@ def _drift_facts(subject: Subject) -> dict[str, Any]:
 
 
 def _noise_facts(subject: Subject) -> dict[str, Any] | None:
-    """Standard error of the mean of one axis at each pose; None if it was not measured."""
+    """Return the standard error of the mean of one axis at each pose; None if it was not measured."""
     if subject.dataset is None or subject.dataset.wrench_cov is None:
         return None
     variance = np.einsum("nii->ni", subject.dataset.wrench_cov)
@@ -305,7 +304,7 @@ def _planned_sweep(run: Run | None) -> Plan | None:
 
 
 def _motion_facts(motion: MotionResult, planned: Plan | None) -> dict[str, Any]:
-    """Return what a recording in motion gives beside the static model, and the planned sweep."""
+    """Return the parameters that only a recording in motion gives, and the planned sweep."""
     return {
         "inertia_kg_m2": motion.inertia_kg_m2.tolist(),
         "sigma": {name: np.asarray(value).tolist() for name, value in motion.sigma.items()},

@@ -1,6 +1,6 @@
-"""The figures of a report: SVG that takes its colours from the page, so that light and dark are one file.
+"""The figures of a report as SVG with the colours of the page, so that one file serves light and dark mode.
 
-Matplotlib writes fixed colours. Each one used here stands for a CSS variable and is replaced by it afterwards.
+Matplotlib writes fixed colours. Each colour used here is replaced by a CSS variable afterwards.
 """
 
 import math
@@ -25,7 +25,7 @@ from ftdrivers.sweep import WRISTS, Sweep
 
 INK, PAPER, GRID, BAD = "#010101", "#020202", "#030303", "#040404"
 SERIES = ("#050505", "#060606", "#070707")
-# Colour that stands for each variable of the page.
+# CSS variable of the page for each colour.
 VARIABLES = {
     INK: "currentColor",
     PAPER: "var(--paper)",
@@ -33,11 +33,12 @@ VARIABLES = {
     BAD: "var(--bad)",
     **{colour: f"var(--series-{k})" for k, colour in enumerate(SERIES)},
 }
-# Letters stay readable on a phone, and two figures fit side by side on a desk.
+# Text stays readable on a phone, and two figures fit side by side on a desktop screen.
 WIDTH_IN = 5.0
-# Longer times are shown in minutes.
+# Longer durations are shown in minutes, s.
 LONG_S = 200
-# Most dots of a figure: of more poses every second, third, … is drawn, because each dot has its size in the file.
+# Largest number of dots in a figure; of more poses every second, third, … is drawn, because each dot increases the
+# file.
 MOST_DOTS = 400
 # Weaker correlations are not drawn.
 INVISIBLE = 0.02
@@ -65,11 +66,11 @@ _STYLE: Mapping[Any, Any] = {
 
 
 def draw_figure(name: str, facts: Facts) -> str:
-    """Draw the figure of this name as an SVG element without links, scripts or fixed ink."""
+    """Return the figure of this name as an SVG element without links, scripts or fixed text colours."""
     height, (left, right, bottom, top), fill = _FIGURES[name]
     height_in = height(facts) if callable(height) else height
     with mpl.rc_context(dict(_STYLE)):
-        # Fixed margins, because a layout takes as long as the drawing.
+        # Fixed margins, because an automatic layout takes as long as the drawing.
         figure = Figure(figsize=(WIDTH_IN, height_in))
         figure.subplots_adjust(left / WIDTH_IN, bottom / height_in, 1 - right / WIDTH_IN, 1 - top / height_in)
         fill(figure, facts)
@@ -79,7 +80,7 @@ def draw_figure(name: str, facts: Facts) -> str:
 
 
 def _inlined(svg: str, name: str) -> str:
-    """Make a file of matplotlib an element of a page: unique ids, no prologue or size, colours as variables."""
+    """Return a matplotlib SVG file as an element of a page: unique ids, no prologue or size, variable colours."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
@@ -119,13 +120,13 @@ def _draw_coverage(figure: Any, facts: Facts) -> None:
         circle = np.cos(radius) * towards + np.sin(radius) * np.outer(np.cos(turn), across[0])
         circle += np.sin(radius) * np.outer(np.sin(turn), across[1])
         x, y = _on_map(circle)
-        jumps = np.flatnonzero(np.hypot(np.diff(x), np.diff(y)) > 0.7) + 1  # over the edge of the map
+        jumps = np.flatnonzero(np.hypot(np.diff(x), np.diff(y)) > 0.7) + 1  # at the edge of the map
         axes.plot(np.insert(x, jumps, np.nan), np.insert(y, jumps, np.nan), "--", color=SERIES[1], linewidth=1.5)
 
 
 @contextmanager
 def _globe(axes: Any) -> Iterator[None]:
-    """Draw outline and graticule of a map, before and after what is on it, and name the axes."""
+    """Draw outline, graticule and axis names of a map, below and above its content."""
     axes.set_aspect("equal")
     axes.axis("off")
     axes.set(xlim=(-2.95, 2.95), ylim=(-1.75, 1.75))
@@ -138,13 +139,13 @@ def _globe(axes: Any) -> Iterator[None]:
     box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
     for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
         x, y = _hammer(*np.radians([elevation, azimuth]))
-        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose that points there
+        axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose at this place
     axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
     axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
 
 
 def _hammer(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
-    """Equal-area map of the sphere (Hammer 1892), rad; +x in the middle, +z at the top."""
+    """Return an equal-area map of the sphere (Hammer 1892) from angles in rad; +x in the middle, +z at the top."""
     length = np.sqrt(1 + np.cos(elevation) * np.cos(azimuth / 2))
     x = 2 * np.sqrt(2) * np.cos(elevation) * np.sin(azimuth / 2) / length
     return np.asarray(x), np.asarray(np.sqrt(2) * np.sin(elevation) / length)
@@ -178,7 +179,7 @@ def _draw_correlation(figure: Any, facts: Facts) -> None:
     axes.spines[:].set_visible(False)
     seen = np.argwhere(matrix > INVISIBLE)
     corners = seen[:, None, ::-1] + [[0, 0], [1, 0], [1, 1], [0, 1]]
-    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # the strength is opacity: 0 is the page itself
+    colours = [to_rgba(SERIES[0], matrix[i, j]) for i, j in seen]  # opacity shows the strength
     axes.add_collection(PolyCollection(list(corners), facecolors=colours, linewidth=0), autolim=False)
     for edge in range(0, n + 1, 3):
         axes.plot([0, n], [edge, edge], color=GRID, linewidth=0.8)
@@ -294,7 +295,7 @@ def _draw_comparison(figure: Any, facts: Facts) -> None:
 
 
 _Margins = tuple[float, float, float, float]
-# Height and margins (left, right, bottom, top) in inches and how to draw it, by name.
+# By name: height and margins (left, right, bottom, top) in inches, and the function that draws the figure.
 _FIGURES: Mapping[str, tuple[float | Callable[[Facts], float], _Margins, Callable[[Any, Facts], None]]] = {
     "force_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "force_N", "mN")),
     "torque_map": (3.4, (0.1, 0.1, 0.45, 0.1), lambda figure, facts: _map(figure, facts, "torque_Nm", "mN·m")),

@@ -1,4 +1,4 @@
-"""The facts of a report as a self-contained page."""
+"""A report as a self-contained HTML page."""
 
 import re
 from typing import TYPE_CHECKING
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def render_page(facts: Facts) -> str:
-    """Write the page of the facts from `ftdrive.report.facts.facts_of`. Raises `ConfigError` without jinja2."""
+    """Return the HTML page of the facts from `ftdrive.report.facts.facts_of`. Raises `ConfigError` without jinja2."""
     environment = templates("ftdrive.report", "a report in HTML", "report", "--format json")
     from markupsafe import Markup
 
@@ -28,12 +28,12 @@ def render_page(facts: Facts) -> str:
 
 
 def templates(package: str, what: str, extra: str, instead: str) -> "Environment":
-    """Return the templates of a package, which escape every value.
+    """Return the templates of a package, with escaping of every value.
 
     Raises
     ------
     ConfigError
-        jinja2 is not installed: `what` needs it, `extra` has it, and the option `instead` does without it.
+        jinja2 is not installed: `what` needs it, `extra` contains it, and the option `instead` works without it.
     """
     try:
         from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -49,7 +49,7 @@ def templates(package: str, what: str, extra: str, instead: str) -> "Environment
 
 
 def with_code(text: str) -> "Markup":
-    """Escape a text, and set what stands between backticks as code."""
+    """Escape a text, and format text between backticks as code."""
     from markupsafe import Markup, escape
 
     return Markup(re.sub(r"`([^`]*)`", r"<code>\1</code>", str(escape(text))))

@@ -1,4 +1,4 @@
-"""The sections of a report, in the order in which a reader needs them: sentences, tables and figures from its facts."""
+"""The sections of a report in reading order: sentences, tables and figures from its facts."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,32 +17,32 @@ from ftdrive.words.result import SIGMA_OF_THE_TOOL, estimate_rows
 
 Facts = Mapping[str, Any]
 
-# One good pose in 1000 deviates more, in root mean square over the six channels.
+# Root mean square over the six channels that one good pose in 1000 exceeds, in sigmas.
 SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
-# N or N·m: the sigma of a channel without drift.
+# A smaller sigma of a channel, N or N·m, means that it has no drift.
 _ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
 class ReportTable:
-    """Cells as text; the first of each row is its heading."""
+    """A table of texts; the first cell of each row is its heading."""
 
     caption: str
     columns: Sequence[str]
     rows: Sequence[Sequence[str]]
     folded: bool = False
-    """A long one, which a page shows on request."""
+    """Whether the table is long, so that a page shows it on request."""
 
     @property
     def narrow(self) -> bool:
-        """Whether it fits beside a figure."""
+        """Whether the table fits next to a figure."""
         return 2 < len(self.columns) <= 4
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A figure by its name, with what a reader sees in it and what good looks like."""
+    """A figure by name, with a text alternative, and a caption that explains a good result."""
 
     name: str
     alt: str
@@ -51,7 +51,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """One heading; `name` is its anchor."""
+    """A section with heading; `name` is its anchor."""
 
     name: str
     title: str
@@ -61,7 +61,7 @@ class Section:
 
 
 def rounded(value: float | None, digits: int = 3) -> str:
-    """Write a number with this many significant digits, without an exponent; "-" for None."""
+    """Return a number with `digits` significant digits, without an exponent; "-" for None."""
     if value is None:
         return "-"
     if value == 0 or not math.isfinite(value):
@@ -71,12 +71,12 @@ def rounded(value: float | None, digits: int = 3) -> str:
 
 
 def capital(words: str) -> str:
-    """Begin a sentence with a capital letter."""
+    """Return a text with a capital first letter."""
     return words[:1].upper() + words[1:]
 
 
 def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
-    """Choose the poses to list and draw, in their order: all, or the worst quarter and evenly spread others."""
+    """Return the poses to list and draw, in order: all, or the worst ones and evenly spread others."""
     if len(poses) <= most:
         return list(poses)
     size = np.array([pose["sigmas"] or pose["force_N"] for pose in poses])
@@ -86,19 +86,19 @@ def shown_poses(poses: Sequence[Any], most: int = 200) -> list[Any]:
 
 
 def estimates_section(facts: Facts) -> Section:
-    """Show the estimates with sigma, their correlations, and gain and cross-talk if found."""
+    """Return the section with the estimates, their correlations, and gain and cross-talk if estimated."""
     result, strong = facts["result"], facts["correlation"]["strong"]
     taken = "poses" if facts["motion"] is None else "parts of the motion"
     pairs = "; ".join(f"{label_of(one)} and {label_of(other)} {value:+.2f}" for one, other, value in strong[:5])
     text = [
-        f"Method {result['method']}, {result['n_poses']} {taken}, gravity {result['g_m_s2']:g} m/s². Wrenches are on "
+        f"Method {result['method']}, {result['n_poses']} {taken}, gravity {result['g_m_s2']:g} m/s². Wrenches act on "
         "the sensor, in its axes, about its origin. Centre of mass and biases are in sensor axes.",
         f"Strongest correlations: {pairs}." if pairs else "No two parameters are correlated by more than 0.7.",
     ]
     figure = Figure(
         "correlation",
         f"Matrix of the correlations of the 15 estimated parameters. {text[1]}",
-        "Correlation of the estimates. Good: faint everywhere beside the diagonal. A strong field means that the poses "
+        "Correlation of the estimates. Good: faint except on the diagonal. A strong field means that the poses "
         "hardly separate two parameters: add other orientations.",
     )
     rows = [(name, value, sigma) for _, _, name, _, value, sigma in estimate_rows(result)]
@@ -124,7 +124,7 @@ def _pair(value: float, sigma: float, sign: str = "") -> tuple[str, str]:
 
 
 def error(facts: Facts) -> Section:
-    """Show the predicted error over all orientations, and its worst direction."""
+    """Return the section with the predicted error over all orientations, and its worst direction."""
     force, torque = facts["error_map"]["force_N"], facts["error_map"]["torque_Nm"]
     text = [
         f"Compensation error of a free tool at the next use: {facts['error']['words']}.",
@@ -133,7 +133,7 @@ def error(facts: Facts) -> Section:
         f"Worst direction for the torque: {torque['words']}, {rounded(torque['largest'])} N·m.",
     ]
     trust = (
-        "The map shows the stated uncertainty only: the error above has what the model lacks."
+        "The map only shows the stated uncertainty: the error above also includes model errors."
         if facts["error"]["cross_validated"]
         else "The measured noise explains the residuals, so the map can be trusted."
     )
@@ -144,7 +144,7 @@ def error(facts: Facts) -> Section:
             f"{rounded(float(np.min(one['map'])))} to {rounded(one['largest'])} {unit}, largest {one['words']}.",
             f"Predicted {kind} error (one sigma, worst turn of the tool about its axis) for each direction of the tool "
             "axis (flange z) in base. Dots: poses. Cross: worst direction. Good: one colour, and every value below "
-            f"the contact {kind} that matters to you. {trust}",
+            f"the contact {kind} that you need to measure. {trust}",
         )
         for kind, one, unit in (("force", force, "N"), ("torque", torque, "N·m"))
     ]
@@ -153,18 +153,18 @@ def error(facts: Facts) -> Section:
         for name, one in (("force, N", force), ("torque, N·m", torque))
     ]
     caption = "Predicted error, one sigma: rms over all orientations, and largest"
-    columns = ("error", "rms", "largest", "tool axis there, in base")
+    columns = ("error", "rms", "largest", "tool axis at the largest, in base")
     return Section(
         "error", "Compensation error over all orientations", text, figures, [ReportTable(caption, columns, rows)]
     )
 
 
 def contact(facts: Facts) -> Section:
-    """Show the sigma of a contact, which has the errors of the sensor itself."""
+    """Return the section with the sigma of a contact, which includes the errors of the sensor."""
     found = facts["contact"]
     text = [
-        "The compensation error above holds in free air. Under contact the errors of the sensor itself are added, and "
-        "grow with the force.",
+        "The compensation error above applies to a free tool. Under contact, the errors of the sensor are added, which "
+        "increase with the force.",
         f"{found['words']}.",
     ]
     if found["source"] != "loads":
@@ -172,7 +172,7 @@ def contact(facts: Facts) -> Section:
     if (tool := found["tool"]) is not None:
         com = ", ".join(f"{1e3 * value:.1f}" for value in tool["p_sensor_com_m"])
         text.append(
-            f"Without the errors of the sensor the tool weighs {tool['mass_kg']:.4f} kg, with its centre of mass at "
+            f"Corrected for sensor errors, the tool weighs {tool['mass_kg']:.4f} kg, with its centre of mass at "
             f"({com}) mm in sensor axes."
         )
     near, far = found["sigma_N"][0], found["sigma_N"][-1]
@@ -183,23 +183,23 @@ def contact(facts: Facts) -> Section:
         "contact",
         f"Line of the sigma of a force at the tip: {rounded(near)} N without contact, {rounded(far)} N at "
         f"{found['force_N'][-1]:g} N.{without}",
-        "Sigma of a force at the tip of the tool, as the length of its error. Good: below the accuracy that your "
-        f"contact needs.{without}",
+        "Sigma of a force at the tip of the tool, as the norm of its error. Good: below the accuracy that your "
+        f"contact task needs.{without}",
     )
     return Section("contact", "Error under contact", text, [figure])
 
 
 def cross_validation(facts: Facts) -> Section:
-    """Show the error in predicting each pose from the others, by method."""
+    """Return the section with the leave-one-out error of each method."""
     found = facts["cross_validation"]
     text = []
     if found["force_N"] is not None:
         text.append(
             f"Each pose predicted from all others: {rounded(found['force_N'])} N, {rounded(found['torque_Nm'])} N·m "
-            "rms. Good: well below the contact that matters to you."
+            "rms. Good: well below the contact that you need to measure."
         )
     if found["reason"]:
-        text.append(f"Methods are not compared. {found['reason']}")
+        text.append(f"The methods are not compared. {found['reason']}")
         return Section("cross-validation", "Cross-validation", text)
     solved = [one for one in found["methods"] if "reason" not in one]
     errors = {"residual": "residual", "cross_validated": "left out"}
@@ -224,17 +224,17 @@ def cross_validation(facts: Facts) -> Section:
         "Bars of the cross-validated force and torque error of each method"
         + (f"; {best['method']} has the smallest force error." if best else "."),
         "Error in predicting each pose from all others, by method, logarithmic. Good: the method of this result "
-        "(orange) has one of the shortest bars. Methods with a known mounting fail if the sensor is mounted otherwise.",
+        "(orange) has one of the shortest bars. Methods with a known mounting fail for another mounting.",
     )
     return Section("cross-validation", "Cross-validation", text, [figure] if crossed else [], tables)
 
 
 def residuals(facts: Facts) -> Section:
-    """Show the residuals of each pose, and in time; of a motion, of its parts."""
+    """Return the section with the residuals per pose and over time; for a motion, of its parts."""
     result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
     text = [
         f"Residuals: {facts['residuals']}.",
-        f"They are {result['noise_factor']:.2f} times the measured noise (p = {_p_value_in_words(result['p_value'])})."
+        f"Their size is {result['noise_factor']:.2f} times the noise (p = {_p_value_in_words(result['p_value'])})."
         if result["p_value"] is not None
         else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
     ]
@@ -250,7 +250,7 @@ def residuals(facts: Facts) -> Section:
                 "pose_residuals",
                 f"Bars of the cross-validated residual of each pose in sigma; the largest is {worst['sigmas']:.1f} at "
                 f"pose {worst['name']}.",
-                "Residual of each pose if all others predict it, in sigma. Good: bars about 1, none above the dashed "
+                "Residual of each pose predicted from others, in sigma. Good: bars of about 1, none above the dashed "
                 f"line at {SUSPICIOUS_SIGMAS:g}. Repeat a pose above it. Hatched: rejected.",
             )
         )
@@ -261,7 +261,7 @@ def residuals(facts: Facts) -> Section:
             "time_residuals",
             f"Force and torque residuals along x, y and z against {order}.",
             f"Measured minus predicted wrench, drift included, against {order}. "
-            "Good: a scatter about zero. A slope or slow wave is drift; one point far away is contact or a cable.",
+            "Good: a scatter about zero. A slope or slow wave is drift; an outlier is contact or a cable.",
         )
     )
     rows = [
@@ -276,13 +276,13 @@ def residuals(facts: Facts) -> Section:
         for pose in shown_poses(poses)
     ]
     columns = ("pose", "t, s", *(f"F{a}, N" for a in _AXES), *(f"T{a}, mN·m" for a in _AXES), "sigma", "used")
-    few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, the worst among them)"
+    few = "" if len(rows) == len(poses) else f" ({len(rows)} of {len(poses)} poses, including the worst)"
     tables = [] if in_motion else [ReportTable(f"Table of the residuals{few}", columns, rows, folded=True)]
     return Section("residuals", "Residuals", text, figures, tables)
 
 
 def drift(facts: Facts) -> Section:
-    """Show the drift in the fit and of the repeated first pose."""
+    """Return the section with the drift in the fit and of the repeated first pose."""
     seen = facts["drift"]
     found, again = seen["in_fit"], seen["first_pose_again"]
     text = []
@@ -290,7 +290,7 @@ def drift(facts: Facts) -> Section:
         text.append(f"{capital(again['words'])}.")
     if seen["lag1"] is not None:
         text.append(
-            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift makes it larger."
+            f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift increases it."
         )
     tables = tuple[ReportTable, ...]()
     if found is None:
@@ -313,10 +313,10 @@ def drift(facts: Facts) -> Section:
 
 
 def noise(facts: Facts) -> Section:
-    """Show the noise of the mean at each pose."""
+    """Return the section with the noise of the mean at each pose."""
     measured = facts["noise"]
     if measured is None:
-        why = "The source states no noise of its poses: add columns sigma_fx to sigma_tz, or calibrate with ftdrive."
+        why = "The source contains no noise of its poses: add columns sigma_fx to sigma_tz, or calibrate with ftdrive."
         return Section("noise", "Noise of each pose", [why])
     force, torque = np.array(measured["force_N"]), np.array(measured["torque_Nm"])
     text = [
@@ -326,7 +326,7 @@ def noise(facts: Facts) -> Section:
     ]
     if measured["unsteady"]:
         stops = ", ".join(map(str, measured["unsteady"]))
-        text.append(f"Not steady while averaged: stop {stops}. Something swung or was touched there.")
+        text.append(f"Not steady while averaged: stop {stops}. Something swung there or was touched.")
     figure = Figure(
         "noise",
         f"Noise of the mean at each pose, {rounded(float(force.min()))} to {rounded(float(force.max()))} N.",
@@ -337,10 +337,10 @@ def noise(facts: Facts) -> Section:
 
 
 def coverage(facts: Facts) -> Section:
-    """Show which directions of gravity the poses cover."""
+    """Return the section with the directions of gravity covered by the poses."""
     found, title = facts["coverage"], "Coverage of orientations"
     if found is None:
-        return Section("coverage", title, ["The calibration file holds no orientations: report its run folder."])
+        return Section("coverage", title, ["The calibration file contains no orientations: report its run folder."])
     gap_deg = math.degrees(found["largest_gap_rad"])
     text = [
         capital(found["words"]),
@@ -352,14 +352,14 @@ def coverage(facts: Facts) -> Section:
         "coverage",
         f"Map of the directions of gravity in flange axes; the largest gap has a radius of {gap_deg:.0f}°.",
         "Direction of gravity in flange axes at each pose. Good: dots in all parts of the map. The circle is the "
-        f"largest gap, {gap_deg:.0f}°; the 24 orientations of the paper leave 55°.",
+        f"largest gap, {gap_deg:.0f}°; the 24 orientations of the paper have a gap of 55°.",
     )
     return Section("coverage", title, text, [figure])
 
 
-# One difference in 370 is larger by chance.
+# A difference exceeds this number of sigmas by chance once in 370.
 LIMIT_SIGMAS = 3
-# What a plan predicts a sigma of: in words with its unit, factor to that, and key in plan and result.
+# Sigmas predicted by a plan: name with unit, factor to this unit, and key in plan and result.
 _PREDICTED = (
     ("mass, g", 1e3, "mass_kg"),
     ("centre of mass, mm", 1e3, "p_sensor_com_m"),
@@ -368,19 +368,19 @@ _PREDICTED = (
     ("force compensation, N", 1.0, "force_rms_N"),
     ("torque compensation, N·m", 1.0, "torque_rms_Nm"),
 )
-# Times the prediction: what is larger is named.
+# A sigma larger than predicted by this factor is reported.
 _AS_PREDICTED = 1.2
 _AS_GOOD = "No sigma is more than 20 % larger than predicted."
 _WHY_LARGER = "Noise or errors of this sensor are larger than the plan assumed."
-# Two results of one tool differ more than this by chance in one case of 1000.
+# Significance of a difference between two results of one tool.
 CHANGED_P = 1e-3
 
 
 def tour(facts: Facts) -> Section:
-    """Show run, plan, devices and settings."""
+    """Return the section with run, plan, devices and settings."""
     run, title = facts["tour"], "Tour and settings"
     if run is None:
-        return Section("tour", title, ["The source is not a run folder: it holds no plan, devices or settings."])
+        return Section("tour", title, ["The source is not a run folder, so it contains no plan, devices or settings."])
     started = f"{str(run['created_utc'])[:19]} UTC"
     text = [f"Run {run['run']}, started {started}, mode {run['mode']}, {run['stops']} stops."]
     keys = ("model", "serial", "firmware")
@@ -391,7 +391,7 @@ def tour(facts: Facts) -> Section:
     ]
     plan = run["plan"]
     if plan is None:
-        text.append(run["plan_error"] or "The poses were chosen by hand: there is no plan.")
+        text.append(run["plan_error"] or "The poses were chosen by hand, without a plan.")
         return Section("tour", title, text, (), tables)
     text += plan["why"]
     if "sweep" in plan:
@@ -409,7 +409,7 @@ def tour(facts: Facts) -> Section:
         if got > _AS_PREDICTED * expected:
             larger.append(f"{name.partition(',')[0]} ({got / expected:.2g} times)")
     text.append(f"Larger sigma than predicted: {', '.join(larger)}. {_WHY_LARGER}" if larger else _AS_GOOD)
-    caption = "One sigma as the plan predicted it, from a usual sensor, and as obtained"
+    caption = "One sigma, predicted by the plan for a typical sensor, and obtained"
     return Section("tour", title, text, (), [ReportTable(caption, ("sigma", "predicted", "obtained"), rows), *tables])
 
 
@@ -418,10 +418,10 @@ def _largest_size(values: Any) -> float:
 
 
 def comparison(facts: Facts) -> Section:
-    """Show the differences from the previous result."""
+    """Return the section with the differences from the previous result."""
     found, title = facts["comparison"], "Comparison with the previous result"
     if found is None:
-        why = facts["compared_with"] or "There is no result to compare with: name one with --parent."
+        why = facts["compared_with"] or "There is no result to compare with: give one with --parent."
         return Section("comparison", title, [why])
     text = [
         f"Compared with {facts['compared_with']}: id {found['id']}, {found['verdict']}, mass {found['mass_kg']:.4f} kg."
@@ -429,18 +429,16 @@ def comparison(facts: Facts) -> Section:
     before, now = found["sensors"]
     if before != now:
         text.append(
-            f"Errors of the sensor under contact: {before} before, {now} now. So the same contact reads otherwise."
+            f"Errors of the sensor under contact: {before} before, {now} now. So the same contact has another reading."
         )
     if found["same_data"]:
-        text.append("Both rest on the same data: the test below does not apply, because it assumes independent noise.")
+        text.append(
+            "Both results use the same data. The test below does not apply, because it assumes independent noise."
+        )
     else:
         changed = [one["name"] for one in found["groups"][:-1] if one["p_value"] < CHANGED_P]
-        text.append(
-            f"Changed by more than chance explains: {', '.join(changed)}."
-            if changed
-            else "Nothing changed by more than chance explains."
-        )
-        text.append("A bias may change from day to day; a change of anything else means another tool or mounting.")
+        text.append(f"Significant changes: {', '.join(changed)}." if changed else "No significant change.")
+        text.append("A bias may change from day to day; any other change means another tool or mounting.")
     groups = [
         (one["name"], f"{one['chi2']:.4g}", str(one["dof"]), _p_value_in_words(one["p_value"]))
         for one in found["groups"]
@@ -463,12 +461,12 @@ def comparison(facts: Facts) -> Section:
 
 
 def provenance(facts: Facts) -> Section:
-    """Show where the result comes from and how to get it again."""
+    """Return the section with the origin of the result, and how to reproduce it."""
     text = [f"Report of {facts['source']}, written {facts['created_utc']}. Calibration id {facts['id']}."]
     if facts["reproduce"]:
         text.append(f"Reproduce the result: `{facts['reproduce']}`. The id must be {facts['id']}.")
     else:
-        text.append("The file holds no data: solve the dataset with the hash below to reproduce the result.")
+        text.append("The file contains no data: solve the dataset with the hash below to reproduce the result.")
     text += _last_verification(facts["trust"] or {})
     rows, columns = list(_flattened(facts["result"]["provenance"])), ("field", "value")
     long = [row for row in rows if row[0].startswith(("devices.", "station."))]
@@ -486,17 +484,17 @@ def _last_verification(trust: Facts) -> Iterator[str]:
 
 
 def motion(facts: Facts) -> Section:
-    """Show what only motion gives, and the planned sweep."""
+    """Return the section with the parameters that only motion gives, and the planned sweep."""
     found = facts["motion"]
     sigma = found["sigma"]
     moments, of_moments = (np.array(values) for values in (found["inertia_kg_m2"], sigma["inertia_kg_m2"]))
     principal = np.linalg.eigvalsh(moments)
     text = [
-        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contact, gaps, both ends, which the "
-        "filter needs, and what is too fast where the position is unknown.",
-        f"The wrench follows the pose by {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
+        f"{100 * found['used_share']:.0f} % of the recording was used. Not used: contacts, gaps, both ends, which the "
+        "filter needs, and fast motion with unknown position.",
+        f"Delay of the wrench after the pose: {with_sigma(1e3 * found['delay_s'], 1e3 * sigma['delay_s'])} ms.",
         f"The origin of the sensor is {with_sigma(1e3 * found['height_m'], 1e3 * sigma['height_m'])} mm above the "
-        "flange face, as the acceleration shows it.",
+        "flange face, determined from the acceleration.",
         f"Principal moments of inertia about the centre of mass: {', '.join(rounded(1e3 * one) for one in principal)} "
         "g·m². Good: all positive, and each at most the sum of the others.",
     ]
@@ -508,9 +506,9 @@ def motion(facts: Facts) -> Section:
     keys, columns = ("duration_s", "force_N", "torque_Nm"), ("at, s", "for, s", "force, N", "torque, N·m")
     touches = [(f"{one['t_s']:.1f}", *(rounded(one[key], 2) for key in keys)) for one in found["contacts"]]
     if touches:
-        tables.append(ReportTable("Contact, which was left out", columns, touches))
+        tables.append(ReportTable("Contacts, which were left out", columns, touches))
     else:
-        text.append("No contact was found.")
+        text.append("No contact was detected.")
     if found["sweep"] is None:
         return Section("motion", "Motion", text, (), tables)
     figure = Figure(
@@ -522,9 +520,9 @@ def motion(facts: Facts) -> Section:
 
 
 def sections_of(facts: Mapping[str, Any]) -> list[Section]:
-    """Write the sections in the order in which a reader needs them; one without data says why it is empty.
+    """Return the sections in reading order; a section without data gives the reason.
 
-    A calibration in motion has no poses, and so none of the sections about single ones.
+    A calibration in motion has no poses, and therefore no sections about single poses.
     """
     in_motion = facts["motion"] is not None
     return [
@@ -547,7 +545,7 @@ def _p_value_in_words(p_value: float) -> str:
 
 
 def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the values of nested objects with their full names, as text."""
+    """Yield the values of nested objects as text, with their full names."""
     for name, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flattened(inner, f"{prefix}{name}.")

@@ -1,4 +1,4 @@
-"""What a report is about: a result, as much of its data as its source holds, and whether the data are as they were."""
+"""Subject of a report: a result, the data in its source, and whether these are unchanged."""
 
 import shlex
 from collections.abc import Callable, Mapping, Sequence
@@ -18,23 +18,23 @@ from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedData, SolveOptions, read_source, solve_in_motion
 from ftdrive.runs.verification import age_and_check, newest, verification_near
 
-# If a store cannot be read: why.
+# Message for a store that cannot be read.
 MAY_BE_MISSING = "a later verification may be missing, because {}"
 
 
 def trust(
     result: CalibrationResult, source: Path, store_url: Callable[[], str | None], now: datetime
 ) -> dict[str, Any]:
-    """Return age and last verification of a result; a store that cannot be read is named in `store_error`.
+    """Return age and last verification of a result; an error of the store is in `store_error`.
 
-    `source` is its file or run folder. `store_url` reads `[store] url`; None is the user's store.
+    `source` is the file or run folder of the result. `store_url` reads `[store] url`; None means the user's store.
     """
-    # SQLAlchemy takes a quarter of a second, for which help need not wait.
+    # SQLAlchemy takes a quarter of a second to import, which help must not wait for.
     from ftdrive.store.store import Store
 
     last, error = verification_near(source, result.id), ""
     try:
-        # From folders and store, the later one: a store may be new, and a folder may have moved.
+        # The later one of folder and store, because a store may be new and a folder may have moved.
         last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
     except (BadStore, ConfigError) as unreadable:
         error = str(unreadable)
@@ -46,32 +46,32 @@ def trust(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Subject:
-    """A result with its data; what the source does not hold is None or empty."""
+    """A result with its data; data missing in the source are None or empty."""
 
     source: Path
     result: CalibrationResult
     reproduce: str
-    """Command that gives the result again; empty if the data are not here."""
+    """Command that reproduces the result; empty without data."""
     dataset: CalibrationDataset | None = None
     run: Run | None = None
     records: Sequence[PoseRecord] = ()
     solved_with: Mapping[str, Any] = field(default_factory=dict)
-    """What `ftcalib.compare` takes beside the dataset."""
+    """Arguments of `ftcalib.compare` in addition to the dataset."""
     parent: CalibrationResult | None = None
     parent_name: str = ""
-    """Name of the result to compare with, or why there is none."""
+    """Name of the result to compare with, or the reason why there is none."""
 
 
 def read_subject(source: Path, options: SolveOptions, parent: Path | None = None) -> Subject:
-    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve what is not solved.
+    """Read a calibration file, a run folder, a dataset.json or a CSV file; solve unsolved data.
 
-    A run folder keeps its saved result if that rests on its present poses and no option asks for another one. A
-    calibration file in a run folder is reported with the data of that run. It is compared with `parent`, by default
-    the parent that the result names. Raises `ConfigError`, `DataError`, `NotObservable` or `OSError`.
+    The saved result of a run folder is used if it belongs to the present poses and no option requires another one. A
+    calibration file in a run folder is reported with the data of that run. The result is compared with `parent`, by
+    default the parent named in the result. Raises `ConfigError`, `DataError`, `NotObservable` or `OSError`.
     """
     if _is_calibration(source):
         if options != SolveOptions():
-            raise ConfigError(f"{source} is solved already: give its dataset or run, or leave out the options of solve")
+            raise ConfigError(f"{source} is already solved: give its dataset or run, or leave out the options of solve")
         subject = _of_result(source, CalibrationResult.load(source))
     else:
         subject = _of_data(source, options)
@@ -80,7 +80,7 @@ def read_subject(source: Path, options: SolveOptions, parent: Path | None = None
 
 
 def _is_calibration(source: Path) -> bool:
-    """Check whether a file says that it is a calibration; False if it is no JSON, which reading it as data reports."""
+    """Whether a file is a calibration by its format; False if it is not JSON, which reading it as data reports."""
     if source.is_dir() or source.suffix != ".json":
         return False
     try:
@@ -124,7 +124,7 @@ def _known_of(data: RecordedData) -> dict[str, Any]:
 
 
 def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tuple[CalibrationResult | None, str]:
-    """Load the result to compare with; also return its name, or the reason why there is none."""
+    """Return the result to compare with and its name, or None and the reason."""
     if given is not None:
         path = Run(given).calibration_path if given.is_dir() else given
         return CalibrationResult.load(path), str(given)
@@ -137,4 +137,4 @@ def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tupl
             found = CalibrationResult.load(at)
             if found.id == named.get("id"):
                 return found, f"{path}, its parent"
-    return None, f"The parent {named.get('id')} is not at {path}: name its file with --parent."
+    return None, f"The parent {named.get('id')} is not at {path}: give its file with --parent."

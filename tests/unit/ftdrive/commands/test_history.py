@@ -44,7 +44,7 @@ def runs(tmp_path: Path) -> Path:
 
 
 def test_the_list_names_results_trends_and_what_to_do(run: Callable[..., Ran], runs: Path) -> None:
-    assert "No results. `ftdrive calibrate`" in run("history")[2]
+    assert "No results. Add them with `ftdrive calibrate`" in run("history")[2]
     code, out, err = run("history", "--index", runs)
     lines = out.splitlines()
     assert (code, len(lines), err) == (0, 6 + 4 + 2, "")
@@ -79,7 +79,7 @@ def test_as_json_it_is_one_object(run: Callable[..., Ran], runs: Path) -> None:
 
 
 def test_the_last_weighing_of_each_tool_is_a_line_and_days_are_a_table(run: Callable[..., Ran], runs: Path) -> None:
-    assert "No weighings. `ftdrive weigh`" in run("history", "--weighings")[2]
+    assert "No weighings. Add them with `ftdrive weigh`" in run("history", "--weighings")[2]
     run("history", "--index", runs)
     days = [(datetime.now(UTC) - timedelta(days=27 - n)).date().isoformat() for n in range(28)]
     for n, day in enumerate(days):
@@ -170,7 +170,7 @@ def test_one_tool_on_a_sensor_with_and_without_loads_reads_contacts_differently(
     for name, made in (("loads", "2026-11-20T08:00:00+00:00"), ("later", "2026-11-20T09:30:00+00:00")):
         sensor = replace(SensorMatrix.usual(), source="loads", provenance={"created_utc": made})
         replace(CalibrationResult.load(alone), sensor=sensor).save(runs / f"{name}.json")
-    for first, words in (("gripper-0", "of the data sheet in A"), ("loads.json", "2026-11-20 08:00 in A")):
+    for first, words in (("gripper-0", "from the data sheet in A"), ("loads.json", "2026-11-20 08:00 in A")):
         out = run("diff", runs / first, runs / "later.json")[1].splitlines()
         for line in (out[2], out[-1]):
             assert words in line

@@ -96,7 +96,7 @@ def test_the_error_is_listed_with_its_worst_direction() -> None:
     ]
     assert "0.0100 to 0.0231 N, largest up" in section.figures[0].alt
     assert "0.00100 to 0.00231 N·m" in section.figures[1].alt
-    assert "has what the model lacks" in section.figures[0].caption
+    assert "also includes model errors" in section.figures[0].caption
     facts["error"]["cross_validated"] = False
     assert "can be trusted" in error(facts).figures[0].caption
 
@@ -123,7 +123,7 @@ def test_methods_are_compared_where_they_have_a_result() -> None:
     assert section.tables[1].rows == [("srom", "23 poses")]
     assert section.figures[0].alt.endswith("lrom has the smallest force error.")
     none: dict[str, Any] = {"force_N": None, "torque_Nm": None, "reason": "No poses.", "methods": []}
-    assert cross_validation({"cross_validation": none}).text == ["Methods are not compared. No poses."]
+    assert cross_validation({"cross_validation": none}).text == ["The methods are not compared. No poses."]
     alone = cross_validation({"cross_validation": {**none, "reason": "", "methods": methods[2:3]}})
     assert (alone.figures, len(alone.tables)) == ([], 1)
 
@@ -183,7 +183,7 @@ def test_noise_is_given_by_its_median_and_largest() -> None:
     assert section.text[1].startswith("Not steady while averaged: stop 2, 5.")
     assert section.figures[0].alt.endswith("0.0100 to 0.0900 N.")
     assert len(noise({"noise": {**measured, "unsteady": []}}).text) == 1
-    assert noise({"noise": None}).text[0].startswith("The source states no noise")
+    assert noise({"noise": None}).text[0].startswith("The source contains no noise")
 
 
 def test_coverage_names_its_largest_gap() -> None:

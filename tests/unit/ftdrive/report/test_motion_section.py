@@ -20,7 +20,7 @@ FOUND = {
 def test_what_only_motion_gives_is_listed() -> None:
     section = motion({"motion": FOUND})
     assert section.text[0].startswith("87 % of the recording was used.")
-    assert section.text[1] == "The wrench follows the pose by 3.21 ± 0.12 ms."
+    assert section.text[1] == "Delay of the wrench after the pose: 3.21 ± 0.12 ms."
     assert "is 33.40 ± 0.60 mm above" in section.text[2]
     principal = ", ".join(f"{1e3 * one:.2f}" for one in np.linalg.eigvalsh(MOMENTS))
     assert f"centre of mass: {principal} g·m²" in section.text[3]
@@ -35,5 +35,5 @@ def test_what_only_motion_gives_is_listed() -> None:
 
 def test_no_contact_and_no_sweep_are_said_or_left_out() -> None:
     section = motion({"motion": {**FOUND, "contacts": [], "sweep": None}})
-    assert section.text[-1] == "No contact was found."
+    assert section.text[-1] == "No contact was detected."
     assert (len(section.tables), section.figures) == (1, ())

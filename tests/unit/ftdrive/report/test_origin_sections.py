@@ -66,7 +66,7 @@ def test_a_run_is_described_by_its_plan_and_what_came_of_it() -> None:
 @pytest.mark.parametrize(
     ("plan", "error", "words"),
     [
-        (None, "", "The poses were chosen by hand: there is no plan."),
+        (None, "", "The poses were chosen by hand, without a plan."),
         (None, "plan.json is damaged", "plan.json is damaged"),
         (PLAN | {"sweep": {}}, "", "Proven clear along the whole curve, nearest 23 mm."),
     ],
@@ -75,7 +75,7 @@ def test_without_a_tour_only_devices_and_settings_are_listed(plan: Any, error: s
     section = tour({"tour": {**RUN, "plan": plan, "plan_error": error}, "result": RESULT})
     assert section.text[-1] == words
     assert [table.caption for table in section.tables] == ["Devices", "Settings"]
-    assert tour({"tour": None}).text == ["The source is not a run folder: it holds no plan, devices or settings."]
+    assert tour({"tour": None}).text == ["The source is not a run folder, so it contains no plan, devices or settings."]
 
 
 def test_a_comparison_names_what_changed_by_more_than_chance() -> None:
@@ -92,14 +92,14 @@ def test_a_comparison_names_what_changed_by_more_than_chance() -> None:
              "sensors": ["assumed", "assumed"], "parameters": parameters}  # fmt: skip
     section = comparison({"comparison": found, "compared_with": "old.json"})
     assert section.text[0] == "Compared with old.json: id 29ce87, good, mass 1.2346 kg."
-    assert section.text[1] == "Changed by more than chance explains: force bias."
+    assert section.text[1] == "Significant changes: force bias."
     assert section.tables[0].rows[0] == ("force bias", "31.23", "3", "0.00099")
     assert section.tables[0].rows[2] == ("all", "99", "15", "< 0.0001")
     assert section.tables[1].rows == [("force bias x", "+0.12", "+4.3"), ("centre of mass z", "-0.00012", "-")]
     alike = {**found, "groups": groups[1:]}
     assert comparison({"comparison": alike, "compared_with": ""}).text[1].startswith("Nothing changed")
     same = comparison({"comparison": {**found, "same_data": True}, "compared_with": ""}).text
-    assert (len(same), same[1].startswith("Both rest on the same data")) == (2, True)
+    assert (len(same), same[1].startswith("Both results use the same data")) == (2, True)
     assert comparison({"comparison": None, "compared_with": "It is gone."}).text == ["It is gone."]
 
 
@@ -116,7 +116,7 @@ def test_the_origin_says_how_to_reproduce_and_what_was_verified() -> None:
     ]
     assert [table.rows for table in section.tables] == [[("by", "me")], [("devices.arm.serial", "1")]]
     bare = provenance({**facts, "reproduce": "", "trust": None, "result": {"provenance": {"by": "me"}}})
-    assert bare.text[1].startswith("The file holds no data")
+    assert bare.text[1].startswith("The file contains no data")
     assert len(bare.tables) == 1
     passed = provenance({**facts, "trust": {"last_verification": {**last, "passed": True}}})
     assert "UTC, passed: bias." in passed.text[-1]

@@ -380,7 +380,7 @@ def test_a_result_without_its_data_is_reported_as_far_as_it_goes(tmp_path: Path)
     assert outcome.exit_code == 0, outcome.output
     found = json.loads((tmp_path / "report.json").read_text())
     assert "report its run folder" in coverage(found).text[0]
-    assert cross_validation(found).text[-1].startswith("Methods are not compared.")
+    assert cross_validation(found).text[-1].startswith("The methods are not compared.")
     assert "does not" not in command(path, "--format", "json").output
 
 

@@ -418,7 +418,7 @@ def test_a_drift_in_the_fit_is_said_with_what_it_means_for_the_next_use(capsys: 
     assert "drift: first pose again" in lines
     assert "drift in the fit: 0.500 ± 0.020 N, 0.0500 ± 0.0020 N·m from the first pose to the last" in lines
     assert "next use: the result has the bias of the last pose, 0.25 N, 0.010 N·m from the mean; it changes" in lines
-    assert "it moves 0.50 N, 0.0020 N·m a minute. Tare before use." in lines
+    assert "it changes by 0.50 N, 0.0020 N·m per minute. Tare before use." in lines
     assert drift_in_use(followed()) is None
     # a recording in motion has no last pose from which the bias could go on
     in_motion = replace(moved, drift=drift, mean_bias=mean_bias, quality={"loo_force_rms_N": 0.01, "worst_pose": 3})
