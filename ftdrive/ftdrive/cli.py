@@ -136,8 +136,6 @@ def fleet() -> None:
 
 
 class _MessageHandler(logging.Handler):
-    """Prints log records on stderr, above a live screen if one is active."""
-
     def emit(self, record: logging.LogRecord) -> None:
         from ftdrive.terminal.console import messages
 
@@ -231,7 +229,6 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _explain_click_error(error: click.ClickException, arguments: Sequence[str]) -> None:
-    """Print an error in the command line, and what to type."""
     from ftdrive.mistakes import existing, missing, of_subcommand, without_value
 
     if isinstance(error, click.MissingParameter):
@@ -257,6 +254,5 @@ def _other_command(arguments: Sequence[str], about: str = "") -> str:
 
 
 def _say(text: str) -> None:
-    """Print on stderr, unless it is closed."""
     with suppress(OSError):
         echo(text, err=True)

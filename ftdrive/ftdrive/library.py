@@ -163,7 +163,6 @@ def read_recording(
 
 
 def _of_tables(source: Any, calibration: CalibrationResult | None, table: TableOptions | None) -> Recording:
-    """Read a recording of another program. Raises `ConfigError` without a calibration, or `BadDataset`."""
     if calibration is None:
         raise ConfigError("a recording of another program has no calibration: give one as calibration=")
     tables = tables_of(source, table)
@@ -503,7 +502,6 @@ def solve_load_runs(
 
 
 def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
-    """Return one run with its load, the identity of its sensor, and the description of its cell."""
     data = read_source(path, SolveOptions())
     origin = data.provenance if "devices" in data.provenance else data.dataset.meta
     return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), sensor_identity(origin), data

@@ -110,7 +110,6 @@ def kind_of(path: Path) -> str | None:
 
 
 def _runs_in(folder: Path) -> Iterator[Path]:
-    """Yield the runs in a folder, newest first."""
     yield from filter(is_run, sorted(folder.iterdir(), reverse=True))
 
 

@@ -200,7 +200,6 @@ def calibrate_command(
 
 
 def _report_calibration(outcome: Outcome, page: Page | None, *, simulate: bool, every: bool, as_json: bool) -> None:
-    """Print the result and what to do next, and show both on the page."""
     result, run, folder = outcome.result, outcome.run, quote(str(outcome.run.folder))
     is_saved = result.verdict != "rejected"
     commands = [f"ftdrive report {folder}   (how good it is, and why)"]
@@ -232,7 +231,6 @@ def _options_of(
     seconds: float | None,
     **others: Any,
 ) -> tuple[SessionOptions, Load | None]:
-    """Return the session options, and the load on the tool. Raises `ConfigError`."""
     flags = {mode: others.pop(mode) for mode in _MODES}
     mode: Mode = next((mode for mode, is_given in flags.items() if is_given), "auto")
     poses = 6 if minimal or gripped else 24 if earlier is None else 4
@@ -248,7 +246,6 @@ def _options_of(
 
 
 def _given(context: click.Context) -> dict[str, Any]:
-    """Return the values of the given options by name."""
     names = {one.name: max(one.opts, key=len) for one in context.command.params}
     given = {names[name]: value for name, value in context.params.items() if value}
     if context.get_parameter_source("method") is ParameterSource.DEFAULT:

@@ -104,7 +104,6 @@ def compensate(
 
 
 def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Path | None) -> str:
-    """Return the error message for an incomplete command line, with everything that is missing."""
     if wrench is None and orientation_file is None:
         own = "" if calibration is None else f" --calibration {calibration}"
         missing, line = "the file of the recording", f"RECORDING{own}"

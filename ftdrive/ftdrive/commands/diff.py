@@ -92,7 +92,6 @@ def diff(first: str, second: str, as_json: bool) -> None:
 
 
 def _side(text: str) -> _Side:
-    """Find a calibration by path or id; raises `ConfigError`."""
     if (path := Path(text)).exists():
         result = read_calibration(path)
         sigma_kg = result.parameters.weight_sigma_N(result.covariance) / result.g_m_s2

@@ -127,7 +127,6 @@ def doctor(
 
 
 def _is_pushing() -> bool:
-    """Ask the operator to push; return False if no operator can answer."""
     echo(f"Push the tool along +X of the base, about 20 N; press Enter and hold for {PUSH_S:.0f} s", err=True)
     return bool(sys.stdin.readline())
 

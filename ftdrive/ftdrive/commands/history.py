@@ -117,7 +117,6 @@ def history(
 
 
 def _fit_json(fit: Any) -> dict[str, Any]:
-    """Return the fields of a `ftcalib.after.series.BiasTemperature` as JSON."""
     return {
         "slope_per_K": fit.slope.tolist(),
         "sigma_per_K": fit.sigma.tolist(),

@@ -88,7 +88,6 @@ def runs_option(words: str = "Parent folder of the new run folder.") -> Callable
 
 
 def _known_sets(_context: click.Context, _parameter: click.Parameter, sets: str | None) -> str | None:
-    """Refuse unknown sets before a device is opened."""
     if sets is not None:
         from ftcalib.poses.selection import names_of
 
@@ -337,7 +336,6 @@ class NewFile(click.Path):
 
 
 def _drawable(_context: click.Context, _parameter: click.Parameter, png: Path | None) -> Path | None:
-    """Refuse to draw before any work if the package for figures is missing."""
     if png is not None:
         require_extra("viz", "--png", "matplotlib")
     return png
@@ -410,10 +408,7 @@ class SourceOptions(NamedTuple):
     def open(
         self, stack: ExitStack, frame: "WrenchFrame", track: "Tracking" = "off", stages: Mapping[str, Any] = {}
     ) -> "Stream":
-        """Open the stream with these stages, until `stack` closes it; print the state of the calibration and warnings.
-
-        The state of the calibration and warnings are printed.
-        """
+        """Open the stream with these stages, until `stack` closes it; print state and warnings."""
         from ftdrive.terminal.console import messages
 
         calibration = self.calibration()
@@ -523,7 +518,6 @@ FRAME = frame_options("sensor", "sensor")
 
 
 def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: str) -> dict[str, Any]:
-    """Parse settings of stages before a device is opened. Raises `ConfigError`."""
     from ftdrive.servers.parameters import STAGE_TEXTS, checked_value
 
     found = {}

@@ -40,7 +40,6 @@ HEADINGS = {
 
 
 def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str | None) -> float | None:
-    """Return the speed in mm/s; infinity for "none"."""
     if text is None or text.lower() == "none":
         return None if text is None else inf
     with suppress(ValueError):

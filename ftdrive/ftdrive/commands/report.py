@@ -130,7 +130,6 @@ def report(
 
 
 def _saved(text: str, folder: Path) -> Path:
-    """Save under the first unused name; retry if another report takes it meanwhile."""
     while True:
         with suppress(FileExistsError):
             write_new(path := unused_path(folder / "report.html"), text)

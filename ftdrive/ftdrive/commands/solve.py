@@ -160,7 +160,6 @@ def _poses_of(test: Path, options: SolveOptions) -> CalibrationDataset:
 
 
 def _rehearsed_folder(sensor: str | None, method: str, *, cases: bool) -> AbstractContextManager[Path]:
-    """Record a run of an emulated cell with the poses for the method or the cases."""
     from ftdrive.session.rehearsal import rehearsed_run  # imports drivers and screen
     from ftdrive.terminal.screen import open_operator
 
@@ -174,7 +173,6 @@ def _solve_each(
     show: Callable[[SolveOptions, bool, Path, Path], None],
     as_json: bool,
 ) -> None:
-    """Solve each source separately, and show its result."""
     first_failure: AcceptanceError | DataError | None = None
     for source in sources:
         # A source that fails does not prevent the others from being solved.
@@ -214,7 +212,6 @@ def _show_result(
 
 
 def _next_commands(result: CalibrationResult, source: Path, output: Path | None) -> list[str]:
-    """Return the next commands; `report` has fewer options, and in motion only reads a run."""
     why, context = "   (how good it is, and why)", click.get_current_context()
     if output is not None and (result.verdict != "rejected" or context.params["force"]):
         return [f"ftdrive report {quote(str(output))}{why}", f"ftdrive live --calibration {quote(str(output))}"]
@@ -236,7 +233,6 @@ def _solved(data: Any, options: SolveOptions) -> CalibrationResult:
 
 
 def _print_table(provenance: Mapping[str, Any]) -> None:
-    """Print what was recognised in a table, to reveal a wrong guess."""
     if words := provenance.get("table"):
         messages.print(hanging(" ", f"{provenance.get('source') or ''}: {words}".removeprefix(": "), messages))
 

@@ -128,7 +128,6 @@ def verify_command(
 
 
 def _report_verification(verified: Verified, update: Answer, page: Page | None, *, again: str, as_json: bool) -> None:
-    """Print the outcome and the next step, and show both on the page; save the update if it is wanted."""
     if not as_json:
         print_verification(verified)
     conclude_verification(page, verified)
@@ -144,7 +143,6 @@ def _report_verification(verified: Verified, update: Answer, page: Page | None, 
 
 
 def _ask_on_page(page: Page | None, as_json: bool, question: Question) -> str:
-    """Ask in the terminal, and show the question on the page meanwhile."""
     show = (lambda _: None) if page is None else page.put
     show({"question": asked(question)})
     try:

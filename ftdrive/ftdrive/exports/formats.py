@@ -45,8 +45,7 @@ class ExportFormat:
 
     In a document, "$name" stands for a value, and "*name" in a list for the components of a vector. A name is a field
     of calibration or settings, or defined in `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its
-    components as in ROS messages; `registry.py` defines the other suffixes.
-    """
+    components as in ROS messages; `registry.py` defines the other suffixes."""
     notes: tuple[str, ...] = ()
     """Sentences for the user of the target, with values in braces."""
     elsewhere: Mapping[str, str] = field(default_factory=dict)

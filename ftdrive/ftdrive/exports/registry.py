@@ -90,7 +90,6 @@ def recorded_sensor(path: Path, calibration: CalibrationResult) -> tuple[float |
 
 
 def _yaml(document: Any) -> str:
-    """Return YAML that keeps every bit of a float and the order of keys."""
     # YAML 1.1 reads 1e-05 as text and yes as true; PyYAML quotes such texts.
     return yaml.safe_dump(document, sort_keys=False, default_flow_style=None, width=10**6)
 
@@ -219,14 +218,12 @@ def _inertia_note(v: _Values) -> str:
 
 
 def _point_mass(v: _Values, what: str) -> str:
-    """Return a comment of XML and the start of its next line; empty if the inertia was identified."""
     if v.inertia_kg_m2 is not None:
         return ""
     return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
 
 
 def _assumed(v: _Values) -> str:
-    """Return a note about the centre of mass of the sensor; empty if it was measured."""
     if not v.settings.sensor_mass_kg or v.settings.sensor_com_mm is not None:
         return ""
     return (
@@ -411,13 +408,11 @@ def export_calibration(
 
 
 def _above(value: float) -> str:
-    """Return the next larger number with two digits."""
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return f"{np.ceil(value / step) * step:.2g}"
 
 
 def _lost(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
-    """Yield the properties of the calibration that the target cannot express, beyond rounding."""
     tilt_rad = angle_between_vectors(np.array([0.0, 0.0, -1.0]), calibration.gravity_force_base_N)
     turn_rad = float(angle_between(calibration.R_flange_sensor, np.eye(3)))
     if "tilt" not in target.expresses and tilt_rad > 1e-9:
@@ -458,7 +453,6 @@ def _describe_value(value: JSON, form: str) -> str:
 
 
 def _made_by(calibration: CalibrationResult, verification: VerificationRecord | None) -> str:
-    """Return a line with id, date, last verification and version of the calibration."""
     made = calibration.provenance.get("created_utc")
     date = made if isinstance(made, str) else "at an unknown time"
     verified = "not verified"
@@ -470,7 +464,6 @@ def _made_by(calibration: CalibrationResult, verification: VerificationRecord | 
 
 
 def _with_header(text: str, comment: Comment, lines: Iterable[str]) -> str:
-    """Return the text with comment lines, reduced to printable ASCII."""
     clean = [plain_ascii(line) for line in lines]
     if comment == "none":
         return text

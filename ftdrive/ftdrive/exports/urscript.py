@@ -135,7 +135,6 @@ def _joint_row(q_rad: tuple[float, ...]) -> str:
 
 
 def _scene(scene: dict[str, Any]) -> Iterator[str]:
-    """Yield the surroundings as text; planes and boxes in the form of `--plane` and `--box`."""
     lean_rad = float(scene["lean_rad"])
     names = [name for name, angle in MOUNTINGS.items() if abs(lean_rad - angle) < 1e-9]
     yield f"mounted: {names[0] if names else f'base leans {degrees(lean_rad):.1f} deg towards its -x'}"

@@ -185,8 +185,6 @@ class _Blocks(SampleSource):
 
 
 class _RunningSums(Sink):
-    """Statistics of the result, updated with each block."""
-
     def __init__(self) -> None:
         self.samples, self._gaps = 0, 0
         self._begin_ns, self._end_ns, self._seq = 0, 0, 0

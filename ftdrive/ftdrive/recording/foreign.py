@@ -164,7 +164,6 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
 
 
 def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Sequence[str]) -> Table:
-    """Return times and values as a table, sorted by time."""
     t_ns, values = column
     order = np.argsort(t_ns, kind="stable")
     t_s = (t_ns - origin_ns)[order] * 1e-9
@@ -172,7 +171,6 @@ def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Seque
 
 
 def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
-    """Return the given topic of a type, or the only one. Raises `ConfigError`."""
     of_kind = sorted({one.topic for one in reader.connections if one.msgtype == kind})
     if topic is not None and topic not in of_kind:
         known = ", ".join(of_kind) or "none"
@@ -225,7 +223,6 @@ def _checked_column(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Col
 
 
 def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
-    """Return the reader that converts messages to poses. Raises `ConfigError` or `BadUrl`."""
     if pose_topic is None:
         return Poses(_chosen(reader, _POSES, None, "--pose-topic"))
     named = pose_reader_of(SCHEME + pose_topic.removeprefix(SCHEME))
@@ -321,7 +318,6 @@ class TablePair:
         return in_blocks(Measured(block, (), share[0]) for block in paired)
 
     def _estimated_delay(self) -> tuple[float, float]:
-        """Return the delay and its sigma, estimated from means over `_MEAN_S`."""
         info = self.header.info
         size = max(1, round(_MEAN_S * info.sensor_rate_Hz))
         means = list(_before_a_fault(_mean_samples(self._wrench, size)))
@@ -343,7 +339,6 @@ def _before_a_fault(parts: Iterator[T]) -> Iterator[T]:
 
 
 def _mean_samples(table: Table, size: int) -> Iterator[FtSamples]:
-    """Yield the mean wrench of every `size` samples, numbered, at their mean time."""
     t_s, wrench, count = np.empty(0), np.empty((0, 6)), 0
     for rows in table.wrenches():
         t_s, wrench = np.concatenate([t_s, rows.t_s]), np.concatenate([wrench, rows.values])

@@ -113,7 +113,6 @@ class McapFile(GrowingFile):
             self._attachments.append(AttachmentIndex(place, len(record), 0, 0, len(data), name, "application/json"))
 
     def _add(self, content: bytes) -> int:
-        """Append to the data section; return the offset."""
         place = self.add(content)
         self._crc = zlib.crc32(content, self._crc)
         return place

@@ -96,7 +96,6 @@ class RecordingFiles:
             file.discard()
 
     def _named(self, error: OSError) -> OSError:
-        """Return an error of the same type that names the kept samples."""
         kept = " and ".join(f"{path} contains {samples} samples" for path, samples in self.partial.items())
         kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample is kept"
         return type(error)(f"{error.strerror or error}: {kept}")

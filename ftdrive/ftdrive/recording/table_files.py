@@ -60,8 +60,6 @@ _PARQUET_END: Final = b"PAR1"
 
 
 class _TableFile(GrowingFile):
-    """A new recording as a table."""
-
     def __init__(self, path: Path, header: Header) -> None:
         super().__init__(path)
         self.samples = 0

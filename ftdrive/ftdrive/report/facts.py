@@ -104,7 +104,6 @@ def contact_error(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _error_map(result: CalibrationResult) -> dict[str, Any]:
-    """Return the error over the directions of the tool axis, with the worst direction as text."""
     found = error_map(result)
     for one in (found["force_N"], found["torque_Nm"]):
         one["axes"] = _along_axes(direction := np.array(one["worst_direction"]))
@@ -113,13 +112,11 @@ def _error_map(result: CalibrationResult) -> dict[str, Any]:
 
 
 def _along_axes(direction: Array) -> str:
-    """Return the axis along a unit vector (3,), or the two or three axes between which it points."""
     names = axes_along(direction)
     return f"along {names[0]}" if len(names) == 1 else f"between {' and '.join(names)}"
 
 
 def _direction_in_words(direction: Array, frame: str) -> str:
-    """Return the direction of a unit vector (3,) in a frame as text."""
     return f"{_along_axes(direction)} of the {frame}"
 
 
@@ -195,7 +192,6 @@ def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[s
 
 
 def _about_of(result: CalibrationResult) -> str:
-    """Return arm, sensor, tool and time of a calibration, as far as recorded."""
     known = result.provenance
     setup, devices = known.get("setup") or {}, known.get("devices") or {}
     named = [
@@ -236,7 +232,6 @@ def _cross_validation(subject: Subject) -> dict[str, Any]:
 
 
 def _pose_facts(subject: Subject) -> list[dict[str, Any]]:
-    """Return the poses: residual (6,), its size in sigmas predicted by the others, and whether the pose was used."""
     result, dataset = subject.result, subject.dataset
     names = pose_names(subject.records) or [str(row + 1) for row in range(result.n_poses)]
     spread = result.quality.get("residual_sigma") or [None] * result.n_poses
@@ -304,7 +299,6 @@ def _planned_sweep(run: Run | None) -> Plan | None:
 
 
 def _motion_facts(motion: MotionResult, planned: Plan | None) -> dict[str, Any]:
-    """Return the parameters that only a recording in motion gives, and the planned sweep."""
     return {
         "inertia_kg_m2": motion.inertia_kg_m2.tolist(),
         "sigma": {name: np.asarray(value).tolist() for name, value in motion.sigma.items()},

@@ -126,7 +126,6 @@ def _draw_coverage(figure: Any, facts: Facts) -> None:
 
 @contextmanager
 def _globe(axes: Any) -> Iterator[None]:
-    """Draw outline, graticule and axis names of a map, below and above its content."""
     axes.set_aspect("equal")
     axes.axis("off")
     axes.set(xlim=(-2.95, 2.95), ylim=(-1.75, 1.75))

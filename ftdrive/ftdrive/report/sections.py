@@ -545,7 +545,6 @@ def _p_value_in_words(p_value: float) -> str:
 
 
 def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the values of nested objects as text, with their full names."""
     for name, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flattened(inner, f"{prefix}{name}.")

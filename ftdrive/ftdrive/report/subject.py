@@ -124,7 +124,6 @@ def _known_of(data: RecordedData) -> dict[str, Any]:
 
 
 def _parent(result: CalibrationResult, source: Path, given: Path | None) -> tuple[CalibrationResult | None, str]:
-    """Return the result to compare with and its name, or None and the reason."""
     if given is not None:
         path = Run(given).calibration_path if given.is_dir() else given
         return CalibrationResult.load(path), str(given)

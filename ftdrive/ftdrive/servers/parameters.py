@@ -158,7 +158,6 @@ class NodeParameters:
 
 
 def _as_builtin(value: Any) -> Any:
-    """Return a value of rclpy as a builtin type: arrays as lists."""
     return list(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 

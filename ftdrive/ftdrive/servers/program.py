@@ -153,7 +153,6 @@ class ProgramService(Sink):
                 self._registers.close()
 
     def _watch(self) -> None:
-        """Mark the wrench as stale when no samples arrive, and reconnect to the controller."""
         clock = self._stream.clock
         while not self._ends.wait(0.02):
             with self._lock:
@@ -197,7 +196,6 @@ class ProgramService(Sink):
         return [*tracked.bias.tolist(), tracked.last_seen_s + max(self._newest_ns * 1e-9 - tracked.t_s, 0.0)]
 
     def _judge(self, block: Block) -> Condition:
-        """Return the condition of the tool; a force along gravity is an unknown load."""
         if not block.in_contact[-1]:
             return Condition.FREE
         R_base_sensor = block.R_base_flange[-1] @ self._stream.info.calibration.R_flange_sensor

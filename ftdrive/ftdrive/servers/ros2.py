@@ -273,7 +273,6 @@ class Ros2Node(Sink):
             stack.pop_all()
 
     def _require_alone(self) -> None:
-        """Raise `ConfigError` if another node with this name sends reports."""
         received = Event()
         # A killed node stays in the list of nodes for up to 20 s, so a running one is recognised by its reports.
         subscription = self.node.create_subscription(
@@ -351,7 +350,6 @@ class Ros2Node(Sink):
                 self._log.info(event.text)
 
     def _publish(self, block: Block, info: StreamInfo) -> None:
-        """Publish the means completed by a block."""
         means, now_s = self._averaged.add(block), time.monotonic()
         if means:
             t_ns = means.t_host_ns + info.utc_offset_ns
@@ -375,7 +373,6 @@ class Ros2Node(Sink):
     # ------------------------------------------------------------------------------------------------------- reporting
 
     def _fail(self, text: str) -> None:
-        """Log a failure once, even if it repeats."""
         if text != self._failure:
             self._failure = text
             self._log.error(text)
@@ -430,7 +427,6 @@ class Ros2Node(Sink):
             raise ConfigError(why) from None
 
     def _change_tool(self, stream: Stream) -> None:
-        """Change to a tool requested by a client, between two reads."""
         try:
             tool, decided = self._wanted.get_nowait()
         except Empty:

@@ -12,8 +12,7 @@ from ftdrive.stream.stream import Sink
 
 RATE_HZ = 200.0
 """Sending rate, Hz: a plot of 5 s is about 1000 pixels wide, so a higher rate is not visible. PlotJuggler parses
-datagrams in the thread of its window, and the system drops datagrams that are not read in time.
-"""
+datagrams in the thread of its window, and the system drops datagrams that are not read in time."""
 
 
 class UdpSender(Sink):

@@ -162,7 +162,6 @@ class ContactTest:
             yield slice(start, stop)
 
     def _turn(self, R_base_flange: Array) -> None:
-        """Evaluate the covariance of the prediction for a new orientation."""
         known = self._calibration
         if known is None or (self._R is not None and np.abs(R_base_flange - self._R).max() < _TURN_RAD):
             return

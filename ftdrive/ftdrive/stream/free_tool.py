@@ -112,8 +112,6 @@ class _State(NamedTuple):
 
 
 class _WindowFit(NamedTuple):
-    """One window of a run, with the state and the centre of mass of the part after it."""
-
     window: Window
     state: _State
     place: Array | None
@@ -279,7 +277,6 @@ class FreeToolFilter:
         )
 
     def _ahead(self, state: _State, t_s: float, R_base_flange: Array, systematic: Array) -> _State:
-        """Return the state predicted for a later time in another orientation."""
         dt_s = _later(t_s, state.t_s)
         turned_rad = float(np.linalg.norm(R_base_flange - state.R_base_flange)) / np.sqrt(2)
         alike = np.exp(-turned_rad / _LOCAL_RAD)
@@ -506,7 +503,6 @@ def _corrected(state: _State, y: Array, covariance: Array, H: Array) -> tuple[_S
 
 
 def _diagonal(matrix: Array) -> Array:
-    """Return a writable view (…, n) of the diagonal."""
     diagonal: Array = np.einsum("...ii->...i", matrix)
     return diagonal
 

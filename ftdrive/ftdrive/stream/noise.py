@@ -25,8 +25,7 @@ SPEEDS_RAD_S = (0.15, 0.4, 0.7)
 """Limits of the speed classes: angular speed plus flange speed divided by 0.5 m, rad/s."""
 ACCELERATION_RAD_S2 = 1.5
 """Limit between the two acceleration classes, rad/s²: angular acceleration plus that of the flange divided by 0.5 m,
-beyond the centripetal part.
-"""
+beyond the centripetal part."""
 SLOW = 2
 """Only the slow speed classes are divided by acceleration: at higher speeds ringing and ripple do not depend on it."""
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW

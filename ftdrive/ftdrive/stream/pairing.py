@@ -159,8 +159,7 @@ class DelayEstimator:
         motion = calibration.motion
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
         """Delay by which samples are paired: first that of the calibration, then the estimate once it is accurate
-        enough.
-        """
+        enough."""
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
         """Standard deviation of the delay."""
 
@@ -188,7 +187,6 @@ class DelayEstimator:
                 break
 
     def _whole_seconds(self, paired: Paired) -> list[Paired]:
-        """Add samples; return the completed seconds."""
         self._pending.append(paired)
         begin_ns = int(self._pending[0].t_host_ns[0])
         seconds = int((paired.t_host_ns[-1] - begin_ns) * 1e-9 / _BATCH_S)
@@ -376,7 +374,6 @@ def _clock_of(states: ArmStates) -> Timeline:
 
 
 def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:
-    """Pair samples with the poses at their times, which must be inside the track."""
     return Paired(t_ns, samples.t_device_s, samples.seq, samples.status, samples.wrench, *poses.at(t_ns))
 
 

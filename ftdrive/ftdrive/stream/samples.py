@@ -164,8 +164,7 @@ class Sample(Displayed):
     A reading is the mean over 20 ms, so a contact begins after 40 to 60 ms. One reading of a free tool in a million
     exceeds the limit (`false_alarm_rate`). The limit follows the noise in the present state of motion, also with
     filtered sensors. A force that grows by less than 20 N within an hour is taken for drift of the bias. In motion,
-    inertia that is not subtracted raises the limit, so smaller contacts are not detected.
-    """
+    inertia that is not subtracted raises the limit, so smaller contacts are not detected."""
     frame: WrenchFrame
 
 

@@ -141,8 +141,7 @@ class CellSource(SampleSource):
         self._devices = devices
         self.block_s = 0.003
         """Duration of the samples per read, s; a block costs about the same with one sample as with many. May be set at
-        any time: longer blocks arrive later and need less processor time.
-        """
+        any time: longer blocks arrive later and need less processor time."""
         self.payload_kg: float | None = None
         """Payload in the controller; None if it is not reported."""
         self._arm: RobotArm | None = None
@@ -193,7 +192,6 @@ class CellSource(SampleSource):
         return self._given
 
     def _described(self) -> StreamInfo:
-        """Return the description of the cell without calibration and rates."""
         arm, offset = _ALONE, None
         if self._arm is not None:
             arm, status = self._arm.identify(), self._arm.status()
@@ -227,7 +225,6 @@ class CellSource(SampleSource):
         return DelayEstimator(self.info.calibration, self.info.p_flange_sensor_m)
 
     def _chosen(self, wanted: CalibrationResult | str | None, info: StreamInfo) -> StreamInfo:
-        """Add the calibration for these devices and their mount to a description. Raises `ConfigError`."""
         if wanted is None:
             return info
         calibration, name, warnings = wanted, self._name, tuple[str, ...]()
@@ -359,7 +356,6 @@ class CellSource(SampleSource):
         raise error
 
     def _reopen(self, role: str, failure: DeviceError) -> None:
-        """Reopen the devices; raise the error if they still fail."""
         self.clock.sleep((self._next_ns - self.clock.now_ns()) * 1e-9)
         self._next_ns = self.clock.now_ns() + round(_RETRY_S * 1e9)
         self._unfollow()

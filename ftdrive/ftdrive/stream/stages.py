@@ -339,8 +339,6 @@ class Neighbours:
 
 
 class _Reference(NamedTuple):
-    """The empty tool from the calibration or a tare."""
-
     empty: Calibrated
     t_ns: int
     # Sensor temperature at that time; NaN if unknown.
@@ -420,7 +418,6 @@ class FreeTool:
         return self._refer(self._references)
 
     def _refer(self, references: list[_Reference]) -> Array:
-        """Use the newest reference, at the present temperature, as the empty tool."""
         self._references = references
         empty, _, then_C = references[-1]
         if self._temperature is not None:

@@ -57,8 +57,7 @@ class CommandConsole(Console):
 
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
 """Folds between words on a terminal, but not in a file. Brackets and colons are printed unchanged, because paths
-contain them.
-"""
+contain them."""
 
 answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())
 """Console on stdout for results, verdicts and names of saved files. `-q` does not silence it; `--json` replaces it."""

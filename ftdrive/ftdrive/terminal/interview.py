@@ -28,7 +28,7 @@ from ftdrivers.errors import DeviceError
 
 
 class _Back(Exception):
-    """Raised if the operator wants the previous question."""
+    pass
 
 
 class Interview:

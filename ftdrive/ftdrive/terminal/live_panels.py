@@ -154,7 +154,6 @@ def _component_row(view: View, name: str, now: tuple[str, str], peaks: str) -> L
 
 
 def _at_rest(view: View) -> Line:
-    """Return a line with the sigma of a free tool."""
     if (reading := view.live) is None:
         return Line()
     force, torque = (_digits(float(reading.rest_sigma[i : i + 3].max()), _decimals(reading, i)) for i in (0, 3))
@@ -167,7 +166,6 @@ def _digits(sigma: float, places: int) -> str:
 
 
 def _fixed(value: float, places: int, width: int) -> str:
-    """Return a number in at most `width` cells; decimals are dropped for large raw readings."""
     while places and len(f"{value:+z.{places}f}") > width:
         places -= 1
     return f"{value:+z.{places}f}"
@@ -370,7 +368,6 @@ def _event_lines(view: View, note: FeedNote, width: int) -> list[Line]:
 
 
 def _hanging(head: Line, parts: Sequence[Part], width: int) -> list[Line]:
-    """Return lines with words after a head; further lines are indented to the first word."""
     lines, indent = [head], head.width
     for part in parts:
         for i, word in enumerate(part.text.split(" ")):

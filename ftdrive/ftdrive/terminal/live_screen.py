@@ -110,7 +110,6 @@ _SEEK_S = 5.0
 
 
 def _actions(feed: Feed) -> dict[str, Callable[[], object]]:
-    """Return the action of each key that runs between two reads."""
     stream = feed.stream
     found: dict[str, Callable[[], object]] = {
         "x": partial(feed.next_frame, "axes", get_args(Axes)),

@@ -61,8 +61,6 @@ def read_answer(supervisor: Supervisor, question: Question) -> str:
 
 
 class _Keyless:
-    """An operator without keys; SIGINT stops the session."""
-
     has_keys = False
     pressed_by = "the operator"
     supervisor: Supervisor

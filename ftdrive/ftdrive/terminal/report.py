@@ -133,7 +133,6 @@ def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: b
 
 
 def _to_digits(value: float) -> str:
-    """Return a positive number with three digits, at most three of them decimals; NaN as "-"."""
     if np.isnan(value):
         return "-"
     return f"{value:.{0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3}f}"

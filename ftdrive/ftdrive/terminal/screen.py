@@ -369,7 +369,6 @@ class Screen:
 
 
 def _history(event: Event, view: SessionView) -> bool:
-    """Whether an event is printed above the frame, because the frame does not show it."""
     match event:
         case StateChanged():
             return event.state is State.HOLD and not view.tripped

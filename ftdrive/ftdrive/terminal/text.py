@@ -148,7 +148,6 @@ def _width(widths: Sequence[int]) -> int:
 
 
 def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[str]:
-    """Return the lines of a row with folded texts; columns on the second line are not folded."""
     texts = zip(row[:beside], widths, strict=False)
     folded = [wrap(text, width, break_long_words=False, break_on_hyphens=False) for text, width in texts]
     for parts in zip_longest(*folded, fillvalue=""):

@@ -43,8 +43,6 @@ _LEGEND: Final = legend(
 
 @dataclass(eq=False, slots=True)
 class _Field:
-    """One answer in the form: selection, typed text, value, and message below it."""
-
     key: str
     name: str
     label: str
@@ -127,7 +125,6 @@ class InitPage:
         self._page.on(name, put)
 
     def _add(self, key: str, text: str | None = None) -> None:
-        """Add a field; for rows, with a new number."""
         number = f" {next(self._numbers[key])}" if key in _ROWS else ""
         name, label, text = f"{key}{number}", _ROWS.get(key, [BY_KEY[key].label])[0] + number, text or ""
         options, choice, typed = (*BY_KEY[key].choices,), model_named(text, controller_major=0) or text, ""
@@ -142,7 +139,6 @@ class InitPage:
         self._on(f"{name} remove", partial(self._fields.pop, name))
 
     def _refresh(self) -> bool:
-        """Judge all answers, show errors, draw the cell and save the draft; return whether the form is complete."""
         described, near = self._described, ""
         self._read()
         wrong = [field for field in self._fields.values() if not self._judge(field)]
@@ -164,7 +160,6 @@ class InitPage:
         return bool(words["tone"] == GOOD)
 
     def _part(self, part: str) -> Part | None:
-        """Return one part of the form; None if all its values are known."""
         asked = {one.key: one.key if one.repeats else one.key.split(".")[0] for one in self._described.questions}
         fields = [field for field in self._fields.values() if asked.get(field.key) == part]
         shown, head, note = [control for field in fields for control in field.controls()], part.capitalize(), ""
@@ -179,7 +174,6 @@ class InitPage:
         return controls(*shown, head=head, note=note) if shown else None
 
     def _read(self) -> None:
-        """Copy the answers from the fields; the report of a changed address is discarded."""
         described = self._described
         for key, question in BY_KEY.items():
             texts = [field.text for field in self._fields.values() if field.key == key and field.text]
@@ -191,7 +185,6 @@ class InitPage:
                 described.texts |= {key: texts} if texts else {}
 
     def _judge(self, field: _Field) -> bool:
-        """Set value and message of a field; return whether it is valid or empty."""
         described, question = self._described, BY_KEY[field.key]
         said = self._found.get(field.key, ("" if question.repeats else question.how, QUIET))
         field.value = None
@@ -205,7 +198,6 @@ class InitPage:
         return said[1] != BAD
 
     def _require_complete(self, wrong: Collection[_Field]) -> None:
-        """Raise `ConfigError` if the file cannot be written yet."""
         if wrong:
             raise ConfigError(f"Correct the red fields: {', '.join(field.label for field in wrong)}.")
         self._described.judge_rows(BY_KEY[TOOL])
@@ -216,7 +208,6 @@ class InitPage:
         self._described.cell()
 
     def _look(self) -> None:
-        """Read robot and sensor, and show their reports here and in the terminal."""
         for field in [one for one in self._fields.values() if one.name in (ROBOT, SENSOR) and one.text]:
             self._page.put({"form/words": lines(f"Reading {field.text} …", tone=ASK)})
             # Ctrl-C cannot interrupt a host name lookup, which may take 10 s, but it interrupts this wait.

@@ -131,7 +131,6 @@ class LivePage:
 
 
 def _still(certifier: Certifier | None) -> dict[str, Part | None]:
-    """Return the static parts: base, surroundings, legend and initial camera."""
     shown: dict[str, Part | None] = {"scene/base": scene.axes(0.25, named=True)}
     rows, size_m = [*_LEGEND], 2.0
     if certifier is not None:
@@ -174,7 +173,6 @@ def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
 
 
 def _devices(info: StreamInfo) -> Part:
-    """Return arm, sensor and tool, and the marks of cell and calibration, such as EMULATED."""
     texts = " · ".join([words.name_devices(info), *info.marks])
     return parts.lines(texts, tone=parts.WARN if info.marks else parts.QUIET)
 

@@ -45,7 +45,6 @@ def on_page(
 
 
 def _last_line(error: BaseException) -> str:
-    """Return the line printed in the terminal when an error ends a session."""
     if isinstance(error, Declined):
         return str(error)
     return "interrupted" if isinstance(error, KeyboardInterrupt) else f"error: {in_one_line(in_a_sentence(error))}"

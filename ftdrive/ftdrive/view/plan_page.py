@@ -129,7 +129,6 @@ def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | Non
 
 
 def _swept(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
-    """Return the tool at joint vectors (n, 6), one part per cylinder."""
     bodies = certifier.arm.bodies(q_rad[:: max(1, len(q_rad) // 250)])
     copies = np.concatenate([bodies.centre_m, scene.turned_up(bodies.axis)], axis=-1)
     sizes = zip(bodies.half_length_m, bodies.radius_m, bodies.rounding_m, strict=True)

@@ -64,8 +64,7 @@ class Onlooker(Guard):
         self.seen: Seen | None = None
         self.fresh_s = self.age_s = self.looked_s = 0.0
         """Time at which the newest sample was first seen, its age, and the time of the last look on the computer's
-        clock.
-        """
+        clock."""
 
     def look(self, seen: Seen) -> None:
         """Keep the observation."""
@@ -246,8 +245,6 @@ class SessionPage:
 
 
 class _Cell:
-    """The arm, its next pose as a ghost, and the plan, as parts of a page."""
-
     def __init__(self, planned: events.Planned, certifier: Certifier) -> None:
         self._tour, self._arm = PlanTimeline(planned.plan, planned.way_rad), certifier.arm
         self._asked: Question | None = None
@@ -290,7 +287,6 @@ def asked(question: Question | None) -> Part | None:
 
 
 def _state_panel(view: SessionView, note: str, stopped_by: str) -> Parts:
-    """Return state, progress and remaining time, the last note, and what has stopped the arm."""
     now, last, now_s = view.now, view.last, time.monotonic()
     where, state, words = state_in_words(view, now_s)
     stopped = now is not None and now.state in {State.STOP, State.HOLD}
@@ -310,7 +306,6 @@ def _state_panel(view: SessionView, note: str, stopped_by: str) -> Parts:
 
 
 def _results(view: SessionView) -> Parts:
-    """Return the current estimates, and in a verification the compared poses."""
     parts: Parts = {}
     if (fit := view.estimated) is not None:
         found = [(label, *rounded_estimate(fit, factor, name)) for label, factor, name, _ in ESTIMATES]
@@ -325,7 +320,6 @@ def _results(view: SessionView) -> Parts:
 
 
 def _gravity_sphere(downs: Sequence[tuple[Array, float | None]], above_m: Array | None) -> Parts:
-    """Return the directions of gravity so far on a sphere, above the arm if there is one."""
     if not downs:
         return {}
     colours = [

@@ -108,7 +108,6 @@ class Site(Gate):
         await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
 
     def _viewer_of(self, cookies: str) -> int | None:
-        """Return the number of the viewer with a cookie of this page."""
         for cookie in cookies.split("; "):
             name, _, value = cookie.partition("=")
             token, _, number = value.rpartition(".")
@@ -214,7 +213,6 @@ def serve_page(title: str, address: Address | None = None) -> Iterator[Page]:
 
 
 def _reached_at(host: str) -> str:
-    """Return the address at which others reach a server at `host`; a tablet may not know the host name."""
     if host not in ("0.0.0.0", "::"):
         return host
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, suppress(OSError):

@@ -156,7 +156,6 @@ def _drift_lines(result: CalibrationResult, drift: DriftCheck | None, *, every: 
 
 
 def _two_digits(value: float) -> str:
-    """Return the value with two digits, without an exponent; rounding errors as 0."""
     return "0" if value < _ROUNDING else to_place_of(value, value)
 
 
@@ -190,7 +189,6 @@ def drift_in_use(result: CalibrationResult) -> str | None:
 
 
 def _poses_in_words(result: CalibrationResult, names: Sequence[str] = ()) -> str | None:
-    """Return the worst pose, by name or number, and the cross-validation; None without these figures."""
     quality = result.quality
     if not quality:
         return None
@@ -253,7 +251,6 @@ def verification_in_lines(verified: Verified, *, every: bool = False) -> list[Te
 
 
 def _verdict_in_words(verified: Verified) -> str:
-    """Return the largest differences, and the limits."""
     words = f"largest difference {_two_digits(verified.force_N.max())} N, {_two_digits(verified.torque_Nm.max())} N·m"
     limits = zip(verified.limits, ("N", "N·m"), strict=True)
     if given := [f"{limit:g} {unit}" for limit, unit in limits if limit is not None]:

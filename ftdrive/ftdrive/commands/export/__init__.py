@@ -23,7 +23,6 @@ def export_group() -> None:
 
 @export_group.result_callback()
 def _deliver(made: Made | None) -> None:
-    """Save or print what a command has made."""
     if made is None:
         return
     text, output, about, facts, as_json = made

@@ -70,7 +70,6 @@ def fleet_solve(
 
 
 def _time(since: str) -> datetime:
-    """Return the time in UTC for an age such as 90d or a date. Raises `ConfigError`."""
     try:
         if age := re.fullmatch(r"(\d+)([dh])", since):
             return datetime.now(UTC) - int(age[1]) * _UNITS[age[2]]

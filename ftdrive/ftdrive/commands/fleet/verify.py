@@ -80,7 +80,6 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
 
 
 def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
-    """Return the cells with these names, in this order; all cells if there are no names."""
     if not cells:
         raise ConfigError("the store has no cells: add them with `ftdrive fleet add cells.toml`")
     known = {one.name: one for one in cells}
@@ -90,7 +89,6 @@ def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[Sto
 
 
 def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tuple[str, str]:
-    """Ask at a cell and verify it; return outcome and reason. Raises as `Verifying.take`."""
     cell = _read_cell(one)
     known = fleet.id_of(one.name, cell.tool.name) or ""
     paths = [Path(result.path) for result in store.find(known) if result.id == known] if known else []
@@ -106,7 +104,6 @@ def _verify(one: StoredCell, store: Store, url: str | None, fleet: Fleet) -> tup
 
 
 def _session(cell: CellConfig, path: Path, options: SessionOptions) -> Verified:
-    """Guide the operator through a verification, as `ftdrive verify` without options does."""
     task = Verifying.of(cell, path, options)
     with open_operator(command=task.command) as operator:
         verified = task.take(operator, NO_LIMITS, options)
@@ -130,7 +127,6 @@ def _read_cell(one: StoredCell) -> CellConfig:
 
 
 def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
-    """Ask whether an operator stands at the cell; any answer other than yes, and the end of the input, mean no."""
     text = (
         f"Cell {one.name}, robot {cell.robot.host}, tool {cell.tool.name}: does an operator stand at this cell, with "
         "the emergency stop in reach? Only yes starts its verification, Enter skips it"
