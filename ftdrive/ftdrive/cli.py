@@ -151,9 +151,8 @@ def main() -> int:
     # The matrices of a calibration are small: threads of linear algebra wait for each other longer than they compute.
     # numpy reads this variable when it is imported, later.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Ctrl-C, `kill` and a closed terminal all end a command in the same way: the arm is stopped first. Also set the
-    # handlers if these signals are inherited as ignored, as in a background job; `nohup` means that the terminal may
-    # close.
+    # Ctrl-C, `kill` and a closed terminal all end a command in the same way: the arm is stopped first. Set the handlers
+    # even if these signals are inherited as ignored, as in a background job, except for `nohup`.
     for name in ("SIGINT", "SIGTERM"):
         signal.signal(getattr(signal, name), signal.default_int_handler)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:

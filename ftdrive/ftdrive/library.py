@@ -128,9 +128,8 @@ def read_recording(
     Parameters
     ----------
     source : str, Path, DataFrame or mapping
-        A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet. Or a recording of
-        another program: a bag, or a table with wrench and orientation as text, DataFrame of pandas or Polars, or arrays
-        by name.
+        A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet. Or of another program:
+        a bag, or a table with wrench and orientation as text, DataFrame or arrays by name.
     columns : collection of str
         Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
     calibration : CalibrationResult, optional
@@ -143,8 +142,7 @@ def read_recording(
     ConfigError
         The suffix is unknown, a package is missing, or a recording of another program has no calibration.
     BadRecording, BadDataset
-        The file is damaged, has no sample or an unknown format. A truncated file is read to its end; `cut` gives the
-        reason.
+        Damaged, empty or unknown. A truncated file is read to its end; `cut` gives the reason.
     OSError
         The file does not exist or cannot be read.
 

@@ -111,9 +111,7 @@ HEADINGS = {
 @click.option("--gripped", is_flag=True, help="The gripper holds the load at an unknown position; 6 poses.")
 @click.option("--sweep", is_flag=True, help="Calibrate in one smooth motion of the wrist, with inertia and delay.")
 @click.option(
-    "--passive",
-    is_flag=True,
-    help="No motion commands: record while any program or freedrive moves the arm, until the result is good.",
+    "--passive", is_flag=True, help="No motion commands: record while another program or freedrive moves the arm."
 )
 @click.option(
     "--seconds",
@@ -122,9 +120,7 @@ HEADINGS = {
 )
 @click.option("--step", is_flag=True, help="Wait for Enter before each move.")
 @click.option(
-    "--fast",
-    is_flag=True,
-    help="Move at the speed of the plan (at most 60 °/s, 250 mm/s), after one complete slow run.",
+    "--fast", is_flag=True, help="Move at the speed of the plan (at most 60 °/s, 250 mm/s) after one slow run."
 )
 @click.option("--manual", is_flag=True, help="No motion commands: you move the arm to the poses that ftdrive shows.")
 @click.option("--listen", is_flag=True, help="No motion commands: a program on the pendant moves the arm.")
@@ -266,6 +262,4 @@ def refuse_contradictions(given: Mapping[str, Any]) -> None:
         raise ConfigError(f"{words}: leave it out, or choose --method lrom")
     seconds = given.get("--seconds")
     if seconds is not None and (seconds > _LONGEST_SWEEP_S if "--sweep" in given else "--passive" not in given):
-        raise ConfigError(
-            f"--seconds {seconds:g} is not possible: use up to {_LONGEST_SWEEP_S} with --sweep, or --passive"
-        )
+        raise ConfigError(f"--seconds {seconds:g}: give up to {_LONGEST_SWEEP_S} with --sweep, or use --passive")

@@ -23,16 +23,12 @@ from ftdrive.terminal.text import echo
 
 @click.command()
 @click.argument("path", metavar="[RECORDING]", required=False, type=PATH)
-@click.option(
-    "--calibration", metavar="PATH", type=PATH, help="Calibration to use: a calibration.json or its run folder."
-)
+@click.option("--calibration", metavar="PATH", type=PATH, help="Calibration: a calibration.json or its run folder.")
 @click.option("--wrench", metavar="FILE", type=FILE, help="Table of the wrench, instead of RECORDING.")
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="Table of the flange poses, with --wrench.")
 @BAG_TOPICS
 @TABLE
-@click.option(
-    "--delay", metavar="S|auto", help="Delay of the wrench in a recording of another program, s.  [default: auto]"
-)
+@click.option("--delay", metavar="S|auto", help="Delay of the wrench of another program, s.  [default: auto]")
 @FORCE
 @click.option(
     "--bias",

@@ -33,9 +33,7 @@ def loads() -> None:
 @SOURCE
 @click.option("--replay", type=PATH, help="Check a recording instead of a cell.")
 @click.option("--zero", is_flag=True, help="Tare the free tool first, which removes the drift since the calibration.")
-@click.option(
-    "--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses at rest to combine."
-)
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Poses to combine.")
 @click.option("--wait", "wait_s", type=Number(1, 600), default=60.0, show_default=True, help="Longest wait, s.")
 @JSON
 def loads_check(
@@ -78,9 +76,7 @@ def loads_check(
         free = "Record the free tool at rest for a second, and then hang the load."
         echo(f"{drifted} {'Use --zero.' if replay is None else free}", err=True)
     if not found.is_within:
-        raise NotAccepted(
-            "the reading of the load is outside the accuracy stated for the sensor: check mass and mounting"
-        )
+        raise NotAccepted("the reading is outside the accuracy stated for the sensor: check mass and mounting")
 
 
 @loads.command("solve")

@@ -118,9 +118,7 @@ YES = click.option(
     is_flag=True,
     help="Answer the safety questions automatically, except for a first run or a move of the whole arm.",
 )
-CONFIG = click.option(
-    "--config", type=FILE, help="TOML file with the description of the cell, instead of ./ftdrive.toml."
-)
+CONFIG = click.option("--config", type=FILE, help="TOML file that describes the cell, instead of ./ftdrive.toml.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,9 +170,7 @@ class CellOptions:
         """Return the cell of a sensor; no settings of the arm are required."""
         cell = cell_of(self.settings(), devices=False)
         if not cell.sensor.url:
-            raise ConfigError(
-                "no sensor: give --sensor URL, or --simulate; find one with `ftdrive devices --probe PLACE`"
-            )
+            raise ConfigError("no sensor: give --sensor URL, or --simulate; see `ftdrive devices --probe PLACE`")
         return cell
 
     def cell_to_resume(self, folder: Path, header: Mapping[str, Any], say: Callable[[str], object]) -> CellConfig:
@@ -574,9 +570,7 @@ SOLVED_WITH = _together(
         help="Model of the bias drift; rows without times are taken as equally spaced.",
     ),
     click.option("--mass-kg", metavar="KG", type=POSITIVE, help="Known mass below the sensor."),
-    click.option(
-        "--level-deg", metavar="DEG", type=Number(0, 180), help="Declare the base level within DEG (one sigma)."
-    ),
+    click.option("--level-deg", metavar="DEG", type=Number(0, 180), help="The base is level within DEG (one sigma)."),
     click.option("--mounting-deg", metavar="RX,RY,RZ", help="Known rotation vector of the sensor in the flange."),
     click.option(
         "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
@@ -598,9 +592,7 @@ _OF_TABLE = _together(
         type=click.Choice(["sensor", "flange", "tcp", "base"]),
         help="Axes of the wrench; tcp and base are about the TCP.  [default: from the layout, mostly sensor]",
     ),
-    click.option(
-        "--sign", type=click.Choice(["1", "-1"]), help="Sign of the wrench: -1 for a sensor that reports the reaction."
-    ),
+    click.option("--sign", type=click.Choice(["1", "-1"]), help="Use -1 for a sensor that reports the reaction."),
     click.option("--model", help="Model of the UR arm, such as UR5e, for joint angles."),
     click.option("--urdf", metavar="FILE", help="URDF of another arm, FILE?flange=LINK&base=LINK, for joint angles."),
 )

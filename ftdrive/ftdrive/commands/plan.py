@@ -65,11 +65,7 @@ def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str |
     "--cone", "cone_deg", type=float, metavar="DEG", help="Use only poses with the tool within DEG of straight down."
 )
 @click.option(
-    "--free-box",
-    "box_mm",
-    type=float,
-    metavar="MM",
-    help="Let the flange move by up to MM to each side; the whole arm moves.",
+    "--free-box", "box_mm", type=float, metavar="MM", help="Let the flange move MM to each side with the whole arm."
 )
 @click.option(
     "--posture",
@@ -79,7 +75,7 @@ def _tip_speed(_context: click.Context, _parameter: click.Parameter, text: str |
     help="Angles of the first three joints, degrees.",
 )
 @click.option(
-    "--mounting", help="Mounting of the base: floor, wall, ceiling, or its tilt towards -x in degrees (wall: 90)."
+    "--mounting", help="Mounting: floor, wall, ceiling, or tilt of the base towards -x in degrees (wall: 90)."
 )
 @click.option(
     "--plane",

@@ -86,9 +86,7 @@ def push(
             echo("\n".join(proposal_in_lines(proposal)), err=True)
         if not sends:
             beside(as_json).print(
-                "Dry run: nothing was sent."
-                if dry_run
-                else "The controller has these values already: nothing was sent."
+                "Dry run: nothing was sent." if dry_run else "The controller already agrees: nothing was sent."
             )
             return
 

@@ -81,9 +81,7 @@ HEADINGS = {
 )
 @SOLVED_WITH
 @click.option("--as-published", is_flag=True, help="Use Carlson's methods as published, without biases.")
-@click.option(
-    "--wrench", metavar="FILE", type=FILE, help="In motion: table of the wrench, if it is in a separate file."
-)
+@click.option("--wrench", metavar="FILE", type=FILE, help="In motion: separate table of the wrench.")
 @click.option("--orientation-file", metavar="FILE", type=FILE, help="Table of the flange poses, with --wrench.")
 @click.option(
     "--from",
@@ -99,10 +97,7 @@ HEADINGS = {
     help="With --method all: show the largest errors on these poses of the free tool, as in Yu's Table III.",
 )
 @click.option(
-    "--table-iii",
-    "cases",
-    is_flag=True,
-    help=f"Solve the 11 cases of Yu's Table III, from a run with --set {EVERY_SET}.",
+    "--table-iii", "cases", is_flag=True, help=f"The 11 cases of Yu's Table III, from a run with  --set {EVERY_SET}."
 )
 @click.option("--together", "joined", is_flag=True, help="Combine runs of one tool, each with its own bias.")
 @BAG_TOPICS
@@ -245,9 +240,7 @@ def _solve_together(
         with unpack(source) as place:
             data = read_place(place, options)
             if not isinstance(data, RecordedData):
-                raise ConfigError(
-                    f"--together combines runs with poses at rest, and {source} is in motion: leave it out"
-                )
+                raise ConfigError(f"--together needs poses at rest, and {source} is in motion: leave it out")
             # Without the earlier result of a new tool, which would otherwise be counted once per run.
             results.append(_solved(replace(data, earlier=None), options))
     result = together(results)

@@ -48,9 +48,7 @@ from ftdrive.view.session_page import asked
 @simulate(
     "Use the emulated cell of the calibration, or calibrate one first; --sensor emulated://NAME selects its sensor."
 )
-@click.option(
-    "--quick", is_flag=True, help="Take 2 poses instead of 6, at the speed of the plan after one complete slow run."
-)
+@click.option("--quick", is_flag=True, help="Take 2 poses instead of 6, at the speed of the plan after one slow run.")
 @click.option("--poses", type=click.IntRange(2, 500), help="Number of poses.")
 @click.option("--max-force", "force_N", type=POSITIVE, metavar="N", help="Largest accepted difference of the force, N.")
 @click.option(

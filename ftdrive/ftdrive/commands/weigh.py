@@ -34,9 +34,7 @@ from ftdrive.view.page import drawing
 @click.option(
     "--zero", is_flag=True, help="Tare the empty gripper first, which removes the drift since the calibration."
 )
-@click.option(
-    "--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Number of poses of one load to combine."
-)
+@click.option("--poses", type=click.IntRange(1, 24), default=1, show_default=True, help="Poses to combine.")
 @click.option("--moving", is_flag=True, help="Weigh the load while the arm carries it; start with an empty gripper.")
 @click.option("--count", "part_kg", type=POSITIVE, metavar="KG", help="Count parts of this mass.")
 @click.option("--once", is_flag=True, help="Print one weight and exit; with --zero, wait for a part.")
@@ -63,9 +61,7 @@ def weigh_command(
     weighed while the arm carries it, with its complete centre of mass. The arm is only read, never moved. Ctrl-C ends.
     """
     if moving and (zero or poses > 1):
-        raise ConfigError(
-            "--moving tracks the bias and measures the complete centre of mass: leave out --zero and --poses"
-        )
+        raise ConfigError("--moving tracks the bias and needs only one pose: leave out --zero and --poses")
     view.require(once=once, allow_control=allow_control)
     with ExitStack() as stack:
         stream = source.open(stack, SENSOR_FRAME, "show" if moving else "off")

@@ -1,7 +1,6 @@
 """The formats of an exported calibration as data: keys, units, signs and frames of each target.
 
-This module does not import numpy, because help and completion must be fast. `registry.py` computes the values named in
-a row, and writes it.
+Without numpy, because help and completion must be fast. `registry.py` computes the named values, and writes a row.
 """
 
 from collections.abc import Mapping
@@ -35,13 +34,11 @@ class ExportFormat:
     subtracts: tuple[Literal["bias", "weight"], ...] = ("bias", "weight")
     """What the target subtracts from the reading."""
     expresses: tuple[Property, ...] = ("tilt", "rotation")
-    """Properties of the calibration that the target can express, in the file or elsewhere; response: see
-    `has_own_reading`."""
+    """Properties of the calibration that the target can express; for response see `has_own_reading`."""
     comment: Comment = "#"
     """Form of the header comment."""
     content: Any = None
-    """Content of the file: a document that is written as YAML, or a text with values in braces; None for the complete
-    result.
+    """Content: a document that is written as YAML, or a text with values in braces; None for the complete result.
 
     In a document, "$name" stands for a value, and "*name" in a list for the components of a vector. A name is a field
     of calibration or settings, or defined in `registry.py`. "minus_name" is the negative of a vector, "name_xyz" its

@@ -174,13 +174,10 @@ def _require_exportable(plan: Plan) -> None:
         or not all(0 < step.speed_rad_s <= _FASTEST_RAD_S for step in plan.steps)
         or not 0 < plan.acceleration_rad_s2 <= _FASTEST_RAD_S2
     ):
-        raise PlanRefused(
-            "the plan contains a joint angle, speed or acceleration that no arm can reach: make a new plan"
-        )
+        raise PlanRefused("the plan has a joint angle, speed or acceleration that no arm can reach: make a new plan")
 
 
-# The service is taken as stopped without a change of the live counter for this time, s. The states below 0 are
-# otherwise unused.
+# Time without a change of the live counter after which the service is taken as stopped, s; then its states.
 STALE_S: Final = 0.06
 # Time-out of a request, s.
 LIMIT_S: Final = 2.0

@@ -107,9 +107,7 @@ class RecordingReader:
             count += len(piece.rows)
             yield piece
         if not count:
-            raise BadRecording(
-                "it contains no sample, because the file was cut or the stream ended at once: record again", self.path
-            )
+            raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", self.path)
 
     def blocks(self) -> Iterator[Measured]:
         """Yield the samples as measured: wrench and pose with their times. Raises as `pieces`."""
@@ -125,8 +123,7 @@ class RecordingReader:
 def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ()) -> Recording:
     """Read a recording of `RecordingReader` into memory.
 
-    Raises for a damaged file and for one without a sample. A truncated file is read to its end; `cut` then gives the
-    reason.
+    Raises for a damaged or empty file. A truncated file is read to its end; `cut` then gives the reason.
     """
     # A damaged file raises, because a caller in Python would not see a printed message.
     reader = RecordingReader(Path(path), columns)

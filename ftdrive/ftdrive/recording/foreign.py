@@ -153,9 +153,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
     except ProtocolError as error:
         raise BadDataset(f"{path.name}: {error}") from error
     except Exception as error:  # of rosbags, SQLite, zstd or YAML
-        raise BadDataset(
-            f"{path.name} cannot be read ({error}): it is damaged or has another version. Record it again"
-        ) from error
+        raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged or has another version") from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
     return (
         _time_ordered_table(path.name, wrench, origin_ns, CHANNELS),

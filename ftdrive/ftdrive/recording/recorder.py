@@ -65,8 +65,7 @@ class RecordingFiles:
     def complete(self) -> None:
         """Complete all files with every sample.
 
-        Raises `OSError` if a file could not be completed; the others are. The message names what each `.partial`
-        contains.
+        Raises `OSError` if a file could not be completed; its message names what each `.partial` contains.
         """
         files, self._files, failure = self._files, [], None
         with _uninterrupted():

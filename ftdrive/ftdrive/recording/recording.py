@@ -196,9 +196,7 @@ def _stages_of(values: Mapping[str, Any]) -> Stages:
     usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
     off = {name: None if value is None else type(value)() for name, value in usual.items()}
     if newer := [name for name, value in dict(values).items() if value and name not in off]:
-        raise BadRecording(
-            f"the recording uses the stage {newer[0]}, which this version does not have: use a newer ftdrive"
-        )
+        raise BadRecording(f"the stage {newer[0]} is unknown to this version: use a newer ftdrive")
     return Stages(**{name: values.get(name, value) for name, value in off.items()})
 
 

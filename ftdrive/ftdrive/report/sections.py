@@ -433,7 +433,7 @@ def comparison(facts: Facts) -> Section:
         )
     if found["same_data"]:
         text.append(
-            "Both results use the same data. The test below does not apply, because it assumes independent noise."
+            "Both results use the same data, so the test below, which assumes independent noise, does not apply."
         )
     else:
         changed = [one["name"] for one in found["groups"][:-1] if one["p_value"] < CHANGED_P]

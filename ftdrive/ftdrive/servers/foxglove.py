@@ -2,8 +2,7 @@
 
 Wrenches, poses, joint angles and frames are ROS 2 messages, because the viewers have no other wrench type and
 PlotJuggler no other encoding. Arrows and events have types of Foxglove. Programs can tare, and set frame and stages.
-Pages in a browser are accepted from a short list of origins, and have these rights if control is allowed, see
-`http_gate`.
+Browser pages are accepted from a few origins, and may do the same if control is allowed, see `http_gate`.
 """
 
 import json
@@ -115,9 +114,8 @@ class FoxgloveServer(Sink, ServerListener):
     """Sends a stream to any number of clients.
 
     No client delays the stream. Messages wait in one queue per client; the SDK drops the oldest from a full queue
-    without counting them. Therefore `STATUS` contains the number of messages sent per topic: a client that received
-    fewer since the previous status has lost the others. The SDK reports a slow client at most every 30 s, which is
-    logged.
+    without counting them. Therefore `STATUS` contains the number of messages sent per topic, from which a client can
+    count its losses. A slow client is logged at most every 30 s.
 
     Requests of clients are handled in a thread of the SDK.
 
@@ -310,8 +308,7 @@ class FoxgloveServer(Sink, ServerListener):
 def _send_at_once(port: int) -> None:
     """Set TCP_NODELAY on the socket of this process that listens on a port; its connections inherit the option.
 
-    The SDK does not set the option. Without it, a message waits up to 40 ms for the acknowledgement of the previous
-    one.
+    Without the option, a message waits up to 40 ms for the acknowledgement of the previous one.
     """
     folder = Path("/dev/fd")  # Windows has none
     for name in [path.name for path in folder.iterdir()] if folder.is_dir() else []:

@@ -89,9 +89,7 @@ class Fixed:
         False, "Reliable delivery. Otherwise best effort with depth 5, which a reliable subscriber cannot receive."
     )
     base_frame: str = _described_parameter("base", "Name of the controller's base frame: base for a UR, not base_link.")
-    flange_frame: str = _described_parameter(
-        "tool0", "Name of the flange frame with z out: tool0 for a UR, not flange."
-    )
+    flange_frame: str = _described_parameter("tool0", "Name of the flange frame, z out: tool0 for a UR, not flange.")
     sensor_frame: str = _described_parameter("ft_sensor", "Name of the sensor frame, used by ~/wrench_raw.")
     publish_base_tf: bool = _described_parameter(
         False, "Also publish base to flange on /tf, which the arm's driver usually does."

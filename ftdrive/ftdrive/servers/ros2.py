@@ -1,8 +1,7 @@
 """Node of `ftdrive ros2`: a compensated stream as topics, transforms, services and diagnostics.
 
 The node follows REP 103, 105 and 107: SI units, `frame_id` for axes and origin of a wrench, stamps with the time of
-measurement. During a fault, no wrench is published and a diagnostic gives the reason; old or zero wrenches are never
-published.
+measurement. During a fault, no wrench is published, and a diagnostic gives the reason.
 """
 
 import math

@@ -26,8 +26,7 @@ from ftdrive.stream.samples import Ns, Paired
 
 # The covariance of the prediction is evaluated again after the tool has turned by this angle.
 _TURN_RAD = 0.02
-# Sigma of the acceleration of a moving arm: without positions, and predicted from past poses only. Sigma of the angular
-# acceleration.
+# Sigma of accelerations of a moving arm: without positions, predicted from past poses, and angular.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
 # Error of the time of a predicted wrench besides that of the delay: accelerations are means over a similar time.
 _INEXACT_S = 0.005

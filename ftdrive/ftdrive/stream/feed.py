@@ -74,8 +74,7 @@ class Feed(Sink):
         self.status = stream.status()
         self.sigma = self.rest_sigma = self.sample_sigma = np.full(6, np.nan)
         """(6,) standard deviations: of a mean over `MEAN_S` under the present contact, of such a mean of a free tool,
-        and of one sample of a free tool. Like the status, they are at most 50 ms of stream time older than the newest
-        block."""
+        and of one sample of a free tool. Updated every 50 ms, like the status."""
         self.newest_ns: int | None = None
         """Time of the newest sample."""
         self.turned_ns = stream.clock.now_ns()

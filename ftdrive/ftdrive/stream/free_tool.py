@@ -45,16 +45,14 @@ _BIAS, _RATE, _LOCAL, _PART = slice(0, 6), slice(6, 12), slice(12, 18), slice(18
 _UNIT = np.repeat([1.0, 0.03], 3)
 ANY_BIAS = np.square(_UNIT)
 """Variance (6,) added when tracking begins, because the bias may have changed by more than the drift explains."""
-# Candidate random walks of the bias within an hour, one sigma, N. The last two are for sensors that warm up or are
-# worn.
+# Candidate random walks of the bias within an hour, one sigma, N; the last two for warming or worn sensors.
 WALKS_N = (0.03, 0.1, 0.3, 1.0, 3.0)
 # Time constant of forgetting for the likelihoods of the walks, because a warm sensor walks less.
 _FORGET_S = 3600.0
 # Typical drift of the bias within an hour, one sigma, N; the drift rate may change by as much within an hour.
 _RATE_N = 5.0
 _RATE_VARIANCE = np.square(_RATE_N / 3600 * _UNIT)
-# Correlation angle of the error of the calibration: weights turn with the sine of the angle, forces of cables change
-# sooner.
+# Correlation angle of the calibration error: weights vary with the sine of the angle, cable forces faster.
 _LOCAL_RAD = 0.5
 # Gate on the squared innovation of a window; a free tool exceeds it about once an hour.
 _GATE = float(chdtri(6, 1e-4))
@@ -65,8 +63,7 @@ _SAME = float(chdtri(4, 1e-3))
 # Fewest and most consecutive windows that determine a part; older windows are dropped.
 _RUN, _LONGEST_RUN = 4, 24
 # A new part is accepted after gravity has turned by this angle in the sensor, or the arm has moved this far: a contact
-# stays in place. A steady force along gravity that travels with the arm is taken for a part, because no measurement
-# distinguishes it.
+# stays in place. A steady force along gravity that moves with the arm looks like a part.
 _TURN_RAD, _TRAVEL_M = 0.25, 0.15
 # A window is used only after this many further windows fit the state, because the begin of a contact may be too small
 # to detect. A contact that begins slowly therefore does not change the bias.
@@ -77,8 +74,7 @@ _TRUSTED_N = 20.0
 # An estimate farther from the trusted bias than this, N, or than this many sigmas, may contain a slow contact: 3 N that
 # grow within 300 s are then detected before they have changed the bias by 0.5 N.
 _DOUBTFUL_N, _DOUBTFUL_SIGMAS = 0.2, 3.0
-# Assumed random walk of a new sensor within an hour, N, and the time constant of its estimate, which is longer than a
-# contact.
+# Assumed random walk of a new sensor within an hour, N, and the time constant of its estimate, s.
 _USUAL_WALK_N, _WALK_KNOWN_S = 1.0, 1800.0
 # Drift allowed at a tare, one sigma, N.
 _TARED_N = 0.5

@@ -24,8 +24,7 @@ REST = 0
 SPEEDS_RAD_S = (0.15, 0.4, 0.7)
 """Limits of the speed classes: angular speed plus flange speed divided by 0.5 m, rad/s."""
 ACCELERATION_RAD_S2 = 1.5
-"""Limit between the two acceleration classes, rad/s²: angular acceleration plus that of the flange divided by 0.5 m,
-beyond the centripetal part."""
+"""Limit between the two acceleration classes: angular plus flange acceleration (centripetal excluded) / 0.5 m."""
 SLOW = 2
 """Only the slow speed classes are divided by acceleration: at higher speeds ringing and ripple do not depend on it."""
 STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
@@ -35,8 +34,7 @@ STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
 # From this displacement of the centre of mass on, its inertial wrench counts. It shows before the motion does.
 _FELT_M = 4e-5
-# Rest begins this long after the last motion. A state of motion ends this long after its last sample, because links
-# ring.
+# Rest begins, and a state of motion ends, this long after its last sample, because links ring, s.
 _HOLD_S, _RINGS_S = 0.5, 0.4
 _LEVER_M = 0.5
 _SPEEDS = np.array(SPEEDS_RAD_S)
@@ -169,12 +167,10 @@ class NoiseEstimator:
         self._size = samples_in_reading(rate_Hz)
         self._unread = np.empty((0, 7))
         self._at_rest = True
-        # Mean (6), scatter (6, 6) and state of each reading since the last window or transition between rest and
-        # motion.
+        # Mean (6), scatter (6, 6) and state of each reading since the last window or change of rest and motion.
         self._open = np.empty((0, 43))
         self._mean_before: Array | None = None
-        # Per window: scatter of the readings, scatter of the samples within readings, and step from the previous
-        # window.
+        # Per window: scatter of readings, scatter of samples within readings, step from the previous window.
         self._windows: list[deque[tuple[Array, Array, Array]]] = [deque(maxlen=_WINDOWS) for _ in range(STATES)]
         self._known: dict[int, SensorNoise] = {}
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
@@ -352,8 +348,7 @@ class Windows:
         self._stride = max(1, round(_KNOT_S * info.sensor_rate_Hz))
         self._weights = np.hanning(self._size + 2)[1:-1] / (np.hanning(self._size + 2).sum())
         self._unknown = wrench_by_acceleration(calibration.mass_kg, self._tool.p_sensor_com_m) * _UNKNOWN_M_S2
-        # Samples of one window and its margins, copied as they arrive: joining blocks at the end would take too long at
-        # once.
+        # Samples of one window and its margins, copied as they arrive, to avoid one long copy at its end.
         self._rows = np.empty(self._size + 2 * self._stride * _REACH, _ROW)
         self.restart()
 

@@ -38,8 +38,7 @@ PERIOD_S = 0.024
 _BATCH_S = 1.0
 # The acceleration comes from this many neighbours on each side.
 _REACH = 2
-# Weights that smooth the force as the acceleration is smoothed, which comes from means of poses by a parabola through
-# five of them.
+# Weights that smooth the force like the acceleration, which comes from parabolas through five mean poses.
 _SAME = np.convolve([2, 3, 2], [1, 10, 1]) / 84
 # The estimate is applied below this sigma, computed without the most informative second.
 _USABLE_S = 3e-3
@@ -151,15 +150,13 @@ class DelayEstimator:
         eigenvalues, V = np.linalg.eigh(errors)
         self._scale[1:10, 1:10] = V * np.sqrt(np.maximum(eigenvalues, 0.0))
         self._scale[10:, 10:] = (_LEVER_M if known else _ANY_LEVER_M) * np.eye(3)
-        # per second: products of derivatives and residual, number of values, reduction for correlation, smallest
-        # variance
+        # per second: products of derivatives and residual, their number, reduction, smallest variance
         self._seconds: deque[tuple[Array, int, float, float]] = deque(maxlen=window)
         self._pending: list[Paired] = []
         self._settling = False
         motion = calibration.motion
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
-        """Delay by which samples are paired: first that of the calibration, then the estimate once it is accurate
-        enough."""
+        """Delay used for pairing: that of the calibration, then the estimate once it is accurate enough."""
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
         """Standard deviation of the delay."""
 

@@ -370,9 +370,7 @@ class CellSource(SampleSource):
             raise
         arm = _ALONE if self._arm is None else self._arm.identify()
         if arm != self.info.arm or self._sensor.identify() != self.info.sensor:
-            raise ConfigError(
-                f"another device answers ({arm.model} {arm.serial}): start the command again"
-            ) from failure
+            raise ConfigError(f"another device answers ({arm.model} {arm.serial}): start again") from failure
         self._pairing.forget()
         self._was_interrupted = True
         self._failure = None

@@ -37,8 +37,7 @@ TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
 """Standard deviation of the drift of the bias since the calibration or the last tare that a tare accepts."""
 
-# The acceleration comes from poses at this spacing over twice this reach: a longer reach smooths the edges of a move
-# and delays the samples more.
+# The acceleration comes from poses at this spacing over twice this reach: longer ones blur and delay moves.
 _KNOT_S, _REACH_S = 0.002, 0.015
 # Largest motion of the flange during a tare.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4

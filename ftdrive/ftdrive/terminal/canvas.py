@@ -93,11 +93,7 @@ class Canvas(ABC):
             self.is_over = True
         elif key == "v" and self._address:
             is_ours = is_loopback(urlsplit(self._address).hostname or "")
-            words = (
-                "for this computer only: for a tablet, use --view-address"
-                if is_ours
-                else "anyone with it sees the page"
-            )
+            words = "of this computer only: use --view-address" if is_ours else "anyone with it sees the page"
             code = [Line(" ").add(row, "white on black") for row in qr_code(self._address)]
             self.cover = [Line(f" {self._address}"), Line(f" {words}"), *code, Line(" Any key returns.")]
         else:

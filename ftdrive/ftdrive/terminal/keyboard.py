@@ -22,8 +22,7 @@ _NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C
 _KEYS = {key.value: key for key in Key}
 # A letter within this time of another one belongs to a word, such as a late answer, s.
 _WORD_S = 0.3
-# These keys also count within a word, because an unnecessary stop is harmless. Other letters in a word become
-# `Key.OTHER`.
+# Keys that count within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
 _ALWAYS = {Key.PAUSE, Key.STOP}
 
 

@@ -97,11 +97,7 @@ class LiveScreen(Canvas):
             self._summary.span_s = SPANS_S[(SPANS_S.index(self._summary.span_s) + 1) % len(SPANS_S)]
         elif key == "b":
             mark = self._feed.stream.mark
-            self.entry = (
-                lambda text: self._feed.do(partial(mark, text)),
-                "text of the mark, then Enter; Esc cancels",
-                "",
-            )
+            self.entry = (lambda text: self._feed.do(partial(mark, text)), "text, then Enter; Esc cancels", "")
         elif (action := _actions(self._feed).get(key)) is not None:
             self._feed.do(action)
 

@@ -57,9 +57,7 @@ class Page:
 
     def add_stop(self, stop: Callable[[str], object]) -> None:
         """Show a Stop button; `stop` is called in another thread, with the name of the viewer."""
-        self.put(
-            {"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. This is not an emergency stop.")}
-        )
+        self.put({"stop": controls(button("stop", "Stop", key="q"), note="Stops the arm. No emergency stop.")})
         self.on("stop", lambda viewer, _: stop(viewer))
 
     def act(self, viewer: str, name: object, value: object) -> None:

@@ -20,8 +20,7 @@ FORCE, TORQUE, PATH, UNKNOWN = "force", "torque", "path", "unknown"
 def body(half_length_m: float, radius_m: float, rounding_m: float, colour: str, **more: Any) -> Part:
     """Return a cylinder along z with rounded edges: a capsule for radius 0, a ball for radius and length 0.
 
-    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), positions and
-    quaternions.
+    `more` are `at` (3,), `turn` (4,), a quaternion with w first, `alpha`, and `copies` (n, 7), position and turn.
     """
     shape = rounded_list([half_length_m, radius_m, rounding_m])
     return {"kind": "body", "shape": shape, "colour": colour} | {

@@ -63,8 +63,7 @@ class Onlooker(Guard):
     def __init__(self) -> None:
         self.seen: Seen | None = None
         self.fresh_s = self.age_s = self.looked_s = 0.0
-        """Time at which the newest sample was first seen, its age, and the time of the last look on the computer's
-        clock."""
+        """First sight of the newest sample, its age, and the last look on the computer's clock, s."""
 
     def look(self, seen: Seen) -> None:
         """Keep the observation."""
@@ -77,8 +76,7 @@ class SessionPage:
     """An operator that shows the session of another operator on a page, on which any viewer may stop it.
 
     The other operator answers the questions. A thread draws the newest state while the page is open in a browser, so
-    that browsers do not delay the session. If the thread fails or hangs, the session continues and `pressed` reports
-    the failure.
+    that browsers do not delay the session. If it fails or hangs, the session continues and `pressed` reports it.
     """
 
     def __init__(self, page: Page, operator: Operator, command: str) -> None:

@@ -102,8 +102,7 @@ class Site(Gate):
         if number is None:
             number, self._opened = self._opened, self._opened + 1
         # Browsers send the cookies of one port to all ports of a host, so the name contains the port. The page reloads
-        # itself, because after a redirect from another page, such as the file of `announced`, browsers would not send a
-        # strict cookie.
+        # itself, because browsers send no strict cookie after a redirect from another page.
         cookie = f"Set-Cookie: ftdrive-{self.port}={self.token}.{number}; HttpOnly; SameSite=Strict; Path=/"
         await request.answer(HTTPStatus.OK, _OPENED, "text/html; charset=utf-8", cookie, *_SAFE)
 
@@ -230,8 +229,7 @@ def announced(page: Page, address: Address | None, print_page: Callable[..., obj
     if shared or (sys.platform == "linux" and not any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY")))):
         yield
         return
-    # As an argument of the browser, the address would be visible to every user in `ps`. Only the owner may enter the
-    # folder.
+    # As an argument of the browser, the address would be visible in `ps`. Only the owner may enter the folder.
     with TemporaryDirectory(prefix="ftdrive-", ignore_cleanup_errors=True) as folder:
         file = Path(folder, "page.html")
         file.write_text(f'<!doctype html><meta http-equiv="refresh" content="0;url={escape(page.url)}">')

@@ -289,11 +289,7 @@ class StreamSummary:
             if link.error or link.age_s > STALE_S:
                 return f"{device.model}: {link.error or f'no sample for {link.age_s:.1f} s'}"
         waits_s = (feed.stream.clock.now_ns() - feed.turned_ns) * 1e-9
-        return (
-            f"no samples were read for {waits_s:.0f} s, because the output is blocked: check its reader"
-            if waits_s > _HELD_S
-            else ""
-        )
+        return f"no samples read for {waits_s:.0f} s: check the reader of the output" if waits_s > _HELD_S else ""
 
     def _reading(self) -> ShownWrench | None:
         if (recent := self._recent) is None:

@@ -46,12 +46,7 @@ def _deliver(made: Made | None) -> None:
 )
 @_OUTPUT
 @click.option(
-    "--dwell",
-    "dwell_s",
-    type=Number(0, 600),
-    default=4.0,
-    show_default=True,
-    help="Dwell time at each pose, s (urscript).",
+    "--dwell", "dwell_s", type=Number(0, 600), default=4.0, show_default=True, help="Dwell at each pose, s (urscript)."
 )
 @simulate("Export the plan of an emulated cell in the default posture of `ftdrive plan`.")
 @JSON
@@ -81,13 +76,7 @@ def export_plan(
 
 
 @export_group.command()
-@click.option(
-    "--first",
-    type=click.IntRange(24, 33),
-    default=24,
-    show_default=True,
-    help="First register, as for `serve-load --first`.",
-)
+@click.option("--first", type=click.IntRange(24, 33), default=24, show_default=True, help="As in `serve-load --first`.")
 @click.option("--example", is_flag=True, help="Append a program that weighs a part and sets the payload.")
 @_OUTPUT
 @simulate("Accepted for consistency; the functions do not change.")

@@ -52,7 +52,7 @@ def _frame_option(option: str, usual: str, words: str) -> Callable[[Any], Any]:
     "Name of the controller's base frame; for base_link, vectors are turned by 180° about z, as in ROS.",
 )
 @_frame_option(
-    "--flange-frame", "tool0", "Name of the flange frame, with z out; for flange, x points out, as in ROS-Industrial."
+    "--flange-frame", "tool0", "Name of the flange frame, z out; for flange, x is out, as in ROS-Industrial."
 )
 @_frame_option("--sensor-frame", "ft_sensor", "Name of the sensor and its frame.")
 @_frame_option("--tool-frame", "tool", "Name of the tool and its frame.")

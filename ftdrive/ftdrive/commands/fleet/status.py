@@ -27,9 +27,7 @@ _TITLES = ("cell", "tool", "verdict", "age", "verified", "drift, σ", "due", "we
 
 @click.command()
 @STORE
-@click.option(
-    "--html", "page_path", metavar="FILE", type=NewFile(), help="New file for a page with plots of the drift."
-)
+@click.option("--html", "page_path", metavar="FILE", type=NewFile(), help="New file: a page with plots of the drift.")
 @JSON
 def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """List all cells: what is due, and what drifts.

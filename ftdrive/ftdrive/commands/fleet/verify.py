@@ -40,9 +40,7 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     the cell. No option answers this question, and a terminal is required.
     """
     if not (sys.stdin.isatty() and sys.stderr.isatty()):
-        raise ConfigError(
-            "fleet verify asks a question at every cell, and needs a terminal: run it in a terminal at the cells"
-        )
+        raise ConfigError("fleet verify asks at every cell and needs a terminal: run it in one at the cells")
     refuse_variables()
     if names and due:
         raise ConfigError("CELL and --due exclude one another: leave one of them out")
