@@ -175,7 +175,7 @@ def test_what_cannot_be_converted_to_parquet_stays_in_mcap(
         fill_disk(100_000)
     else:
         monkeypatch.setattr(ParquetFile, "append", Mock(side_effect=failure))
-    with pytest.raises(OSError, match=rf"a\.parquet was not written .*`ftdrive convert {kept} {path}` saves"):
+    with pytest.raises(OSError, match=rf"a\.parquet was not written .*`ftdrive convert {kept} {path}`"):
         recorder.end()
     assert (recorder.saved, recorder.partial) == ([tmp_path / "b.csv"], {kept: 1100})
     assert sorted(tmp_path.iterdir()) == [kept, tmp_path / "b.csv"]

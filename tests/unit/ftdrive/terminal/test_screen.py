@@ -176,7 +176,7 @@ def test_a_first_pose_shows_its_coverage_and_no_numbers() -> None:
     text = "\n".join(drawn(view(MIDDLE[0], pose(1, 1), first)))
     assert "coverage  RED   condition >100 " in text
     assert "out of plane >100 " in text
-    assert "residual: no fit" in text
+    assert "residual: no previous fit" in text
     assert "drift  not known" in text
     assert "nan" not in text
     assert "inf" not in text
@@ -276,7 +276,7 @@ def test_a_sweep_on_hold_shows_that_it_starts_again_and_promises_no_poses() -> N
     *_, keys, kept, resume = drawn(on_hold)
     assert keys.endswith("Ctrl-C ends")
     assert kept == "kept in runs/a"
-    assert resume.startswith("resume  starts again")
+    assert resume.startswith("resume  start again")
 
 
 # The terminal.

@@ -404,7 +404,7 @@ def test_a_session_whose_page_cannot_be_drawn_goes_on_and_says_so_once(
 
 
 def is_failure(event: object) -> bool:
-    return isinstance(event, Noted) and "cannot be drawn" in event.words
+    return isinstance(event, Noted) and "cannot be updated" in event.words
 
 
 def test_a_page_that_hangs_is_reported_and_not_waited_for(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
