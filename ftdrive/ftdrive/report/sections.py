@@ -234,7 +234,7 @@ def residuals(facts: Facts) -> Section:
     result, poses, in_motion = facts["result"], facts["poses"], facts["motion"] is not None
     text = [
         f"Residuals: {facts['residuals']}.",
-        f"Their size is {result['noise_factor']:.2f} times the noise (p = {_p_value_in_words(result['p_value'])})."
+        f"They are {result['noise_factor']:.2f} times the measured noise (p = {_p_value_in_words(result['p_value'])})."
         if result["p_value"] is not None
         else "The noise was not measured but estimated from the residuals, so their size does not test the fit.",
     ]

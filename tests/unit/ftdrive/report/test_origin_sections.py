@@ -97,7 +97,7 @@ def test_a_comparison_names_what_changed_by_more_than_chance() -> None:
     assert section.tables[0].rows[2] == ("all", "99", "15", "< 0.0001")
     assert section.tables[1].rows == [("force bias x", "+0.12", "+4.3"), ("centre of mass z", "-0.00012", "-")]
     alike = {**found, "groups": groups[1:]}
-    assert comparison({"comparison": alike, "compared_with": ""}).text[1].startswith("Nothing changed")
+    assert comparison({"comparison": alike, "compared_with": ""}).text[1].startswith("No significant change")
     same = comparison({"comparison": {**found, "same_data": True}, "compared_with": ""}).text
     assert (len(same), same[1].startswith("Both results use the same data")) == (2, True)
     assert comparison({"comparison": None, "compared_with": "It is gone."}).text == ["It is gone."]

@@ -336,7 +336,7 @@ def test_a_rejected_run_gets_a_report_with_its_reasons(tmp_path: Path) -> None:
     assert outcome.exit_code == 0, outcome.output
     found = json.loads(outcome.stdout)
     assert found["verdict"] == "rejected"
-    assert "Do not compensate" in found["next_step"]
+    assert "Do not use the calibration" in found["next_step"]
     assert any("R103 was not steady" in one["words"] for one in found["hints"])
     assert found["tour"]["devices"] == DEVICES
     assert not run.calibration_path.exists()
@@ -356,7 +356,7 @@ def test_a_saved_result_is_reported_with_the_data_of_its_run(tmp_path: Path) -> 
     moved = tmp_path / "calibration.json"
     saved.save(moved)
     assert read_subject(moved, SolveOptions()).dataset is None
-    with pytest.raises(ConfigError, match="solved already"):
+    with pytest.raises(ConfigError, match="already solved"):
         read_subject(moved, SolveOptions(drift="none"))
 
 

@@ -63,7 +63,7 @@ def test_a_failed_verification_is_in_every_format_and_changes_the_next_step(
     path = calibrated / "calibration.json"
     document = json.loads(report(path, "--format", "json").stdout)
     assert document["trust"]["last_verification"]["reason"] == "the force bias has changed by 0.5 N"
-    assert "accept the update" in document["next_step"]
+    assert "accept the proposed update" in document["next_step"]
     text = render_page(document)
     assert "VERIFICATION FAILED" in text
     assert "the force bias has changed by 0.5 N" in text

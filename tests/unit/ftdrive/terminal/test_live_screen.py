@@ -133,7 +133,7 @@ def test_a_frame_that_is_not_configured_is_left_out_and_named() -> None:
 
 def test_keys_tare_undo_and_mark() -> None:
     screen = Screen()
-    assert "text of the mark, then Enter; Esc cancels" in screen.press("t", "b")[-1]
+    assert "text, then Enter; Esc cancels" in screen.press("t", "b")[-1]
     screen.press("t", "escape", "u", "b", "enter", "b")
     assert screen.press(*"q ho", "backspace", "backspace", *"hi")[-1].strip() == "q hi"
     lines = screen.press("enter")
