@@ -282,7 +282,7 @@ def test_the_sensor_that_is_named_is_emulated(
         (("solve", "--simulate", "."), "DATASET does not go with --simulate"),
         (("solve", "--sensor", "emulated://bota", "."), "--sensor is only for --simulate"),
         *(((command,), "--simulate") for command in ("solve", "replay", "report", "bundle", "live", "push")),
-        (("push", ".", "--restore", "."), "--restore takes everything"),
+        (("push", ".", "--restore", "."), "--restore uses only the receipt"),
         (("record", "-o", "a.csv"), "--simulate"),
         (("transcript", "play"), "--simulate"),
         (("export", "plan", "--format", "csv"), "--simulate"),

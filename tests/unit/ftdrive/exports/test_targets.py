@@ -132,9 +132,7 @@ def in_motion() -> CalibrationResult:
 
 
 def test_an_inertia_from_motion_is_written() -> None:
-    found = {
-        name: export_calibration(in_motion(), name, MEASURED, max_force_error_N=1e3) for name in ("urdf", "mujoco")
-    }
+    found = {name: export_calibration(in_motion(), name, MEASURED, max_force_error_N=9) for name in ("urdf", "mujoco")}
     written = re.findall(r'i([xyz]{2})="(\S+)"', found["urdf"].text)
     moments = {"xx": 0.002, "yy": 0.0024, "zz": 0.0014, "xy": 0.0001, "xz": -0.0002, "yz": 0.0003}
     assert {axes: float(value) for axes, value in written} == moments
