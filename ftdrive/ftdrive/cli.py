@@ -228,10 +228,10 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 def _explain_click_error(error: click.ClickException, arguments: Sequence[str]) -> None:
-    from ftdrive.mistakes import existing, missing, of_subcommand, without_value
+    from ftdrive.mistakes import missing_parameters, of_subcommand, similar_path, without_value
 
     if isinstance(error, click.MissingParameter):
-        error = click.UsageError(missing(error, arguments), error.ctx)
+        error = click.UsageError(missing_parameters(error, arguments), error.ctx)
     elif isinstance(error, click.NoSuchOption):
         error = click.UsageError(of_subcommand(error, arguments), error.ctx)
     elif isinstance(error, click.BadOptionUsage):
@@ -241,7 +241,7 @@ def _explain_click_error(error: click.ClickException, arguments: Sequence[str]) 
             _say(f"error: {in_one_line(other)}")
             return
         if isinstance(error, click.BadParameter) and error.param and isinstance(error.param.type, click.Path):
-            error = click.UsageError(error.format_message() + existing(cli, arguments), error.ctx)
+            error = click.UsageError(error.format_message() + similar_path(cli, arguments), error.ctx)
     error.show(message := StringIO())
     echo(message.getvalue(), err=True, nl=False)
 

@@ -482,7 +482,7 @@ def solve_load_runs(
         raise ConfigError(f"the runs are of different sensors ({name} {ours} and {other[name]}): give those of one")
     of_cells = (one.setup.weighed_kg for _, _, one in read if one.setup.weighed_kg is not None)
     weighed = next(of_cells, None) if tool_mass is None else mass_of(tool_mass)
-    prior = _prior(data, identity, [path.name for path in paths], say)
+    prior = _prior_matrix(data, identity, [path.name for path in paths], say)
     solution = solve_loads(
         [run for run, _, _ in read],
         prior,
@@ -505,7 +505,7 @@ def _run_of(path: Path) -> tuple[LoadRun, dict[str, Any], RecordedData]:
     return LoadRun(path.name, data.dataset, Load.of_header(data.dataset.meta)), sensor_identity(origin), data
 
 
-def _prior(
+def _prior_matrix(
     data: RecordedData, identity: dict[str, Any], names: list[str], say: Callable[[str], object]
 ) -> SensorMatrix:
     """Return the prior matrix of the sensor: from earlier loads, its data sheet, or typical errors."""

@@ -174,7 +174,7 @@ def _is_read(parameter: click.Parameter) -> bool:
     return isinstance(parameter.type, click.Path) and parameter.type.exists
 
 
-def existing(group: click.Group, arguments: Sequence[str]) -> str:
+def similar_path(group: click.Group, arguments: Sequence[str]) -> str:
     """Return a sentence with a path similar to the missing one, or with the way to find one."""
     for _, _, name, _ in _unmatched_arguments(group, arguments):
         path = Path(name)
@@ -198,7 +198,7 @@ def _question(names: Iterable[str]) -> str:
     return f" Did you mean {' or '.join(quoted)}?" if quoted else ""
 
 
-def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
+def missing_parameters(error: click.MissingParameter, arguments: Sequence[str]) -> str:
     """Return all missing parameters of a line, of which `click` names only the first, and the complete line."""
     context = error.ctx
     if context is None or context.info_name not in arguments:
@@ -214,7 +214,7 @@ def missing(error: click.MissingParameter, arguments: Sequence[str]) -> str:
     if "--simulate" in options and not {"--simulate", "--calibration", "--tool", "--sensor"} & set(typed):
         real = [options[name] for name in ("--calibration", "--sensor") if name in options]
         absent += [one for one in real if one.metavar in {"PATH", "URL"}][:1]
-    words = " ".join(_blank(one, context) for one in absent)
+    words = " ".join(_placeholder(one, context) for one in absent)
     return f"Missing {names}. Type\n{' '.join([context.command_path, shlex.join(typed)]).rstrip()} {words}"
 
 
@@ -228,7 +228,7 @@ def without_value(error: click.BadOptionUsage, group: click.Group, arguments: Se
             words.append(argument)
     for one in command.params:
         if error.option_name in one.opts:
-            return f"{error.format_message()} Type\n{' '.join([*words, _blank(one, click.Context(command))])}"
+            return f"{error.format_message()} Type\n{' '.join([*words, _placeholder(one, click.Context(command))])}"
     return error.format_message()
 
 
@@ -245,6 +245,6 @@ def of_subcommand(error: click.NoSuchOption, arguments: Sequence[str]) -> str:
     return error.format_message()
 
 
-def _blank(parameter: click.Parameter, context: click.Context) -> str:
+def _placeholder(parameter: click.Parameter, context: click.Context) -> str:
     value = parameter.make_metavar(context)
     return f"{max(parameter.opts, key=len)} {value}" if isinstance(parameter, click.Option) else value

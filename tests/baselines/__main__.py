@@ -27,7 +27,7 @@ import numpy as np
 import ftdrive
 import tests.conftest  # the configuration and the terminal of the user do not matter  # noqa: F401
 from ftcalib.published.methods import PUBLISHED
-from ftdrive.recording.replay import replayed
+from ftdrive.recording.replay import open_replay
 from ftdrive.stream.samples import Block, Stages, WrenchFrame
 from tests.baselines.pack import unpack
 from tests.system.command_line import CommandLine
@@ -58,7 +58,7 @@ def results(old: CommandLine) -> Iterator[tuple[str, str]]:
     for method in PUBLISHED:
         yield method, text_or_error(partial(solution, dataset(), method))
     for recording in ("rest.mcap", "pushed.mcap", "held.mcap"):
-        stream = replayed(
+        stream = open_replay(
             old.folder / recording, old.folder / "quick", WrenchFrame("sensor"), speed=math.inf, force=True
         )
         yield f"weigh {recording}", text_or_error(partial(weighed, stream))
@@ -84,7 +84,7 @@ def blocks(old: CommandLine) -> Iterator[tuple[str, str]]:
     }
     for name, (file, frame, stages, track) in settings.items():
         calibration = old.folder / "sweep" if stages.inertia else None
-        stream = replayed(old.folder / file, calibration, frame, speed=math.inf, force=True)
+        stream = open_replay(old.folder / file, calibration, frame, speed=math.inf, force=True)
         stream.stages, stream.track = stages, track  # type: ignore[assignment]
         read = list[Block]()
         while not stream.has_ended:

@@ -11,7 +11,7 @@ from ftdrive.errors import ConfigError
 from ftdrive.mistakes import kind_of
 from ftdrive.runs.bundle import write_bundle
 from ftdrive.session.rehearsal import rehearsed_run
-from ftdrive.terminal.console import beside, hanging
+from ftdrive.terminal.console import indented, message_console
 from ftdrive.terminal.screen import open_operator
 
 
@@ -57,10 +57,10 @@ def bundle(
         redacted, left_out = write_bundle(folder, path, transcripts)
     if as_json:
         write_json({"schema_version": 1, "file": str(path), "redacted": redacted, "left_out": left_out})
-    say = beside(as_json)
+    say = message_console(as_json)
     counted = ", ".join(f"{count} {kind}" for kind, count in redacted.items()) or "nothing found"
-    say.print(hanging(" redacted: ", counted, say))
+    say.print(indented(" redacted: ", counted, say))
     if left_out:
         words = f"{', '.join(left_out)} (neither text nor a pose, or above 200 MB)"
-        say.print(hanging(" left out: ", words, say))
+        say.print(indented(" left out: ", words, say))
     say.print(f" Saved {path}")

@@ -44,7 +44,7 @@ from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.rehearsal import put_on
 from ftdrive.session.session import method_of_poses, run_calibration
 from ftdrive.store import index_run
-from ftdrive.terminal.console import beside, messages
+from ftdrive.terminal.console import message_console, messages
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import open_operator
 from ftdrive.view.outcome import conclude_calibration, on_page
@@ -154,7 +154,7 @@ def calibrate_command(
     after you type a word. If possible, only the three wrist joints move. Ctrl-C stops the arm and keeps the poses;
     --resume continues.
     """
-    refuse_contradictions(_given(click.get_current_context()))
+    refuse_contradictions(_given_options(click.get_current_context()))
     options, load = _options_of(**chosen)
     with ExitStack() as stack:
         page = stack.enter_context(view.page("ftdrive calibrate"))
@@ -186,7 +186,7 @@ def calibrate_command(
         ):
             outcome = run_calibration(cell, shown, options, load)
         if outcome is None:
-            beside(as_json).print(words := "Dry run: nothing has moved.")
+            message_console(as_json).print(words := "Dry run: nothing has moved.")
             if page is not None:
                 conclude(page, words)
             return
@@ -241,7 +241,7 @@ def _options_of(
     return options, None if load is None else Load.of(load, at, gripped=gripped)
 
 
-def _given(context: click.Context) -> dict[str, Any]:
+def _given_options(context: click.Context) -> dict[str, Any]:
     names = {one.name: max(one.opts, key=len) for one in context.command.params}
     given = {names[name]: value for name, value in context.params.items() if value}
     if context.get_parameter_source("method") is ParameterSource.DEFAULT:

@@ -17,7 +17,7 @@ from ftdrive.runs.calibration import MARKS, read_calibration
 from ftdrive.runs.source import SolveOptions
 from ftdrive.stream.samples import WrenchFrame
 from ftdrive.tables.table import TableOptions
-from ftdrive.terminal.console import beside, messages, working
+from ftdrive.terminal.console import message_console, messages, working
 from ftdrive.terminal.text import echo
 
 
@@ -66,7 +66,7 @@ def compensate(
     if path is not None and (wrench is not None or orientation_file is not None):
         raise ConfigError("RECORDING does not go with --wrench and --orientation-file: leave one of the two out")
     if path is None and (wrench is None or orientation_file is None):
-        raise ConfigError(_missing(wrench, orientation_file, calibration))
+        raise ConfigError(_missing_input(wrench, orientation_file, calibration))
     if (wrench_topic or pose_topic) and not (path and is_bag(path)):
         raise ConfigError("--wrench-topic and --pose-topic are only for a ROS bag: leave them out")
     loaded = None if calibration is None else read_calibration(calibration, accept_edited=force)
@@ -94,12 +94,12 @@ def compensate(
         echo("\n".join(_result_lines(result, str(frame))))
     if output is not None:
         short = "" if failure is None else f": the first {result['samples']} samples"
-        beside(as_json).print(f" Saved {output}{short}")
+        message_console(as_json).print(f" Saved {output}{short}")
     if failure is not None:
         raise failure
 
 
-def _missing(wrench: Path | None, orientation_file: Path | None, calibration: Path | None) -> str:
+def _missing_input(wrench: Path | None, orientation_file: Path | None, calibration: Path | None) -> str:
     if wrench is None and orientation_file is None:
         own = "" if calibration is None else f" --calibration {calibration}"
         missing, line = "the file of the recording", f"RECORDING{own}"

@@ -8,8 +8,8 @@ from ftdrive.commands.options import JSON, PATH, NewFile, write_json
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.recording.files import RecordingReader, format_of
 from ftdrive.recording.foreign import is_recording
-from ftdrive.recording.recorder import converted
-from ftdrive.terminal.console import beside, messages, working
+from ftdrive.recording.recorder import convert_recording
+from ftdrive.terminal.console import message_console, messages, working
 
 
 @click.command()
@@ -30,12 +30,12 @@ def convert(source: Path | None, target: Path | None, output: Path | None, as_js
         raise BadRecording("another program wrote this file: read it with `ftdrive compensate`", source)
     with working("Converting") as show:
         reader = RecordingReader(source)
-        found, failure = converted(reader, target, show)
+        found, failure = convert_recording(reader, target, show)
     cut = reader.cut if failure is None else str(failure) or "interrupted"
     if cut:
         messages.print(f" {source} is incomplete ({cut}): {found['duration_s']:.1f} s are saved.")
     short = "" if failure is None else f": the first {found['samples']} samples"
-    beside(as_json).print(f" Saved {target}{short}")
+    message_console(as_json).print(f" Saved {target}{short}")
     if as_json:
         write_json({"schema_version": 1, "file": str(target), **found, "complete": not cut})
     if failure is not None:

@@ -14,7 +14,7 @@ from ftdrive.cell.emulated import Station
 from ftdrive.checks.computer import can_details, can_interfaces, check_serial_port, name_by_id
 from ftdrive.checks.discovery import probe_place
 from ftdrive.commands.options import JSON, check_simulate, simulate, write_json
-from ftdrive.terminal.console import answer, hanging
+from ftdrive.terminal.console import answer, indented
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError
 
@@ -51,7 +51,7 @@ def devices_command(places: tuple[str, ...], simulate: bool, as_json: bool) -> N
     )
     if places:
         clock = clock_in_force()
-        found["answers"] = [answer for place in places for answer in _answers(place, clock, failures)]
+        found["answers"] = [answer for place in places for answer in _probe_place(place, clock, failures)]
     if as_json:
         write_json({"schema_version": 1, **found})
     else:
@@ -73,7 +73,7 @@ def _serial_port(port: ListPortInfo) -> dict[str, Any]:
     }
 
 
-def _answers(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
+def _probe_place(place: str, clock: Clock, failures: list[Exception]) -> list[dict[str, Any]]:
     """Probe one place. An error is added to `failures` and returned, so that the other places are probed."""
     nothing = {"port": place, "url": None, "what": "no known sensor answers", "error": None}
     try:
@@ -91,24 +91,24 @@ def _emulated_devices(failures: list[Exception]) -> dict[str, Any]:
         return {
             "serial": [_serial_port(ListPortInfo(path)) for path in (serial["port"], can["channel"])],
             "can": [],
-            "answers": [answer for place in places for answer in _answers(place, station.clock, failures)],
+            "answers": [answer for place in places for answer in _probe_place(place, station.clock, failures)],
         }
 
 
 def _print_devices(found: dict[str, Any]) -> None:
     for port in found["serial"]:
         words = [port["by_id"] or port["port"], port["description"], port["usb"]]
-        answer.print(hanging(" serial  ", "   ".join(word for word in words if word), answer))
+        answer.print(indented(" serial  ", "   ".join(word for word in words if word), answer))
         for finding in port["findings"]:
-            answer.print(hanging(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], answer))
-            answer.print(hanging(f"{'':11}fix: ", finding["fix"] or "-", answer))
+            answer.print(indented(Text.assemble(" " * 9, ("!", "yellow"), " "), finding["found"], answer))
+            answer.print(indented(f"{'':11}fix: ", finding["fix"] or "-", answer))
     for interface in found["can"]:
         words = [str(value) for value in interface.values()]
-        answer.print(hanging(" can     ", "   ".join(words), answer))
+        answer.print(indented(" can     ", "   ".join(words), answer))
     for kind, name in (("serial", "serial ports"), ("can", "CAN interfaces of the kernel")):
         if not found[kind]:
             answer.print(f" no {name}")
     for reply in found.get("answers", ()):
         what = reply["what"] if reply["error"] is None else f"{reply['what']}: {reply['error']}"
         words = [reply["port"], what, reply["url"]]
-        answer.print(hanging(" probed  ", "   ".join(word for word in words if word), answer))
+        answer.print(indented(" probed  ", "   ".join(word for word in words if word), answer))

@@ -34,7 +34,7 @@ from ftdrive.errors import NotAccepted
 from ftdrive.planning.planner import guess_of_devices
 from ftdrive.runs.calibration import read_calibration
 from ftdrive.session.guards import Limits
-from ftdrive.terminal.console import answer, hanging, messages, working
+from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.text import echo
 
 # Checks that a summary shows for robot, sensor and noise; for other subjects, the first one that passed.
@@ -136,9 +136,9 @@ def _print_checks(found: list[Check], *, every: bool) -> None:
         checks = list(group)
         for i, check in enumerate(checks if every else _attention_only(checks)):
             head = Text.assemble(f" {'' if i else subject:<12}", _MARK[check.state], " ")
-            answer.print(hanging(head, check.found, answer))
+            answer.print(indented(head, check.found, answer))
             if check.fix is not None and check.state in {"warning", "failed"}:
-                answer.print(hanging(f"{'':15}fix: ", check.fix, answer))
+                answer.print(indented(f"{'':15}fix: ", check.fix, answer))
     words = {"ok": "All checks passed", "warning": "Usable; see the lines with !", "failed": "Not ready"}
     passed, skipped = (sum(check.state == state for check in found) for state in ("ok", "skipped"))
     count = "" if every else f" ({passed} passed, {skipped} skipped; --all shows each)"

@@ -15,7 +15,7 @@ from ftdrive.runs.weighings import WeighingDay
 from ftdrive.store import open_store
 from ftdrive.store.history import age_days, drifts, warnings
 from ftdrive.store.records import StoredResult, read_records, record_paths
-from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.text import echo, print_table
 from ftdrive.words.history import DAY_TITLES, day_row, last_weighing_in_words, result_table, temperature_lines
 
@@ -113,7 +113,7 @@ def history(
     for line in (*trend_lines, *warmth_lines, *map(_HOUR.format_map, moved), *weighing_lines):
         echo(line)
     for words in advice:
-        answer.print(hanging(" ! ", words, answer), style="yellow")
+        answer.print(indented(" ! ", words, answer), style="yellow")
 
 
 def _fit_json(fit: Any) -> dict[str, Any]:
@@ -132,7 +132,7 @@ def _fit_json(fit: Any) -> dict[str, Any]:
 
 def _print_left_out(left_out: Sequence[str]) -> None:
     for words in left_out:
-        messages.print(hanging(" left out: ", words))
+        messages.print(indented(" left out: ", words))
 
 
 def _show_weighings(days: Sequence[WeighingDay], name: str, left_out: Sequence[str], as_json: bool) -> None:

@@ -20,7 +20,7 @@ from ftdrive.commands.options import (
     write_json,
 )
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.console import beside, messages
+from ftdrive.terminal.console import message_console, messages
 
 
 @click.command()
@@ -110,5 +110,5 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
     draft.unlink(missing_ok=True)
     if as_json:
         write_json({"schema_version": 1, "file": str(output), **described.found(), "config": cell.to_dict()})
-    beside(as_json).print(f"Wrote {output}{words}")
+    message_console(as_json).print(f"Wrote {output}{words}")
     messages.print_next(f"ftdrive doctor{end}", f"ftdrive plan{end}")

@@ -30,7 +30,7 @@ from ftdrive.commands.options import (
 from ftdrive.errors import ConfigError
 from ftdrive.library import certifier_of
 from ftdrive.recording.recorder import RawTable, Recorder
-from ftdrive.recording.replay import replayed
+from ftdrive.recording.replay import open_replay
 from ftdrive.stream.feed import Feed
 from ftdrive.stream.samples import Tracking, WrenchFrame
 from ftdrive.stream.sources import CellSource
@@ -109,7 +109,7 @@ def live(
         checks = list[Check]()
         recorder: Callable[[Path], Sink] | None = None
         if replay is not None:
-            stream = replayed(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
+            stream = open_replay(replay, source.path, frame, speed=1.0 if speed is None else speed, force=source.force)
             stream.track = track
             stream.stages = replace(stream.stages, **stages)
         elif raw:

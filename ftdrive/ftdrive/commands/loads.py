@@ -12,7 +12,7 @@ from ftdrive.cell.emulated import TOOL_MM
 from ftdrive.commands.options import JSON, PATH, SOURCE, Number, SourceOptions, write_json
 from ftdrive.errors import ConfigError, NotAccepted
 from ftdrive.library import check_known_load, solve_load_runs
-from ftdrive.recording.replay import replayed
+from ftdrive.recording.replay import open_replay
 from ftdrive.runs.calibration import next_sensor_file, sensor_files
 from ftdrive.runs.load import Load, mass_of
 from ftdrive.stream.processing import SENSOR_FRAME
@@ -55,7 +55,7 @@ def loads_check(
     load = Load("load", *mass_of(mass)) if at is None else Load.of(mass, at, gripped=False)
     with ExitStack() as stack:
         if replay is not None:
-            stream = replayed(replay, source.path, SENSOR_FRAME, speed=float("inf"), force=source.force)
+            stream = open_replay(replay, source.path, SENSOR_FRAME, speed=float("inf"), force=source.force)
         else:
             stream = source.open(stack, SENSOR_FRAME)
         if zero and replay is None:

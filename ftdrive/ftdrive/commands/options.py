@@ -48,7 +48,7 @@ class Headed(click.Command):
                 formatter.write_dl([options[name].get_help_record(ctx) or ("", "") for name in names.split()])
 
 
-def _together(*options: Callable[[F], F]) -> Callable[[F], F]:
+def _combined(*options: Callable[[F], F]) -> Callable[[F], F]:
     """Return one decorator for several options, in the order of the help."""
 
     def added(command: F) -> F:
@@ -225,7 +225,7 @@ CALIBRATION = click.option(
 )
 
 
-BAG_TOPICS = _together(
+BAG_TOPICS = _combined(
     click.option("--wrench-topic", metavar="TOPIC", help="Topic of WrenchStamped in a ROS bag."),
     click.option(
         "--pose-topic",
@@ -293,9 +293,9 @@ class ViewOptions:
             return
         self.require()
         from ftdrive.terminal.console import print_page
-        from ftdrive.view.site import announced, serve_page
+        from ftdrive.view.site import announce_page, serve_page
 
-        with serve_page(title, address) as page, announced(page, address, print_page):
+        with serve_page(title, address) as page, announce_page(page, address, print_page):
             yield page
 
 
@@ -331,15 +331,15 @@ class NewFile(click.Path):
         return path
 
 
-def _drawable(_context: click.Context, _parameter: click.Parameter, png: Path | None) -> Path | None:
+def _check_drawable(_context: click.Context, _parameter: click.Parameter, png: Path | None) -> Path | None:
     if png is not None:
         require_extra("viz", "--png", "matplotlib")
     return png
 
 
-PLAN_FILES = _together(
+PLAN_FILES = _combined(
     click.option("--output", type=NewFile(), help="Save the plan as a new JSON file."),
-    click.option("--png", type=NewFile(), callback=_drawable, help="Save stick figures (needs ftdrive[viz])."),
+    click.option("--png", type=NewFile(), callback=_check_drawable, help="Save stick figures (needs ftdrive[viz])."),
 )
 
 
@@ -554,7 +554,7 @@ def write_json(value: Mapping[str, Any]) -> None:
     click.echo(json.dumps(value))
 
 
-SOLVED_WITH = _together(
+SOLVED_WITH = _combined(
     click.option(
         "--orientation",
         type=click.Choice(["R_base_flange", "R_flange_base"]),
@@ -576,7 +576,7 @@ SOLVED_WITH = _together(
         "--up", metavar="X,Y,Z", help="Up direction in base axes, such as 0,0,1 on a floor; declares the mounting."
     ),
 )
-_OF_TABLE = _together(
+_OF_TABLE = _combined(
     click.option(
         "--columns",
         metavar="NAMES",

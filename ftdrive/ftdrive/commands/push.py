@@ -27,7 +27,7 @@ from ftdrive.runs.calibration import read_calibration
 from ftdrive.session.events import Question
 from ftdrive.session.rehearsal import rehearsed_run
 from ftdrive.session.settings_push import EFFECTS, WORDS, Receipt, propose, restore, send
-from ftdrive.terminal.console import answer, beside
+from ftdrive.terminal.console import answer, message_console
 from ftdrive.terminal.screen import open_operator
 from ftdrive.terminal.text import echo
 from ftdrive.words.session import proposal_in_lines, settings_in_words
@@ -85,7 +85,7 @@ def push(
         else:
             echo("\n".join(proposal_in_lines(proposal)), err=True)
         if not sends:
-            beside(as_json).print(
+            message_console(as_json).print(
                 "Dry run: nothing was sent." if dry_run else "The controller already agrees: nothing was sent."
             )
             return

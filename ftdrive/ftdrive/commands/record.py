@@ -14,7 +14,7 @@ from ftdrive.recording import Recorder
 from ftdrive.recording.files import require_new_recordings
 from ftdrive.stream.samples import Tracking, WrenchFrame
 from ftdrive.stream.stream import pump
-from ftdrive.terminal.console import beside, messages, working
+from ftdrive.terminal.console import message_console, messages, working
 
 
 class Duration(click.ParamType):  # type: ignore[type-arg]  # a generic type in newer versions of click only
@@ -94,7 +94,7 @@ def _report_recording(recorder: Recorder, frame: WrenchFrame, name: str, *, as_j
     rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"
-        beside(as_json).print(f" Saved {path}: {samples}")
+        message_console(as_json).print(f" Saved {path}: {samples}")
     if as_json:
         files = {
             "files": [str(path) for path in recorder.saved],

@@ -16,7 +16,7 @@ from ftdrive.runs.calibration import require_accepted
 from ftdrive.runs.run import Run
 from ftdrive.runs.source import RecordedRun, solve_records
 from ftdrive.session.rehearsal import rehearsed_run
-from ftdrive.terminal.console import answer, hanging, messages, working
+from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.report import print_result
 from ftdrive.terminal.screen import open_operator
 
@@ -40,15 +40,15 @@ def replay(source: Path | None, simulate: bool, sensor: str | None, every: bool,
     check_simulate(simulate, real={"RUN": source}, emulated={"--sensor": sensor})
     if simulate:
         with rehearsed_run(open_operator(), sensor) as recorded:
-            _repeat(Run(recorded), recorded, every, as_json)
+            _repeat_run(Run(recorded), recorded, every, as_json)
     elif source is not None:
         with unpack(source) as folder:
-            _repeat(Run(folder), source, every, as_json)
+            _repeat_run(Run(folder), source, every, as_json)
     else:
         raise ConfigError("no run: give its folder or bundle, or --simulate")
 
 
-def _repeat(run: Run, source: Path, every: bool, as_json: bool) -> None:
+def _repeat_run(run: Run, source: Path, every: bool, as_json: bool) -> None:
     recorded = RecordedRun(run.records())
     records: list[PoseRecord] = []
     sampling = Sampling(**run.header()["config"]["sampling"])
@@ -66,12 +66,12 @@ def _repeat(run: Run, source: Path, every: bool, as_json: bool) -> None:
         print_result(outcome.result, drift=outcome.drift, records=records, every=every)
     require_accepted(outcome.result)
     if run.calibration_path.exists():
-        equal = equality(outcome.result, CalibrationResult.load(run.calibration_path))
+        equal = compare_results(outcome.result, CalibrationResult.load(run.calibration_path))
         if not as_json:
-            answer.print(hanging(" ✔ ", f"{equal}: {run.calibration_path.name} of {source}", answer))
+            answer.print(indented(" ✔ ", f"{equal}: {run.calibration_path.name} of {source}", answer))
 
 
-def equality(again: CalibrationResult, saved: CalibrationResult) -> str:
+def compare_results(again: CalibrationResult, saved: CalibrationResult) -> str:
     """Return how well two results agree; raise `NotAccepted` if they differ by more than rounding."""
     one, other = again.to_dict(), saved.to_dict()
     keys = [key for key in one if key != "provenance" and one[key] != other[key]]

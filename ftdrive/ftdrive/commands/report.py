@@ -29,13 +29,13 @@ from ftdrive.commands.options import (
 from ftdrive.errors import ConfigError
 from ftdrive.report.facts import facts_of
 from ftdrive.report.page import render_page
-from ftdrive.report.subject import MAY_BE_MISSING, read_subject, trust
+from ftdrive.report.subject import MAY_BE_MISSING, read_subject, trust_facts
 from ftdrive.runs import is_run
 from ftdrive.runs.bundle import unpack
 from ftdrive.runs.source import SolveOptions, known_values, up_direction
 from ftdrive.store import store_url
 from ftdrive.tables.table import TableOptions
-from ftdrive.terminal.console import beside, hanging, messages, working
+from ftdrive.terminal.console import indented, message_console, messages, working
 from ftdrive.terminal.text import echo
 
 _FORMATS = ("html", "json")
@@ -106,9 +106,9 @@ def report(
     with unpack(source) if source is not None else _report_folder(sensor) as found:
         with working("Solving"):
             subject = read_subject(found, options, parent)
-        trusted = trust(subject.result, found, store_url, datetime.now(UTC))
+        trusted = trust_facts(subject.result, found, store_url, datetime.now(UTC))
         if trusted["store_error"]:
-            messages.print(hanging(" ! ", MAY_BE_MISSING.format(trusted["store_error"])))
+            messages.print(indented(" ! ", MAY_BE_MISSING.format(trusted["store_error"])))
         if source is not None and found != source:  # unpacked
             command = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=command)
@@ -118,10 +118,10 @@ def report(
     if output is not None:
         write_new(output, text)
     elif form == "html":
-        output = _saved(text, Path() if source is None else source if is_run(source) else source.parent)
+        output = _save_report(text, Path() if source is None else source if is_run(source) else source.parent)
     if output is not None:
-        say = beside(as_json)
-        say.print(hanging(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
+        say = message_console(as_json)
+        say.print(indented(f" {facts['verdict'].upper()}  ", f"compensation error {facts['error']['words']}", say))
         say.print(f" Saved {output}")
     if as_json:
         write_json({**facts, "file": output and str(output)})
@@ -129,7 +129,7 @@ def report(
         echo(text, nl=False, fold=False)
 
 
-def _saved(text: str, folder: Path) -> Path:
+def _save_report(text: str, folder: Path) -> Path:
     while True:
         with suppress(FileExistsError):
             write_new(path := unused_path(folder / "report.html"), text)

@@ -44,7 +44,7 @@ from ftdrive.runs.calibration import require_accepted
 from ftdrive.runs.pose_hints import hints, numbers_in_dataset
 from ftdrive.runs.source import RecordedData, SolveOptions, read_source
 from ftdrive.store import index_run
-from ftdrive.terminal.console import beside, hanging, messages, working
+from ftdrive.terminal.console import indented, message_console, messages, working
 from ftdrive.terminal.report import print_cases, print_comparison, print_result, print_tests
 from ftdrive.terminal.text import echo
 from ftdrive.words.text import in_one_line
@@ -193,7 +193,7 @@ def _show_result(
     data = read_place(place, options)
     if isinstance(data, RecordedData):
         _print_table(data.provenance)
-    result, records = _solved(data, options), data.records if isinstance(data, RecordedData) else ()
+    result, records = _solve_shown(data, options), data.records if isinstance(data, RecordedData) else ()
     if not isinstance(data, RecordedData):
         _print_table(result.provenance)
     if as_json:
@@ -222,14 +222,14 @@ def _next_commands(result: CalibrationResult, source: Path, output: Path | None)
     return commands
 
 
-def _solved(data: Any, options: SolveOptions) -> CalibrationResult:
+def _solve_shown(data: Any, options: SolveOptions) -> CalibrationResult:
     with working(f"Solving {counted(len(data.dataset), 'pose')}" if isinstance(data, RecordedData) else "Solving"):
         return solve_place(data, options)
 
 
 def _print_table(provenance: Mapping[str, Any]) -> None:
     if words := provenance.get("table"):
-        messages.print(hanging(" ", f"{provenance.get('source') or ''}: {words}".removeprefix(": "), messages))
+        messages.print(indented(" ", f"{provenance.get('source') or ''}: {words}".removeprefix(": "), messages))
 
 
 def _solve_together(
@@ -242,7 +242,7 @@ def _solve_together(
             if not isinstance(data, RecordedData):
                 raise ConfigError(f"--together needs poses at rest, and {source} is in motion: leave it out")
             # Without the earlier result of a new tool, which would otherwise be counted once per run.
-            results.append(_solved(replace(data, earlier=None), options))
+            results.append(_solve_shown(replace(data, earlier=None), options))
     result = together(results)
     if as_json:
         write_json({"sources": [str(source) for source in sources], **result.to_dict()})
@@ -256,7 +256,7 @@ def _save(result: CalibrationResult, output: Path | None, force: bool, as_json: 
         require_accepted(result, to_be_saved=output is not None)
     if output is not None:
         result.save(output)
-        beside(as_json).print(f" Saved {output}")
+        message_console(as_json).print(f" Saved {output}")
 
 
 def _show_all(

@@ -15,7 +15,7 @@ from ftdrive.checks.computer import SensorAddress
 from ftdrive.commands.options import EMULATED_SENSOR, FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.runs.calibration import versions
-from ftdrive.terminal.console import answer, hanging, messages, working
+from ftdrive.terminal.console import answer, indented, messages, working
 from ftdrive.terminal.text import Group
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.transcript import Transcript, Writer
@@ -123,8 +123,8 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
     if as_json:
         write_json({"schema_version": 1, "url": loaded.header["url"], "recorded": recorded, "played": played})
     else:
-        answer.print(hanging(" recorded  ", _describe_bytes(recorded), answer))
-        answer.print(hanging(" played    ", _describe_bytes(played), answer))
+        answer.print(indented(" recorded  ", _describe_bytes(recorded), answer))
+        answer.print(indented(" played    ", _describe_bytes(played), answer))
     if (played_s := played["duration_s"]) < (whole_s := loaded.header["duration_s"]):
         messages.print(f" The recording was interrupted: {played_s:.3g} s of {whole_s:g} s were played.")
 

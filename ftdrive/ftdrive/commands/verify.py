@@ -39,7 +39,7 @@ from ftdrive.terminal.report import print_verification
 from ftdrive.terminal.screen import open_operator
 from ftdrive.view.outcome import conclude_verification, on_page
 from ftdrive.view.page import Page
-from ftdrive.view.session_page import asked
+from ftdrive.view.session_page import question_part
 
 
 @click.command()
@@ -142,7 +142,7 @@ def _report_verification(verified: Verified, update: Answer, page: Page | None, 
 
 def _ask_on_page(page: Page | None, as_json: bool, question: Question) -> str:
     show = (lambda _: None) if page is None else page.put
-    show({"question": asked(question)})
+    show({"question": question_part(question)})
     try:
         return (JsonOperator() if as_json else PlainOperator(quiet=messages.quiet)).ask(question)
     finally:

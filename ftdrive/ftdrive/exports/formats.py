@@ -219,9 +219,9 @@ FORMATS: Mapping[str, ExportFormat] = {
     # jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp, master; Robot.cpp gives it the gravity of constants.h. 13
     # numbers, one a line: mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of a
     # model whose sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its origin:
-    # here the flange. The offset has the couple first. With g along -z of the world, and p the place of the sensor:
+    # here the flange. The offset has the torque first. With g along -z of the world, and p the place of the sensor:
     #     force = raw - offset[3:] - mass g
-    #     couple = raw - offset[:3] - (com - p) x (mass g), in sensor axes
+    #     torque = raw - offset[:3] - (com - p) x (mass g), in sensor axes
     # White space must follow the last number. The reader stops there.
     "mc-rtc": ExportFormat(
         "mc_rtc, calib_data.NAME of a force sensor",

@@ -223,7 +223,7 @@ def _point_mass(v: _Values, what: str) -> str:
     return f"<!-- {what}not identified: zeros stand for a point mass; put values of the CAD model here -->\n      "
 
 
-def _assumed(v: _Values) -> str:
+def _assumption_note(v: _Values) -> str:
     if not v.settings.sensor_mass_kg or v.settings.sensor_com_mm is not None:
         return ""
     return (
@@ -256,7 +256,7 @@ _VALUES: Mapping[str, Callable[[_Values], Any]] = {
     "payload_kg": lambda v: v.payload.mass_kg,
     "payload_com_m": lambda v: v.payload.p_flange_com_m,
     "payload_inertia": _payload_inertia,
-    "assumed": _assumed,
+    "assumed": _assumption_note,
     "true_kg": lambda v: true_tool(v.calibration)[0],
     "true_com_m": lambda v: true_tool(v.calibration)[1],
     "J": lambda v: np.zeros(9) if (J := v.inertia_kg_m2) is None else J,
@@ -391,7 +391,8 @@ def export_calibration(
             if force_N > max_force_error_N:
                 raise NotAccepted(
                     f"{words}, and the limit is {max_force_error_N:g} N. Choose another format "
-                    f"({', '.join(_lossless(calibration, target))}), or accept it: --max-force-error {_above(force_N)}"
+                    f"({', '.join(_lossless_formats(calibration, target))}), or accept it: "
+                    f"--max-force-error {_round_up(force_N)}"
                 )
             notes.append(f"{words}.")
     notes += filter(None, (note.format_map(values) for note in target.notes))
@@ -407,7 +408,7 @@ def export_calibration(
     return Exported(_with_header(text, target.comment, header), tuple(shown), elsewhere, force_N, torque_Nm)
 
 
-def _above(value: float) -> str:
+def _round_up(value: float) -> str:
     step = 10.0 ** (np.floor(np.log10(value)) - 1)
     return f"{np.ceil(value / step) * step:.2g}"
 
@@ -436,7 +437,7 @@ def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
     )
 
 
-def _lossless(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
+def _lossless_formats(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
     """Yield the formats that lose nothing, subtract as much, and read this sensor if the target does."""
     for name, other in FORMATS.items():
         as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading

@@ -12,7 +12,7 @@ import numpy as np
 from ftdrive.errors import BadRecording, ConfigError
 from ftdrive.recording.growing_file import partial_of
 from ftdrive.recording.mcap_file import McapFile, read_mcap
-from ftdrive.recording.recording import ROW, Measured, Piece, Recording, changed, divided, in_blocks, read_ahead
+from ftdrive.recording.recording import ROW, Measured, Piece, Recording, in_blocks, next_header, read_ahead, split_piece
 from ftdrive.recording.table_files import CsvFile, ParquetFile, read_csv, read_parquet
 from ftdrivers.installation import missing_extra
 
@@ -129,7 +129,7 @@ def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
-    reduce(changed, events, reader.header)  # raises for a stage of a newer version
+    reduce(next_header, events, reader.header)  # raises for a stage of a newer version
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 
@@ -161,7 +161,7 @@ def write_recording(path: str | Path, recording: Recording | RecordingReader) ->
     try:
         with closing(read_ahead(recording.pieces())) as pieces:
             for piece in pieces:
-                for rows, events in divided(piece):
+                for rows, events in split_piece(piece):
                     file.append(rows, events)
         file.complete()
     except BaseException:

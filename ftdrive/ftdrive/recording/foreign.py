@@ -143,7 +143,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
                 raise BadDataset(f"{path.name}: the first bytes are not those of a ROS 1 bag: record it again")
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-            wrenches = _chosen(reader, WRENCH, wrench_topic, "--wrench-topic")
+            wrenches = _choose_topic(reader, WRENCH, wrench_topic, "--wrench-topic")
             named = _pose_reader(reader, pose_topic)
             messages = _read_topics(reader, [wrenches, *named.topics])
             wrench = _number_column(reader, wrenches, messages[wrenches], 6)
@@ -168,7 +168,7 @@ def _time_ordered_table(name: str, column: _Column, origin_ns: int, names: Seque
     return Table({"t": t_s, **dict(zip(names, values[order].T, strict=True))}, name=name)
 
 
-def _chosen(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
+def _choose_topic(reader: "AnyReader", kind: str, topic: str | None, option: str) -> str:
     of_kind = sorted({one.topic for one in reader.connections if one.msgtype == kind})
     if topic is not None and topic not in of_kind:
         known = ", ".join(of_kind) or "none"
@@ -222,10 +222,10 @@ def _checked_column(topic: str, t_ns: NDArray[np.int64], numbers: Array) -> _Col
 
 def _pose_reader(reader: "AnyReader", pose_topic: str | None) -> PoseReader:
     if pose_topic is None:
-        return Poses(_chosen(reader, _POSES, None, "--pose-topic"))
+        return Poses(_choose_topic(reader, _POSES, None, "--pose-topic"))
     named = pose_reader_of(SCHEME + pose_topic.removeprefix(SCHEME))
     if isinstance(named, Poses):
-        _chosen(reader, _POSES, next(iter(named.topics)), "--pose-topic")
+        _choose_topic(reader, _POSES, next(iter(named.topics)), "--pose-topic")
     missing = [topic for topic in named.topics if topic not in reader.topics and topic != "/tf_static"]
     if missing:
         raise ConfigError(f"--pose-topic {pose_topic}: the bag has no topic {missing[0]}")

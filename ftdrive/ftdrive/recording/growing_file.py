@@ -77,7 +77,7 @@ def _lock(file: IO[bytes]) -> bool:
     return True
 
 
-def _holder(file: IO[bytes]) -> str:
+def _lock_holder(file: IO[bytes]) -> str:
     """Return the process that locked a file, from /proc/locks, see proc_locks(5)."""
     with suppress(OSError):
         for line in Path("/proc/locks").read_text(encoding="ascii").splitlines():
@@ -98,7 +98,7 @@ def partial_of(path: Path, *, grows: bool) -> Path:
         with open_file(partial) as file:
             if not _lock(file):
                 raise FileExistsError(
-                    f"{_holder(file)} still records to {partial}: choose another name, or end that recording first"
+                    f"{_lock_holder(file)} still records to {partial}: choose another name, or end that recording first"
                 )
         if not grows:
             raise FileExistsError(

@@ -26,7 +26,7 @@ from ftcalib.files import MOST_BYTES, open_file, parsed_json
 from ftdrive import __version__
 from ftdrive.errors import BadRecording
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import ROW, ZSTD_LEVEL, Header, Piece, Rows, changed
+from ftdrive.recording.recording import ROW, ZSTD_LEVEL, Header, Piece, Rows, next_header
 from ftdrive.stream import ros2
 from ftdrive.stream.samples import StreamEvent, matrices
 
@@ -123,7 +123,7 @@ class McapFile(GrowingFile):
         from zstandard import compress
 
         for event in events:
-            self._header = changed(self._header, event)
+            self._header = next_header(self._header, event)
         if not len(rows) and not events:
             return
         content, tables = self._messages([*self._groups(rows, events)])
@@ -155,11 +155,11 @@ class McapFile(GrowingFile):
         offset_ns = self._header.info.utc_offset_ns
         if len(rows):
             t_ns = rows["t_host_ns"] + offset_ns
-            yield t_ns, rows["seq"], _bodies(rows, t_ns, self._header.frame.id)
+            yield t_ns, rows["seq"], _pack_samples(rows, t_ns, self._header.frame.id)
             some = np.flatnonzero(np.diff(t_ns // _TRANSFORMS_STEP_NS, prepend=0))
             yield t_ns[some], 0, {ros2.TRANSFORMS: self._transforms(rows[some], t_ns[some])}
-        log = partial(_log, offset_ns=offset_ns)
-        for topic, kind, pack in ((EVENTS, "", log), (LOAD, "load", _pack_load), (TRACKED, "tracked", _tracked)):
+        log = partial(_pack_log, offset_ns=offset_ns)
+        for topic, kind, pack in ((EVENTS, "", log), (LOAD, "load", _pack_load), (TRACKED, "tracked", _pack_tracked)):
             for event in events:
                 if kind in ("", event.kind):
                     packed = ros2.ENCODING + pack(event)
@@ -215,7 +215,7 @@ class McapFile(GrowingFile):
         self.add(end + summary + footer + MAGIC)
 
 
-def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:
+def _pack_samples(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArray[np.void]]:
     sample = np.zeros(len(rows), [("encoding", "V4"), *_SAMPLE])
     sample["encoding"] = np.void(ros2.ENCODING)
     for name, _ in _SAMPLE:
@@ -229,7 +229,7 @@ def _bodies(rows: Rows, t_ns: NDArray[np.int64], frame: str) -> dict[str, NDArra
     }
 
 
-def _log(event: StreamEvent, offset_ns: int) -> bytes:
+def _pack_log(event: StreamEvent, offset_ns: int) -> bytes:
     """Pack an event as Log: the kind as name, the values in `function` as JSON."""
     stamp = divmod(event.t_host_ns + offset_ns, 1_000_000_000)
     packed = struct.pack("<iIB3x", *stamp, 30 if event.kind in ros2.WARNINGS else 20)
@@ -246,7 +246,7 @@ def _pack_load(event: StreamEvent) -> bytes:
     return struct.pack("<8d", values["mass_kg"], values["mass_sigma_kg"], *com_m, *sigma_m)
 
 
-def _tracked(event: StreamEvent) -> bytes:
+def _pack_tracked(event: StreamEvent) -> bytes:
     """Pack tracked bias and part; an unknown age is infinite."""
     values = event.values
     age_s = np.inf if values["last_seen_s"] is None else values["last_seen_s"]
@@ -385,7 +385,7 @@ class _Content:
         The indexes are checked, because the CRC of a chunk covers only its messages.
         """
         messages, indexes, self._messages, self.indexes = self._messages, self.indexes, b"", []
-        found = [_indexed(messages, index) for index in indexes]
+        found = [_read_index(messages, index) for index in indexes]
         _require_complete(
             messages,
             np.concatenate([_NONE, *(places for _, _, places, _ in found)]),
@@ -417,7 +417,7 @@ class _Content:
         return Piece(self._header, rows, events, share)
 
 
-def _indexed(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return the channel of an index, and times, begins and ends (n,) of its messages, after comparing it with them."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T

@@ -22,7 +22,7 @@ from ftdrive.recording.files import (
     write_recording,
 )
 from ftdrive.recording.growing_file import GrowingFile
-from ftdrive.recording.recording import ROW, Header, Rows, divided, read_ahead, to_records
+from ftdrive.recording.recording import ROW, Header, Rows, read_ahead, split_piece, to_records
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
@@ -50,7 +50,7 @@ class RecordingFiles:
 
         Raises `OSError`; then no file is completed, and the message names what each `.partial` contains.
         """
-        with _uninterrupted():
+        with _delay_signals():
             try:
                 for file in self._files:
                     file.append(rows, events)
@@ -68,7 +68,7 @@ class RecordingFiles:
         Raises `OSError` if a file could not be completed; its message names what each `.partial` contains.
         """
         files, self._files, failure = self._files, [], None
-        with _uninterrupted():
+        with _delay_signals():
             # after an error there are no files
             for path, file in zip(self._paths, files, strict=False):
                 try:
@@ -96,7 +96,7 @@ class RecordingFiles:
 
     def _named(self, error: OSError) -> OSError:
         kept = " and ".join(f"{path} contains {samples} samples" for path, samples in self.partial.items())
-        kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample is kept"
+        kept = f"{kept}, which `ftdrive convert` saves as a complete file" if kept else "no sample was kept"
         return type(error)(f"{error.strerror or error}: {kept}")
 
 
@@ -279,7 +279,7 @@ class RawTable(Sink):
         self._file.complete()
 
 
-def converted(
+def convert_recording(
     reader: RecordingReader, target: Path, show: Callable[[str], object] = lambda _: None
 ) -> tuple[dict[str, Any], BaseException | None]:
     """Convert a recording of any length to a new file; return samples, duration_s and gaps, and what ended it early.
@@ -294,7 +294,7 @@ def converted(
         stack.callback(files.discard)
         try:
             for piece in read_ahead(reader.pieces()):
-                for rows, events in divided(piece):
+                for rows, events in split_piece(piece):
                     if len(rows):
                         if not samples:
                             first_ns, seq = int(rows["t_host_ns"][0]), int(rows["seq"][0]) - 1
@@ -311,7 +311,7 @@ def converted(
 
 
 @contextmanager
-def _uninterrupted() -> Iterator[None]:
+def _delay_signals() -> Iterator[None]:
     """Delay Ctrl-C, `kill` and a closing terminal, so that each file gets the whole piece."""
     waiting: list[tuple[Any, Any, Any]] = []
     handlers = {}

@@ -330,9 +330,9 @@ class Recording(Displayed):
     def pieces(self) -> Iterator[Piece]:
         """Yield samples in pieces of one frame, with the events since the previous piece and the header valid there."""
         header = self.header
-        for rows, events in divided(Piece(header, self.rows, self.events, 1.0)):
+        for rows, events in split_piece(Piece(header, self.rows, self.events, 1.0)):
             for event in events:
-                header = changed(header, event)
+                header = next_header(header, event)
             yield Piece(header, rows, events, 1.0)
 
     def blocks(self) -> Iterator[Measured]:
@@ -340,14 +340,14 @@ class Recording(Displayed):
         return in_blocks(piece.measured() for piece in self.pieces())
 
 
-def changed(header: Header, event: StreamEvent) -> Header:
+def next_header(header: Header, event: StreamEvent) -> Header:
     """Return the header valid after an event. Raises `BadRecording` for a stage of a newer version."""
     if event.kind == "frame":
         return replace(header, frame=frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 
-def divided(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
+def split_piece(piece: Piece) -> Iterator[tuple[Rows, Sequence[StreamEvent]]]:
     """Divide samples at changes of frame or stages, and after `PIECE_ROWS`; events stay before the next samples."""
     n = len(piece.rows)
     events = sorted(piece.events, key=lambda event: event.t_host_ns)

@@ -22,7 +22,7 @@ from ftdrive.stream.stream import Stream
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 
 
-def replayed(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
+def open_replay(path: Path, calibration: Path | None, frame: WrenchFrame, *, speed: float, force: bool) -> Stream:
     """Open the stream of a run folder, a recording (by default with its own calibration) or a table of another program.
 
     Raises `ConfigError` without a calibration, and `DataError` or `OSError` for a file that cannot be used.

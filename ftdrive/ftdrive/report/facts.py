@@ -50,7 +50,7 @@ def label_of(parameter: str) -> str:
     return f"{_LABELS[name]} {axis}".strip()
 
 
-def compared(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
+def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> dict[str, Any]:
     """Return the comparison of a result with an earlier one from other data.
 
     `sensors` are the sources of the sensor errors, before and now. `parameters` have for each error coordinate its
@@ -184,7 +184,7 @@ def facts_of(subject: Subject, trust: Mapping[str, Any] | None = None) -> dict[s
         "coverage": None if R_base_flange is None else _coverage_facts(subject, R_base_flange),
         "motion": None if result.motion is None else _motion_facts(result.motion, sweep),
         "tour": None if subject.run is None else _tour(subject.run, len(subject.records)),
-        "comparison": None if subject.parent is None else compared(result, subject.parent),
+        "comparison": None if subject.parent is None else comparison_facts(result, subject.parent),
         "compared_with": subject.parent_name,
         "reproduce": subject.reproduce,
         "result": result.to_dict(),

@@ -75,10 +75,10 @@ def draw_figure(name: str, facts: Facts) -> str:
         fill(figure, facts)
         written = StringIO()
         figure.savefig(written, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return _inlined(written.getvalue(), name)
+    return _inline_svg(written.getvalue(), name)
 
 
-def _inlined(svg: str, name: str) -> str:
+def _inline_svg(svg: str, name: str) -> str:
     """Return a matplotlib SVG file as an element of a page: unique ids, no prologue or size, variable colours."""
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg[svg.index("<svg") :], flags=re.DOTALL)
     svg = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" aria-hidden="true">', svg, count=1)
@@ -95,7 +95,7 @@ def _map(figure: Any, facts: Facts, kind: str, unit: str) -> None:
     elevation, azimuth = (np.radians(found[name]) for name in ("elevation_deg", "azimuth_deg"))
     axes = figure.add_subplot()
     error = 1e3 * np.array(found[kind]["map"])
-    x, y = _hammer(*np.meshgrid(elevation, azimuth, indexing="ij"))
+    x, y = _hammer_map(*np.meshgrid(elevation, azimuth, indexing="ij"))
     levels = MaxNLocator(12).tick_values(0, error.max() or 1.0)
     filled = axes.contourf(x, y, error, levels=levels, cmap="viridis", antialiased=False)
     filled.set_edgecolor("face")
@@ -130,19 +130,19 @@ def _globe(axes: Any) -> Iterator[None]:
     axes.set(xlim=(-2.95, 2.95), ylim=(-1.75, 1.75))
     quarter, half = np.linspace(-np.pi / 2, np.pi / 2, 61), np.linspace(-np.pi, np.pi, 121)
     for azimuth in np.radians([-180, -90, 0, 90, 180]):
-        axes.plot(*_hammer(quarter, np.full_like(quarter, azimuth)), color=INK, linewidth=0.5, alpha=0.6)
+        axes.plot(*_hammer_map(quarter, np.full_like(quarter, azimuth)), color=INK, linewidth=0.5, alpha=0.6)
     for elevation in np.radians([-45, 0, 45]):
-        axes.plot(*_hammer(np.full_like(half, elevation), half), color=INK, linewidth=0.5, alpha=0.6)
+        axes.plot(*_hammer_map(np.full_like(half, elevation), half), color=INK, linewidth=0.5, alpha=0.6)
     yield
     box = {"boxstyle": "round,pad=0.15", "facecolor": PAPER, "edgecolor": "none"}
     for name, elevation, azimuth in (("+x", 0, 0), ("+y", 0, 90), ("-y", 0, -90), ("-x", 0, 180), ("-x", 0, -180)):
-        x, y = _hammer(*np.radians([elevation, azimuth]))
+        x, y = _hammer_map(*np.radians([elevation, azimuth]))
         axes.text(x, y - 0.2, name, ha="center", va="center", fontsize=8, bbox=box)  # below a pose at this place
     axes.text(0, np.sqrt(2) + 0.08, "+z", ha="center", va="bottom", fontsize=8)
     axes.text(0, -np.sqrt(2) - 0.08, "-z", ha="center", va="top", fontsize=8)
 
 
-def _hammer(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
+def _hammer_map(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
     """Return an equal-area map of the sphere (Hammer 1892) from angles in rad; +x in the middle, +z at the top."""
     length = np.sqrt(1 + np.cos(elevation) * np.cos(azimuth / 2))
     x = 2 * np.sqrt(2) * np.cos(elevation) * np.sin(azimuth / 2) / length
@@ -151,7 +151,7 @@ def _hammer(elevation: Any, azimuth: Any) -> tuple[Array, Array]:
 
 def _on_map(directions: Any) -> tuple[Array, Array]:
     x, y, z = np.array(directions).T
-    return _hammer(np.arcsin(np.clip(z, -1, 1)), np.arctan2(y, x))
+    return _hammer_map(np.arcsin(np.clip(z, -1, 1)), np.arctan2(y, x))
 
 
 def _dots(axes: Any, directions: Any, **style: Any) -> None:

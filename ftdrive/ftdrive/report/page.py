@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from ftdrive import __version__
 from ftdrive.errors import ConfigError
-from ftdrive.report.sections import Facts, capital, sections_of
+from ftdrive.report.sections import Facts, capitalized, sections_of
 from ftdrivers.installation import missing_extra
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def render_page(facts: Facts) -> str:
     from ftdrive.report.figures import draw_figure
 
     sections = sections_of(facts)
-    environment.filters["sentence"] = lambda text: with_code(capital(text))
+    environment.filters["sentence"] = lambda text: with_code(capitalized(text))
     drawn = {one.name: Markup(draw_figure(one.name, facts)) for section in sections for one in section.figures}
     template = environment.get_template("report.html.j2")
     return template.render(facts=facts, sections=sections, drawn=drawn, version=__version__)

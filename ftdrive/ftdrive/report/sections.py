@@ -70,7 +70,7 @@ def rounded(value: float | None, digits: int = 3) -> str:
     return f"{value:.{min(places, 9)}f}"
 
 
-def capital(words: str) -> str:
+def capitalized(words: str) -> str:
     """Return a text with a capital first letter."""
     return words[:1].upper() + words[1:]
 
@@ -287,7 +287,7 @@ def drift(facts: Facts) -> Section:
     found, again = seen["in_fit"], seen["first_pose_again"]
     text = []
     if again is not None:
-        text.append(f"{capital(again['words'])}.")
+        text.append(f"{capitalized(again['words'])}.")
     if seen["lag1"] is not None:
         text.append(
             f"Residuals of successive poses are correlated by {seen['lag1']:.2f}. Good: near 0. Drift increases it."
@@ -308,7 +308,7 @@ def drift(facts: Facts) -> Section:
         columns = ("channel", "change of the bias", "± 1 sigma", "in sigma")
         tables = (ReportTable("Bias at the last pose minus bias at the first", columns, rows),)
     if seen["in_use"] is not None:
-        text.append(f"{capital(seen['in_use'])}. Tare before use.")
+        text.append(f"{capitalized(seen['in_use'])}. Tare before use.")
     return Section("drift", "Drift", text, (), tables)
 
 
@@ -343,7 +343,7 @@ def coverage(facts: Facts) -> Section:
         return Section("coverage", title, ["The calibration file contains no orientations: report its run folder."])
     gap_deg = math.degrees(found["largest_gap_rad"])
     text = [
-        capital(found["words"]),
+        capitalized(found["words"]),
         f"{found['orientations']} different orientations (24 or more count as 24) determine {found['rank']} of 15 "
         "parameters.",
         f"Largest gap: {gap_deg:.0f}° around the direction {found['gap_words']}.",
@@ -480,7 +480,7 @@ def _last_verification(trust: Facts) -> Iterator[str]:
         outcome = "passed" if last["passed"] else "FAILED"
         yield f"Last verification {last['created_utc'][:16]} UTC, {outcome}: {last['reason']}. File {last['path']}."
     if trust.get("store_error"):
-        yield f"{capital(MAY_BE_MISSING.format(trust['store_error']))}."
+        yield f"{capitalized(MAY_BE_MISSING.format(trust['store_error']))}."
 
 
 def motion(facts: Facts) -> Section:

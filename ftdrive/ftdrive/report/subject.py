@@ -22,7 +22,7 @@ from ftdrive.runs.verification import age_and_check, newest, verification_near
 MAY_BE_MISSING = "a later verification may be missing, because {}"
 
 
-def trust(
+def trust_facts(
     result: CalibrationResult, source: Path, store_url: Callable[[], str | None], now: datetime
 ) -> dict[str, Any]:
     """Return age and last verification of a result; an error of the store is in `store_error`.

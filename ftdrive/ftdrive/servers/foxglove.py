@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from ftdrive.errors import ConfigError
 from ftdrive.servers.http_gate import PassingGate, hidden_host
-from ftdrive.servers.parameters import change, parameters_of, with_changes
+from ftdrive.servers.parameters import parameters_of, set_stream, with_changes
 from ftdrive.stream import ros2
 from ftdrive.stream.samples import Block, Picked, StreamEvent, quaternions
 from ftdrive.stream.stream import Sink, Stream
@@ -55,7 +55,7 @@ _ORANGE, _BLUE = messages.Color(r=1.0, g=0.5, b=0.0, a=1.0), messages.Color(r=0.
 _HEAD_M = 0.02
 
 
-def _stamp(t_utc_ns: int) -> messages.Timestamp:
+def _timestamp(t_utc_ns: int) -> messages.Timestamp:
     return messages.Timestamp(*divmod(t_utc_ns, 1_000_000_000))
 
 
@@ -63,7 +63,7 @@ def _arrows(block: Block, t_utc_ns: int) -> messages.SceneUpdate:
     """Return arrows of force (orange) and torque (blue) of the newest sample, in the wrench frame."""
     force_N, torque_Nm = block.wrench[-1, :3], block.wrench[-1, 3:]
     entity = messages.SceneEntity(
-        timestamp=_stamp(t_utc_ns),
+        timestamp=_timestamp(t_utc_ns),
         frame_id=block.frame.id,
         id="wrench",
         frame_locked=True,
@@ -216,7 +216,7 @@ class FoxgloveServer(Sink, ServerListener):
         for event in events:
             t_ns = np.array([event.t_host_ns + offset_ns])
             level = messages.LogLevel.Warning if event.kind in ros2.WARNINGS else messages.LogLevel.Info
-            log = messages.Log(timestamp=_stamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
+            log = messages.Log(timestamp=_timestamp(int(t_ns[0])), level=level, message=event.text, name=event.kind)
             self._send(EVENTS, t_ns, partial(list, [log]))
 
     def _send_block(self, block: Block, t_ns: NDArray[np.int64]) -> None:
@@ -284,7 +284,7 @@ class FoxgloveServer(Sink, ServerListener):
         """Set all parameters, or none with a warning; return the resulting values. Called in a thread of the SDK."""
         stream, changes = self._stream, [(one.name, one.get_value()) for one in parameters]
         try:
-            change(stream, *with_changes(stream.frame, stream.stages, changes))
+            set_stream(stream, *with_changes(stream.frame, stream.stages, changes))
         except ConfigError as error:
             self._control.publish_status(str(error), StatusLevel.Warning)
         return self.on_get_parameters(client, [])

@@ -60,7 +60,7 @@ def with_changes(frame: WrenchFrame, stages: Stages, changes: Iterable[tuple[str
     return WrenchFrame(**of_frame), Stages(**of_stages)
 
 
-def change(stream: "Stream", frame: WrenchFrame, stages: Stages, then: Callable[[], object] = lambda: None) -> None:
+def set_stream(stream: "Stream", frame: WrenchFrame, stages: Stages, then: Callable[[], object] = lambda: None) -> None:
     """Set frame and stages of a stream, and call `then`; after a `ConfigError` of these the stream is unchanged."""
     before = stream.frame, stream.stages
     try:

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from ftdrive.errors import ConfigError
-from ftdrive.servers.parameters import Fixed, NodeParameters, change
+from ftdrive.servers.parameters import Fixed, NodeParameters, set_stream
 from ftdrive.stream.processing import SENSOR_FRAME
 from ftdrive.stream.ros2 import WARNINGS, Transform, pack_transforms, pack_wrenches, transforms_of
 from ftdrive.stream.samples import Block, LinkStatus, Picked, Stages, StreamEvent, StreamInfo, WrenchFrame
@@ -410,7 +410,7 @@ class Ros2Node(Sink):
     def _apply(self, frame: WrenchFrame, stages: Stages, tool: str) -> None:
         """Apply parameters in the thread of the node. Raises `ConfigError` and then changes none."""
         if self._stream is not None:
-            change(self._stream, frame, stages, partial(self._request_tool, tool))
+            set_stream(self._stream, frame, stages, partial(self._request_tool, tool))
 
     def _request_tool(self, tool: str) -> None:
         if tool == self.parameters.tool:

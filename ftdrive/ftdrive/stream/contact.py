@@ -178,11 +178,11 @@ class ContactTest:
             if state != REST:
                 covariance = covariance + self._friction + self._unknown[inertia]
             self._whitening = key, np.linalg.inv(np.linalg.cholesky(covariance)), offset
-            self.limit = _hotelling(self.false_alarm_rate, noise.dof)
+            self.limit = _hotelling_limit(self.false_alarm_rate, noise.dof)
         return self._whitening[1:]
 
 
-def _hotelling(rate: float, dof: float) -> float:
+def _hotelling_limit(rate: float, dof: float) -> float:
     """Return the limit of the squared distance of six channels whose covariance has `dof` degrees of freedom."""
     if dof <= 6:
         return float("inf")

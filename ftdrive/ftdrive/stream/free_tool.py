@@ -229,7 +229,7 @@ class FreeToolFilter:
         self.hold(np.zeros(4), np.zeros((4, 4)))
         self.expect(np.square(_TARED_N * _UNIT))
         self._state = self._ahead(self._state, self._t_s, R_base_flange, systematic)
-        self._state, _ = _corrected(self._state, self._subtracted, noise, _FREE)
+        self._state, _ = _correct(self._state, self._subtracted, noise, _FREE)
         self._trusted, self._is_doubtful = self._mixed(self._state).x[_BIAS], False
 
     def undo_tare(self, change: Array) -> None:
@@ -249,7 +249,7 @@ class FreeToolFilter:
 
     def update(self, window: Window) -> Tracked:
         """Update the state with the next window, and return the estimate."""
-        dt_s, self._t_s = _later(window.t_s, self._t_s), window.t_s
+        dt_s, self._t_s = _time_step_s(window.t_s, self._t_s), window.t_s
         if np.isnan(self._state.t_s):
             self._state = self._state._replace(t_s=window.t_s)
         self.changes += 1
@@ -273,7 +273,7 @@ class FreeToolFilter:
         )
 
     def _ahead(self, state: _State, t_s: float, R_base_flange: Array, systematic: Array) -> _State:
-        dt_s = _later(t_s, state.t_s)
+        dt_s = _time_step_s(t_s, state.t_s)
         turned_rad = float(np.linalg.norm(R_base_flange - state.R_base_flange)) / np.sqrt(2)
         alike = np.exp(-turned_rad / _LOCAL_RAD)
         F = _KEPT + dt_s * _DRIFTS + alike * _TURNS
@@ -325,7 +325,7 @@ class FreeToolFilter:
     def _follow(self, window: Window) -> list[StreamEvent]:
         """Use a window while the part is known, or begin an interruption."""
         now = self._at(self._mixed(self._state), window)
-        if self._compared(now, window, _place(now))[0] < _GATE:
+        if self._compared(now, window, _part_com(now))[0] < _GATE:
             self._queue.append(window)
             if len(self._queue) > _GUARD:
                 self._count(self._queue.pop(0))
@@ -348,16 +348,16 @@ class FreeToolFilter:
 
     def _count(self, window: Window) -> None:
         """Update the state with a window, and the estimate of its noise."""
-        dt_s = _later(window.t_s, self._state.t_s)
+        dt_s = _time_step_s(window.t_s, self._state.t_s)
         now = self._at(self._state, window)
         mixed = self._mixed(now)
-        distance, H, C = self._compared(mixed, window, _place(mixed))
+        distance, H, C = self._compared(mixed, window, _part_com(mixed))
         if (np.diag(H @ mixed.P @ H.T) < np.diag(C)).all():
             n, squares = self._noise[window.state]
             keep = min(1.0, _MOST_WINDOWS / (n + 1))
             left = (window.residual - H @ mixed.x) / self._shaken(window, mixed.x[_PART])
             self._noise[window.state] = (n + 1) * keep, (squares + np.outer(left, left)) * keep
-        self._state, likelihood = _corrected(now, window.residual, C * _less(distance), H)
+        self._state, likelihood = _correct(now, window.residual, C * _inflation(distance), H)
         self._likelihood = self._likelihood * np.exp(-dt_s / _FORGET_S) + likelihood
         weights = np.exp(self._likelihood - self._likelihood.max())
         self._weights = weights / weights.sum()
@@ -367,11 +367,11 @@ class FreeToolFilter:
         """End an interruption if the latest windows agree on a part."""
         before = self._mixed(self._state).x
         before[_PART] = self._before[0]
-        left_N = (window.residual - _observed(window, None) @ before)[:3]
+        left_N = (window.residual - _observation(window, None) @ before)[:3]
         self._peak_N = max(self._peak_N, float(np.linalg.norm(left_N)))
         # if the state before the interruption fits again, the contact is over
         now = self._at(self._mixed(self._held), window)
-        is_explained = self._compared(now, window, _place(now))[0] < _GATE
+        is_explained = self._compared(now, window, _part_com(now))[0] < _GATE
         self._queue = [*self._queue, window] if is_explained else []
         if len(self._queue) > _GUARD + 1:
             return self._end(self._held, self._queue[_GUARD:])
@@ -402,8 +402,8 @@ class FreeToolFilter:
             distance, H, C = self._compared(self._mixed(state), window, place)
             if distance >= _GATE:
                 return None
-            state, _ = _corrected(state, window.residual, C * _less(distance), H)
-            run.append(_WindowFit(window, state, _place(self._mixed(state)) if run else place))
+            state, _ = _correct(state, window.residual, C * _inflation(distance), H)
+            run.append(_WindowFit(window, state, _part_com(self._mixed(state)) if run else place))
         return run
 
     def _decided(self, state: _State) -> _State | None:
@@ -412,7 +412,7 @@ class FreeToolFilter:
         for part, part_P in (self._before, (np.zeros(4), _EMPTY)):
             off = mean[_PART] - part
             if off @ np.linalg.solve(covariance[_PART, _PART] + part_P + _NO_PART, off) < _SAME:
-                return _corrected(state, part, part_P, np.eye(22)[_PART])[0]
+                return _correct(state, part, part_P, np.eye(22)[_PART])[0]
         is_new = mean[_PART][0] >= NOTHING_KG and self._moved([fit.window for fit in self._run])
         return state if is_new else None
 
@@ -467,7 +467,7 @@ class FreeToolFilter:
 
     def _compared(self, state: _State, window: Window, place: Array | None) -> tuple[float, Array, Array]:
         """Return the squared distance of a window, its observation matrix H, and its noise covariance."""
-        H, C = _observed(window, place), self._covariance(window, state.x[_PART])
+        H, C = _observation(window, place), self._covariance(window, state.x[_PART])
         left = window.residual - H @ state.x
         return float(left @ np.linalg.solve(H @ state.P @ H.T + C, left)), H, C
 
@@ -477,17 +477,17 @@ def _force_sizes(wrench: Array) -> Array:
     return np.asarray(np.sqrt(np.square(wrench / _UNIT).reshape(2, 3).sum(axis=1)))
 
 
-def _later(t_s: float, before_s: float) -> float:
+def _time_step_s(t_s: float, before_s: float) -> float:
     """Return the time difference, s; 0 for the first time and for a jump back within a recording."""
     return t_s - before_s if t_s > before_s else 0.0
 
 
-def _less(distance: float) -> float:
+def _inflation(distance: float) -> float:
     """Return the factor on the noise covariance of a window at this squared distance, for Student's distribution."""
     return max(1.0, (_TAILS + distance) / (_TAILS + 6))
 
 
-def _corrected(state: _State, y: Array, covariance: Array, H: Array) -> tuple[_State, Array]:
+def _correct(state: _State, y: Array, covariance: Array, H: Array) -> tuple[_State, Array]:
     """Return the state of each walk after a measurement, and the log likelihoods (n,)."""
     HP, left = H @ state.P, y - state.x @ H.T
     S = HP @ H.T + covariance
@@ -512,7 +512,7 @@ _FREE = np.zeros((6, 22))
 _FREE[:, _BIAS] = _FREE[:, _LOCAL] = np.eye(6)
 
 
-def _observed(window: Window, p_sensor_m: Array | None) -> Array:
+def _observation(window: Window, p_sensor_m: Array | None) -> Array:
     """Return the matrix (6, 22) from state to residual, linearised about the part's centre of mass if known."""
     place_m = window.p_sensor_near_m if p_sensor_m is None else p_sensor_m
     of_part = np.zeros((6, 4))
@@ -524,7 +524,7 @@ def _observed(window: Window, p_sensor_m: Array | None) -> Array:
     return H
 
 
-def _place(state: _State) -> Array | None:
+def _part_com(state: _State) -> Array | None:
     """Return the centre of mass of the part (3,); None if it is too uncertain to linearise the torque about."""
     mass_kg, moment_kg_m = state.x[_PART][0], state.x[_PART][1:]
     placed = mass_kg > NOTHING_KG and float(np.trace(state.P[_PART, _PART][1:, 1:])) < (_PLACED_M * mass_kg) ** 2

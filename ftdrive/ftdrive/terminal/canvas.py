@@ -120,7 +120,7 @@ class Canvas(ABC):
             # last, because a blocked terminal may delay the others
             stack.enter_context(self.reading())
             while not self.is_over:
-                rest = _sent(fd, rest or self._changes(console, fd))
+                rest = _send(fd, rest or self._changes(console, fd))
                 if why := supervisor.absence():
                     raise SupervisorGone(why)
                 while (key := keyboard.stroke()) is not None:
@@ -182,7 +182,7 @@ class Canvas(ABC):
         return captured.get().encode(console.encoding, "replace")
 
 
-def _sent(fd: int, rest: bytes) -> bytes:
+def _send(fd: int, rest: bytes) -> bytes:
     """Send bytes that the terminal accepts until the next drawing is due; return the rest, so that keys do not wait."""
     due_s = time.monotonic() + REFRESH_S
     while rest and (left_s := due_s - time.monotonic()) > 0 and select.select([], [fd], [], left_s)[1]:

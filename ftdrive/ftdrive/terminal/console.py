@@ -13,7 +13,7 @@ from rich.segment import Segment
 from rich.style import Style
 from rich.text import Text
 
-from ftdrive.terminal.text import NARROWEST, glued, unglued
+from ftdrive.terminal.text import NARROWEST, glue, unglue
 from ftdrive.words.text import as_typed, is_command, visible
 
 # A slower command prints what it is doing, even to a pipe.
@@ -69,7 +69,7 @@ def has_screen() -> bool:
     return are_terminals and os.name == "posix" and not messages.is_dumb_terminal
 
 
-def beside(as_json: bool) -> CommandConsole:
+def message_console(as_json: bool) -> CommandConsole:
     """Return the console for messages about a result: stdout, or stderr if `--json` writes to stdout."""
     return messages if as_json else answer
 
@@ -99,7 +99,7 @@ def qr_code(address: str) -> list[str]:
     return code.getvalue().splitlines()
 
 
-def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
+def indented(head: str | Text, words: str, console: Console = messages) -> Text:
     """Return the words after a head; on a narrow terminal the next lines are indented to the first word.
 
     Print the text with `soft_wrap`, so that a line with a command stays whole.
@@ -108,11 +108,11 @@ def hanging(head: str | Text, words: str, console: Console = messages) -> Text:
     words, width = as_typed(words), console.width - first.cell_len
     if console.soft_wrap or width < NARROWEST:
         return first + Text(words)
-    parts = Text(glued(words, width)).split()
+    parts = Text(glue(words, width)).split()
     lines = [line for part in parts for line in ([part] if is_command(part.plain) else part.wrap(console, width))]
     for line in lines:
         line.rstrip()
-        line.plain = unglued(line.plain)
+        line.plain = unglue(line.plain)
     return first + Text("\n" + " " * first.cell_len).join(lines)
 
 

@@ -21,7 +21,7 @@ from ftdrive.checks.description import (
 )
 from ftdrive.checks.discovery import is_place, places
 from ftdrive.errors import ConfigError
-from ftdrive.terminal.console import hanging, messages
+from ftdrive.terminal.console import indented, messages
 from ftdrive.terminal.text import echo, in_whole_words
 from ftdrive.words.text import visible
 from ftdrivers.errors import DeviceError
@@ -247,4 +247,4 @@ def _yes_or_no(answer: str) -> None:
 
 def say(words: str, head: str = "") -> None:
     """Print on stderr; further lines are indented to the first word after the head."""
-    messages.print(hanging(head, words), soft_wrap=True)
+    messages.print(indented(head, words), soft_wrap=True)

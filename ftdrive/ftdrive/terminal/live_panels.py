@@ -39,7 +39,7 @@ _NOTES |= dict.fromkeys(("tare-refused", "gap", "stale", "failed"), BAD)
 # ---------------------------------------------------------------------------------------------------------- head
 
 
-def head(view: View, width: int, page: Line | None = None) -> list[Line]:
+def head_lines(view: View, width: int, page: Line | None = None) -> list[Line]:
     """Return the lines with devices, stages, calibration, and the device without samples or the page in the browser."""
     rule = Line() if page is None else page.add(" ")
     rule.add("─" * (width - rule.width), FAINT)
@@ -84,7 +84,7 @@ def _provenance(view: View, width: int) -> Line:
         if number >= _LOWPASS or not view.info.is_raw:
             chain.append(Part(f"{number} {name}") if is_on else Part(f"{number} {name}(off)", FAINT))
     usual = view.info.is_raw or (stages.bias and stages.gravity)
-    right = Line(words.meaning(view), STRONG if usual else WARNING).add(", ")
+    right = Line(words.wrench_meaning(view), STRONG if usual else WARNING).add(", ")
     right.add(words.short_frame(view.reading.frame), STRONG).add(" ")
     room = width - right.width - 2 - sum(cell_len(part.text) for part in chain)
     arrow = " ▸ " if room >= 3 * (len(chain) - 1) else "▸"
@@ -115,7 +115,7 @@ def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
         lines.append(head)
         for i in range(first, first + 3):
             low, high = view.peaks.low[i], view.peaks.high[i]
-            peaks = "" if low > high else "".join(f"{_fixed(peak, places - 1, 7):>8}" for peak in (low, high))
+            peaks = "" if low > high else "".join(f"{_fit_number(peak, places - 1, 7):>8}" for peak in (low, high))
             now = ("", "") if reading is None else format_component(reading, i)
             line = _component_row(view, f" {AXES[i]} ", now, peaks)
             if bar_cells:
@@ -135,7 +135,7 @@ def component_table(view: View, width: int, *, with_trace: bool) -> list[Line]:
 def format_component(reading: ShownWrench, i: int) -> tuple[str, str]:
     """Return the value of a component and its sigma, with the same number of decimals."""
     places = _decimals(reading, i // 3 * 3)
-    return _fixed(reading.wrench[i], places, 8), _digits(reading.sigma[i], places)
+    return _fit_number(reading.wrench[i], places, 8), _digits(reading.sigma[i], places)
 
 
 def _decimals(reading: ShownWrench | None, first: int) -> int:
@@ -165,7 +165,7 @@ def _digits(sigma: float, places: int) -> str:
     return "--" if np.isnan(sigma) else f"{sigma:.{places}f}"
 
 
-def _fixed(value: float, places: int, width: int) -> str:
+def _fit_number(value: float, places: int, width: int) -> str:
     while places and len(f"{value:+z.{places}f}") > width:
         places -= 1
     return f"{value:+z.{places}f}"
@@ -266,7 +266,7 @@ def _check_line(check: Check) -> Line:
 # -------------------------------------------------------------------------------------------------------- others
 
 
-def others(view: View) -> list[Line]:
+def other_wrench_lines(view: View) -> list[Line]:
     """Return lines with the wrench after fewer stages, and in other frames."""
     if view.reading is None or not (rows := words.other_wrenches(view)):
         return []
@@ -409,7 +409,7 @@ def show_table(views: Iterable[View]) -> None:
         for view in views:
             width = answer.width
             separator = Line("─" * width, FAINT)
-            lines = [*head(view, width), *component_table(view, width, with_trace=True), separator, *links(view)]
+            lines = [*head_lines(view, width), *component_table(view, width, with_trace=True), separator, *links(view)]
             shown = Group(*(line.fit(width).as_text() for line in lines))
             screen.update(Group(shown, "Ctrl-C ends"))
         screen.update(Group(shown, "The recording has ended."))

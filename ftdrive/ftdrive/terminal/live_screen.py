@@ -141,10 +141,10 @@ _LEAST_PLOT_ROWS, _LEAST_EVENTS = 3, 3
 
 def draw_live(view: View, width: int, height: int, page: Line | None = None) -> list[Line]:
     """Return the screen as `height` lines of `width` cells; `page` is the line with the address of a page."""
-    head = live_panels.head(view, width, page)
+    head = live_panels.head_lines(view, width, page)
     foot = live_panels.keys(view, width)
     rows = max(0, height - len(head) - 1)
-    body = _wide(view, width, rows) if width >= _WIDE else _narrow_layout(view, width, rows)
+    body = _wide_lines(view, width, rows) if width >= _WIDE else _narrow_layout(view, width, rows)
     return [line.fit(width) for line in [*head, *body, *[Line()] * (rows - len(body)), foot][:height]]
 
 
@@ -166,10 +166,10 @@ def _narrow_layout(view: View, width: int, rows: int) -> list[Line]:
     return body[:rows]
 
 
-def _wide(view: View, width: int, rows: int) -> list[Line]:
+def _wide_lines(view: View, width: int, rows: int) -> list[Line]:
     separator = Line("─" * _LEFT, FAINT)
     left = [*live_panels.component_table(view, _LEFT, with_trace=False), separator, *live_panels.links(view), separator]
-    for extra in (live_panels.others(view), live_panels.sphere(view), live_panels.identity(view, _LEFT)):
+    for extra in (live_panels.other_wrench_lines(view), live_panels.sphere(view), live_panels.identity(view, _LEFT)):
         if extra and rows - len(left) >= len(extra) + 1 + _LEAST_EVENTS:
             left += [*extra, separator]
     left += live_panels.events(view, _LEFT, max(0, rows - len(left)))

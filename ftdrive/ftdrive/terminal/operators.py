@@ -18,7 +18,7 @@ from ftdrive.words.text import TextLine, visible
 _SAME: Final = {"y": "yes", "n": "no", "q": "quit", "quit": "q", "skip": "s", "redo": "r"}
 
 
-def match(question: Question, typed: str) -> str | None:
+def match_answer(question: Question, typed: str) -> str | None:
     """Return the answer that was typed; None if it is not an answer.
 
     If a word must be typed exactly, "no" raises `Declined`.
@@ -103,7 +103,7 @@ class JsonOperator(_Keyless):
                 }
             )
             typed = read_answer(self.supervisor, question)
-            if (answer := match(question, typed)) is not None:
+            if (answer := match_answer(question, typed)) is not None:
                 return answer
             error = not_an_answer(question, typed)
 
@@ -163,7 +163,7 @@ class PlainOperator(_Keyless):
                 raise
             if not self._stdin.isatty():
                 self._write(typed)
-            if (answer := match(question, typed)) is not None:
+            if (answer := match_answer(question, typed)) is not None:
                 return answer
             self._write(not_an_answer(question, typed) + "\n")
 

@@ -14,7 +14,7 @@ from ftcalib.compare import MethodResult
 from ftcalib.rounding import counted, to_place_of
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftdrive.runs.verification import Verified
-from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.words.result import conclusion, estimate_rows, truth_in_words, verification_in_lines
 from ftdrivers.interfaces import Array
 
@@ -58,11 +58,11 @@ def print_result(
     answer.print(_result_table(result, truth, every=every))
     first, *lines = conclusion(result, drift=drift, records=records, hinted=hinted, every=every)
     head = Text.assemble(" ", (result.verdict.upper(), _STYLE[result.verdict]), "  ")
-    answer.print(hanging(head, first.words, answer))
+    answer.print(indented(head, first.words, answer))
     if truth is not None:
-        answer.print(hanging(" truth: ", truth_in_words(result, truth), answer))
+        answer.print(indented(" truth: ", truth_in_words(result, truth), answer))
     for line in lines:
-        answer.print(hanging(line.head, line.words, answer), style=line.style)
+        answer.print(indented(line.head, line.words, answer), style=line.style)
     if saved is not None:
         answer.print(f" Saved {saved}")
 
@@ -98,7 +98,7 @@ def print_comparison(compared: Sequence[MethodResult]) -> None:
     answer.print(table, soft_wrap=True)
     for one in compared:
         if one.reason is not None:
-            answer.print(hanging(f" {one.method}: ", one.reason, answer))
+            answer.print(indented(f" {one.method}: ", one.reason, answer))
 
 
 def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], MethodResult]], heading: str) -> None:
@@ -107,7 +107,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
     `titles` head the first columns: the method, or case, method and sets. `heading` names the test set and the
     reference.
     """
-    answer.print(hanging(" ", heading, answer))
+    answer.print(indented(" ", heading, answer))
     table = Table(box=None, padding=(0, 0, 0, 1), pad_edge=True)
     for title in titles:
         table.add_column(title, justify="right" if title == "case" else "left", no_wrap=True)
@@ -169,9 +169,9 @@ def print_verification(verified: Verified) -> None:
     answer.print(_verification_table(verified))
     verdict = ("PASS", "bold green") if verified.passed else ("FAILED", "bold red")
     first, *lines = verification_in_lines(verified, every=messages.verbose)
-    answer.print(hanging(Text.assemble(" ", verdict, "  "), first.words, answer))
+    answer.print(indented(Text.assemble(" ", verdict, "  "), first.words, answer))
     for line in lines:
-        answer.print(hanging(line.head, line.words, answer), style=line.style)
+        answer.print(indented(line.head, line.words, answer), style=line.style)
 
 
 def _verification_table(verified: Verified) -> Table:

@@ -28,9 +28,9 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.terminal.console import hanging, messages
+from ftdrive.terminal.console import indented, messages
 from ftdrive.terminal.keyboard import Keyboard
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer, prompt, read_answer
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match_answer, not_an_answer, prompt, read_answer
 from ftdrive.terminal.supervisor import Supervisor
 from ftdrive.words.session import (
     ESTIMATES,
@@ -74,7 +74,7 @@ def draw_session(view: SessionView, now_s: float, *, width: int = 80, height: in
     if view.folder or view.last is not None:
         drift = drift_so_far(view)
         blocks += [
-            (3, _last(view)),
+            (3, _last_pose(view)),
             (9, [_rule(width)]),
             *_finding_rows(view, width, with_cube=wide and height > 20),
             (5, [Text(f"drift  {drift.words}", drift.style)]),
@@ -119,7 +119,7 @@ def _state_lines(view: SessionView, now_s: float, width: int) -> list[Text]:
     return [line.append(f"  {words}" if words else "")]
 
 
-def _last(view: SessionView) -> list[Text]:
+def _last_pose(view: SessionView) -> list[Text]:
     pose, fit = view.last, view.estimated
     if pose is None:
         return []
@@ -332,7 +332,7 @@ class Screen:
     def _print(self, lines: Sequence[TextLine]) -> None:
         for line in lines:
             head, words = self._view.shown(line.head), self._view.shown(line.words)
-            self._console.print(hanging(head, words, self._console), style=line.style, soft_wrap=True)
+            self._console.print(indented(head, words, self._console), style=line.style, soft_wrap=True)
 
     def _new_live(self) -> Live:
         return Live(console=self._console, get_renderable=self._frame, refresh_per_second=REFRESH_HZ)
@@ -353,7 +353,7 @@ class Screen:
                 self._console.file.write("\n")
                 raise
             used += len(lines) + (last.cell_len + 1 + cell_len(typed.rstrip("\n"))) // width + 1
-            if (answer := match(question, typed)) is not None:
+            if (answer := match_answer(question, typed)) is not None:
                 break
             other = Text(self._view.shown(not_an_answer(question, typed)))
             self._console.print(other, crop=True, no_wrap=True)

@@ -21,14 +21,14 @@ _WHOLE: Final = 1000
 _QUOTED = re.compile(r"`[^`\n]+`")
 
 
-def glued(text: str, width: int | None = None) -> str:
+def glue(text: str, width: int | None = None) -> str:
     """Return text in which each command in backticks is one word, unless wider than a line of `width` columns.
 
-    Fold the text, and print it `unglued`.
+    Fold the text, and print it after `unglue`.
 
     Examples
     --------
-    >>> unglued(glued("type `ftdrive help`"))
+    >>> unglue(glue("type `ftdrive help`"))
     'type `ftdrive help`'
     """
     return _QUOTED.sub(
@@ -36,7 +36,7 @@ def glued(text: str, width: int | None = None) -> str:
     )
 
 
-def unglued(text: str) -> str:
+def unglue(text: str) -> str:
     """Return folded text with the spaces of its commands restored."""
     return text.replace(GLUE, " ")
 
@@ -54,11 +54,11 @@ class WholeWords(click.HelpFormatter):
 
     def getvalue(self) -> str:
         """Return the help."""
-        return unglued(super().getvalue()).replace(_HYPHEN, "-")
+        return unglue(super().getvalue()).replace(_HYPHEN, "-")
 
     @staticmethod
     def _whole(text: str) -> str:
-        return glued(text).replace("-", _HYPHEN)
+        return glue(text).replace("-", _HYPHEN)
 
 
 class Group(click.Group):
@@ -97,7 +97,7 @@ def in_whole_words(text: str, file: IO[str], head: str = "") -> str:
         replace_whitespace=False,
     )
     return "\n".join(
-        line if is_command(line.strip()) else unglued(fold.fill(glued(line))) + line[len(line.rstrip()) :]
+        line if is_command(line.strip()) else unglue(fold.fill(glue(line))) + line[len(line.rstrip()) :]
         # keep the trailing space of a prompt
         for line in text.split("\n")
     )
@@ -157,4 +157,4 @@ def _lines(row: Sequence[str], widths: Sequence[int], beside: int) -> Iterator[s
 
 
 def _table_line(row: Sequence[str], widths: Sequence[int]) -> str:
-    return unglued(GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip())
+    return unglue(GAP.join(text.ljust(width) for text, width in zip(row, widths, strict=False)).rstrip())

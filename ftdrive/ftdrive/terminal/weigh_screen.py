@@ -44,7 +44,7 @@ class WeighScreen(Canvas):
         keys = "" if self._weighing.moving else "z zero the empty gripper   p combine poses of one load   "
         title = "   ".join(["ftdrive weigh", name_devices(info), *info.marks])
         lines = [Line(f"  {title}"), self.page() or Line(), Line()]
-        lines += [Line(f"  {row}", STRONG) for row in large(mass)]
+        lines += [Line(f"  {row}", STRONG) for row in large_figures(mass)]
         for text in ("", "   ".join(beside), format_scale(shown), self._weighing.note):
             lines += [Line(f"  {line}") for line in wrap(text, max(width - 4, 1)) or [""]]
         return [*lines, *[Line()] * (height - 1 - len(lines)), Line(f"  {keys}q quit")]
@@ -61,7 +61,7 @@ class WeighScreen(Canvas):
             self._weighing.joins = not self._weighing.joins
 
 
-def large(text: str) -> list[str]:
+def large_figures(text: str) -> list[str]:
     """Return figures as three rows of block characters; other characters are in the last row."""
     rows = ["", "", ""]
     for one in text:

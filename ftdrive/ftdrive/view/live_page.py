@@ -62,7 +62,7 @@ class LivePage:
         self._summary = StreamSummary(feed, checks)
         self._drawn, self._q_rad = 0, np.full(6, np.inf)
         self._arm = None if certifier is None else certifier.arm
-        page.put(_still(certifier))
+        page.put(_static_scene(certifier))
         page.on("tare", lambda *_: feed.do(feed.stream.tare))
         page.on("undo", lambda *_: feed.do(feed.stream.undo_tare))
         if (replay := self._summary.view().replay) is not None:
@@ -130,7 +130,7 @@ class LivePage:
         return shown | scene.wrench_parts(p_base_m, drawn, _M_PER_N, _M_PER_NM)
 
 
-def _still(certifier: Certifier | None) -> dict[str, Part | None]:
+def _static_scene(certifier: Certifier | None) -> dict[str, Part | None]:
     shown: dict[str, Part | None] = {"scene/base": scene.axes(0.25, named=True)}
     rows, size_m = [*_LEGEND], 2.0
     if certifier is not None:
@@ -154,11 +154,11 @@ def texts(view: View, reading: ShownWrench | None) -> dict[str, Part | None]:
     what, (state, _), info = words.WAITING, words.state(view), view.info
     rows = [parts.reading(name, "--", unit, note=_BLANK, size=size, tone=parts.BAD) for name, unit, size in _ROWS]
     if reading is not None:
-        what = f"{words.meaning(view)}, {reading.frame}; stages: {stages_in_words(reading.stages)}"
+        what = f"{words.wrench_meaning(view)}, {reading.frame}; stages: {stages_in_words(reading.stages)}"
         value = f"{state}, {view.contact_s:.1f} s" if state == words.CONTACT else state
         note = words.line_of_force(reading) or _BLANK
         rows[0] |= {"value": value, "note": note, "tone": _TONES.get(state, parts.QUIET)}
-        rows[1:] = [_size(view, reading, 0), _size(view, reading, 3)]
+        rows[1:] = [_size_line(view, reading, 0), _size_line(view, reading, 3)]
     notes = [
         note.words if note.t_host_ns is None else f"{words.time_of_day(info, note.t_host_ns)} {note.words}"
         for note in islice(view.notes, _EVENTS)
@@ -177,11 +177,11 @@ def _devices(info: StreamInfo) -> Part:
     return parts.lines(texts, tone=parts.WARN if info.marks else parts.QUIET)
 
 
-def _size(view: View, reading: ShownWrench, first: int) -> Part:
+def _size_line(view: View, reading: ShownWrench, first: int) -> Part:
     (size, sigma), (name, unit, large) = reading.size(first), _ROWS[2 if first else 1]
-    name += f" {str(reading.frame).partition(', ')[2]}" if first else f", {words.meaning(view)}"
+    name += f" {str(reading.frame).partition(', ')[2]}" if first else f", {words.wrench_meaning(view)}"
     around = f"± {to_place_of(sigma, sigma)} (1 sigma)" if np.isfinite(sigma) else ""
-    note = words.direction(reading, first) or _BLANK
+    note = words.direction_text(reading, first) or _BLANK
     return parts.reading(name, to_place_of(size, sigma), unit, sigma=around, note=note, size=large)
 
 

@@ -67,7 +67,7 @@ class Page:
         found = next((one for part in shown for one in part if one["name"] == name and not one.get("disabled")), None)
         if found is None or found["name"] not in self._acts:
             raise ValueError("this page does not have this control now")
-        self._acts[found["name"]](viewer, _valid(found, value))
+        self._acts[found["name"]](viewer, _valid_value(found, value))
 
     def since(self, version: int) -> tuple[int, str]:
         """Return the present version, and the parts newer than `version` as JSON; empty if there are none."""
@@ -89,7 +89,7 @@ class Page:
         return 0.0 if self._drawn_s is None else monotonic() - self._drawn_s
 
 
-def _valid(control: Part, value: object) -> object:
+def _valid_value(control: Part, value: object) -> object:
     match control["type"]:
         case "button" if value is None:
             return value

@@ -59,7 +59,7 @@ class PlanPage:
 
     def __init__(self, page: Page, plan: Plan, certifier: Certifier) -> None:
         self._page, self._plan, self._arm, self._tour = page, plan, certifier.arm, PlanTimeline(plan)
-        self._volumes = _swept(certifier, self._tour.q_rad)
+        self._volumes = _swept_scene(certifier, self._tour.q_rad)
         self._lock = threading.Lock()
         self._chosen: dict[str, Any] = {"along": 0.0, "play": False, "speed": "1 ×", "swept": False}
         self._drawn: dict[str, Any] = {}
@@ -88,7 +88,7 @@ class PlanPage:
         if chosen == self._drawn:
             return
         self._drawn, t_s, swept = chosen, chosen["along"], chosen["swept"]
-        head, *words = describe(self._plan, self._tour.move(t_s))
+        head, *words = describe_move(self._plan, self._tour.move(t_s))
         rows = [*PLAN_LEGEND, *([(scene.TOOL, "body", "room that the tool sweeps over")] if swept else [])]
         shown = controls(
             button("previous", "Previous pose"),
@@ -128,15 +128,15 @@ def plan_parts(certifier: Certifier, tour: PlanTimeline) -> dict[str, Part | Non
     }
 
 
-def _swept(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
+def _swept_scene(certifier: Certifier, q_rad: Array) -> dict[str, Part | None]:
     bodies = certifier.arm.bodies(q_rad[:: max(1, len(q_rad) // 250)])
     copies = np.concatenate([bodies.centre_m, scene.turned_up(bodies.axis)], axis=-1)
     sizes = zip(bodies.half_length_m, bodies.radius_m, bodies.rounding_m, strict=True)
     parts = [scene.body(*size, scene.TOOL, alpha=0.15, copies=copies[:, i]) for i, size in enumerate(sizes)]
-    return {f"scene/swept/{i}": parts[i] for i in scene.carried(certifier.arm)}
+    return {f"scene/swept/{i}": parts[i] for i in scene.carried_bodies(certifier.arm)}
 
 
-def describe(plan: Plan, move: int) -> tuple[str, str, str]:
+def describe_move(plan: Plan, move: int) -> tuple[str, str, str]:
     """Return texts about a move, its smallest distance, and the space to keep free."""
     if move < 0:
         return "From the present posture to the first pose", "This approach is confirmed separately.", ""

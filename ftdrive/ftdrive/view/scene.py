@@ -88,7 +88,7 @@ def arm_parts(
     if q_rad is None:
         return dict.fromkeys([*names, f"scene/{name}/along"])
     q = np.reshape(np.asarray(q_rad, dtype=np.float64), (1, 6))
-    bodies, beyond = arm.bodies(q), carried(arm)
+    bodies, beyond = arm.bodies(q), carried_bodies(arm)
     turns = turned_up(bodies.axis[0])
     parts: dict[str, Part | None] = {}
     for i, key in enumerate(names):
@@ -106,7 +106,7 @@ def arm_parts(
     return parts
 
 
-def carried(arm: ArmModel) -> range:
+def carried_bodies(arm: ArmModel) -> range:
     """Return the indices of the bodies beyond the flange: the tool, and a load that hangs from it."""
     return range(arm.names.index("tool 1"), len(arm.names))
 

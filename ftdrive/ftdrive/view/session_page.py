@@ -20,7 +20,7 @@ from ftdrive.session.guards import Guard, RangeGuard, Seen
 from ftdrive.view import scene
 from ftdrive.view.page import HUNG_S, Page
 from ftdrive.view.parts import ASK, BAD, GOOD, QUIET, WARN, Part, bar, bars, controls, lines, readings, text_table
-from ftdrive.view.plan_page import PLAN_LEGEND, PlanTimeline, describe, plan_parts
+from ftdrive.view.plan_page import PLAN_LEGEND, PlanTimeline, describe_move, plan_parts
 from ftdrive.words.session import (
     ESTIMATES,
     SessionView,
@@ -212,7 +212,7 @@ class SessionPage:
         if self._scene is None and self._plan is not None and self._cell is not None:
             self._scene = _Cell(self._plan, self._cell[0])
             self._page.put(self._scene.fixed)
-        parts = {"question": asked(question), **_state_panel(view, note, self._stopped_by), **_results(view)}
+        parts = {"question": question_part(question), **_state_panel(view, note, self._stopped_by), **_results(view)}
         if self._scene is not None:
             parts |= self._scene.parts(view.now, self._stop, seen, question, ended=ended)
         if seen is not None and self._cell is not None:
@@ -264,7 +264,7 @@ class _Cell:
         if question is not None:
             if question is not self._asked:
                 self.chosen_s = float(self._tour.begins_s[(stop - 1) % len(self._tour.begins_s)])
-            note = ". ".join(describe(self._tour.plan, self._tour.move(self.chosen_s))[:2])
+            note = ". ".join(describe_move(self._tour.plan, self._tour.move(self.chosen_s))[:2])
             goal_rad, along = self._tour.at(self.chosen_s), controls(self._tour.slider(self.chosen_s), note=note)
         elif seen is not None and seen.motion.moving and not ended:
             goal_rad = seen.motion.goal_rad
@@ -279,7 +279,7 @@ class _Cell:
         }
 
 
-def asked(question: Question | None) -> Part | None:
+def question_part(question: Question | None) -> Part | None:
     """Return the question that waits in the terminal."""
     return None if question is None else lines(question.text, head="Answer in the terminal", tone=ASK)
 

@@ -222,7 +222,7 @@ def _reached_at(host: str) -> str:
 
 
 @contextmanager
-def announced(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
+def announce_page(page: Page, address: Address | None, print_page: Callable[..., object]) -> Iterator[None]:
     """Print the address of a page, with a QR code for other devices if shared; else open it if there is a screen."""
     shared = address is not None and not is_loopback(address[0])
     print_page(page.url, shared=shared)

@@ -254,7 +254,7 @@ def proposal_in_lines(push: Push) -> list[str]:
     if before_kg is not None and push.old.mass_kg is not None and abs(before_kg - push.old.mass_kg) > 1e-3:
         lines.append(f"At the calibration, the payload in the controller was {before_kg:.3f} kg.")
     if push.lean is not None:
-        lines.append(_lean(push))
+        lines.append(_lean_text(push))
     if push.contact is not None:
         force_N, torque_Nm = np.linalg.norm(push.contact[:3]), np.linalg.norm(push.contact[3:])
         lines.append(
@@ -301,7 +301,7 @@ def settings_in_words(settings: ControllerSettings | None) -> str:
     return f"{settings.mass_kg:.3f} kg at {_format_vector(settings.p_flange_com_m, '.1f', 1e3)} mm{up}"
 
 
-def _lean(push: Push) -> str:
+def _lean_text(push: Push) -> str:
     up = push.old.up_base_m_s2
     if up is None:
         return f"The base {push.lean}, compared with [workcell] mounting; the controller does not report its gravity."

@@ -347,7 +347,7 @@ def state(view: View) -> tuple[str, str]:
     return CONTACT if reading.in_contact else FREE, f"test {chi2}, limit {view.status.contact_limit:.1f}"
 
 
-def meaning(view: View) -> str:
+def wrench_meaning(view: View) -> str:
     """Return what the wrench contains after the stages; empty before the first sample."""
     if view.reading is None:
         return ""
@@ -376,7 +376,7 @@ def _point_name(frame: WrenchFrame) -> str:
     )
 
 
-def direction(reading: ShownWrench, first: int) -> str:
+def direction_text(reading: ShownWrench, first: int) -> str:
     """Return the direction of the force (`first` 0) or the axis of the torque (3); empty for noise."""
     if not reading.is_significant(first):
         return ""

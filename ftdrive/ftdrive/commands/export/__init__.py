@@ -10,7 +10,7 @@ from ftdrive.commands.export.calibration import Made, calibration
 from ftdrive.commands.options import FILE, JSON, NewFile, Number, check_simulate, simulate, write_json
 from ftdrive.errors import ConfigError
 from ftdrive.exports.formats import FORMATS
-from ftdrive.terminal.console import answer, beside, hanging
+from ftdrive.terminal.console import answer, indented, message_console
 from ftdrive.terminal.text import Group, echo
 
 _OUTPUT = click.option("-o", "--output", type=NewFile(), help="Save as a new file instead of printing to stdout.")
@@ -28,7 +28,7 @@ def _deliver(made: Made | None) -> None:
     text, output, about, facts, as_json = made
     if output is not None:
         write_new(output, text)
-        beside(as_json).print(f" Saved {output}")
+        message_console(as_json).print(f" Saved {output}")
     if as_json:
         write_json({"schema_version": 1, **about, "file": output and str(output), **facts, "text": text})
     elif output is None:
@@ -103,7 +103,7 @@ def formats(as_json: bool) -> None:
         return
     width = max(map(len, FORMATS))
     for name, one in FORMATS.items():
-        answer.print(hanging(f"{name:{width}}  ", one.description, answer))
+        answer.print(indented(f"{name:{width}}  ", one.description, answer))
 
 
 export_group.add_command(calibration)

@@ -12,7 +12,7 @@ from ftdrive.commands.options import EMULATED_SENSOR, FORCE, JSON, NewFile, Numb
 from ftdrive.errors import ConfigError
 from ftdrive.exports.formats import FORMATS, MAX_FORCE_ERROR_N
 from ftdrive.session.rehearsal import rehearsed_run
-from ftdrive.terminal.console import hanging, messages
+from ftdrive.terminal.console import indented, messages
 from ftdrive.terminal.screen import open_operator
 
 # Text, new file, JSON before and after the file name, and whether to print JSON.
@@ -112,7 +112,7 @@ def calibration(
     if verification is not None and not verification.passed:
         notes.append(f"the last verification of this calibration failed: {verification.reason}")
     for note in notes:
-        messages.print(hanging(" note: ", note))
+        messages.print(indented(" note: ", note))
     about = {"format": target, "calibration": result.id, "marks": list(marks_of(result))}
     facts = {name: getattr(made, name) for name in ("max_force_error_N", "max_torque_error_Nm", "notes", "elsewhere")}
     return made.text, output, about, facts, as_json

@@ -12,7 +12,7 @@ from ftdrive.fleet.cells import Owners, read_cells, refuse_ambiguous
 from ftdrive.fleet.state import join_names
 from ftdrive.store import open_store
 from ftdrive.store.records import record_paths
-from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.console import answer, indented, messages
 
 
 @click.command()
@@ -60,7 +60,7 @@ def index(folders: Sequence[Path], url: str | None) -> None:
     found = open_store(url)
     indexed = found.index(*folders)
     for words in indexed.unreadable:
-        messages.print(hanging(" left out: ", words))
+        messages.print(indented(" left out: ", words))
     added = f"{counted(indexed.results, 'result')} and {counted(indexed.verifications, 'verification')}"
     if indexed.weighings:
         added += f" and {counted(indexed.weighings, 'day')} of weighings"
@@ -75,4 +75,4 @@ def index(folders: Sequence[Path], url: str | None) -> None:
             arms, them = ("arm", "it") if len(strange) == 1 else ("arms", "them")
             names = join_names(sorted(strange))
             words = f"no cell has the {arms} {names}: add {them} to cells.toml, then `ftdrive fleet add`"
-            answer.print(hanging(" ! ", words, answer), style="yellow")
+            answer.print(indented(" ! ", words, answer), style="yellow")

@@ -48,7 +48,7 @@ def fleet_solve(
     """
     if folders and url:
         raise ConfigError("RUNS and --store exclude one another: leave one out")
-    after = None if since is None else _time(since)
+    after = None if since is None else _parse_since(since)
     found = run_folders(folders) if folders else sorted({Path(one.path).parent for one in open_store(url).results()})
     if not found:
         messages.print("No runs: give their folders, or add them to the store with `ftdrive fleet index RUNS`.")
@@ -66,10 +66,10 @@ def fleet_solve(
     else:
         echo("\n".join(report.lines()))
     if report.failed:
-        raise NotAccepted(f"{len(report.failed)} of {len(runs)} runs could not be solved: fix the reasons, and repeat")
+        raise NotAccepted(f"{len(report.failed)} of {len(runs)} runs could not be solved: fix the causes, and repeat")
 
 
-def _time(since: str) -> datetime:
+def _parse_since(since: str) -> datetime:
     try:
         if age := re.fullmatch(r"(\d+)([dh])", since):
             return datetime.now(UTC) - int(age[1]) * _UNITS[age[2]]

@@ -18,7 +18,7 @@ from ftdrive.fleet.status import fleet_of, fleet_state
 from ftdrive.servers.http_gate import host_and_port, is_loopback, with_port
 from ftdrive.store import open_store
 from ftdrive.store.store import Store
-from ftdrive.terminal.console import answer, beside, hanging, messages, print_address
+from ftdrive.terminal.console import answer, indented, message_console, messages, print_address
 from ftdrive.terminal.text import print_table
 from ftdrivers.clock import REAL
 
@@ -48,7 +48,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         from ftdrive.fleet.page import fleet_page  # needs an extra
 
         write_new(page_path, fleet_page(fleet, observed, found.name))
-        beside(as_json).print(f" Saved {page_path}")
+        message_console(as_json).print(f" Saved {page_path}")
     if as_json:
         states = {"cells": [one.to_dict(now) for one in fleet.cells], "findings": [*map(asdict, fleet.findings)]}
         write_json({"schema_version": 1, "store": found.name, "now": now.isoformat(), **states})
@@ -60,7 +60,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
         print_table(_TITLES[:shown], rows, folding={"cell", "tool"})
         answer.print(summary(fleet, now), style="bold")
         for words in attention(fleet, now):
-            answer.print(hanging(" ! ", words, answer), style="yellow")
+            answer.print(indented(" ! ", words, answer), style="yellow")
 
 
 def _status_row(one: CellState, now: datetime) -> tuple[str, ...]:
@@ -94,7 +94,7 @@ def fleet_serve(address: str, url: str | None) -> None:
     """
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
     found = open_store(url)
-    with closing(MetricsServer(host, port, partial(_page, found))) as metrics:
+    with closing(MetricsServer(host, port, partial(_status_page, found))) as metrics:
         print_address(f"Serving {found.name} at ", f"http://{with_port(host, metrics.port)}/metrics")
         print_address("The page of the fleet is at ", f"http://{with_port(host, metrics.port)}/")
         if not is_loopback(host):
@@ -106,7 +106,7 @@ def fleet_serve(address: str, url: str | None) -> None:
         serve_status(partial(fleet_state, found), metrics.update, REAL, say=messages.print)
 
 
-def _page(store: Store) -> str:
+def _status_page(store: Store) -> str:
     from ftdrive.fleet.page import fleet_page  # needs an extra
 
     observed = Observed.read(store, datetime.now(UTC))

@@ -47,7 +47,7 @@ def arguments(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
         assert not force
         return pushed(speed=speed, frame=frame)
 
-    monkeypatch.setattr(live, "replayed", stream)
+    monkeypatch.setattr(live, "open_replay", stream)
     return ["--calibration", str(path), "--replay", str(tmp_path)]
 
 

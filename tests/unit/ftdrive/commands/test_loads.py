@@ -110,7 +110,7 @@ def test_a_recording_is_tared_where_the_tool_is_free_before_the_load(
     rows = Paired.concatenate([*free, rests((POSE, load), (POSE, drift), seconds=1.5)])
     rows = replace(rows, t_host_ns=np.arange(len(rows)) * 1_000_000, seq=np.arange(len(rows)))
     known = info(replace(calibrated(), sensor=SensorMatrix.usual(0.02)))
-    monkeypatch.setattr("ftdrive.commands.loads.replayed", lambda *_, **__: replayed(known, rows, speed=float("inf")))
+    monkeypatch.setattr("ftdrive.commands.loads.open_replay", lambda *_, **__: replayed(known, rows, speed=np.inf))
     found = run("check", "1.000", "--replay", str(tmp_path), "--json")
     answer = json.loads(found.stdout)
     assert answer["scale_error"] == pytest.approx(0.09, abs=4 * answer["scale_sigma"])

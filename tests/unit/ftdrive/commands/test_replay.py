@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from ftcalib import CalibrationResult, Finding
-from ftdrive.commands.replay import equality
+from ftdrive.commands.replay import compare_results
 from ftdrive.errors import NotAccepted
 from tests.unit.ftdrive.stream.simulated import calibrated
 
@@ -18,10 +18,10 @@ def moved(result: CalibrationResult, sigmas: float) -> CalibrationResult:
 
 def test_a_replay_is_equal_to_rounding() -> None:
     saved = calibrated()
-    assert equality(calibrated(), saved) == "equal to the last digit"
-    assert equality(moved(saved, 1e-8), saved).startswith("equal except for rounding, within ")
+    assert compare_results(calibrated(), saved) == "equal to the last digit"
+    assert compare_results(moved(saved, 1e-8), saved).startswith("equal except for rounding, within ")
     with pytest.raises(NotAccepted, match=r"differs from the saved calibration in .*"):
-        equality(moved(saved, 1e-4), saved)
+        compare_results(moved(saved, 1e-4), saved)
     other = replace(moved(saved, 1e-8), findings=(*saved.findings, Finding.of("response_small")))
     with pytest.raises(NotAccepted, match="differs"):
-        equality(other, saved)
+        compare_results(other, saved)

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib import files
 from ftdrive.errors import BadRecording
 from ftdrive.recording import Recorder, Recording, RecordingReader, load_recording, table_files, write_recording
-from ftdrive.recording.recording import Header, changed
+from ftdrive.recording.recording import Header, next_header
 from ftdrive.stream.samples import Stages, StreamEvent, WrenchFrame
 from tests.unit.ftdrive.recorded import BASE_TCP, CONFIGURATION, UTC_OFFSET_NS, block, info
 
@@ -104,7 +104,7 @@ def test_a_file_of_another_version_lacks_stages_that_were_off_and_may_have_one_t
     with pytest.raises(BadRecording, match=r"the stage smoothing is unknown to this version: use a newer ftdrive"):
         Header.from_dict(document | {"stages": newer})
     with pytest.raises(BadRecording, match="the stage smoothing is unknown to this version"):
-        changed(header, StreamEvent(0, "stages", "", newer))
+        next_header(header, StreamEvent(0, "stages", "", newer))
 
 
 def test_conversion_is_lossless(paths: Sequence[Path], tmp_path: Path) -> None:

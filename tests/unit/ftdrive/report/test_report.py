@@ -26,7 +26,7 @@ from ftcalib.routine import PoseRecord, TourPose
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
-from ftdrive.report.facts import _about_of, _error_map, compared, contact_error, facts_of
+from ftdrive.report.facts import _about_of, _error_map, comparison_facts, contact_error, facts_of
 from ftdrive.report.figures import VARIABLES
 from ftdrive.report.page import render_page as written
 from ftdrive.report.sections import comparison, contact, coverage, cross_validation, sections_of, shown_poses
@@ -249,7 +249,7 @@ def test_a_contact_has_the_sigma_of_its_sensor_with_and_without_loads() -> None:
     assert "errors of the sensor are assumed, not measured" in assumed["words"]
     assert "known from loads, sensor.json of 2026-11-20" in known["words"]
     assert any(f"the tool weighs {before.mass_kg / 1.02:.4f} kg" in one for one in contact({"contact": known}).text)
-    differences = comparison({**facts(), "comparison": compared(now, before)}).text
+    differences = comparison({**facts(), "comparison": comparison_facts(now, before)}).text
     assert "assumed, not measured before, known from loads, sensor.json of 2026-11-20 08:00 now" in differences[1]
 
 
@@ -266,13 +266,13 @@ def test_a_moved_centre_of_mass_is_the_only_group_that_changed() -> None:
     step = np.zeros(15)
     step[9] = 8 * np.sqrt(2 * before.covariance[9, 9])
     after = replace(before, parameters=before.parameters.moved(step), provenance={"dataset_sha256": "other"})
-    found = compared(after, before)
+    found = comparison_facts(after, before)
     changed = [one["name"] for one in found["groups"] if one["p_value"] < 1e-3]
     assert changed == ["centre of mass", "all"]
     assert found["parameters"][9]["change"] == pytest.approx(step[9])
     assert found["parameters"][9]["sigmas"] == pytest.approx(8)
     assert not found["same_data"]
-    assert compared(before, before)["same_data"]
+    assert comparison_facts(before, before)["same_data"]
 
 
 def test_two_results_of_one_tool_do_not_differ() -> None:
@@ -283,7 +283,7 @@ def test_parameters_known_in_both_are_not_tested() -> None:
     before = with_covariance({6: 0.01**2, 9: 1e-8})
     step = np.zeros(15)
     step[[6, 9]] = 0.01, 1e-4
-    found = compared(replace(before, parameters=before.parameters.moved(step)), before)
+    found = comparison_facts(replace(before, parameters=before.parameters.moved(step)), before)
     assert [group["name"] for group in found["groups"]] == ["force bias", "centre of mass", "all"]
     assert found["parameters"][0]["sigmas"] is None
     assert found["groups"][-1]["dof"] == 2

@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from ftcalib import CalibrationResult
 from ftdrive.cli import cli
 from ftdrive.report.page import render_page
-from ftdrive.report.subject import trust
+from ftdrive.report.subject import trust_facts
 from ftdrive.store.database import default_file
 from ftdrive.store.store import Store
 from tests.unit.ftdrive.store.run_folders import FIRST, new_run, result, verified
@@ -33,7 +33,7 @@ def calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def known(source: Path, store_url: Callable[[], str | None] = lambda: None) -> dict[str, Any]:
     loaded = CalibrationResult.load(source / "calibration.json" if source.is_dir() else source)
-    return trust(loaded, source, store_url, NOW)
+    return trust_facts(loaded, source, store_url, NOW)
 
 
 def test_the_later_of_run_folders_and_store_counts(calibrated: Path, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling
+from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling_limit
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
@@ -47,8 +47,8 @@ def test_the_limit_is_that_of_an_estimated_covariance() -> None:
         "ni,ni->n", readings, np.linalg.solve(np.swapaxes(samples, 1, 2) @ samples / dof, readings[..., None])[..., 0]
     )
     for rate in (0.1, 0.02):
-        assert (squared > _hotelling(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
-    assert _hotelling(0.01, 6.0) == float("inf") > _hotelling(0.01, 6.1)
+        assert (squared > _hotelling_limit(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
+    assert _hotelling_limit(0.01, 6.0) == float("inf") > _hotelling_limit(0.01, 6.1)
 
 
 @pytest.mark.parametrize("state", [0, 2])
@@ -81,7 +81,7 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
         inexact = felt
     covariance += np.outer(inexact, inexact)
     assert chi2[-1] == pytest.approx((reading - OFFSET) @ np.linalg.solve(covariance, reading - OFFSET))
-    assert test.limit == _hotelling(1e-4, NOISE.dof)
+    assert test.limit == _hotelling_limit(1e-4, NOISE.dof)
     np.testing.assert_array_equal(beyond, chi2 > test.limit)
     np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
     restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)

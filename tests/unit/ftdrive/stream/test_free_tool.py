@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
 from ftcalib.model import Array
-from ftdrive.stream.free_tool import ANY_BIAS, FreeToolFilter, _corrected, _less, _observed, _place, _State
+from ftdrive.stream.free_tool import ANY_BIAS, FreeToolFilter, _correct, _inflation, _observation, _part_com, _State
 from ftdrive.stream.noise import REST, Window
 from ftdrive.stream.samples import StreamEvent, Tracked
 
@@ -177,7 +177,7 @@ def test_a_part_is_a_point_mass(p_m: Array | None) -> None:
     force_N = 1.5 * (WINDOW.felt_m_s2 - WINDOW.lever_s2 @ at_m)
     bias = np.arange(6.0)
     local, as_read = np.arange(6.0) ** 2, np.eye(6) + 0.01 * np.arange(36.0).reshape(6, 6)
-    wrench = _observed(replace(WINDOW, as_read=as_read), p_m) @ np.r_[bias, np.ones(6), local, 1.5, 1.5 * at_m]
+    wrench = _observation(replace(WINDOW, as_read=as_read), p_m) @ np.r_[bias, np.ones(6), local, 1.5, 1.5 * at_m]
     np.testing.assert_allclose(wrench, bias + local + as_read @ np.r_[force_N, np.cross(at_m, force_N)])
 
 
@@ -185,19 +185,19 @@ def test_a_place_is_known_from_3_cm_on_and_of_a_part_only() -> None:
     x, P = np.r_[np.zeros(18), 2.0, 0.2, 0.4, 0.6], np.zeros((22, 22))
     for at, known in ((0.0599, True), (0.0601, False)):
         P[range(19, 22), range(19, 22)] = at**2 / 3
-        place = _place(state(x, P))
+        place = _part_com(state(x, P))
         assert (place is not None) == known
         if place is not None:
             np.testing.assert_allclose(place, [0.1, 0.2, 0.3])
-    assert _place(state(np.r_[np.zeros(18), 0.0199, np.zeros(3)], 0 * P)) is None
-    assert _place(state(np.r_[np.zeros(18), 0.0201, np.zeros(3)], 0 * P)) is not None
+    assert _part_com(state(np.r_[np.zeros(18), 0.0199, np.zeros(3)], 0 * P)) is None
+    assert _part_com(state(np.r_[np.zeros(18), 0.0201, np.zeros(3)], 0 * P)) is not None
 
 
 def test_a_correction_is_that_of_the_information_form() -> None:
     rng = np.random.default_rng(4)
     x, P, C = rng.standard_normal((2, 10)), covariances(rng, 2, 10), covariances(rng, 1, 6)[0]
     H, y = rng.standard_normal((6, 10)), rng.standard_normal(6)
-    (found, found_P, *_), likelihood = _corrected(state(x, P), y, C, H)
+    (found, found_P, *_), likelihood = _correct(state(x, P), y, C, H)
     expected = []
     for k in range(2):
         information = np.linalg.inv(P[k]) + H.T @ np.linalg.inv(C) @ H
@@ -232,8 +232,8 @@ def test_vibration_shakes_a_part_as_it_shakes_the_tool() -> None:
 
 
 def test_a_far_window_counts_less_as_by_students_distribution() -> None:
-    assert (_less(0.0), _less(6.0)) == (1.0, 1.0)
-    assert _less(26.0) == pytest.approx(30 / 10)  # weight of t with 4 degrees of freedom in 6 dimensions
+    assert (_inflation(0.0), _inflation(6.0)) == (1.0, 1.0)
+    assert _inflation(26.0) == pytest.approx(30 / 10)  # weight of t with 4 degrees of freedom in 6 dimensions
 
 
 def test_a_part_is_new_once_gravity_has_turned_or_the_arm_has_gone() -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from ftdrive import cli
-from ftdrive.terminal.console import hanging
+from ftdrive.terminal.console import indented
 from ftdrive.words.text import as_typed
 
 
@@ -28,7 +28,7 @@ def test_without_uv_nothing_changes() -> None:
 @pytest.mark.usefixtures("_started_by_uv")
 def test_with_uv_every_command_begins_with_it(words: str, typed: str) -> None:
     assert as_typed(words) == typed
-    assert hanging(" ! ", words).plain.split() == ["!", *typed.split()]
+    assert indented(" ! ", words).plain.split() == ["!", *typed.split()]
 
 
 @pytest.mark.usefixtures("_started_by_uv")

@@ -28,7 +28,7 @@ from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
 from ftdrive.session.events import Noted, Question
 from ftdrive.terminal import console
-from ftdrive.terminal.console import answer, hanging, messages
+from ftdrive.terminal.console import answer, indented, messages
 from ftdrive.terminal.lines import Line
 from ftdrive.terminal.operators import PlainOperator
 from ftdrive.terminal.screen import open_operator
@@ -63,14 +63,14 @@ def test_brackets_and_colons_are_no_markup(monkeypatch: pytest.MonkeyPatch) -> N
 def test_what_is_longer_than_the_terminal_goes_on_under_its_first_word(width: int) -> None:
     console = Console(width=width, file=io.StringIO(), color_system=None)
     words = " ".join(f"word{k}" for k in range(30))
-    console.print(hanging("  head: ", words, console))
+    console.print(indented("  head: ", words, console))
     assert isinstance(console.file, io.StringIO)
     first, *others = console.file.getvalue().splitlines()
     assert first.startswith("  head: word0 ")
     assert others
     assert all(re.match(r" {8}word\d", line) and len(line) <= width for line in others)
     assert " ".join([first.removeprefix("  head: ").strip(), *map(str.strip, others)]) == words
-    assert hanging("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
+    assert indented("head: ", words, Console(width=width, soft_wrap=True)).plain == f"head: {words}"  # a file
 
 
 @pytest.mark.parametrize("before", range(20))
@@ -80,7 +80,7 @@ def test_a_command_in_backticks_stays_whole(before: int, monkeypatch: pytest.Mon
     words = f"{'x' * before} install it by `uv sync --extra viz` or `pip install x`, then start again"
     for shown in (
         in_whole_words(words, sys.stderr),
-        hanging(" ! ", words, Console(width=40, file=io.StringIO(), color_system=None)).plain,
+        indented(" ! ", words, Console(width=40, file=io.StringIO(), color_system=None)).plain,
     ):
         assert max(map(len, shown.splitlines())) <= 40
         assert "`uv sync --extra viz`" in shown
@@ -98,7 +98,7 @@ def test_help_breaks_no_address_and_cuts_no_sentence() -> None:
 def test_a_line_that_is_a_command_is_never_broken() -> None:
     console = Console(width=40, file=io.StringIO(), color_system=None)
     command = "ftdrive calibrate --resume /home/operator/cells/left/runs/2026-11-28T040528Z-calibrate"
-    console.print(hanging("   ", f"kept in a folder; after a stop, continue with\n{command}", console), soft_wrap=True)
+    console.print(indented("   ", f"kept in a folder; after a stop, continue with\n{command}", console), soft_wrap=True)
     assert isinstance(console.file, io.StringIO)
     assert command in console.file.getvalue()
 

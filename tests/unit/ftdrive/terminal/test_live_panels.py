@@ -11,7 +11,7 @@ from ftdrive.stream.feed import FeedNote
 from ftdrive.stream.samples import Stages, WrenchFrame
 from ftdrive.terminal import live_panels
 from ftdrive.terminal.lines import GOOD, WARNING, Line
-from ftdrive.terminal.live_panels import others, sphere
+from ftdrive.terminal.live_panels import other_wrench_lines, sphere
 from ftdrive.terminal.live_screen import draw_live
 from ftdrive.words.stream import View, line_of_force
 from ftdrivers.interfaces import Fact
@@ -64,7 +64,7 @@ def test_range_is_used_by_the_load_where_the_zero_is_arbitrary(view: View) -> No
 def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -> None:
     push = np.array([1.0, -2.0, -5.0, 0.1, 0.2, -0.3])
     reading = replace(reading_of(view), raw=FREE + TARE + push, R_base_flange=R_BASE_FLANGE, frame=SENSOR)
-    lines = [text(line) for line in others(replace(view, reading=reading))]
+    lines = [text(line) for line in other_wrench_lines(replace(view, reading=reading))]
     found = {line[:21].strip(): [float(one) for one in line[21:].split()] for line in lines[1:]}
     assert lines[0].split() == ["in", "sensor", "@", "sensor", "Fx", "Fy", "Fz", "Tx", "Ty", "Tz"]
     rounded = {"as measured": FREE + TARE + push, "without bias": FREE + push - BIAS, "and without gravity": push}
@@ -75,7 +75,7 @@ def test_the_wrench_is_shown_with_fewer_stages_and_in_other_frames(view: View) -
     below = np.cross([0, 0, 0.035], R_flange_sensor @ push[:3])  # the sensor is 35 mm below the flange
     np.testing.assert_allclose(found["flange @ flange"][3:], R_flange_sensor @ push[3:] + below, atol=0.00051)
     np.testing.assert_allclose(found["base @ tcp"][:3], R_BASE_FLANGE @ R_flange_sensor @ push[:3], atol=0.0051)
-    silent = [text(line) for line in others(replace(view, reading=reading, silent="the arm"))]
+    silent = [text(line) for line in other_wrench_lines(replace(view, reading=reading, silent="the arm"))]
     assert all(line.count("--.--") == 6 for line in silent[1:])
 
 
@@ -120,17 +120,17 @@ def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) ->
 )
 def test_what_is_left_in_the_wrench_is_named(stages: Stages, words: str, view: View) -> None:
     reading = replace(reading_of(view), stages=stages, frame=WrenchFrame("flange", (0.0, 0.01, -0.15)))
-    line = text(live_panels.head(replace(view, reading=reading), 120)[1])
+    line = text(live_panels.head_lines(replace(view, reading=reading), 120)[1])
     assert line.rstrip().endswith(f"{words}, flange @ (0,10,-150) mm")
 
 
 @pytest.mark.parametrize("width", [80, 120])
 def test_a_calibration_of_another_cell_is_marked_in_the_header_and_not_green(view: View, width: int) -> None:
     foreign = replace(view, info=replace(view.info, foreign=True, emulated=True))
-    assert FOREIGN in text(live_panels.head(foreign, width)[0])
-    styles = {part.text: part.style for part in live_panels.head(foreign, width)[2].parts}
+    assert FOREIGN in text(live_panels.head_lines(foreign, width)[0])
+    styles = {part.text: part.style for part in live_panels.head_lines(foreign, width)[2].parts}
     assert styles["GOOD"] == WARNING
-    assert {part.text: part.style for part in live_panels.head(view, width)[2].parts}["GOOD"] == GOOD
+    assert {part.text: part.style for part in live_panels.head_lines(view, width)[2].parts}["GOOD"] == GOOD
 
 
 def test_a_refusal_is_read_to_its_end_on_a_low_screen(view: View) -> None:

@@ -26,7 +26,7 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.terminal.operators import JsonOperator, PlainOperator, match, not_an_answer
+from ftdrive.terminal.operators import JsonOperator, PlainOperator, match_answer, not_an_answer
 from ftdrive.terminal.text import in_whole_words
 from tests.unit.ftdrive.terminal.test_screen import estimated, pose
 
@@ -62,12 +62,12 @@ POSE = pose(7, 5, attempts=2, steady=False)
     ],
 )
 def test_what_counts_as_an_answer(question: Question, typed: str, answer: str | None) -> None:
-    assert match(question, typed) == answer
+    assert match_answer(question, typed) == answer
 
 
 def test_a_word_that_must_be_typed_can_be_refused() -> None:
     with pytest.raises(Declined, match="no, not MOVE"):
-        match(MOVE, "no")
+        match_answer(MOVE, "no")
 
 
 def test_a_script_reads_events_and_answers_questions() -> None:

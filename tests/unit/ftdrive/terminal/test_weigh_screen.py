@@ -10,7 +10,7 @@ import pytest
 
 from ftcalib.after.weighing import Weight
 from ftdrive.stream.weighing import WORDS, CannotWeigh, ScaleState, Weighing
-from ftdrive.terminal.weigh_screen import WeighScreen, large
+from ftdrive.terminal.weigh_screen import WeighScreen, large_figures
 from ftdrivers.errors import StreamBroken
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.terminal.fake_stream import INFO
@@ -87,11 +87,11 @@ class Scale:
 
 
 def mass(text: str) -> list[str]:
-    return [row.strip() for row in large(text)]
+    return [row.strip() for row in large_figures(text)]
 
 
 def test_figures_are_three_rows_high_and_letters_one() -> None:
-    assert [row.rstrip() for row in large("-4.06 kg")] == [
+    assert [row.rstrip() for row in large_figures("-4.06 kg")] == [
         "    █ █   █▀█ █▀▀",
         "▀▀▀ ▀▀█   █ █ █▀█",
         "      ▀ ▀ ▀▀▀ ▀▀▀  kg",

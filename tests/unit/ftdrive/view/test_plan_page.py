@@ -18,7 +18,7 @@ from ftdrive.planning.motion import Speeds
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import guess_of, plan_tour
 from ftdrive.view.page import Page
-from ftdrive.view.plan_page import PlanPage, PlanTimeline, describe
+from ftdrive.view.plan_page import PlanPage, PlanTimeline, describe_move
 from ftdrive.view.scene import arm_parts, turned_up, wrench_parts
 
 
@@ -69,7 +69,7 @@ def test_the_tour_goes_through_every_pose_in_its_time_and_back(plan: Plan) -> No
     middle_s = tour.begins_s[2] + plan.steps[2].duration_s / 2
     np.testing.assert_allclose(tour.at(middle_s), plan.nodes_rad[2:4].mean(axis=0))
     assert [tour.move(float(t_s)) for t_s in tour.begins_s] == list(range(6))
-    assert [describe(plan, move)[0].split(",")[0] for move in (0, 5)] == ["Move 1 of 6", "Move 6 of 6"]
+    assert [describe_move(plan, move)[0].split(",")[0] for move in (0, 5)] == ["Move 1 of 6", "Move 6 of 6"]
     # The path of the tool is drawn through each pose, in pieces of some degrees.
     assert all(np.abs(tour.q_rad - q).max(axis=1).min() < 1e-9 for q in plan.nodes_rad)
     assert np.abs(np.diff(tour.q_rad, axis=0)).max() < np.radians(7)
@@ -84,7 +84,7 @@ def test_the_tour_begins_where_the_arm_stands(plan: Plan) -> None:
     assert tour.end_s == pytest.approx(approach_s + alone.end_s)
     np.testing.assert_allclose(tour.at(approach_s + 3.0), alone.at(3.0))
     assert (tour.move(approach_s - 0.1), tour.move(approach_s)) == (-1, 0)
-    assert "From the present posture" in describe(plan, tour.move(0.0))[0]
+    assert "From the present posture" in describe_move(plan, tour.move(0.0))[0]
 
 
 def test_the_approach_of_a_resumed_run_ends_at_its_own_pose(plan: Plan) -> None:
@@ -111,7 +111,7 @@ def test_the_page_shows_cell_plan_and_controls(shown: PlanPage, plan: Plan) -> N
     assert {"scene/plane 1", "scene/plane 2", "scene/box 1", "scene/ball", "scene/path", "scene/camera"} <= set(parts)
     named = {colour for colour, _, _ in parts["scene/legend"]["rows"]}
     assert {part["colour"] for name, part in parts.items() if name.startswith("scene/") and "colour" in part} == named
-    assert (parts["state"]["head"], *parts["state"]["lines"]) == describe(plan, 0)
+    assert (parts["state"]["head"], *parts["state"]["lines"]) == describe_move(plan, 0)
     assert arm_is_at(shown, plan.nodes_rad[0])
 
 
@@ -123,7 +123,7 @@ def test_viewers_step_from_pose_to_pose(shown: PlanPage, page: Page, plan: Plan)
     page.act("viewer 0", "largest", None)
     largest = int(np.argmax([step.turn_rad for step in plan.steps]))
     assert arm_is_at(shown, plan.nodes_rad[largest])
-    assert parts_of(shown)["state"]["head"] == describe(plan, largest)[0]
+    assert parts_of(shown)["state"]["head"] == describe_move(plan, largest)[0]
 
 
 def test_the_slider_moves_the_arm(shown: PlanPage, page: Page, plan: Plan) -> None:

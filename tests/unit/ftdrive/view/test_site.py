@@ -16,7 +16,7 @@ import pytest
 from ftdrive.terminal.console import print_page
 from ftdrive.view.page import Page, drawing
 from ftdrive.view.parts import button, check_box, choice, controls, lines, slider, text_field
-from ftdrive.view.site import announced, serve_page
+from ftdrive.view.site import announce_page, serve_page
 from tests.wire.waiting import wait_until
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
@@ -228,7 +228,7 @@ def test_the_browser_is_given_a_file_that_only_its_owner_can_read(
     opened: list[str] = []
     monkeypatch.setenv("DISPLAY", ":0")
     monkeypatch.setattr("webbrowser.open", opened.append)
-    with announced(page, None, print_page):
+    with announce_page(page, None, print_page):
         (address,) = opened
         file = Path(urlsplit(address).path)
         assert "token" not in address

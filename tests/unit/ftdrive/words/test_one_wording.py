@@ -15,7 +15,7 @@ from ftcalib import CalibrationResult
 from ftcalib.findings import Verdict
 from ftdrive.report.facts import facts_of
 from ftdrive.report.page import templates, with_code
-from ftdrive.report.sections import capital
+from ftdrive.report.sections import capitalized
 from ftdrive.report.subject import Subject
 from ftdrive.runs.calibration import EMULATED, FOREIGN
 from ftdrive.session.events import State, StateChanged
@@ -36,7 +36,7 @@ from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
 def read(result: CalibrationResult) -> str:
     """Return the text of the report without figures."""
     environment = templates("ftdrive.report", "", "report", "")
-    environment.filters["sentence"] = lambda text: with_code(capital(text))
+    environment.filters["sentence"] = lambda text: with_code(capitalized(text))
     facts = facts_of(Subject(Path("poses.csv"), result, ""))
     page = environment.get_template("report.html.j2").render(facts=facts, sections=[], drawn={}, version="")
     return " ".join(html.unescape(re.sub("<[^>]*>", "", page)).split())
