@@ -126,7 +126,7 @@ def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch
         plans.extend([] if plans else [plan_for(*arguments, **options)])
         return plans[0]
 
-    monkeypatch.setattr(planner, "plan_for", plan_once)
+    monkeypatch.setattr("ftdrive.commands.plan.plan_for", plan_once)
     shown, quiet = run(*PLAN), run("-q", *PLAN)
     assert "Predicted" in shown.stdout
     assert shown.stderr.splitlines()[-2:] == ["Next", "   ftdrive calibrate --minimal   (asks before anything moves)"]
