@@ -177,9 +177,9 @@ def _require_exportable(plan: Plan) -> None:
         raise PlanRefused("the plan has a joint angle, speed or acceleration that no arm can reach: make a new plan")
 
 
-# Time without a change of the live counter after which the service is taken as stopped, s; then its states.
+# Time without a change of the live counter after which the service is taken as stopped, s.
 STALE_S: Final = 0.06
-# Time-out of a request, s.
+# Time-out of a request, s; then the states without an answer.
 LIMIT_S: Final = 2.0
 GONE, LATE, UNSEEN = -1, -2, -3
 
@@ -218,11 +218,11 @@ def functions(first: int, *, example: bool = False) -> str:
 
 _TEXT = """\
 # Functions for `ftdrive serve-load`, registers from <FIRST>.
-# A state of 0 is good. <GONE>: the service is gone, or its sensor is silent. <LATE>: no answer in time.
+# A state of 0 means success. <GONE>: the service or its sensor does not respond. <LATE>: no answer in time.
 # Refused: <CODES>.
-# With any other state than 0 all numbers are 0: never use them.
+# In any other state, all numbers are 0: do not use them. Only `ftd_wrench` has further valid states.
 
-# Whether wrench and weight are up to date; takes one to some cycles.
+# Whether wrench and weight are up to date; takes one to three cycles.
 def ftd_alive():
   local before = <live>
   local still = 0.0
@@ -237,7 +237,7 @@ def ftd_alive():
 end
 
 # [state, fx, fy, fz, tx, ty, tz] of the contact, N and N*m, as set in serve-load (base axes, about the TCP).
-# The state is 0 when nothing touches, 1 in contact, 2 with a load that was not weighed: the wrench is valid then.
+# The wrench is valid in states 0 (free tool), 1 (contact) and 2 (a load that was not weighed).
 def ftd_wrench():
   if not ftd_alive():
     return [<GONE>, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -283,7 +283,7 @@ def ftd_request(command):
   return <LATE>
 end
 
-# Tare the empty gripper at rest: 0 is good. Call it before each grasp.
+# Tare the empty gripper at rest; return 0 for success. Call it before each grasp.
 def ftd_zero():
   return ftd_request(<ZERO>)
 end
@@ -294,8 +294,8 @@ def ftd_status():
 end
 
 # Weigh the part at rest, in 0.6 s: [state, mass, sigma, smallest mass, x, y, z, sigma of x, y, z], kg and m.
-# Centre of mass in flange axes from the flange. A mass of 0 is an empty gripper. The wrench is without the part from
-# now on.
+# Centre of mass in flange axes from the flange. A mass of 0 is an empty gripper. From now on, the weight of the
+# part is subtracted from the wrench.
 def ftd_weigh():
   local state = ftd_request(<WEIGH>)
   if state != 0:
@@ -317,7 +317,7 @@ end
 _BIAS = """\
 
 # [state, age, fx, fy, fz, tx, ty, tz]: change of the bias since the calibration, N and N*m, sensor axes, and seconds
-# since it was seen last. Needs `serve-load --track`. <UNSEEN>: it is not followed, or was not seen yet.
+# since it was last observed. Needs `serve-load --track`. <UNSEEN>: it is not tracked, or not yet observed.
 def ftd_bias():
   if not ftd_alive():
     return [<GONE>, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
@@ -332,7 +332,7 @@ end
 
 _EXAMPLE = """\
 
-# An example: the payload of the tool alone is that of `ftdrive export calibration --format ur-payload`.
+# Example. `ftdrive export calibration --format ur-payload` gives the payload of the tool alone.
 def ftd_example(tool_kg, tool_cog):
   if ftd_zero() != 0:
     popup("The scale has no zero.", title="ftdrive", error=True, blocking=True)
