@@ -14,7 +14,7 @@ from ftcalib.files import JSON
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.session import Drift
 from ftcalib.model import STANDARD_GRAVITY_M_S2, UP_IN_BASE, Array, Parameters, angle_between, predict
-from ftcalib.poses.selection import EVERY_SET, numbers_of
+from ftcalib.poses.selection import EVERY_SET, set_numbers
 from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
 from ftcalib.solver import estimator_of, solve
@@ -183,14 +183,14 @@ def table_iii(
         Poses of a set are missing.
     """
     row_of = {int(number): row for row, number in enumerate(numbers)}
-    counts = {name: sum(number not in row_of for number in numbers_of(name).tolist()) for name in EVERY_SET.split("+")}
+    counts = {name: sum(number not in row_of for number in set_numbers(name).tolist()) for name in EVERY_SET.split("+")}
     if missing := [f"{count} of {name}" for name, count in counts.items() if count]:
         raise NotObservable(
             f"Table III lacks poses of its sets ({', '.join(missing)}): take {EVERY_SET}, without leaving out a pose"
         )
 
     def part(sets: str) -> CalibrationDataset:
-        rows = [row_of[number] for name in sets.split("+") for number in numbers_of(name).tolist()]
+        rows = [row_of[number] for name in sets.split("+") for number in set_numbers(name).tolist()]
         return CalibrationDataset.of(dataset.R_base_flange[rows], dataset.wrench[rows], t_s=dataset.t_s[rows])
 
     truth = truth or solve(part(_ALL)).parameters

@@ -40,7 +40,7 @@ from ftcalib.sensor_matrix import (
     Response,
     SensorMatrix,
 )
-from ftcalib.shown import Estimate, estimates_of, figure_of, frame_of, rows_of
+from ftcalib.shown import ShownEstimate, data_frame, shown_estimates, summary_rows, wrench_figure
 
 # A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
 _CONTRADICTS = 4.0
@@ -494,18 +494,18 @@ class CalibrationResult(Displayed, Calibrated):
 
     def _summary(self) -> Summary:
         amount = counted(self.n_poses, "pose") if self.motion is None else f"{100 * self.motion.used_share:.0f} % used"
-        rows = rows_of(self.estimates)
+        rows = summary_rows(self.estimates)
         force_N, torque_Nm = self.likely_error()
         rows.insert(6, Row("error of a free tool, rms", [f"{force_N:.4f} N", f"{torque_Nm:.5f} N·m"]))
         title = f"Calibration {self.id}, {amount}, method {self.method}, estimates ± 1 sigma"
         return Summary(title, rows, self.reasons, self.verdict)
 
     @property
-    def estimates(self) -> list[Estimate]:
+    def estimates(self) -> list[ShownEstimate]:
         """Each quantity with its sigma, in the order in which it is shown."""
         sigma = self.sigma
         values = {key: getattr(self if hasattr(self, key) else self.motion, key) for key in sigma}
-        return estimates_of({**values, "sigma": sigma, "covariance": self.covariance})
+        return shown_estimates({**values, "sigma": sigma, "covariance": self.covariance})
 
     def to_frame(self) -> Any:
         """Return the estimates as a DataFrame of pandas, else of Polars.
@@ -527,7 +527,7 @@ class CalibrationResult(Displayed, Calibrated):
             for key, sigmas in [(one.key, np.where(one.is_known, 0.0, one.sigma))]
             for axis, value, sigma in zip(one.axes, one.values, sigmas, strict=True)
         ]
-        return frame_of(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
+        return data_frame(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
 
     def plot(self) -> Any:
         """Draw what the fit leaves of each pose, or row of a recording in motion: measured minus predicted.
@@ -542,7 +542,7 @@ class CalibrationResult(Displayed, Calibrated):
         UsageError
             matplotlib is not installed.
         """
-        return figure_of(
+        return wrench_figure(
             np.arange(1.0, len(self.residuals) + 1),
             self.residuals,
             label="pose" if self.motion is None else "row of the recording",

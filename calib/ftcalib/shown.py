@@ -34,7 +34,7 @@ _IN_MOTION: Final[Sequence[tuple[str, float, str, str]]] = (
 _KNOWN_BELOW: Final = 1e-9
 
 
-class Estimate(NamedTuple):
+class ShownEstimate(NamedTuple):
     """A quantity of a calibration: a number, a vector, a symmetric tensor, or a mounting as its rotation vector."""
 
     label: str
@@ -57,13 +57,13 @@ class Estimate(NamedTuple):
         return {1: ("",), 3: tuple("xyz"), 6: ("xx", "yy", "zz", "xy", "xz", "yz")}[len(self.values)]
 
 
-def estimates_of(document: Mapping[str, Any]) -> list[Estimate]:
+def shown_estimates(document: Mapping[str, Any]) -> list[ShownEstimate]:
     """Return the estimates in the content of a calibration file: values, `sigma` and `covariance`."""
     known_below = _KNOWN_BELOW * float(np.sqrt(np.diag(document["covariance"]).max()))
     found = []
     for label, factor, unit, key in (*_QUANTITIES, *(_IN_MOTION if "inertia_kg_m2" in document else ())):
         values, sigma = (values_of(source[key], key) for source in (document, document["sigma"]))
-        found.append(Estimate(label, factor, unit, key, values, sigma, sigma <= known_below))
+        found.append(ShownEstimate(label, factor, unit, key, values, sigma, sigma <= known_below))
     return found
 
 
@@ -77,7 +77,7 @@ def values_of(value: Any, key: str) -> Array:
     return np.atleast_1d(values)
 
 
-def rows_of(estimates: Iterable[Estimate]) -> list[Row]:
+def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
     """Return the lines of a summary; the gravity force has none, because it follows from mass and tilt."""
     rows = list[Row]()
     for label, factor, unit, key, values, sigmas, known in estimates:
@@ -90,13 +90,16 @@ def rows_of(estimates: Iterable[Estimate]) -> list[Row]:
         if key == "tilt_beta_rad":  # beside alpha
             rows[-1] = Row("base tilt alpha, beta", [*rows[-1].cells, *cells], unit)
         elif key == "inertia_kg_m2":
-            rows += [Row("inertia xx, yy, zz", cells[:3], unit), Row("inertia xy, xz, yz", cells[3:], unit)]
+            rows += [
+                Row("inertia xx, yy, zz", cells[:3], unit),
+                Row("inertia xy, xz, yz", cells[3:], unit),
+            ]
         else:
             rows.append(Row(f"{label} x, y, z" if len(cells) == 3 else label, cells, unit))
     return rows
 
 
-def frame_of(columns: Mapping[str, ArrayLike]) -> Any:
+def data_frame(columns: Mapping[str, ArrayLike]) -> Any:
     """Return columns by name as a DataFrame of pandas, else of Polars.
 
     Raises
@@ -113,7 +116,7 @@ def frame_of(columns: Mapping[str, ArrayLike]) -> Any:
     raise UsageError("a DataFrame needs pandas or Polars, and neither is installed: pip install pandas")
 
 
-def figure_of(
+def wrench_figure(
     x: Array,
     wrench: Array,
     *,

@@ -13,7 +13,7 @@ from ftcalib import solve as solve_dataset
 from ftcalib.after.weighing import drift_since
 from ftcalib.errors import FtdriveError
 from ftcalib.likelihood.session import Drift
-from ftcalib.loads.check import LoadCheck, check_load
+from ftcalib.loads.check import LoadCheck, check_hung_load
 from ftcalib.loads.model import LoadRun
 from ftcalib.loads.solve import LoadSolution, solve_loads
 from ftcalib.model import STANDARD_GRAVITY_M_S2
@@ -463,7 +463,7 @@ def check_known_load(
         raise refusal
     measured, reference, tare_age_s = best
     drift, p_m = drift_since(tare_age_s), stream.info.p_flange_sensor_m
-    found = check_load(stream.info.calibration, reference, load, measured, drift=drift, p_flange_sensor_m=p_m)
+    found = check_hung_load(stream.info.calibration, reference, load, measured, drift=drift, p_flange_sensor_m=p_m)
     return found, len(measured[0]), tare_age_s
 
 

@@ -16,7 +16,7 @@ from itertools import product
 import numpy as np
 
 from ftcalib import CalibrationDataset, NotObservable, Setup, solve
-from ftcalib.loads.check import check_load
+from ftcalib.loads.check import check_hung_load
 from ftcalib.loads.model import KnownLoad, LoadRun
 from ftcalib.loads.solve import solve_loads
 from ftcalib.sensor_matrix import SensorMatrix
@@ -147,7 +147,7 @@ def checked(poses: int, seed: int) -> dict[str, object]:
     s = TOOL_KG * TOOL_COM_M + TIP_M
     free = sensor.read(np.concatenate([(TOOL_KG + 1.0) * u, np.cross(s, u)], axis=1))
     tared = (hung.dataset.wrench - free).mean(axis=0) - result.parameters.bias
-    found = check_load(
+    found = check_hung_load(
         result,
         result,
         KnownLoad("tip", 1.0, 0.001, (0.0, 0.0, 0.2)),

@@ -21,9 +21,9 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.errors import FtdriveError
 from ftcalib.model import Parameters
-from ftcalib.motion.estimate import fit
-from ftcalib.motion.model import DELAY, INERTIA, Load
-from ftcalib.motion.samples import Means, rows_of
+from ftcalib.motion.estimate import fit_motion
+from ftcalib.motion.model import DELAY, INERTIA, MovingLoad
+from ftcalib.motion.samples import Means, motion_rows
 from ftcalib.motion.solve import solve_motion
 from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 from tests.benchmarks.common import Row, show_rows
@@ -55,10 +55,12 @@ def _errors(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     truth, response = _drawn(kind, seed)
     phase = np.random.default_rng([seed, 98]).uniform(0, 2 * np.pi, 3)
     wrench, poses = means_of(record(truth, sweep(SWEEP_S, phase=(phase[0], phase[1], phase[2])), SWEEP_S, seed))
-    rows = rows_of(wrench.result(), poses.result(), truth.delay_s)
-    found = fit(rows, None, G_M_S2)
+    rows = motion_rows(wrench.result(), poses.result(), truth.delay_s)
+    found = fit_motion(rows, None, G_M_S2)
     inertia = truth.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    load = Load(Parameters(**truth.to_dict()), G_M_S2, inertia, truth.height_m, truth.delay_s - rows.delay_s, response)
+    load = MovingLoad(
+        Parameters(**truth.to_dict()), G_M_S2, inertia, truth.height_m, truth.delay_s - rows.delay_s, response
+    )
     error = np.concatenate([load.static.difference(found.load.static), found.load.vector[15:] - load.vector[15:]])
     return error, np.sqrt(np.diag(found.covariance))
 

@@ -20,7 +20,7 @@ _SINGULAR = 1e-10
 _ROUNDING_SIGMAS = 1e-3
 
 
-class Estimated(Protocol):
+class EstimatedParameters(Protocol):
     """A calibration, an update of it, or a row of a store."""
 
     @property
@@ -62,7 +62,7 @@ class Difference:
             return np.asarray(np.where(self.change == 0, 0.0, self.change / self.sigma))
 
 
-def difference(first: Estimated, second: Estimated) -> Difference:
+def calibration_difference(first: EstimatedParameters, second: EstimatedParameters) -> Difference:
     """Compare two calibrations whose errors are independent.
 
     A field that is identical in both was copied, as by an update of the bias. It is left out of the joint test, because

@@ -14,7 +14,7 @@ from scipy.special import chdtrc as chi2_sf
 from scipy.special import chdtri as chi2_isf
 
 from ftcalib.compensation import Compensator
-from ftcalib.data.dataset import finite
+from ftcalib.data.dataset import require_finite
 from ftcalib.data.dwell_mean import is_stationary, mean_and_covariance
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.findings import Finding
@@ -102,7 +102,8 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     these parameters, or the weight is not significant.
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
-    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
+    R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
+    wrench = require_finite("wrench", wrench, (n, 6))
     C = calibration.joint_covariance
     if not old.gravity_force_base_N.any() and kind != "bias":
         raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
@@ -332,7 +333,7 @@ def tare(
             raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")
     means = [mean_and_covariance(dwell) for dwell in dwells]
     wrench, wrench_cov = np.array([m.mean for m in means]), np.array([m.covariance for m in means])
-    R_base_flange = finite("R_base_flange", R_base_flange, (len(means), 3, 3))
+    R_base_flange = require_finite("R_base_flange", R_base_flange, (len(means), 3, 3))
     change, sigmas = compare_with_prediction(calibration, R_base_flange, wrench, wrench_cov, drift_N, drift_Nm)
     limit = float(chi2_isf(6, FALSE_ALARMS))
     for i in np.flatnonzero(sigmas**2 > limit).tolist():

@@ -30,7 +30,7 @@ from scipy.special import fdtrc as f_sf
 
 from ftcalib.after.state import BLOCKS, Update, reestimate, with_bias_change
 from ftcalib.compensation import Compensator
-from ftcalib.data.dataset import CalibrationDataset, finite, pooled_covariance
+from ftcalib.data.dataset import CalibrationDataset, pooled_covariance, require_finite
 from ftcalib.errors import BadDataset, NotObservable
 from ftcalib.files import JSON
 from ftcalib.likelihood.descent import column_scale
@@ -326,7 +326,7 @@ class Verification:
         }
 
 
-def verify(
+def verify_calibration(
     calibration: CalibrationResult,
     R_base_flange: Array,
     wrench: Array,
@@ -368,8 +368,11 @@ def verify(
     n = len(wrench)
     if n < FEWEST:
         raise BadDataset(f"{n} {'pose is' if n == 1 else 'poses are'} too few for a verification: record 2 or more.")
-    R_base_flange, wrench = finite("R_base_flange", R_base_flange, (n, 3, 3)), finite("wrench", wrench, (n, 6))
-    wrench_cov = finite("wrench_cov", wrench_cov, (n, 6, 6))
+    R_base_flange, wrench = (
+        require_finite("R_base_flange", R_base_flange, (n, 3, 3)),
+        require_finite("wrench", wrench, (n, 6)),
+    )
+    wrench_cov = require_finite("wrench_cov", wrench_cov, (n, 6, 6))
     if not 0 < false_alarms < 1:
         raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
     if fitted is not None and len(fitted) != calibration.n_poses:

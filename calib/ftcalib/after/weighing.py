@@ -22,7 +22,7 @@ from scipy.special import chdtrc as chi2_sf
 
 from ftcalib.after.state import USUAL_DRIFT_N, USUAL_DRIFT_NM, Update
 from ftcalib.compensation import Compensator
-from ftcalib.data.dataset import finite
+from ftcalib.data.dataset import require_finite
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters, jacobian, read_only, skew
@@ -125,7 +125,7 @@ def drift_since(seconds: float, per_h: Array = _DRIFT_PER_H) -> Array:
     return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, _USUAL_DRIFT))
 
 
-def weigh(  # noqa: PLR0913 - the readings and what is known of them
+def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
     reference: Calibrated,
     R_base_flange: Array,
     wrench: Array,
@@ -167,8 +167,8 @@ def weigh(  # noqa: PLR0913 - the readings and what is known of them
         Shapes that do not fit each other, or a tool without weight: the direction of gravity is unknown then.
     """
     n = len(wrench)
-    R_base_flange = finite("R_base_flange", R_base_flange, (n, 3, 3))
-    wrench, noise = finite("wrench", wrench, (n, 6)), finite("noise", noise, (n, 6, 6))
+    R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
+    wrench, noise = require_finite("wrench", wrench, (n, 6)), require_finite("noise", noise, (n, 6, 6))
     tool, response = reference.parameters, reference.shown_response
     known, weight_N = Calibrated(tool, reference.covariance, response), tool.weight_N
     if not weight_N > 0:

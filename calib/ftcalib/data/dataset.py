@@ -17,7 +17,7 @@ from ftcalib.errors import BadDataset
 from ftcalib.files import JSON, check_format, read_object, write_object
 from ftcalib.model import ROUNDING, Array, Rotations, matrices_of, nearest_rotation, read_only
 from ftcalib.rounding import counted
-from ftcalib.shown import frame_of
+from ftcalib.shown import data_frame
 
 FORMAT = "ftdrive.dataset/1"
 
@@ -174,7 +174,7 @@ class CalibrationDataset(Displayed):
         if self.wrench_cov is not None:
             sigma = np.sqrt(np.diagonal(self.wrench_cov, axis1=1, axis2=2))
             columns |= {f"sigma_{name}": values for name, values in zip(CHANNELS, sigma.T, strict=True)}
-        return frame_of(columns)
+        return data_frame(columns)
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the content of a dataset file."""
@@ -231,13 +231,13 @@ class CalibrationDataset(Displayed):
         return digest.hexdigest()
 
 
-def list_names(names: Sequence[str], most: int = 20) -> str:
+def shorten_list(names: Sequence[str], most: int = 20) -> str:
     """Return names for a message, and how many more there are."""
     shown = ", ".join(name if len(name) <= 40 else f"{name[:40]}…" for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
-def finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
+def require_finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
     """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
     array = _require_shape(name, value, shape)
     _reject(name, array, ~np.isfinite(array), "not a finite number.")
@@ -255,7 +255,7 @@ def _require_shape(name: str, value: object, shape: tuple[int, ...]) -> Array:
 
 
 def _require_measured(name: str, value: object, shape: tuple[int, ...]) -> Array:
-    array = finite(name, value, shape)
+    array = require_finite(name, value, shape)
     _reject(name, array, np.abs(array) > LARGEST, f"more than any sensor measures ({LARGEST:g}): check the units.")
     return array
 

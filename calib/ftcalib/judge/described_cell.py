@@ -206,7 +206,9 @@ def _mass(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float
     return [Finding.of("tool_mass_mismatch", load_kg=load_kg, tool_kg=tool_kg, units=suspects, unit_N=unit_N)]
 
 
-def unit_of_force(estimate: Estimate, known: Known | None, setup: Setup, g_m_s2: float) -> tuple[float, float] | None:
+def force_unit_of_cell(
+    estimate: Estimate, known: Known | None, setup: Setup, g_m_s2: float
+) -> tuple[float, float] | None:
     """Return what a unit of force is by the known or the described mass, in N, and its standard deviation."""
     if known is not None and known.mass_kg is not None:
         true_kg, tolerance_kg = known.mass_kg, known.mass_tolerance_kg

@@ -25,7 +25,7 @@ from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.fit import Estimate, Fit, standardize
 from ftcalib.likelihood.session import FEW_POSES_FOR_GAIN, FEW_POSES_FOR_RESPONSE
 from ftcalib.likelihood.structure import error_with_other_joints, hidden_in_any_poses
-from ftcalib.likelihood.variance_components import FORCE, TORQUE, component
+from ftcalib.likelihood.variance_components import FORCE, TORQUE, channel_component
 from ftcalib.model import PARAMETER_NAMES, STANDARD_GRAVITY_M_S2, Array
 from ftcalib.sensor_matrix import Response
 
@@ -89,7 +89,7 @@ def drift_ahead(found: Estimate, t_s: Array | None = None) -> DriftAhead:
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):
         # A random walk has no direction: only its variance grows until the next use.
-        walk[channels] += intervals * found.components.get(component("walk", channels).name, 0.0) ** 2
+        walk[channels] += intervals * found.components.get(channel_component("walk", channels).name, 0.0) ** 2
     linear = np.where(walk > 0, 0.0, found.drift.change * NEXT_USE_S / (time[last] - time[first]))
     # The change from the first pose to the last has the errors of both ends.
     known = found.drift.sigma**2 / 2
@@ -356,7 +356,7 @@ def _units(case: Case, quality: Quality, contradicted: Sequence[Finding] = ()) -
         _rms(found.residuals[quality.used, :3]),
         described=bool(setup.cylinders_m),
         any_bias=setup.sensor_has_arbitrary_zero,
-        unit_N=None if by_mass else described_cell.unit_of_force(case.freest, case.known, setup, case.g_m_s2),
+        unit_N=None if by_mass else described_cell.force_unit_of_cell(case.freest, case.known, setup, case.g_m_s2),
     )
 
 

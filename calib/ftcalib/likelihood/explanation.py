@@ -32,7 +32,7 @@ from ftcalib.likelihood.descent import (
     agreeing_poses,
     fewest_kept,
 )
-from ftcalib.likelihood.session import LEVER_M, Session, inverses, white
+from ftcalib.likelihood.session import LEVER_M, SessionData, inverses, white
 from ftcalib.likelihood.session_noise import Noise
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.variance_components import (
@@ -47,14 +47,14 @@ from ftcalib.likelihood.variance_components import (
     Component,
     Linearised,
     Point,
-    component,
+    channel_component,
     expected_variances,
     maximise,
     noise_of,
     point,
     score,
     squared_length,
-    units,
+    unit_variances,
 )
 from ftcalib.model import Array, Parameters, predict
 
@@ -69,7 +69,7 @@ USUAL_HYSTERESIS = 0.001
 SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02
 
 
-def select(
+def select_explanation(
     problem: Linearised,
     components: Sequence[Component],
     theta: Array,
@@ -118,7 +118,7 @@ def _with_response_instead(problem: Linearised, best: Point, candidates: Sequenc
     added = [c for c in RESPONSE if c in candidates]
     if not added or all(c.kind != "white" for c in best.components):
         return best
-    if len(problem.r) * max(units(problem, best, added)) < SMALL_RESPONSE**2:
+    if len(problem.r) * max(unit_variances(problem, best, added)) < SMALL_RESPONSE**2:
         return best
     rest = [k for k, c in enumerate(best.components) if c not in added and (k < needed or c.kind != "white")]
     quiet = [best.theta[k] * (1e-2 if best.components[k].kind == "white" else 1.0) for k in rest]
@@ -132,7 +132,7 @@ def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Co
     One at a time they may bring less than white noise, which then takes their place.
     """
     for group in (FORCE, TORQUE):
-        walk = component("walk", group)
+        walk = channel_component("walk", group)
         drifts = any(c.kind in ("walk", "slope") and c.share[group[0]] for c in best.components)
         noisy = any(c.kind == "white" and c.share[group[0]] for c in best.components)
         if walk not in candidates or drifts or not noisy or len(best.components) == needed:
@@ -140,7 +140,7 @@ def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Co
         rest = [k for k, c in enumerate(best.components) if k < needed or c.kind != "white" or not c.share[group[0]]]
         kept = [best.components[k] for k in rest]
         added = [walk, *(c for c in RESPONSE if c in candidates and c not in kept)]
-        start = np.append(best.theta[rest], units(problem, best, added))
+        start = np.append(best.theta[rest], unit_variances(problem, best, added))
         best = _better(problem, best, [*kept, *added], start, needed)
     return best
 
@@ -152,7 +152,7 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
         return best
     rest = [k for k in range(len(best.components)) if k not in walks]
     groups = [g for g in (FORCE, TORQUE) if any(best.components[k].share[c] for k in walks for c in g)]
-    slopes = [component("slope", group) for group in groups]
+    slopes = [channel_component("slope", group) for group in groups]
     start = [
         len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
         for g in groups
@@ -178,7 +178,7 @@ def _better(problem: Linearised, best: Point, components: Sequence[Component], t
 def _prune(problem: Linearised, best: Point, needed: int) -> Point:
     """Drop components that raise the likelihood too little: those without effect at once, then one at a time."""
     if best.components:
-        seen = best.theta >= NEGLIGIBLE * units(problem, best, best.components)
+        seen = best.theta >= NEGLIGIBLE * unit_variances(problem, best, best.components)
         seen[:needed] = True
         if not seen.all():
             visible = [best.components[i] for i in np.flatnonzero(seen)]
@@ -200,7 +200,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
 
 def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
     """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
-    start = units(problem, best, waiting)
+    start = unit_variances(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
     problem = problem.with_only(components)
     at = _where_all_are_seen(problem, best, components, theta)
@@ -250,7 +250,7 @@ def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) ->
         for instead in ([], [c for c in candidates if c in noise]):
             components = [*(c for c in best.components if c not in drifts), *instead]
             start = np.array([found.get(c, 0.0) for c in components])
-            start = np.where(start > 0, start, NEGLIGIBLE * units(problem, best, components))
+            start = np.where(start > 0, start, NEGLIGIBLE * unit_variances(problem, best, components))
             bonus = sum(c.needed for c in drifts) - sum(c.needed for c in instead)
             others.append((maximise(problem, components, start), bonus))
     odds = [float(np.exp(min(one.loglik - best.loglik + bonus, 0.0))) for one, bonus in others]
@@ -259,7 +259,7 @@ def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) ->
 
 def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) -> Point:
     """Add the candidates whose variance is positive where the likelihood, as a parabola from zero, is largest."""
-    start = NEGLIGIBLE * units(problem, best, waiting)
+    start = NEGLIGIBLE * unit_variances(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, start])
     at = _where_all_are_seen(problem, best, components, theta)
     slope, information = score(problem, at, components, theta)
@@ -316,7 +316,7 @@ class Explanation:
         return not {"rotation", *EFFECTS}.isdisjoint(c.kind for c in self.components)
 
 
-def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
+def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
     """Find the likeliest explanation, its minima in ascending order, and chi2 without components on the same poses."""
     weights = inverses(session.cov if session.measured else np.broadcast_to(white(1.0, LEVER_M), session.cov.shape))
     minima = session.once("minima", lambda: session.descent.minima(weights))
@@ -353,7 +353,7 @@ def explain(session: Session) -> tuple[Explanation, list[Minimum], float]:
     return chosen, found, static[0].chi2
 
 
-def _explanation_of_some(session: Session) -> Explanation | None:
+def _explanation_of_some(session: SessionData) -> Explanation | None:
     """Explain some of many poses; return None if they show neither a walk nor an error that has a structure.
 
     Errors that neighbouring poses share look like walks of many axes, which take long to try in many poses. More poses
@@ -371,11 +371,11 @@ def _explanation_of_some(session: Session) -> Explanation | None:
     return Explanation(e.parameters, session.everything, e.components, e.theta * shorter)
 
 
-def _of_all_poses(session: Session, e: Explanation) -> Explanation:
+def _of_all_poses(session: SessionData, e: Explanation) -> Explanation:
     """Estimate parameters and variances from all poses, and reject poses, with the components of an explanation."""
     p, kept = e.parameters, e.kept
     problem = session.linearise(p, kept)
-    at = select(problem, e.components, e.theta, (), len(session.always()))
+    at = select_explanation(problem, e.components, e.theta, (), len(session.always()))
     for _ in range(ROUNDS):
         distances = squared_length(*at.left_out())
         before, kept = kept, _membership(session, kept, distances, at)
@@ -389,7 +389,7 @@ def _of_all_poses(session: Session, e: Explanation) -> Explanation:
     return Explanation(p, before, at.components, at.theta, _criterion(session, at, distances), noise=at.noise)
 
 
-def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
+def _with_expected_noise(session: SessionData, e: Explanation) -> Explanation:
     """Take the white noise that is expected instead of the likeliest, if it was not measured."""
     if session.measured:
         return e
@@ -398,7 +398,7 @@ def _with_expected_noise(session: Session, e: Explanation) -> Explanation:
     return replace(e, theta=theta, noise=None)
 
 
-def _is_quiet(session: Session, best: Minimum) -> bool:
+def _is_quiet(session: SessionData, best: Minimum) -> bool:
     """Whether the measured noise explains everything, so that nothing more would be found."""
     always, candidates = session.always(), [*session.candidates(), *session.structure()]
     if not session.measured or always or session.drift == "linear":
@@ -414,7 +414,7 @@ def _is_quiet(session: Session, best: Minimum) -> bool:
     return not candidates or bool(_predicted_gains(problem, at, candidates)[0].max() < WORTH_A_TRY)
 
 
-def _explanations(session: Session, minima: list[Minimum], weights: Array) -> list[Explanation]:
+def _explanations(session: SessionData, minima: list[Minimum], weights: Array) -> list[Explanation]:
     """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
     p = minima[0].parameters
     found = [_improve(session, p, session.everything)]
@@ -428,7 +428,7 @@ def _explanations(session: Session, minima: list[Minimum], weights: Array) -> li
     return found
 
 
-def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
+def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
     always, candidates, structure = session.always(), session.candidates(), session.structure()
     best, problem, at = session.once((p, kept.tobytes()), lambda: _begin(session, p, kept))
@@ -442,22 +442,22 @@ def _improve(session: Session, p: Parameters, kept: Kept) -> Explanation:
             break
         # What compensation knows has been tried first: structured errors would take its place.
         tried = True
-        again = select(problem, at.components, at.theta, [*candidates, *structure], len(always))
+        again = select_explanation(problem, at.components, at.theta, [*candidates, *structure], len(always))
         if set(again.components) == set(at.components):
             break
         at = again
     return best
 
 
-def _begin(session: Session, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
+def _begin(session: SessionData, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
     """Choose the first components."""
     problem, always = session.linearise(p, kept), session.always()
-    at = select(problem, always, session.start(problem, always), session.candidates(), len(always))
+    at = select_explanation(problem, always, session.start(problem, always), session.candidates(), len(always))
     return Explanation(p, kept), problem, at
 
 
 def _improve_once(
-    session: Session, best: Explanation, p: Parameters, problem: Linearised, at: Point
+    session: SessionData, best: Explanation, p: Parameters, problem: Linearised, at: Point
 ) -> tuple[Explanation, Parameters, Linearised, Point, bool]:
     """Improve all but the choice of further components; the last value says that nothing else needs to be tried."""
     candidates, needed, kept = session.candidates(), len(session.always()), problem.kept
@@ -479,12 +479,12 @@ def _improve_once(
     kept = _membership(session, kept, distances, at)
     if (kept != best.kept).any():
         problem = session.linearise(p, kept)
-        at = select(problem, at.components, at.theta, (), needed)
+        at = select_explanation(problem, at.components, at.theta, (), needed)
     return best, p, problem, at, False
 
 
 def _settle(
-    session: Session, p: Parameters, kept: Kept, problem: Linearised, at: Point
+    session: SessionData, p: Parameters, kept: Kept, problem: Linearised, at: Point
 ) -> tuple[Parameters, Linearised, Point]:
     """Go down with the noise as it is and estimate it again, until they agree."""
     for _ in range(ROUNDS):
@@ -494,11 +494,11 @@ def _settle(
         problem = session.linearise(p, kept)
         at = maximise(problem, at.components, at.theta)
         if at.squared_step < SETTLED and not kept.all():  # drop what only rejected poses needed
-            at = select(problem, at.components, at.theta, (), len(session.always()))
+            at = select_explanation(problem, at.components, at.theta, (), len(session.always()))
     return p, problem, at
 
 
-def _membership(session: Session, kept: Kept, distances: Array, at: Point) -> Kept:
+def _membership(session: SessionData, kept: Kept, distances: Array, at: Point) -> Kept:
     """Reject the poses that stand out, the worst first; take back those that do not any more."""
     limit = _limit(session, at)
     # The worst first: a bumped pose bends the fit, and good poses beside it look wrong.
@@ -507,13 +507,13 @@ def _membership(session: Session, kept: Kept, distances: Array, at: Point) -> Ke
     return after if after.sum() >= fewest_kept(session.n) else kept
 
 
-def _limit(session: Session, at: Point) -> float:
+def _limit(session: SessionData, at: Point) -> float:
     """Squared distance of a good pose that one in a thousand exceeds."""
     estimated = any(c.kind == "white" for c in at.components)
     return 6 * float(f_ppf(6, session.dof(at.problem.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
 
 
-def _criterion(session: Session, at: Point, distances: Array) -> float:
+def _criterion(session: SessionData, at: Point, distances: Array) -> float:
     """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
     value, rejected, limit = -2 * at.worth, ~at.problem.kept, _limit(session, at)
     if rejected.any():
@@ -523,7 +523,7 @@ def _criterion(session: Session, at: Point, distances: Array) -> float:
     return value
 
 
-def _with_all_minima(session: Session, e: Explanation, others: list[Minimum]) -> list[Minimum]:
+def _with_all_minima(session: SessionData, e: Explanation, others: list[Minimum]) -> list[Minimum]:
     """Find the minima again, under the noise of the explanation."""
     noise = noise_under(session, e, e.parameters)
     statistics, logdet = session.statistics(noise, e.parameters), noise.logdet
@@ -536,7 +536,7 @@ def _with_all_minima(session: Session, e: Explanation, others: list[Minimum]) ->
     return session.descent.distinct(ends)
 
 
-def _under_own_noise(session: Session, e: Explanation, end: Minimum, logdet: float) -> Minimum:
+def _under_own_noise(session: SessionData, e: Explanation, end: Minimum, logdet: float) -> Minimum:
     """Descend with the noise that an explanation has at the minimum; its logarithm less `logdet` counts as chi2."""
     for _ in range(2):
         noise = noise_under(session, e, end.parameters)
@@ -544,14 +544,14 @@ def _under_own_noise(session: Session, e: Explanation, end: Minimum, logdet: flo
     return replace(end, chi2=end.chi2 + noise.logdet - logdet)
 
 
-def noise_under(session: Session, e: Explanation, p: Parameters) -> Noise:
+def noise_under(session: SessionData, e: Explanation, p: Parameters) -> Noise:
     """Give the noise that an explanation has at parameters."""
     if e.noise is not None and not e.noise_moves:
         return e.noise
     return noise_of(session.linearise(p, e.kept), e.components, e.theta)
 
 
-def _are_gaussian(session: Session, distances: Array) -> bool:
+def _are_gaussian(session: SessionData, distances: Array) -> bool:
     """Whether so many poses are distributed as the noise alone would have them (Kolmogorov and Smirnov)."""
     if session.n < POSES_FOR_THE_SHAPE or _stand_out(session, distances):
         return False
@@ -560,7 +560,7 @@ def _are_gaussian(session: Session, distances: Array) -> bool:
     return apart < float(np.sqrt(np.log(2 / SUSPICIOUS) / (2 * session.n)))
 
 
-def _stand_out(session: Session, distances: Array) -> bool:
+def _stand_out(session: SessionData, distances: Array) -> bool:
     """Whether poses stand out, or so many of them that none does."""
     if session.n < FEWEST_TO_REJECT_FROM:
         return False
@@ -568,7 +568,7 @@ def _stand_out(session: Session, distances: Array) -> bool:
     return bool(distances.max() > chi2_isf(6, 2 * SUSPICIOUS / session.n)) or tail < LIGHT_TAIL
 
 
-def _find_agreeing(session: Session, weights: Array, minima: list[Minimum]) -> list[tuple[Parameters, Kept]]:
+def _find_agreeing(session: SessionData, weights: Array, minima: list[Minimum]) -> list[tuple[Parameters, Kept]]:
     """Find poses that agree within the noise, and those that agree within one that fits half of all poses."""
     starts = [m.parameters for m in minima]
     problem, always = session.linearise(starts[0], session.everything), session.always()

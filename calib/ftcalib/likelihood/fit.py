@@ -14,7 +14,7 @@ from ftcalib.errors import NotObservable
 from ftcalib.known import USUAL_GAIN, Constraints, Known
 from ftcalib.likelihood.descent import FARTHEST, MAX_STEPS, Minimum, column_scale
 from ftcalib.likelihood.explanation import Explanation, explain, noise_under, rivals
-from ftcalib.likelihood.session import Drift, Session
+from ftcalib.likelihood.session import Drift, SessionData
 from ftcalib.likelihood.session_noise import CHUNK, Noise, summed_products
 from ftcalib.likelihood.structure import MOST_POSES as STRUCTURED_POSES
 from ftcalib.likelihood.structure import hidden_columns, hidden_in_any_poses, structure_columns
@@ -28,9 +28,9 @@ from ftcalib.likelihood.variance_components import (
     STRUCTURE,
     Component,
     Point,
-    doubt,
     estimates_of_unknown_variances,
     left_out,
+    mixture_covariance,
     point,
     squared_length,
 )
@@ -295,7 +295,9 @@ def fit(
     NotObservable
         The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
     """
-    session = Session(R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2), gain_sigma)
+    session = SessionData(
+        R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2), gain_sigma
+    )
     e, minima, static_chi2 = explain(session)
     has_structure = any(c in STRUCTURE for c in e.components)
     # Structure explains wrong data so well that no weight remains.
@@ -334,7 +336,7 @@ def _left_out_error(found: Fit) -> float:
     return float(np.log(np.maximum(square, _EXACT)).sum())
 
 
-def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
+def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
     """Put together what follows from an explanation; arguments as `explain` returns them."""
     best = minima[0]
     if not best.settled:
@@ -368,7 +370,7 @@ def _fit_of(session: Session, e: Explanation, minima: list[Minimum], static_chi2
         step = Z @ x[:-SIZE]
         if session.n < POSES_THAT_SHOW_THE_NOISE:
             others = rivals(problem, at, [*session.candidates(), *session.structure()])
-            C = C + doubt(at, others)
+            C = C + mixture_covariance(at, others)
             # A drift that the data show hardly better than none counts for its share.
             step = step + sum(share * (Z @ one.step - step) for one, share in others)
         if drifts:
@@ -419,13 +421,15 @@ def _second_basin_chi2(minima: Sequence[float], components: Iterable[str], dof: 
     return float(dof * np.log(second / best)) if any(name.startswith("white") for name in components) else second - best
 
 
-def _deviation(session: Session, c: Component, variance: float) -> float:
+def _deviation(session: SessionData, c: Component, variance: float) -> float:
     """Standard deviation that the fit used: estimated white noise includes its lower bound."""
     least = 0.0 if session.measured or c.kind != "white" else session.cov[0][np.argmax(c.share), np.argmax(c.share)]
     return float(np.sqrt(variance + least))
 
 
-def _drift(session: Session, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]) -> DriftResult:
+def _drift(
+    session: SessionData, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]
+) -> DriftResult:
     """Best linear prediction of the bias at every pose, and the error of its change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
     problem = session.linearise(best.parameters, noise.kept)

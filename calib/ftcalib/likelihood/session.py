@@ -33,7 +33,7 @@ from ftcalib.likelihood.variance_components import (
     TORQUE,
     Component,
     Linearised,
-    component,
+    channel_component,
 )
 from ftcalib.model import Array, Parameters, jacobian, predict
 from ftcalib.sensor_matrix import GAIN, own_variances, sensor_columns, shown_by
@@ -72,7 +72,7 @@ def _rounding(wrench: Array) -> Array:
     return 1e-12 * np.array([largest_N, max(largest_Nm, LEVER_M * largest_N)])
 
 
-class Session:
+class SessionData:
     """Arguments as in `ftcalib.likelihood.fit.fit`."""
 
     def __init__(
@@ -201,9 +201,9 @@ class Session:
         if not self.measured and self.n < FEW_POSES:
             always = [Component("white_force_N", "white", (1.0, 1.0, 1.0, *[LEVER_M**2] * 3))]
         elif not self.measured:
-            always = [component("white", FORCE), component("white", TORQUE)]
+            always = [channel_component("white", FORCE), channel_component("white", TORQUE)]
         if self.drift == "random-walk":
-            always += [component("walk", group) for group in (FORCE, TORQUE)]
+            always += [channel_component("walk", group) for group in (FORCE, TORQUE)]
         if self.assumes_response:
             always += RESPONSE
         return always
@@ -212,9 +212,9 @@ class Session:
         """Components that the data may show."""
         found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not self.assumes_response else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
-            white = [component("white", FORCE), component("white", TORQUE)] if self.measured else []
+            white = [channel_component("white", FORCE), channel_component("white", TORQUE)] if self.measured else []
             groups = [range(c, c + 1) for c in range(6)] if self.n >= POSES_FOR_EACH_AXIS else [FORCE, TORQUE]
-            walks = [component("walk", group) for group in groups] if self.drift == "auto" else []
+            walks = [channel_component("walk", group) for group in groups] if self.drift == "auto" else []
             walks = walks if self.shown is None else [c for c in walks if c in self.shown]
             found += [*white, ROTATION, *walks]
         if self.n >= FEW_POSES_FOR_HYSTERESIS:
@@ -227,14 +227,14 @@ class Session:
             return ()
         return STRUCTURE if self.n <= STRUCTURED_POSES else tuple(c for c in STRUCTURE if c in (self.shown or ()))
 
-    def some(self, count: int) -> "Session":
+    def some(self, count: int) -> "SessionData":
         """Return the session of so many poses, one from each of as many parts of equal length."""
         # At uneven places within the parts, because a tour may have been repeated at the pace of the parts.
         k = np.arange(count)
         places = ((k + k * GOLDEN_RATIO % 1) * self.n / count).astype(np.intp)
         R, wrench = (x[self.order[places]] for x in self.given)
         cov = self.cov[places] if self.measured else None
-        some = Session(R, wrench, cov, self.time[places], self.drift, self.constraints, self.gain_sigma)
+        some = SessionData(R, wrench, cov, self.time[places], self.drift, self.constraints, self.gain_sigma)
         some.structured = self.structured
         return some
 

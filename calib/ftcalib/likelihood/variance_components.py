@@ -80,7 +80,7 @@ class Component:
         return GAIN_OF_RESPONSE if self.kind in EFFECTS else GAIN
 
 
-def component(kind: Kind, channels: Sequence[int]) -> Component:
+def channel_component(kind: Kind, channels: Sequence[int]) -> Component:
     """Name a component of one channel or of a group of three."""
     what = _AXES[channels[0]] if len(channels) == 1 else "force_N" if channels[0] == 0 else "torque_Nm"
     return Component(f"{kind}_{what}", kind, tuple(float(c in channels) for c in range(6)))
@@ -93,10 +93,10 @@ RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_t
 # What compensation does not know.
 STRUCTURE = (
     Component("kinematics_rad", "kinematics", (0.0,) * 6),
-    Component("load_force", "load", component("load", FORCE).share),
-    Component("load_torque", "load", component("load", TORQUE).share),
-    component("cable", FORCE),
-    component("cable", TORQUE),
+    Component("load_force", "load", channel_component("load", FORCE).share),
+    Component("load_torque", "load", channel_component("load", TORQUE).share),
+    channel_component("cable", FORCE),
+    channel_component("cable", TORQUE),
 )
 
 
@@ -446,7 +446,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
         return point(problem, components, theta)
     most = np.array([problem.largest(c) for c in components])
     best = point(problem, components, np.clip(theta, [problem.smallest(c) for c in components], most))
-    least = np.minimum(1e-3 * NEGLIGIBLE * units(problem, best, components), most)
+    least = np.minimum(1e-3 * NEGLIGIBLE * unit_variances(problem, best, components), most)
     least = np.maximum(least, [problem.smallest(c) for c in components])
     size = np.array([problem.size(c) for c in components])
     caution = 1e-3
@@ -496,7 +496,7 @@ def expected_variances(problem: Linearised, at: Point) -> Array:
     return np.where(white & (mean > at.theta), mean, at.theta)
 
 
-def estimates(at: Point) -> tuple[Array, Array]:
+def parameter_estimates(at: Point) -> tuple[Array, Array]:
     """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
 
     Returns
@@ -520,7 +520,7 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     variances is as much too small (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain: as the
     95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
     """
-    x, C = estimates(at)
+    x, C = parameter_estimates(at)
     if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
     # A variance that was assumed is known.
@@ -530,7 +530,7 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     _, information = score(at.problem, at, at.components, at.theta)
     uncertainty = np.linalg.pinv(information[np.ix_(free, free)], rcond=1e-6, hermitian=True)
     h, steps = 1e-3, np.eye(len(at.theta))[free]
-    around = [estimates(point(at.problem, at.components, at.theta * np.exp(h * row), at)) for row in steps]
+    around = [parameter_estimates(point(at.problem, at.components, at.theta * np.exp(h * row), at)) for row in steps]
     moves, changes = ([(part[i] - own) / h for part in around] for i, own in enumerate((x, C)))
     scale = np.sqrt(np.diag(C))
     scale[scale == 0] = 1.0
@@ -539,28 +539,28 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
     return x, C + 2 * np.transpose(moves) @ uncertainty @ np.array(moves) + wider
 
 
-def doubt(at: Point, others: Sequence[tuple[Point, float]]) -> Array:
+def mixture_covariance(at: Point, others: Sequence[tuple[Point, float]]) -> Array:
     """Covariance (m + 11, m + 11) that `estimates` gain because other variances are right with a share each."""
-    x, C = estimates(at)
+    x, C = parameter_estimates(at)
     total = np.zeros_like(C)
     for one, share in others:
-        other, cov = estimates(one)
+        other, cov = parameter_estimates(one)
         total += share * (cov - C + np.outer(other - x, other - x))
     return total
 
 
-def units(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
+def unit_variances(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
     """Variances (k,) at which each component is about as large as the white noise."""
     kept, n = problem.kept, int(problem.kept.sum())
     variance = np.einsum("ncc,n->c", best.own.D, kept) / n
-    units = []
+    variances = []
     for c in components:
         found = problem.columns(c) if c.kind != "slope" else None
         if found is not None or c.kind == "rotation":
             columns = problem.turn if found is None else np.sqrt(n) * problem.X[..., found]
             square = np.einsum("ncd,ncd,n->c", columns, columns, kept.astype(np.float64)) / (n * columns.shape[2])
-            units.append(float(1 / np.max(square / variance)))
+            variances.append(float(1 / np.max(square / variance)))
         else:
             share = np.array(c.share)
-            units.append(float((variance @ share) / share.sum()) / (n if c.kind == "walk" else 1))
-    return np.array(units)
+            variances.append(float((variance @ share) / share.sum()) / (n if c.kind == "walk" else 1))
+    return np.array(variances)

@@ -50,7 +50,7 @@ class LoadCheck(NamedTuple):
         return values | {"is_within": self.is_within}
 
 
-def check_load(
+def check_hung_load(
     calibration: CalibrationResult,
     reference: Calibrated,
     load: KnownLoad,

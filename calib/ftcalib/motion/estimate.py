@@ -17,9 +17,29 @@ from scipy.special import ndtri
 from ftcalib.after.new_tool import WHOLE, CellPrior
 from ftcalib.known import Known
 from ftcalib.model import Array, DriftResult, Parameters, angle_between
-from ftcalib.motion.model import GAINS, ORDER, SIZE, Load, PoseError, RowNoise, jacobian, runs, states
-from ftcalib.motion.problem import DELAY_S, EXPECTED, GYRATION_M, HEIGHT_M, NEVER, RIDGE, ROUGH_ROWS, Problem, Step
-from ftcalib.motion.samples import Rows
+from ftcalib.motion.model import (
+    GAINS,
+    ORDER,
+    SIZE,
+    MovingLoad,
+    PoseError,
+    RowNoise,
+    motion_jacobian,
+    motion_states,
+    places_in_runs,
+)
+from ftcalib.motion.problem import (
+    DELAY_S,
+    EXPECTED,
+    GYRATION_M,
+    HEIGHT_M,
+    NEVER,
+    RIDGE,
+    ROUGH_ROWS,
+    NormalSolution,
+    Problem,
+)
+from ftcalib.motion.samples import MotionRows
 
 # Squared distance of a row in contact.
 _CONTACT = float(chi2_isf(6, 1e-7))
@@ -70,7 +90,7 @@ LIMIT = 22.0
 class MotionFit:
     """The best fit."""
 
-    load: Load
+    load: MovingLoad
     covariance: Array
     """(34, 34)"""
     kept: NDArray[np.bool_]
@@ -102,8 +122,8 @@ class MotionFit:
         return np.asarray(np.sqrt(np.diag(self.covariance)[15:23]) / expected)
 
 
-def fit(
-    rows: Rows,
+def fit_motion(
+    rows: MotionRows,
     known: Known | None,
     g_m_s2: float,
     *,
@@ -137,17 +157,17 @@ def fit(
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
     effects, sizes = np.zeros(len(problem.basis)), {**_ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
-    solved = Step.none()
+    solved = NormalSolution.none()
     for stage in range(_STAGES):
-        state = states(rows.speed_rad_s, kept)
+        state = motion_states(rows.speed_rad_s, kept)
         r = problem.residuals(load, effects)
         absorbed = problem.absorb(load, rows[kept], solved)
         # An autoregression would take the noise of seconds before its size is chosen.
         order = ORDER if stage > _ALWAYS else 0
-        noise = RowNoise.of(r[kept], absorbed, state[kept], runs(rows.t_s[kept], rows.row_s), order=order)
+        noise = RowNoise.of(r[kept], absorbed, state[kept], places_in_runs(rows.t_s[kept], rows.row_s), order=order)
         if guarded:
             local = _local(r / noise.scale[state], kept)[:, None]
-            place = runs(rows.t_s[kept], rows.row_s)
+            place = places_in_runs(rows.t_s[kept], rows.row_s)
             noise = RowNoise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
             noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
         sums = problem.sums(load, effects, noise, kept, state)
@@ -205,15 +225,15 @@ def _join(
     problem: Problem,
     prior: CellPrior,
     sizes: Mapping[str, float],
-    start: tuple[Load, Array],
+    start: tuple[MovingLoad, Array],
     weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
-) -> tuple[Load, Array, Step, str]:
+) -> tuple[MovingLoad, Array, NormalSolution, str]:
     """Fit rows and a prior from the load and effects of the rows alone, and name what they contradict in the prior.
 
     `weighed` is the noise, with the rows that count and their states, as the rows show it alone.
     """
 
-    def fitted(kept: Sequence[int]) -> tuple[Load, Array, Step]:
+    def fitted(kept: Sequence[int]) -> tuple[MovingLoad, Array, NormalSolution]:
         """Fit; `kept` as of `CellPrior.rows`."""
         (load, effects), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
@@ -239,7 +259,7 @@ def _join(
     return load, effects, solved, contradiction
 
 
-def _rough(problem: Problem, load: Load) -> tuple[Load, float]:
+def _rough(problem: Problem, load: MovingLoad) -> tuple[MovingLoad, float]:
     """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
     rows = problem.rows[:: max(1, len(problem.rows) // ROUGH_ROWS)]
     limit, size = np.inf, SIZE + problem.basis.shape[1]
@@ -247,7 +267,7 @@ def _rough(problem: Problem, load: Load) -> tuple[Load, float]:
     for _ in range(40):
         r = rows.wrench - problem.predict(load, rows)
         scale, weight, limit = robust_weights(r, limit)
-        J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / scale[:, None]
+        J = motion_jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / scale[:, None]
         weighted = (J * weight[:, None, None]).reshape(-1, SIZE)
         H[:SIZE, :SIZE], b[:SIZE] = weighted.T @ J.reshape(-1, SIZE), weighted.T @ (r / scale).ravel()
         step = problem.solve(_ROUGH, (H, b, 0.0), load, no_effects).step
@@ -271,7 +291,7 @@ def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[A
     return scale, (limit / (limit + distance)) ** 2, limit
 
 
-def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
+def rough_delay(rows: MotionRows, known: Known | None, g_m_s2: float) -> float:
     """Delay of the wrench beyond that of the rows, by a robust fit."""
     problem = Problem(rows, known, g_m_s2, point_mass=False)
     return min((_rough(problem, start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
@@ -281,7 +301,7 @@ def rough_delay(rows: Rows, known: Known | None, g_m_s2: float) -> float:
 class FreeFit:
     """A robust fit in which the poses may have an error."""
 
-    load: Load
+    load: MovingLoad
     error: PoseError
     covariance: Array
     """(37, 37) of the load, as of `Load.moved`, then of scale and aside, with what smooth errors do to them."""
@@ -289,7 +309,7 @@ class FreeFit:
     """(2,) of force and torque: the median, as a standard deviation."""
 
 
-def fit_freely(rows: Rows, known: Known | None, g_m_s2: float) -> FreeFit:
+def fit_freely(rows: MotionRows, known: Known | None, g_m_s2: float) -> FreeFit:
     """Fit load and error of the poses, robustly and with white noise, from each mounting that forces allow."""
     problem = Problem(rows[:: max(1, len(rows) // ROUGH_ROWS)], known, g_m_s2, point_mass=False)
     return min(
@@ -297,7 +317,7 @@ def fit_freely(rows: Rows, known: Known | None, g_m_s2: float) -> FreeFit:
     )
 
 
-def _freely(problem: Problem, load: Load) -> FreeFit:
+def _freely(problem: Problem, load: MovingLoad) -> FreeFit:
     rows, limit = problem.rows, np.inf
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
     by_acceleration = np.linalg.lstsq(X, rows.wrench[:, :3], rcond=1e-9)[0][10:13]
@@ -307,7 +327,7 @@ def _freely(problem: Problem, load: Load) -> FreeFit:
         now = error.corrected(rows)
         r = rows.wrench - problem.predict(load, now)
         scale, weight, limit = robust_weights(r, limit)
-        of_load = jacobian(load, now.motion.earlier(load.delay_s, now.rate), now.rate)
+        of_load = motion_jacobian(load, now.motion.earlier(load.delay_s, now.rate), now.rate)
         of_error = PoseError.jacobian(load, rows.motion.earlier(load.delay_s, rows.rate))
         J = np.concatenate([of_load, of_error], axis=2) / scale[:, None]
         weighted = (J * weight[:, None, None]).reshape(-1, SIZE + 3)
@@ -333,11 +353,11 @@ def _freely(problem: Problem, load: Load) -> FreeFit:
     return FreeFit(load, error, Z @ covariance @ Z.T + hidden @ hidden.T, scale[::3])
 
 
-def _first_kept(problem: Problem, load: Load) -> NDArray[np.bool_]:
+def _first_kept(problem: Problem, load: MovingLoad) -> NDArray[np.bool_]:
     """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
     rows = problem.rows
     r = rows.wrench - problem.predict(load, rows)
-    state = states(rows.speed_rad_s, np.ones(len(rows), bool))
+    state = motion_states(rows.speed_rad_s, np.ones(len(rows), bool))
     size = np.abs(r).reshape(-1, 2, 3)
     quiet = np.array([np.quantile(size[state == k], QUIET, axis=(0, 2)) for k in np.unique(state)])
     scale = np.minimum.accumulate(quiet[::-1], axis=0)[::-1] / ndtri((1 + QUIET) / 2) + 1e-12
@@ -366,7 +386,7 @@ def _without_contact(distance: Array) -> NDArray[np.bool_]:
 
 
 def _choose_sizes(
-    problem: Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: Load, effects: Array
+    problem: Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: MovingLoad, effects: Array
 ) -> dict[str, float]:
     """Choose the sizes of the components by restricted likelihood, one after the other.
 

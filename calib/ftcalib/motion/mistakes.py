@@ -21,7 +21,7 @@ from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS
 from ftcalib.model import Array, nearest_rotation
 from ftcalib.motion.estimate import FreeFit, MotionFit, robust_weights
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
-from ftcalib.motion.samples import Rows
+from ftcalib.motion.samples import MotionRows
 
 # Positions that spread farther may be in another unit, if their acceleration agrees with it by this share.
 _FARTHEST_M: Final = 3.0
@@ -65,11 +65,11 @@ OF_AXES: Final = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
 
-Undo = Callable[[Rows], Rows]
+Correction = Callable[[MotionRows], MotionRows]
 """What gives rows without mistakes."""
 
 
-def as_they_are(rows: Rows) -> Rows:
+def unchanged(rows: MotionRows) -> MotionRows:
     """Undo nothing."""
     return rows
 
@@ -81,7 +81,7 @@ Stream = tuple[Array, Array]
 # ------------------------------------------------------------------------------------------------------------- zeroing
 
 
-def falls_to_zero(wrench: Stream) -> tuple[Array, Array]:
+def find_zeroings(wrench: Stream) -> tuple[Array, Array]:
     """Return the times (k,) at which all channels step to about 0, and the steps (k, 6).
 
     The sensor was zeroed there, or a contact ended that began after it was zeroed in the same pose.
@@ -104,7 +104,7 @@ def falls_to_zero(wrench: Stream) -> tuple[Array, Array]:
     return t_s[best + _BESIDE + _WITHIN], steps[best]
 
 
-def bias_steps(rows: Rows, at_s: Array) -> Array:
+def fit_bias_steps(rows: MotionRows, at_s: Array) -> Array:
     """Return the steps (k, 6) of the bias at these times (k,), by a robust fit of all that is linear in the motion."""
     apart = np.abs(rows.t_s[:, None] - at_s).min(axis=1) > 4 * rows.row_s
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns(), rows.t_s[:, None] > at_s])[apart]
@@ -117,7 +117,7 @@ def bias_steps(rows: Rows, at_s: Array) -> Array:
     return np.asarray(solution[-len(at_s) :])
 
 
-def stays(steps: Array, seen: Array) -> Array:
+def are_bias_steps(steps: Array, seen: Array) -> Array:
     """Return which steps (k,) of the reading are steps of the bias."""
     agree = np.sum(steps[:, :3] * seen[:, :3], axis=1)
     return np.asarray(agree > _STAYS * np.sum(seen[:, :3] ** 2, axis=1))
@@ -132,7 +132,7 @@ def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
 # ----------------------------------------------------------------------------------------------------- signs and poses
 
 
-def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Undo]:
+def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Correction]:
     """Find the mistakes of signs, clock and poses that explain the rows, and what undoes them in any rows.
 
     Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
@@ -147,10 +147,10 @@ def mistakes_in(rows: Rows, free: FreeFit, spread_m: float) -> tuple[list[Findin
     """
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
-        return named, as_they_are
+        return named, unchanged
     # A wrench without weight gives any scale.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
-        return [], as_they_are
+        return [], unchanged
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
     moment = float(load.inertia[:3].sum())
     sigma_moment = float(np.sqrt(free.covariance[INERTIA, INERTIA][:3, :3].sum()))
@@ -197,9 +197,9 @@ def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping
     return [*compensated, Finding.of("clock_rate", severity, **of_clock)]
 
 
-def _axes(rows: Rows, change: Array) -> list[Finding]:
+def _axes(rows: MotionRows, change: Array) -> list[Finding]:
     """Find wrong axes and orientations in what is left of the motion at rest, whose axes do not count."""
-    static, left = at_rest(rows)
+    static, left = static_wrench(rows)
     if (left > _EXPLAINED * change).any():
         return []
     some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
@@ -207,7 +207,7 @@ def _axes(rows: Rows, change: Array) -> list[Finding]:
     return [one for one in named if one.code in OF_AXES]
 
 
-def at_rest(rows: Rows) -> tuple[Array, Array]:
+def static_wrench(rows: MotionRows) -> tuple[Array, Array]:
     """Return the wrench (n, 6) at rest in the orientations, and what is left (2,) of force and torque.
 
     The linear function of the motion that fits best has the rest, whatever axes and signs are.
@@ -263,7 +263,7 @@ def _is_height(height_m: float, sigma_m: float) -> bool:
 # ----------------------------------------------------------------------------------------------------- impossible body
 
 
-def impossible(best: MotionFit) -> list[Finding]:
+def find_impossible_body(best: MotionFit) -> list[Finding]:
     """Find an inertia or a height that no body and no sensor has, whatever the cause."""
     findings, sigma_m = list[Finding](), float(np.sqrt(best.covariance[HEIGHT, HEIGHT]))
     moments, axes = np.linalg.eigh(np.tensordot(best.load.inertia, SECOND_MOMENTS, 1))

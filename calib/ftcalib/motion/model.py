@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ftcalib.likelihood.structure import alike
 from ftcalib.model import Array, Parameters, cross, skew
-from ftcalib.motion.samples import Motion, Rows
+from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
@@ -41,7 +41,7 @@ _UNITS = np.eye(9).reshape(9, 3, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Load:
+class MovingLoad:
     """All that is estimated from motion."""
 
     static: Parameters
@@ -107,12 +107,12 @@ class PoseError:
         acceleration = self.scale * motion.acceleration_m_s2 + Omega[:, :, :2] @ self.aside_m
         return Motion(motion.R_base_flange, acceleration, Omega)
 
-    def corrected(self, rows: Rows) -> Rows:
+    def corrected(self, rows: MotionRows) -> MotionRows:
         """Return the rows without the error."""
         return replace(rows, motion=self.undone(rows.motion), rate=self.undone(rows.rate))
 
     @staticmethod
-    def jacobian(load: Load, motion: Motion) -> Array:
+    def jacobian(load: MovingLoad, motion: Motion) -> Array:
         """Derivative (n, 6, 3) of the wrench by scale and aside, given the motion with the error."""
         static, Omega = load.static, motion.Omega_rad2_s2
         moved = np.concatenate([motion.acceleration_m_s2[:, :, None], Omega[:, :, :2]], axis=2)
@@ -120,7 +120,7 @@ class PoseError:
         return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
+def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
     """Wrench (n, 6) that the sensor reads without contact.
 
     Parameters
@@ -140,7 +140,7 @@ def wrench_of(load: Load, motion: Motion, *, bias: bool = True) -> Array:
     return wrench + static.bias if bias else wrench
 
 
-def turn_columns(load: Load, motion: Motion) -> Array:
+def turn_columns(load: MovingLoad, motion: Motion) -> Array:
     """Derivative (n, 6, 3) of the wrench by a small turn of gravity, in flange axes.
 
     An error of a joint turns the pose with its acceleration, which is the same in the axes of the flange.
@@ -150,7 +150,7 @@ def turn_columns(load: Load, motion: Motion) -> Array:
     return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-def lever_columns(load: Load, motion: Motion) -> Array:
+def lever_columns(load: MovingLoad, motion: Motion) -> Array:
     """Derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
 
     Antisymmetric cross-talk shifts the centre of mass that the torques of the weight show, and not this one.
@@ -197,7 +197,7 @@ class SmoothFunctions:
         return np.asarray((alike(R_base_flange, self.R_base_flange) - self.mean) @ self.weights)
 
 
-def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
+def motion_jacobian(load: MovingLoad, motion: Motion, rate: Motion) -> Array:
     """Derivative (n, 6, 34) of the wrench by the error vector of `Load.moved`, at the motion that the delay gives."""
     static, m, Q = load.static, load.mass_kg, load.static.R_flange_sensor
     Qt, F_b, c = Q.T, static.gravity_force_base_N, static.p_sensor_com_m
@@ -230,7 +230,7 @@ def jacobian(load: Load, motion: Motion, rate: Motion) -> Array:
     return J
 
 
-def _force(load: Load, motion: Motion) -> Array:
+def _force(load: MovingLoad, motion: Motion) -> Array:
     """Force (n, 3) of the load in flange axes."""
     weight = load.static.gravity_force_base_N @ motion.R_base_flange
     return np.asarray(weight - load.mass_kg * (motion.acceleration_m_s2 + motion.Omega_rad2_s2 @ load.lever_m))
@@ -254,7 +254,7 @@ _ROWS_PER_ORDER = 25
 _MOST = 0.98
 
 
-def states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
+def motion_states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Return the state of motion (n,) of each row: rest, then classes of speed that have as many kept rows each."""
     moving = speed_rad_s[kept & (speed_rad_s > REST_RAD_S)]
     limits = [REST_RAD_S]
@@ -267,7 +267,7 @@ def states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
     return np.asarray(state if (state[kept] == state.max()).sum() >= FEWEST else np.zeros_like(state))
 
 
-def runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
+def places_in_runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
     """Return the place (n,) of each row in its run of rows without a gap, from 0."""
     breaks = np.flatnonzero(np.diff(t_s, prepend=-np.inf) > 1.5 * row_s)
     return np.asarray(np.arange(len(t_s)) - np.repeat(breaks, np.diff(np.append(breaks, len(t_s)))))

@@ -47,16 +47,16 @@ from ftcalib.motion.model import (
     HEIGHT,
     INERTIA,
     SIZE,
-    Load,
+    MovingLoad,
     RowNoise,
     SmoothFunctions,
-    jacobian,
     lever_columns,
-    runs,
+    motion_jacobian,
+    places_in_runs,
     turn_columns,
     wrench_of,
 )
-from ftcalib.motion.samples import Motion, Rows
+from ftcalib.motion.samples import Motion, MotionRows
 
 # Prior of a tool, one sigma: radius of gyration, sensor height, delay beyond that of the rows.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
@@ -98,7 +98,7 @@ class Problem:
     """Rows of a motion with the unknowns that explain them; arguments as of `ftcalib.motion.estimate.fit`."""
 
     def __init__(
-        self, rows: Rows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
+        self, rows: MotionRows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
     ) -> None:
         self.rows, self.g_m_s2, self.zeroed_s = rows, g_m_s2, zeroed_s
         self.constraints = Constraints(known or Known(), g_m_s2)
@@ -147,7 +147,7 @@ class Problem:
         groups["cross_talk"] = np.append(np.arange(SIZE)[CROSS_TALK], at + np.arange(3)), precision
         return groups, at + 3 - start
 
-    def residuals(self, load: Load, effects: Array) -> Array:
+    def residuals(self, load: MovingLoad, effects: Array) -> Array:
         """Wrench (n, 6) of all rows less that of load and effects."""
         rows, others = self.rows, effects[6 * self.courses :]
         wrench = self.hats(rows.t_s) @ self.drift(effects)
@@ -162,11 +162,11 @@ class Problem:
         knots = _hats(self.knots, t_s)
         return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else knots
 
-    def predict(self, load: Load, rows: Rows) -> Array:
+    def predict(self, load: MovingLoad, rows: MotionRows) -> Array:
         """Wrench (n, 6) of the load alone."""
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
 
-    def smooth_columns(self, load: Load, motion: Motion) -> Array:
+    def smooth_columns(self, load: MovingLoad, motion: Motion) -> Array:
         """Derivative (n, 6, k) of the wrench by turns, by what they move, by a cable and by the gain of the load."""
         R = nearest_rotation(motion.R_base_flange)
         turned = turn_columns(load, motion) @ self.turns(load, R)
@@ -175,7 +175,7 @@ class Problem:
         gained = np.hstack([share, np.einsum("ni,nj->nij", share, share)[:, *np.triu_indices(3)]])
         return np.concatenate([turned, moved, _on_channels(self.functions(R)), _on_channels(gained)], axis=2)
 
-    def turns(self, load: Load, R_base_flange: Array) -> Array:
+    def turns(self, load: MovingLoad, R_base_flange: Array) -> Array:
         """Turns (n, 3, k) of poses, in flange axes: smooth ones, and those of a mount that yields to the torque.
 
         What no session can separate belongs to the parameters: a turn that is constant in flange axes to the mounting,
@@ -193,10 +193,10 @@ class Problem:
         smooth, constant = of(R_base_flange)
         return np.asarray(smooth - constant @ share)
 
-    def columns(self, load: Load, rows: Rows) -> tuple[Array, Array]:
+    def columns(self, load: MovingLoad, rows: MotionRows) -> tuple[Array, Array]:
         """Derivative (n, 6, 34) of the wrench by the load, and by the effects without the courses of the bias."""
         motion = rows.motion.earlier(load.delay_s, rows.rate)
-        J, slow = jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
+        J, slow = motion_jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
         return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)
 
     def drift(self, effects: Array) -> Array:
@@ -209,7 +209,7 @@ class Problem:
         start = self.basis.shape[1] - self.others + 6 * len(self.slow_knots)
         return slice(start, self.basis.shape[1] - 3)
 
-    def unseen(self, load: Load, residuals: Array) -> Array:
+    def unseen(self, load: MovingLoad, residuals: Array) -> Array:
         """Root (n, 6, k) of the covariance that smooth errors give the rows: of an arm, and of a cable.
 
         The arm has the expected one, and the cable pulls by as much as residuals (n, 6) are smooth beyond noise.
@@ -225,14 +225,14 @@ class Problem:
             variance[self.groups[name][0]] = size**2
         return np.asarray(self.smooth_columns(load, motion) * np.sqrt(variance[SIZE:][self.smooth_effects]))
 
-    def next_use(self, load: Load, effects: Array, solved: "Step") -> Array:
+    def next_use(self, load: MovingLoad, effects: Array, solved: "NormalSolution") -> Array:
         """Root mean square error (2,) of compensating a free tool at rest in the poses of the rows, N and N·m.
 
         Turns and cable act then as they did in the recording, and no compensation knows them.
         """
         R = self.functions.R_base_flange
         still = Motion(R, np.zeros((len(R), 3)), np.zeros((len(R), 3, 3)))
-        J = jacobian(load, still, still.earlier(1.0, still))
+        J = motion_jacobian(load, still, still.earlier(1.0, still))
         smooth = self.smooth_columns(load, still)
         error = smooth @ (self.basis.T @ effects)[self.smooth_effects]
         places = np.r_[0:SIZE, SIZE + np.arange(self.basis.shape[1])[self.smooth_effects]]
@@ -240,14 +240,14 @@ class Problem:
         square = np.sum((np.concatenate([J, smooth], axis=2) @ basis[places] @ inverse_root) ** 2, axis=2) + error**2
         return np.asarray(np.sqrt(square.mean(axis=0).reshape(2, 3).sum(axis=1)))
 
-    def prior(self, load: Load) -> tuple[Array, Array]:
+    def prior(self, load: MovingLoad) -> tuple[Array, Array]:
         """Precision (34,) of the values that are not static, beside that of the components, and the present values."""
         sigma = np.full(SIZE, np.inf)
         sigma[INERTIA] = max(load.mass_kg, 0.1) * GYRATION_M**2
         sigma[HEIGHT], sigma[DELAY] = HEIGHT_M, DELAY_S
         return 1 / sigma**2, load.vector
 
-    def starts(self) -> list[Load]:
+    def starts(self) -> list[MovingLoad]:
         """Loads for each mounting that explains the forces as a weight."""
         rows = self.rows[:: max(1, len(self.rows) // ROUGH_ROWS)]
         R, force, ones = nearest_rotation(rows.motion.R_base_flange), rows.wrench[:, :3], np.ones(len(rows))
@@ -256,25 +256,25 @@ class Problem:
         for Q in self.constraints.rotations([one.R.T for one in minima(cost)], cost)[:4]:
             F_b, bias = given_rotation(Q.T, R, force, ones)
             c, torque_bias = com_and_torque_bias(F_b @ R @ Q, rows.wrench[:, 3:])
-            found.append(Load(self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias)), self.g_m_s2))
+            found.append(MovingLoad(self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias)), self.g_m_s2))
         return found
 
-    def free(self, load: Load) -> Array:
+    def free(self, load: MovingLoad) -> Array:
         """Basis (34, m) of what is estimated, without the response."""
         Z = block_diag(self.constraints.free(load.static), np.eye(SIZE - 15))
         return np.asarray(Z[:, ~np.concatenate([np.zeros(Z.shape[1] - (SIZE - 15), bool), self.fixed[15:]])])
 
-    def estimated(self, load: Load, on: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
+    def estimated(self, load: MovingLoad, on: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
         """Basis (34, m) of what is estimated of the load, and places of the effects that are."""
         Z = self.free(load)
         return Z[:, on[np.argmax(np.abs(Z), axis=0)]], SIZE + np.flatnonzero(on[SIZE:])
 
     def sums(
-        self, load: Load, effects: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
+        self, load: MovingLoad, effects: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
     ) -> tuple[Array, Array, float]:
         """Information, gradient and chi2 of load and effects, over kept rows as the noise weighs them."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
-        state, place = state[kept], runs(rows.t_s, rows.row_s)
+        state, place = state[kept], places_in_runs(rows.t_s, rows.row_s)
         size = SIZE + len(self.basis)
         others = np.arange(SIZE + 6 * self.courses, size)
         H, b, chi2 = np.zeros((size, size)), np.zeros(size), 0.0
@@ -296,7 +296,7 @@ class Problem:
         T = block_diag(np.eye(SIZE), self.basis)
         return T.T @ H @ T, T.T @ b, chi2
 
-    def absorb(self, load: Load, rows: Rows, solved: "Step") -> Array:
+    def absorb(self, load: MovingLoad, rows: MotionRows, solved: "NormalSolution") -> Array:
         """Root (n, 6, k) of the covariance of the prediction; none before the first solution, nor for so many rows."""
         if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
@@ -305,7 +305,7 @@ class Problem:
         by_effects = np.concatenate([_on_channels(self.hats(rows.t_s)), others], axis=2)
         return np.asarray(np.concatenate([J, by_effects @ self.basis], axis=2) @ (basis @ inverse_root))
 
-    def components(self, sizes: Mapping[str, float], load: Load) -> tuple[Array, NDArray[np.bool_], float]:
+    def components(self, sizes: Mapping[str, float], load: MovingLoad) -> tuple[Array, NDArray[np.bool_], float]:
         """Prior precision of load and effects, which of them are estimated, and -log det of that of the components."""
         total = SIZE + self.basis.shape[1]
         P, on, log_det = np.zeros((total, total)), np.ones(total, np.bool_), 0.0
@@ -326,10 +326,10 @@ class Problem:
         self,
         sizes: Mapping[str, float],
         sums: tuple[Array, Array, float],
-        load: Load,
+        load: MovingLoad,
         effects: Array,
         prior: tuple[Array, Array] | None = None,
-    ) -> "Step":
+    ) -> "NormalSolution":
         """Solve the sums for load and effects with these sizes of the components, and rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
@@ -356,7 +356,7 @@ class Problem:
         cost = chi2 + float(value @ P @ value + residuals @ residuals - b @ step)
         criterion = cost + log_det
         criterion += 2 * float(np.log(np.diag(factor[0]) * scale).sum())
-        return Step(step + removed, cost, criterion, basis / scale, factor)
+        return NormalSolution(step + removed, cost, criterion, basis / scale, factor)
 
     def criteria(
         self,
@@ -364,7 +364,7 @@ class Problem:
         tried: Array,
         sizes: Mapping[str, float],
         sums: tuple[Array, Array, float],
-        load: Load,
+        load: MovingLoad,
         effects: Array,
     ) -> Array:
         """-2 log restricted likelihood (k,) of a component's sizes beside those of the others, less that of size 0."""
@@ -393,7 +393,7 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class NormalSolution:
     """Solution of the normal equations."""
 
     step: Array

@@ -70,7 +70,7 @@ WIDE_S = 0.12
 NARROW_S = 0.28
 
 
-class Timeline:
+class SampleClock:
     """Time of measurement of every sample of one device: the supporting line below its times of receipt.
 
     Each quarter of a second contributes its least delayed sample; the line is below those of the last ten seconds.
@@ -316,7 +316,7 @@ class Motion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rows:
+class MotionRows:
     """Wrench and motion on one clock, filtered alike, where both are complete."""
 
     t_s: Array
@@ -341,9 +341,9 @@ class Rows:
         return type(self)(*parts, self.delay_s, self.row_s)
 
 
-def rows_of(
+def motion_rows(
     wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0, row_s: float = WIDE_S
-) -> Rows:
+) -> MotionRows:
     """Put wrench and poses on one clock.
 
     Parameters
@@ -380,7 +380,7 @@ def rows_of(
         if start == 0 or _has_samples(t_w, first + MEAN_S * start * step, first + MEAN_S * (end * step + 2 * reach))
     ]
     t, y, columns, rates, speed = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return Rows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, row_s)
+    return MotionRows(t, y, Motion.of_columns(columns), Motion.of_columns(rates), speed, delay_s, row_s)
 
 
 def interpolation_error_rad(poses: tuple[Array, Array]) -> float:

@@ -19,24 +19,32 @@ from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.fit import Estimate
 from ftcalib.likelihood.structure import hidden_in_any_poses, yielding_columns
 from ftcalib.model import STANDARD_GRAVITY_M_S2, Array, jacobian, nearest_rotation, predict
-from ftcalib.motion.estimate import MotionFit, fit, fit_freely, rough_delay
+from ftcalib.motion.estimate import MotionFit, fit_freely, fit_motion, rough_delay
 from ftcalib.motion.mistakes import (
     COMPENSATED,
     JUDGED_ROWS,
     OF_AXES,
+    Correction,
     Stream,
-    Undo,
-    as_they_are,
-    at_rest,
-    bias_steps,
-    falls_to_zero,
-    impossible,
-    mistakes_in,
-    stays,
+    are_bias_steps,
+    find_impossible_body,
+    find_motion_mistakes,
+    find_zeroings,
+    fit_bias_steps,
+    static_wrench,
+    unchanged,
     without_steps,
 )
 from ftcalib.motion.model import HEIGHT, INERTIA, NAMES
-from ftcalib.motion.samples import NARROW_S, WIDE_S, Means, Rows, interpolation_error_rad, require_seconds, rows_of
+from ftcalib.motion.samples import (
+    NARROW_S,
+    WIDE_S,
+    Means,
+    MotionRows,
+    interpolation_error_rad,
+    motion_rows,
+    require_seconds,
+)
 from ftcalib.result import CalibrationResult, MotionResult
 from ftcalib.sensor_matrix import Calibrated, Response
 
@@ -129,16 +137,16 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
     data, ratio, delay_s = _on_one_clock(*data)
-    rows = rows_of(*data, delay_s, NARROW_S if guarded else WIDE_S)
-    mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], as_they_are)
+    rows = motion_rows(*data, delay_s, NARROW_S if guarded else WIDE_S)
+    mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], unchanged)
 
-    def rows_at(delay_s: float) -> tuple[Rows, Rows]:
+    def rows_at(delay_s: float) -> tuple[MotionRows, MotionRows]:
         """Rows without the mistakes, and those that count."""
-        others = undo(rows_of(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
+        others = undo(motion_rows(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
         return others, _select_rows(others, limit_rad_s)
 
     delay_s += rough_delay(_select_rows(undo(rows), limit_rad_s), known, g_m_s2)
-    fit_rows = partial(fit, known=known, g_m_s2=g_m_s2, prior=prior, guarded=guarded, zeroed_s=zeroed_s)
+    fit_rows = partial(fit_motion, known=known, g_m_s2=g_m_s2, prior=prior, guarded=guarded, zeroed_s=zeroed_s)
     rows, used, best = _fit(rows_at, delay_s, partial(fit_rows, point_mass=point_mass or not positions))
     _require_determined(used, best, known)
     start_s, delay_s = data[0][0][0], rows.delay_s + best.load.delay_s
@@ -163,7 +171,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         findings += _other_wrench(used, aligned, best, quality.findings)
         findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
         findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
-        findings += impossible(best) if positions and verdict_of(findings) != "rejected" else []
+        findings += find_impossible_body(best) if positions and verdict_of(findings) != "rejected" else []
     findings += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
     joint = np.r_[0:15, 23:34]
@@ -196,8 +204,10 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
 
 
 def _fit(
-    rows_at: Callable[[float], tuple[Rows, Rows]], delay_s: float, fit_rows: Callable[[Rows], MotionFit]
-) -> tuple[Rows, Rows, MotionFit]:
+    rows_at: Callable[[float], tuple[MotionRows, MotionRows]],
+    delay_s: float,
+    fit_rows: Callable[[MotionRows], MotionFit],
+) -> tuple[MotionRows, MotionRows, MotionFit]:
     """Fit rows at a delay, and again at that of the fit: the model is linear in it only near that of the rows."""
     for _ in range(3):
         rows, used = rows_at(delay_s)
@@ -228,20 +238,20 @@ def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream],
     Files of one recording begin and end together within some seconds, so another rate shows in their durations.
     """
     t_w, t_p = wrench[0], poses[0]
-    delay_s, left = _coarse_delay(rows_of(wrench, poses))
+    delay_s, left = _coarse_delay(motion_rows(wrench, poses))
     best, limit = ((wrench, poses), 1.0, delay_s), _OTHER_RATE * left
     if left < _FOLLOWS:
         return best
     for ratio in float(np.ptp(t_w) / np.ptp(t_p)) * _RATIOS:
         alike = wrench, (t_w[0] + ratio * (t_p - t_p[0]), poses[1])
         with suppress(BadDataset):  # too short
-            delay_s, left = _coarse_delay(rows_of(*alike))
+            delay_s, left = _coarse_delay(motion_rows(*alike))
             if abs(ratio - 1) > _SAME_RATE and left < limit:
                 best, limit = (alike, float(ratio), delay_s), left
     return best
 
 
-def _coarse_delay(rows: Rows) -> tuple[float, float]:
+def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
     """Return the delay, in whole rows, at which a linear function of the motion explains the wrench best.
 
     Also how much it leaves, as a share of the change.
@@ -268,7 +278,7 @@ def _coarse_delay(rows: Rows) -> tuple[float, float]:
     return rows.delay_s + best * rows.row_s, left[best]
 
 
-def _select_rows(rows: Rows, limit_rad_s: float) -> Rows:
+def _select_rows(rows: MotionRows, limit_rad_s: float) -> MotionRows:
     """Return the rows that count: without positions the slow ones, and of poses that are too coarse those at rest."""
     if np.isinf(limit_rad_s):
         return rows
@@ -287,7 +297,7 @@ def _select_rows(rows: Rows, limit_rad_s: float) -> Rows:
     return slow
 
 
-def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> None:
+def _require_determined(rows: MotionRows, best: MotionFit, known: Known | None) -> None:
     """Raise `NotObservable` where the error over all orientations would be as large as the weight."""
     mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
     weight_N = best.load.static.weight_N
@@ -302,7 +312,7 @@ def _require_determined(rows: Rows, best: MotionFit, known: Known | None) -> Non
         raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
 
 
-def _hidden_covariance(rows: Rows, best: MotionFit, orientation_rad: float) -> Array:
+def _hidden_covariance(rows: MotionRows, best: MotionFit, orientation_rad: float) -> Array:
     """Return the covariance (15, 15) from errors that the motion does not show: of arm, mounts and a soft tool.
 
     The smooth errors of the arm are a part of the fit.
@@ -317,11 +327,11 @@ def _hidden_covariance(rows: Rows, best: MotionFit, orientation_rad: float) -> A
     return np.asarray(hidden_in_any_poses(static, orientation_rad) + moved @ moved.T)
 
 
-def _orientations(rows: Rows) -> Array:
+def _orientations(rows: MotionRows) -> Array:
     return nearest_rotation(rows.motion.R_base_flange[:: max(1, len(rows) // JUDGED_ROWS)])
 
 
-def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
+def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
     """Wrench (n, 6) at rest in the orientation of each row.
 
     A fit that fails has the wrong share of the motion. Then the linear function of the motion that fits best has it,
@@ -331,10 +341,10 @@ def _static_wrench(rows: Rows, best: MotionFit, weight_N: float) -> Array:
     kept = best.residuals[best.kept, :3]
     if float(np.sqrt(np.mean(np.sum(kept**2, axis=1)))) < 2 * USABLE_SHARE * weight_N:
         return np.asarray(static)
-    return at_rest(rows)[0]
+    return static_wrench(rows)[0]
 
 
-def _estimate(rows: Rows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
+def _estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
     """Return the estimates, with what they leave of the rows at these places.
 
     Each row has the mean residual of a second around it: what is quicker is vibration.
@@ -363,8 +373,8 @@ def _means(best: MotionFit, rows: int) -> Array:
 
 
 def _findings(
-    rows: Rows,
-    used: Rows,
+    rows: MotionRows,
+    used: MotionRows,
     best: MotionFit,
     motion: MotionResult,
     height_m: float | None,
@@ -402,34 +412,34 @@ def _findings(
 
 def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], Array]:
     """Return the streams with one bias, that of the end, and the times at which the sensor was zeroed."""
-    at_s, seen = falls_to_zero(wrench)
+    at_s, seen = find_zeroings(wrench)
     if len(at_s):
-        steps = bias_steps(rows_of(wrench, poses), at_s)
-        staying = stays(steps, seen)
+        steps = fit_bias_steps(motion_rows(wrench, poses), at_s)
+        staying = are_bias_steps(steps, seen)
         at_s, steps = at_s[staying], steps[staying]
     if len(at_s):
         wrench = without_steps(wrench, at_s, steps)
-        rows = rows_of(wrench, poses, _coarse_delay(rows_of(wrench, poses))[0])
-        wrench = without_steps(wrench, at_s, bias_steps(rows, at_s))
+        rows = motion_rows(wrench, poses, _coarse_delay(motion_rows(wrench, poses))[0])
+        wrench = without_steps(wrench, at_s, fit_bias_steps(rows, at_s))
     return (wrench, poses), at_s
 
 
 def _find_mistakes(
-    data: tuple[Stream, Stream], rows: Rows, known: Known | None, g_m_s2: float
-) -> tuple[list[Finding], Undo]:
+    data: tuple[Stream, Stream], rows: MotionRows, known: Known | None, g_m_s2: float
+) -> tuple[list[Finding], Correction]:
     """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right, and what undoes them."""
     free = fit_freely(rows, known, g_m_s2)
     for _ in range(2):
         if abs(free.load.delay_s) < ALIGNED_S:
             break
         delay_s = float(np.clip(rows.delay_s + free.load.delay_s, -FARTHEST_S, FARTHEST_S))
-        rows = rows_of(*data, delay_s, rows.row_s)
+        rows = motion_rows(*data, delay_s, rows.row_s)
         free = fit_freely(rows, known, g_m_s2)
     spread_m = float(np.linalg.norm(np.ptp(data[1][1][:, 9:], axis=0)))
-    return mistakes_in(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else ([], as_they_are)
+    return find_motion_mistakes(rows, free, spread_m) if abs(free.load.delay_s) < OFFSET_S else ([], unchanged)
 
 
-def _other_wrench(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
+def _other_wrench(used: MotionRows, aligned: MotionRows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
     """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all.
 
     `aligned` has the delay of the fit, which wrong data may not have come near.
@@ -450,7 +460,7 @@ def _other_wrench(used: Rows, aligned: Rows, best: MotionFit, named: Sequence[Fi
     return []
 
 
-def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
+def _narrow(rows: MotionRows, best: MotionFit, *, explained: bool) -> list[Finding]:
     """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
     error = Calibrated(best.load.static, best.covariance[:15, :15]).predicted_error()[0]
@@ -463,7 +473,7 @@ def _narrow(rows: Rows, best: MotionFit, *, explained: bool) -> list[Finding]:
     return [Finding.of("motion_narrow", severity, **values)]
 
 
-def _range_deg(rows: Rows) -> float:
+def _range_deg(rows: MotionRows) -> float:
     """Largest angle between the orientation in the middle of the motion and the others, doubled."""
     R = _orientations(rows)
     turned = np.einsum("ji,njk->nik", nearest_rotation(R.mean(axis=0)), R)
@@ -471,7 +481,7 @@ def _range_deg(rows: Rows) -> float:
     return float(min(2 * np.degrees(np.arccos(cosine)).max(), 360.0))
 
 
-def _contacts(rows: Rows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
+def _contacts(rows: MotionRows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
     """Rows that do not fit, without those beside them that the filter or the margin adds, as contacts."""
     force, torque = (np.where(best.kept, 0.0, np.linalg.norm(best.residuals[:, k : k + 3], axis=1)) for k in (0, 3))
     half = round(0.5 / rows.row_s)

@@ -343,7 +343,7 @@ def paper_set(name: str, *, spare: int = 0, down_base: ArrayLike = (0.0, 0.0, -1
     return np.asarray(drawn[inside][:count])
 
 
-def names_of(sets: str) -> Sequence[str]:
+def set_names(sets: str) -> Sequence[str]:
     """Split the names in "A+E". Raises `ValueError` for an unknown set, a repeated one, or E and its half H."""
     names = sets.split("+")
     if unknown := [name for name in names if name not in COUNTS]:
@@ -353,6 +353,6 @@ def names_of(sets: str) -> Sequence[str]:
     return names
 
 
-def numbers_of(name: str) -> NDArray[np.intp]:
+def set_numbers(name: str) -> NDArray[np.intp]:
     """Return the numbers of the poses of one set: those of the paper for A, 1001 to 1012 for B, from 2001 on for C."""
     return np.arange(1, COUNTS[name] + 1) + 1000 * "ABCDEFG".index("E" if name == "H" else name)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import click
 
 from ftcalib import CalibrationResult
-from ftcalib.after.series import ChiSquare, Difference, Estimated, difference
+from ftcalib.after.series import ChiSquare, Difference, EstimatedParameters, calibration_difference
 from ftcalib.model import PARAMETER_NAMES
 from ftcalib.rounding import to_place_of
 from ftdrive.commands.options import JSON, write_json
@@ -29,7 +29,7 @@ _ROWS = (
 
 
 class _Side(NamedTuple):
-    calibrated: Estimated
+    calibrated: EstimatedParameters
     id: str
     path: str
     created_utc: str | None
@@ -50,7 +50,7 @@ def diff(first: str, second: str, as_json: bool) -> None:
     is compared as one rotation about the flange axes. The exit code is 0 for any difference.
     """
     a, b = _side(first), _side(second)
-    found, sensors = difference(a.calibrated, b.calibrated), _sensors(a, b)
+    found, sensors = calibration_difference(a.calibrated, b.calibrated), _sensors(a, b)
     mass_change_kg, sigma_kg = b.mass_kg - a.mass_kg, (a.mass_sigma_kg**2 + b.mass_sigma_kg**2) ** 0.5
     if as_json:
         sides = {"a": a._asdict(), "b": b._asdict()}

@@ -89,10 +89,10 @@ def runs_option(words: str = "Parent folder of the new run folder.") -> Callable
 
 def _known_sets(_context: click.Context, _parameter: click.Parameter, sets: str | None) -> str | None:
     if sets is not None:
-        from ftcalib.poses.selection import names_of
+        from ftcalib.poses.selection import set_names
 
         try:
-            names_of(sets)
+            set_names(sets)
         except ValueError as error:
             raise ConfigError(str(error)) from error
     return sets

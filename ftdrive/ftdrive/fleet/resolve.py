@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from ftcalib import CalibrationDataset, CalibrationResult, Finding, solve
-from ftcalib.after.series import difference
+from ftcalib.after.series import calibration_difference
 from ftcalib.errors import BadCalibration, BadDataset
 from ftcalib.files import read_object, write_new
 from ftcalib.model import PARAMETER_NAMES
@@ -173,7 +173,7 @@ def _compared(folder: Path, document: bytes | None = None) -> Comparison | str:
     finding = None if new.verdict == "good" else new.findings[0]
     if old is None or _data_hash(old) != _data_hash(new):
         return Comparison(None, new.verdict, finding, PARAMETER_NAMES[0], 0.0)
-    change = difference(old, new).in_sigmas
+    change = calibration_difference(old, new).in_sigmas
     most = int(np.argmax(np.abs(change)))
     return Comparison(old.verdict, new.verdict, finding, PARAMETER_NAMES[most], float(change[most]))
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib.known import Setup
 from ftcalib.poses.information import SUBSET_6, T12, Guess, special
-from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, names_of, numbers_of, paper_set
+from ftcalib.poses.selection import COUNTS, FEWEST_TO_VERIFY, paper_set, set_names, set_numbers
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.cell.config import USUAL_KG, CellConfig, orientation_accuracy_deg
 from ftdrive.cell.units import side_of
@@ -235,7 +235,7 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
     """Plan one tour through sets of orientations of Yu's Fig. 6, such as A+E; `COUNTS` has their names."""
     q_now = checked_joints(q_rad)
     try:
-        names = names_of(sets)
+        names = set_names(sets)
     except ValueError as error:
         raise ConfigError(str(error)) from error
     down = certifier.scene.down_base
@@ -249,7 +249,7 @@ def _plan_sets(certifier: Certifier, q_rad: ArrayLike, sets: str, *, speeds: Spe
             f"no tour of the sets {sets} is reachable and proven clear: jog the arm to another posture, clear the "
             "surroundings, or choose other sets"
         )
-    numbers = np.concatenate([numbers_of(name) for name in names])[tour[0]]
+    numbers = np.concatenate([set_numbers(name) for name in names])[tour[0]]
     why = [f"{len(numbers)} poses: {', '.join(f'{name} {COUNTS[name]}' for name in names)} (Yu et al. 2021, Fig. 6)."]
     why += [] if np.array_equal(tour[1][0, :3], q_now[:3]) else [_elsewhere_words(tour[1][0])]
     return make_plan("sets", why, certifier, numbers.tolist(), tour[1], speeds, guess)

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, Load, jacobian
+from ftcalib.motion.model import DELAY, HEIGHT, INERTIA, MovingLoad, motion_jacobian
 from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M
 from ftcalib.motion.samples import Motion
 from ftcalib.poses.information import Guess
@@ -194,9 +194,9 @@ def predicted(arm: ArmModel, sweep: Sweep, guess: Guess) -> tuple[float, float, 
 
     The mean over 0.12 s of motion is assumed to have the noise that the guess gives for a pose.
     """
-    load = Load(guess.parameters, guess.g_m_s2, inertia=np.r_[np.full(3, 1e-3), np.zeros(3)])
+    load = MovingLoad(guess.parameters, guess.g_m_s2, inertia=np.r_[np.full(3, 1e-3), np.zeros(3)])
     motion, rate = _flange_motion(arm, sweep)
-    J = (jacobian(load, motion, rate) / guess.wrench_sigma[:, None])[:, :, :23].reshape(-1, 23)
+    J = (motion_jacobian(load, motion, rate) / guess.wrench_sigma[:, None])[:, :, :23].reshape(-1, 23)
     prior = np.zeros(23)
     prior[INERTIA], prior[HEIGHT], prior[DELAY] = guess.mass_kg * GYRATION_M**2, HEIGHT_M, DELAY_S
     weight = np.divide(1.0, prior**2, out=np.zeros(23), where=prior > 0)

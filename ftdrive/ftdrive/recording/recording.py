@@ -295,8 +295,8 @@ class Recording(Displayed):
         """
         if "t_host_ns" in (self.rows.dtype.names or ()) and len(self.rows):
             start_ns = int(self.rows["t_host_ns"][0])
-            return shown.frame_of(table_of(self.rows, start_ns, self.header.info.utc_offset_ns))
-        return shown.frame_of({name: self.table[name] for name in self.table.dtype.names or ()})
+            return shown.data_frame(table_of(self.rows, start_ns, self.header.info.utc_offset_ns))
+        return shown.data_frame({name: self.table[name] for name in self.table.dtype.names or ()})
 
     def _summary(self) -> Summary:
         info = self.header.info

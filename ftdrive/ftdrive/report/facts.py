@@ -9,7 +9,7 @@ import numpy as np
 
 from ftcalib import CalibrationResult
 from ftcalib.accuracy import error_map, force_sigma_at_tip, tip_of
-from ftcalib.after.series import difference
+from ftcalib.after.series import calibration_difference
 from ftcalib.after.weighing import true_tool
 from ftcalib.compare import compare
 from ftcalib.errors import NotObservable
@@ -57,7 +57,7 @@ def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> di
     `name`, `change` (rad, N, m, N·m) and `sigmas`, null if exactly known in both. `groups` are tests. `same_data` means
     that both use one dataset, so that the tests do not apply.
     """
-    found = difference(before, result)
+    found = calibration_difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]
     tests = {label_of(name): test for name, test in found.groups.items() if test.dof} | {"all": found.joint}
     return {

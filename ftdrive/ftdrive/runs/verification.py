@@ -287,7 +287,7 @@ class Verified:
 
 def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits: Limits) -> Verified:
     """Compare the poses of a run with a calibration; write dataset.json and verification.json, return the result."""
-    from ftcalib.after.verification import verify
+    from ftcalib.after.verification import verify_calibration
     from ftcalib.data.dataset import pooled_covariance
     from ftcalib.routine import dataset_from, drift_check, is_return
 
@@ -297,7 +297,7 @@ def verify_run(run: "Run", calibration: "CalibrationResult", path: Path, limits:
         raise BadDataset(f"{run.folder} has poses without noise: repeat the verification")
     wrench_cov = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
     fitted = fitted_dataset(calibration, path)
-    outcome = verify(
+    outcome = verify_calibration(
         calibration, dataset.R_base_flange, dataset.wrench, wrench_cov, fitted=fitted, false_alarms=FALSE_ALARMS
     )
     in_dataset = tuple(record for record in records if not is_return(record, records))

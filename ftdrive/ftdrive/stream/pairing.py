@@ -16,7 +16,7 @@ from ftcalib import CalibrationResult
 from ftcalib.compensation import MovedLoad
 from ftcalib.errors import BadDataset
 from ftcalib.model import jacobian, skew
-from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
+from ftcalib.motion.samples import RATE_TOLERANCE, SampleClock
 from ftdrive.stream.samples import Ns, Paired, matrices, quaternions
 from ftdrivers.interfaces import ArmStates, Array, FtSamples
 
@@ -273,8 +273,8 @@ class Pairing:
         self._has_arm = has_arm
         self._estimator = delay if isinstance(delay, DelayEstimator) else None
         self._rate_Hz = sensor_rate_Hz
-        self._sensor: Timeline | None = None
-        self._arm: Timeline | None = None
+        self._sensor: SampleClock | None = None
+        self._arm: SampleClock | None = None
         self._poses = PoseTrack()
         self._waiting: list[tuple[FtSamples, Ns]] = []
         self._delay_s = 0.0 if isinstance(delay, DelayEstimator) else delay
@@ -324,7 +324,7 @@ class Pairing:
         else:  # polled: the time of receipt is the time
             count = np.asarray(samples.t_host_ns * 1e-9)
         if self._sensor is None:
-            self._sensor = Timeline(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else Timeline()
+            self._sensor = SampleClock(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else SampleClock()
         self._sensor.shift_s = self.delay_s
         self._waiting.append((samples, self._sensor.stamp(count, samples.t_host_ns)))
 
@@ -361,13 +361,13 @@ class Pairing:
                 line.restart()
 
 
-def _clock_of(states: ArmStates) -> Timeline:
+def _clock_of(states: ArmStates) -> SampleClock:
     """Return the timeline of a controller from its first states; an emulated clock may run many times faster."""
     host_s = float(states.t_host_ns[-1] - states.t_host_ns[0]) * 1e-9
     device_s = float(states.t_device_s[-1] - states.t_device_s[0])
     if host_s < _SCALED_S or abs(host_s / device_s - 1) < _SCALED:
-        return Timeline()
-    return Timeline(host_s / device_s, _SCALED)
+        return SampleClock()
+    return SampleClock(host_s / device_s, _SCALED)
 
 
 def _paired_with(poses: PoseTrack, t_ns: Ns, samples: FtSamples) -> Paired:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ftcalib.display import Displayed, Row, Summary
 from ftcalib.errors import FtdriveError
-from ftcalib.shown import figure_of
+from ftcalib.shown import wrench_figure
 from ftdrive.cell.config import CellConfig
 from ftdrive.cell.emulated import Station
 from ftdrive.errors import ConfigError
@@ -309,7 +309,7 @@ class Stream(Displayed):
                 break
         t_ns = np.concatenate([block.t_host_ns for block in blocks])
         drawn = t_ns >= begin_ns
-        return figure_of(
+        return wrench_figure(
             (t_ns[drawn] - begin_ns) * 1e-9,
             np.concatenate([block.wrench for block in blocks])[drawn],
             label="time, s",

@@ -101,7 +101,7 @@ class Scale:
         calibration = stream.info.calibration
         contact = calibration.known_contact
         R_base_flange, wrench, noise = self.poses
-        weight = weighing.weigh(
+        weight = weighing.weigh_load(
             reference,
             R_base_flange,
             wrench,

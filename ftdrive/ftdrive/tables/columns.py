@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from itertools import product
 from typing import Final, NamedTuple
 
-from ftcalib.data.dataset import list_names
+from ftcalib.data.dataset import shorten_list
 from ftcalib.errors import BadDataset
 from ftcalib.judge.units import FORCE_UNITS_N, TORQUE_UNITS_NM
 from ftcalib.model import STANDARD_GRAVITY_M_S2
@@ -217,7 +217,7 @@ class SignalColumns:
         near = (self._nearest(layout, one) for layout in LAYOUTS for one in signals if one in layout.signals)
         share, program, missing, signal = max(near, key=lambda one: one[0])
         nearest = f" The layout of {program} lacks {', '.join(missing)}." if share else ""
-        named = list_names([name for name in self.names if name])
+        named = shorten_list([name for name in self.names if name])
         if "wrench" in signals and set(missing) == {"tx", "ty", "tz"}:
             nearest += " A three-axis sensor has no torques and is not supported."
         return f"no {what} among the columns {named}.{nearest} Name the columns: {self.line(signal)}"
@@ -244,7 +244,7 @@ class SignalColumns:
         if not same and column.isdecimal() and 1 <= int(column) <= len(self.names):
             same = [int(column) - 1]
         if len(same) != 1:
-            why = "two columns have this name" if same else f"the columns are {list_names(self.names)}"
+            why = "two columns have this name" if same else f"the columns are {shorten_list(self.names)}"
             raise BadDataset(f"--columns {key}={column}: {why}: give the name of a column, or its number from 1")
         return same[0], unit or [unit for _, unit in _keys_of(self.names[same[0]])][-1]
 

@@ -10,7 +10,7 @@ from ftcalib.accuracy import CONTACT_N, compensation_error, force_sigma_at_tip, 
 from ftcalib.rounding import counted, to_place_of, with_sigma
 from ftcalib.routine import DriftCheck, PoseRecord
 from ftcalib.sensor_matrix import LEAST_COMMON_GAIN
-from ftcalib.shown import estimates_of, values_of
+from ftcalib.shown import shown_estimates, values_of
 from ftdrive.runs.pose_hints import find_moved, hints, pose_names
 from ftdrive.runs.verification import FALSE_ALARMS, Verified
 from ftdrive.words.text import TextLine
@@ -35,7 +35,7 @@ def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
     """Yield each number in the JSON of a result: key, axis, name with unit, truth if known, value, sigma."""
-    for one in estimates_of(document):
+    for one in shown_estimates(document):
         label, scale, unit, key, values, sigmas, fixed = one
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None
         for i, axis in enumerate(one.axes):

@@ -10,7 +10,7 @@ from ftcalib import CalibrationDataset, solve
 from ftcalib.compare import CASES, compare, table_iii
 from ftcalib.errors import NotObservable
 from ftcalib.model import Parameters, predict
-from ftcalib.poses.selection import EVERY_SET, numbers_of, paper_set
+from ftcalib.poses.selection import EVERY_SET, paper_set, set_numbers
 
 TRUTH = Parameters(
     np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
@@ -23,7 +23,7 @@ HEAVIER = replace(
     TRUTH, gravity_force_base_N=1.02 * TRUTH.gravity_force_base_N, p_sensor_com_m=1.5 * TRUTH.p_sensor_com_m
 )
 NAMES = EVERY_SET.split("+")
-NUMBERS = np.concatenate([numbers_of(name) for name in NAMES])
+NUMBERS = np.concatenate([set_numbers(name) for name in NAMES])
 POSES = np.concatenate([paper_set(name) for name in NAMES])
 
 
@@ -93,9 +93,9 @@ def test_the_truth_is_by_default_what_all_poses_but_those_of_d_give() -> None:
 )
 def test_each_case_uses_the_sets_of_the_printed_table(name: str, cases: set[int]) -> None:
     poses = measured(0.0)
-    rows = np.isin(NUMBERS, numbers_of(name))
+    rows = np.isin(NUMBERS, set_numbers(name))
     if name == "E":
-        rows &= ~np.isin(NUMBERS, numbers_of("H"))  # which case 5 uses alone
+        rows &= ~np.isin(NUMBERS, set_numbers("H"))  # which case 5 uses alone
     wrench = poses.wrench.copy()
     wrench[rows] += np.random.default_rng(1).normal(size=(rows.sum(), 6))
     found = table_iii(CalibrationDataset.of(POSES, wrench), NUMBERS.tolist(), TRUTH)
@@ -128,7 +128,7 @@ def test_more_data_are_better_and_the_inside_of_the_data_is_best() -> None:
 
 
 def _far(parameters: Parameters, clean: np.ndarray, test: str) -> float:
-    rows = np.isin(NUMBERS, numbers_of(test))
+    rows = np.isin(NUMBERS, set_numbers(test))
     return float(np.linalg.norm((predict(parameters, POSES[rows]) - clean[rows])[:, :3], axis=1).max())
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, solve
 from ftcalib.after.state import Update
-from ftcalib.after.verification import Expected, verify
+from ftcalib.after.verification import Expected, verify_calibration
 from ftcalib.model import Array, predict
 from tests.known_cells import UPRIGHT as TRUTH
 
@@ -76,7 +76,7 @@ def test_a_verification_has_it_whether_it_passes_or_not() -> None:
     calibration = solve(dataset)
     for truth, change in ((TRUTH, np.zeros(6)), (CHANGED, CHANGE)):
         wrench = predict(truth, new) + rng.normal(size=(6, 6)) * SIGMA
-        found = verify(calibration, new, wrench, np.tile(noise, (6, 1, 1)), fitted=dataset)
+        found = verify_calibration(calibration, new, wrench, np.tile(noise, (6, 1, 1)), fitted=dataset)
         assert found.passed == (truth is TRUTH)
         sigma = found.bias_sigma
         assert np.abs((found.bias_change - change) / np.hypot(sigma, found.calibration_sigma)).max() < 5

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from ftcalib.after.series import difference
+from ftcalib.after.series import calibration_difference
 from ftcalib.model import Array, Parameters, rotation_of
 from tests.known_cells import UPRIGHT as TRUTH
 
@@ -49,7 +49,7 @@ def test_the_p_value_is_uniform_also_where_the_sensor_was_turned_between(turn_de
     p, z = [], []
     for _ in range(runs):
         one, other = estimate(rng, first_cov), estimate(rng, second_cov, turned)
-        found = difference(one, other)
+        found = calibration_difference(one, other)
         if turn_deg:  # only the covariance is asked: the distance from the known turn, in its own axes
             error = -Rotation.from_matrix(
                 turn.T @ other.parameters.R_flange_sensor @ one.parameters.R_flange_sensor.T
@@ -68,7 +68,7 @@ def test_a_change_is_found_where_it_is() -> None:
     covariance = correlated(3)
     step = np.zeros(15)
     step[6:9] = 8 * SIGMA[6:9] * [1, -1, 1]
-    found = difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance))
+    found = calibration_difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance))
     assert found.in_sigmas[6:9] == pytest.approx(8 / np.sqrt(2) * np.array([1, -1, 1]))
     assert found.joint.dof == found.groups["force_bias_N"].dof == 3  # everything else is identical, so it was copied
     assert found.groups["force_bias_N"].p_value < 1e-6
@@ -85,10 +85,10 @@ def test_a_rotation_is_compared_as_one_and_not_number_by_number() -> None:
         TRUTH.torque_bias_Nm,
     )
     covariance = np.diag(SIGMA**2)
-    found = difference(Calibrated(TRUTH, covariance), Calibrated(other, covariance))
+    found = calibration_difference(Calibrated(TRUTH, covariance), Calibrated(other, covariance))
     assert found.change[:3] == pytest.approx(delta, abs=1e-12)
     assert found.joint.chi2 == pytest.approx(0.02**2 / (2 * 1e-6))
-    back = difference(Calibrated(other, covariance), Calibrated(TRUTH, covariance))
+    back = calibration_difference(Calibrated(other, covariance), Calibrated(TRUTH, covariance))
     assert back.joint.chi2 == pytest.approx(found.joint.chi2)
 
 
@@ -96,11 +96,11 @@ def test_values_taken_as_known_count_only_if_they_differ() -> None:
     known = correlated(4)
     known[:3, :], known[:, :3] = 0.0, 0.0
     step = np.random.default_rng(5).multivariate_normal(np.zeros(15), 2 * known)
-    same = difference(Calibrated(TRUTH, known), Calibrated(TRUTH.moved(step), known))
+    same = calibration_difference(Calibrated(TRUTH, known), Calibrated(TRUTH.moved(step), known))
     assert same.joint.dof == 12
     assert same.joint.p_value > 1e-6
     step[0] = 1e-4
-    other = difference(Calibrated(TRUTH, known), Calibrated(TRUTH.moved(step), known))
+    other = calibration_difference(Calibrated(TRUTH, known), Calibrated(TRUTH.moved(step), known))
     assert other.joint.p_value == 0.0
     assert np.isinf(other.in_sigmas[0])
 
@@ -112,8 +112,11 @@ def test_a_known_direction_leaves_one_degree_of_freedom() -> None:
     covariance[3:6, 3:6] = 0.02**2 * np.outer(down, down)
     step = np.zeros(15)
     step[3:6] = 0.1 * down
-    found = difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance))
+    found = calibration_difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance))
     assert found.joint.dof == 1
     assert found.joint.chi2 == pytest.approx(0.1**2 / (2 * 0.02**2))
     step[3:6] = 0.1 * np.cross(down, [1.0, 0.0, 0.0])
-    assert difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance)).joint.p_value == 0.0
+    assert (
+        calibration_difference(Calibrated(TRUTH, covariance), Calibrated(TRUTH.moved(step), covariance)).joint.p_value
+        == 0.0
+    )

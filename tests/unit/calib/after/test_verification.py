@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import BadDataset, CalibrationDataset, CalibrationResult, Parameters, Setup, solve
 from ftcalib.after.state import apply_update
-from ftcalib.after.verification import Verification, expected_with_smooth_errors, verify
+from ftcalib.after.verification import Verification, expected_with_smooth_errors, verify_calibration
 from ftcalib.model import Array, DriftResult, predict
 from ftcalib.poses.information import SUBSET_6, special
 from ftcalib.sensor_matrix import response_columns
@@ -61,7 +61,7 @@ def orientations(n: int, seed: int = 2) -> Array:
 
 def verified(parameters: Parameters, n: int = 6, seed: int = 3, *, gain: bool = False) -> Verification:
     wrench = readings(parameters, orientations(n), seed, COEFFICIENTS if gain else None)
-    return verify(calibrated(gain=gain), orientations(n), wrench, noise_of(n))
+    return verify_calibration(calibrated(gain=gain), orientations(n), wrench, noise_of(n))
 
 
 @pytest.mark.parametrize("gain", [False, True])
@@ -86,7 +86,7 @@ def test_a_change_is_named_and_the_smallest_update_makes_up_for_it(what: str, ga
     assert error @ np.linalg.solve(found.update.covariance, error) < 45  # chi-square, 15 dof: one in 10 000
     child = apply_update(calibrated(gain=gain), found.update)
     wrench = readings(CHANGED[what], orientations(6, 9), 9, COEFFICIENTS if gain else None)
-    assert verify(child, orientations(6, 9), wrench, noise_of(6)).passed
+    assert verify_calibration(child, orientations(6, 9), wrench, noise_of(6)).passed
     json.dumps(found.to_dict(), allow_nan=False)
 
 
@@ -120,7 +120,7 @@ def test_everything_changed_needs_all() -> None:
 def test_a_hand_on_the_tool_in_one_pose_is_no_change_of_the_calibration() -> None:
     wrench = readings(TRUTH, orientations(6), 3)
     wrench[3] += [2.0, 1.0, 0.0, 0.1, 0.0, 0.05]
-    found = verify(calibrated(), orientations(6), wrench, noise_of(6))
+    found = verify_calibration(calibrated(), orientations(6), wrench, noise_of(6))
     assert not found.passed
     assert (found.change, found.update) == (None, None)
     assert "the farthest is pose 4" in found.reason
@@ -131,7 +131,7 @@ def test_two_poses_that_do_not_separate_mounting_from_base_say_so() -> None:
     """Without a turn between them, the poses show a turned sensor and a tilted base alike."""
     R = np.array([Rotation.from_euler("x", 180 + d, degrees=True).as_matrix() for d in (-2.0, 2.0)])
     turned = Rotation.from_euler("y", 1.0, degrees=True).as_matrix() @ TRUTH.R_flange_sensor
-    found = verify(calibrated(), R, readings(replace(TRUTH, R_flange_sensor=turned), R, 4), noise_of(2))
+    found = verify_calibration(calibrated(), R, readings(replace(TRUTH, R_flange_sensor=turned), R, 4), noise_of(2))
     assert not found.passed
     assert {found.change, *found.alternatives} >= {"mounting", "base"}
     assert "do not distinguish it from a change of" in found.reason
@@ -154,7 +154,7 @@ def test_the_uncertainty_of_the_calibration_is_common_to_all_poses() -> None:
         error = rng.multivariate_normal(np.zeros(15), calibration.covariance)
         drawn = replace(calibration, parameters=TRUTH.moved(error))
         wrench = readings(TRUTH, orientations(12), seed)
-        chi2.append(verify(drawn, orientations(12), wrench, noise_of(12)).chi2)
+        chi2.append(verify_calibration(drawn, orientations(12), wrench, noise_of(12)).chi2)
     assert np.mean(chi2) == pytest.approx(72, abs=6 * np.sqrt(2 * 72 / 40))
     assert np.std(chi2) < 20  # 12 expected
 
@@ -163,28 +163,28 @@ def test_errors_of_each_pose_that_the_fit_found_are_expected_again() -> None:
     calibration = calibrated()
     inexact = Rotation.from_rotvec(0.003 * np.random.default_rng(5).normal(size=(6, 3))).as_matrix()
     wrench = readings(TRUTH, orientations(6) @ inexact, 6)
-    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    assert not verify_calibration(calibration, orientations(6), wrench, noise_of(6)).passed
     aware = replace(calibration, components={"rotation_rad": 0.003})
-    assert verify(aware, orientations(6), wrench, noise_of(6)).passed
+    assert verify_calibration(aware, orientations(6), wrench, noise_of(6)).passed
     noisy = replace(calibration, components={"white_force_N": 0.05, "white_torque_Nm": 0.004})
-    assert verify(noisy, orientations(6), wrench, noise_of(6)).passed
+    assert verify_calibration(noisy, orientations(6), wrench, noise_of(6)).passed
 
 
 def test_a_bias_that_walked_in_the_tour_may_walk_on() -> None:
     calibration = calibrated()
     walk = np.cumsum(np.random.default_rng(7).normal(size=(6, 6)) * np.repeat([0.05, 0.001], 3), axis=0)
     wrench = readings(TRUTH, orientations(6), 8) + 1.5 * walk[-1] + walk
-    assert not verify(calibration, orientations(6), wrench, noise_of(6)).passed
+    assert not verify_calibration(calibration, orientations(6), wrench, noise_of(6)).passed
     walking = replace(calibration, components={"walk_force_N": 0.05, "walk_torque_Nm": 0.001})
-    found = verify(walking, orientations(6), wrench, noise_of(6))
+    found = verify_calibration(walking, orientations(6), wrench, noise_of(6))
     assert found.passed
-    jumped = verify(walking, orientations(6), wrench + np.array([2.0, 0, 0, 0, 0, 0]), noise_of(6))
+    jumped = verify_calibration(walking, orientations(6), wrench + np.array([2.0, 0, 0, 0, 0, 0]), noise_of(6))
     assert (jumped.passed, jumped.change) == (False, "bias")
     drift = DriftResult(np.repeat([0.4, 0.005], 3), np.full(6, 0.01))
     linear = replace(calibration, drift=drift)
     ramp = readings(TRUTH, orientations(6), 8) + np.outer(0.5 + np.arange(6) / 24, drift.change)
-    assert not verify(calibration, orientations(6), ramp, noise_of(6)).passed
-    assert verify(linear, orientations(6), ramp, noise_of(6)).passed
+    assert not verify_calibration(calibration, orientations(6), ramp, noise_of(6)).passed
+    assert verify_calibration(linear, orientations(6), ramp, noise_of(6)).passed
 
 
 def test_noise_estimated_from_few_residuals_raises_the_limit() -> None:
@@ -193,7 +193,7 @@ def test_noise_estimated_from_few_residuals_raises_the_limit() -> None:
         1, 1, 1, 0.04, 0.04, 0.04,
     ]  # fmt: skip
     found = [
-        verify(
+        verify_calibration(
             replace(calibrated(poses=n), components={"white_force_N": 0.05, "white_torque_Nm": 0.002}),
             orientations(6),
             wrench,
@@ -210,7 +210,7 @@ def test_the_stated_noise_need_not_be_that_of_the_sensor() -> None:
     for parameters in (TRUTH, CHANGED["bias"]):
         wrench = readings(parameters, new, 3)
         found = [
-            verify(
+            verify_calibration(
                 replace(calibration, covariance=k * calibration.covariance, chi2=calibration.chi2 / k),
                 new,
                 wrench,
@@ -239,13 +239,13 @@ def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> Non
         fitted, R, wrench = inexact(6, seed)
         calibration = solve(fitted, setup=EXACT)
         assert "rotation_rad" not in calibration.components
-        assert not verify(calibration, R, wrench, noise_of(6)).passed
-        assert verify(calibration, R, wrench, noise_of(6), fitted=fitted).passed
+        assert not verify_calibration(calibration, R, wrench, noise_of(6)).passed
+        assert verify_calibration(calibration, R, wrench, noise_of(6), fitted=fitted).passed
 
 
 def test_a_change_is_found_all_the_same() -> None:
     fitted, R, wrench = inexact(6, 1)
-    found = verify(
+    found = verify_calibration(
         solve(fitted, setup=EXACT),
         R,
         wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]),
@@ -263,10 +263,10 @@ def test_hysteresis_is_no_false_alarm_and_hides_no_change() -> None:
     moved = -lag * np.diff(predict(TRUTH, np.concatenate([R[-1:], new])), axis=0)
     fitted = CalibrationDataset(R, y, noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
     calibration = solve(fitted, setup=EXACT)
-    assert verify(calibration, new, y_new + moved, noise_of(6), fitted=fitted).passed
+    assert verify_calibration(calibration, new, y_new + moved, noise_of(6), fitted=fitted).passed
     for what in ("bias", "payload", "centre of mass"):
         changed = readings(CHANGED[what], new, 100) + moved
-        assert verify(calibration, new, changed, noise_of(6), fitted=fitted).change == what
+        assert verify_calibration(calibration, new, changed, noise_of(6), fitted=fitted).change == what
 
 
 def test_a_shifted_centre_of_mass_is_named_although_the_gain_turns_the_forces() -> None:
@@ -280,7 +280,7 @@ def test_a_shifted_centre_of_mass_is_named_although_the_gain_turns_the_forces() 
 
     fitted = CalibrationDataset(R, read(TRUTH, R, 2), noise_of(24), np.zeros(24, np.int64), np.full(24, np.nan))
     moved = read(CHANGED["centre of mass"], new, 3)
-    found = verify(solve(fitted, setup=EXACT), new, moved, noise_of(6), fitted=fitted)
+    found = verify_calibration(solve(fitted, setup=EXACT), new, moved, noise_of(6), fitted=fitted)
     assert (found.change, found.alternatives) == ("centre of mass", ())
 
 
@@ -295,16 +295,18 @@ def test_poses_of_another_kind_of_fit_explain_nothing() -> None:
     unmeasured = replace(fitted, wrench_cov=None)
     assert expected_with_smooth_errors(calibration, unmeasured, R, noise_of(6)) == []
     with pytest.raises(BadDataset, match="6 poses are not those of the calibration, which has 24"):
-        verify(calibrated(), R, readings(TRUTH, R, 0), noise_of(6), fitted=fitted)
+        verify_calibration(calibrated(), R, readings(TRUTH, R, 0), noise_of(6), fitted=fitted)
 
 
 def test_what_cannot_be_verified_is_refused() -> None:
     with pytest.raises(BadDataset, match="1 pose is too few for a verification: record 2 or more"):
-        verify(calibrated(), orientations(1), readings(TRUTH, orientations(1), 0), noise_of(1))
+        verify_calibration(calibrated(), orientations(1), readings(TRUTH, orientations(1), 0), noise_of(1))
     with pytest.raises(BadDataset, match="wrench_cov"):
-        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(3))
+        verify_calibration(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(3))
     with pytest.raises(ValueError, match="false_alarms is 0"):
-        verify(calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(2), false_alarms=0)
+        verify_calibration(
+            calibrated(), orientations(2), readings(TRUTH, orientations(2), 0), noise_of(2), false_alarms=0
+        )
 
 
 def smoothly_turned(R: Array, seed: int) -> Array:
@@ -325,7 +327,7 @@ def test_smooth_errors_of_an_arm_are_no_change_in_other_poses_and_hide_none(seed
         found = solve(fitted)
         for name, truth in {"": TRUTH, **{name: CHANGED[name] for name in changes}}.items():
             y = readings(truth, smoothly_turned(far, seed), 10 + seed)
-            one = verify(found, far, y, noise_of(6), fitted=fitted)
+            one = verify_calibration(found, far, y, noise_of(6), fitted=fitted)
             assert not name or not one.passed
             passed += one.passed
     assert passed == len(seeds)

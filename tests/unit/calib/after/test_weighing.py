@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import solve
 from ftcalib.after.state import tare
-from ftcalib.after.weighing import Weight, drift_since, holding, true_tool, weigh
+from ftcalib.after.weighing import Weight, drift_since, holding, true_tool, weigh_load
 from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters, predict
@@ -45,7 +45,7 @@ class Gripper:
 
     def weigh(self, reference: Calibrated, *R: Array, since_s: float = 1.0, **options: Any) -> Weight:
         means = [mean_and_covariance(self.dwell(one)) for one in R]
-        return weigh(
+        return weigh_load(
             reference,
             np.array(R),
             np.array([one.mean for one in means]),
@@ -125,7 +125,7 @@ def test_poses_that_disagree_are_named() -> None:
     for R in poses:
         means.append(mean_and_covariance(gripper.dwell(R)))
         gripper.com_m = gripper.com_m + np.array([0.01, 0, 0])  # it slips
-    weight = weigh(
+    weight = weigh_load(
         calibrated(),
         np.array(poses),
         np.array([one.mean for one in means]),
@@ -155,7 +155,7 @@ def test_a_gain_that_was_found_acts_on_the_part() -> None:
     )
     read = predict(TRUTH, R) + response.wrench(TRUTH, R) + predict(part, R) + response.wrench(part, R)
     noise = np.tile(np.diag(NOISE**2) / 250, (3, 1, 1))
-    weight = weigh(with_gain, R, read, noise, drift=np.zeros(6), g_m_s2=G, p_sensor_near_m=gripper.com_m)
+    weight = weigh_load(with_gain, R, read, noise, drift=np.zeros(6), g_m_s2=G, p_sensor_near_m=gripper.com_m)
     assert weight.mass_kg == pytest.approx(gripper.mass_kg, abs=1e-9)
     np.testing.assert_allclose(weight.p_sensor_com_m, gripper.com_m, atol=1e-9)
 
@@ -195,7 +195,7 @@ def test_the_covariance_has_all_errors_of_readings_and_calibration(gain: bool) -
 
     def weighed(y: Array, reference: Calibrated = reference, R: Array = R) -> Weight:
         options: dict[str, Any] = {"drift": drift, "g_m_s2": G, "orientation_sigma_rad": turn_rad}
-        return weigh(reference, R, y, noise, p_sensor_near_m=gripper.com_m, **options)
+        return weigh_load(reference, R, y, noise, p_sensor_near_m=gripper.com_m, **options)
 
     def turned(e: Array) -> Array:
         return np.asarray(R @ Rotation.from_rotvec(e.reshape(3, 3)).as_matrix())
@@ -293,8 +293,8 @@ def test_a_sensor_known_by_loads_weighs_without_its_error() -> None:
     held = sensor.read(np.concatenate([(2.0 + TOOL_KG) * u, np.cross(moment, u)], axis=1)) + tool.parameters.bias
     noise = np.tile(np.diag((0.1 * LOAD_NOISE) ** 2), (4, 1, 1))
     known = {"drift": drift_since(0.0), "g_m_s2": tool.g_m_s2, "p_sensor_near_m": tool.R_flange_sensor.T @ p}
-    as_read = weigh(result, R, held, noise, **known)
-    decoded = weigh(result, R, held, noise, **known, contact=result.known_contact)
+    as_read = weigh_load(result, R, held, noise, **known)
+    decoded = weigh_load(result, R, held, noise, **known, contact=result.known_contact)
     sigma_kg = np.hypot(decoded.mass_sigma_kg, decoded.scale_sigma * decoded.mass_kg)
     assert abs(decoded.mass_kg - 2.0) < 3 * sigma_kg < 0.01 * 2.0 < abs(as_read.mass_kg - 2.0)
     # A force at the tip has the errors of the lever too: more than the gain alone.

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import Parameters
 from ftcalib.known import Constraints, Known
-from ftcalib.likelihood.session import Drift, Session, white
+from ftcalib.likelihood.session import Drift, SessionData, white
 from ftcalib.model import Array, SPECIAL_R_flange_base, predict
 
 R24 = np.swapaxes(SPECIAL_R_flange_base, 1, 2)
@@ -28,6 +28,6 @@ def session(
     known: Constraints = NOTHING_KNOWN,
     residuals: Array | float = 0.0,
     t_s: Array | None = None,
-) -> Session:
+) -> SessionData:
     cov = white(SIGMA_N, SIGMA_NM) if measured else None
-    return Session(R, predict(TOOL, R) + residuals, cov, t_s, drift, known)
+    return SessionData(R, predict(TOOL, R) + residuals, cov, t_s, drift, known)

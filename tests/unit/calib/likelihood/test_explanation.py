@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation, RotationSpline
 from ftcalib.likelihood import explanation
 from ftcalib.likelihood.descent import Kept, agreeing_poses, fewest_kept
 from ftcalib.likelihood.explanation import Explanation, _are_gaussian, _criterion, _limit, _membership, _stand_out
-from ftcalib.likelihood.session import Session, inverses
-from ftcalib.likelihood.variance_components import FORCE, Component, Point, component, point
+from ftcalib.likelihood.session import SessionData, inverses
+from ftcalib.likelihood.variance_components import FORCE, Component, Point, channel_component, point
 from ftcalib.model import Array
 from tests.unit.calib.likelihood.sessions import R24, SIGMA_N, SIGMA_NM, TOOL, session
 
@@ -19,11 +19,11 @@ SIGMA = np.repeat([SIGMA_N, SIGMA_NM], 3)
 FARTHEST = stats.chi2.isf(1e-3, 6)
 
 
-def tour(n: int, residuals: Array | float = 0.0) -> Session:
+def tour(n: int, residuals: Array | float = 0.0) -> SessionData:
     return session(np.resize(R24, (n, 3, 3)), drift="none", residuals=residuals)
 
 
-def at(own: Session, kept: Kept, components: tuple[Component, ...] = (), theta: tuple[float, ...] = ()) -> Point:
+def at(own: SessionData, kept: Kept, components: tuple[Component, ...] = (), theta: tuple[float, ...] = ()) -> Point:
     return point(own.linearise(TOOL, kept), components, np.array(theta))
 
 
@@ -80,7 +80,7 @@ def test_noise_is_gaussian_where_its_distribution_is(n: int, off: float, gaussia
 def test_a_pose_is_rejected_beyond_what_one_in_a_thousand_exceeds() -> None:
     own, kept = tour(24), np.arange(24) > 4
     assert _limit(own, at(own, kept)) == pytest.approx(FARTHEST)
-    estimated = at(own, kept, (component("white", FORCE),), (0.01,))
+    estimated = at(own, kept, (channel_component("white", FORCE),), (0.01,))
     assert _limit(own, estimated) == pytest.approx(6 * stats.f.isf(1e-3, 6, 6 * 19 - 15))
 
 
@@ -105,7 +105,7 @@ def test_the_worst_are_rejected_first_and_taken_back_when_they_fit() -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 10.0, 30.0])
-@pytest.mark.parametrize(("components", "theta"), [((), ()), ((component("white", FORCE),), (0.001,))])
+@pytest.mark.parametrize(("components", "theta"), [((), ()), ((channel_component("white", FORCE),), (0.001,))])
 def test_a_rejected_pose_costs_the_limit_and_beyond_it_a_logarithm(
     scale: float, components: tuple[Component, ...], theta: tuple[float, ...]
 ) -> None:
@@ -121,7 +121,7 @@ def test_a_rejected_pose_costs_the_limit_and_beyond_it_a_logarithm(
     assert gained == pytest.approx(limit + 6 * np.log(max(distance / limit, 1.0)) - distance, abs=1e-4)
 
 
-def smooth_tour(n: int, *, measured: bool = True, bumped: int = 0) -> Session:
+def smooth_tour(n: int, *, measured: bool = True, bumped: int = 0) -> SessionData:
     """Return poses along a path, whose residuals are a cable's and noise."""
     rng = np.random.default_rng(5)
     corners = Rotation.random(40, rng=rng)
@@ -135,7 +135,7 @@ def smooth_tour(n: int, *, measured: bool = True, bumped: int = 0) -> Session:
 def test_some_of_many_poses_show_errors_that_have_a_structure(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     searched = list[int]()
 
-    def counted(own: Session, *arguments: Any) -> Explanation:
+    def counted(own: SessionData, *arguments: Any) -> Explanation:
         searched.append(own.n)
         return improve(own, *arguments)
 
@@ -156,7 +156,7 @@ def test_some_of_many_poses_show_errors_that_have_a_structure(measured: bool, mo
 
 
 def test_a_thousand_poses_are_all_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Session, "some", lambda *_: pytest.fail("only some poses were searched"))
+    monkeypatch.setattr(SessionData, "some", lambda *_: pytest.fail("only some poses were searched"))
     rng = np.random.default_rng(6)
     explanation.explain(tour(1000, 2 * SIGMA * rng.normal(size=(1000, 6))))
 

@@ -13,8 +13,8 @@ from ftcalib.judge.verdict import _response
 from ftcalib.known import RANGE_LEVER_M, Constraints, Known
 from ftcalib.likelihood.explanation import with_walks_instead
 from ftcalib.likelihood.fit import Fit, fit
-from ftcalib.likelihood.session import Session
-from ftcalib.likelihood.variance_components import FORCE, RESPONSE, component, maximise
+from ftcalib.likelihood.session import SessionData
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, channel_component, maximise
 from ftcalib.model import Array, gravity_wrench, predict
 from ftcalib.result import require_positive_definite
 from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN, Response, response_columns
@@ -108,9 +108,9 @@ def test_white_noise_hides_no_walk_and_gain() -> None:
     rng = np.random.default_rng(1)
     p, R, wrench, _, _ = session(rng, 24, 0.01, 0.01)
     wrench += np.cumsum(rng.normal(size=(24, 6)), axis=0) * 0.07 * np.repeat([1, 0.025], 3)
-    data = Session(R, wrench, WHITE, None, "auto", Constraints(Known(), 9.8))
+    data = SessionData(R, wrench, WHITE, None, "auto", Constraints(Known(), 9.8))
     problem = data.linearise(p, data.everything)
-    hidden = maximise(problem, [component("white", FORCE), RESPONSE[1]], np.array([0.02, 1e-4]))
+    hidden = maximise(problem, [channel_component("white", FORCE), RESPONSE[1]], np.array([0.02, 1e-4]))
     found = {c.name for c in with_walks_instead(problem, hidden, data.candidates(), 0).components}
     assert {"gain", "walk_force_N"} <= found
     assert "white_force_N" not in found

@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 
 from ftcalib.known import Constraints, Known
 from ftcalib.likelihood.descent import Minimum
-from ftcalib.likelihood.session import Session, inverses, white
+from ftcalib.likelihood.session import SessionData, inverses, white
 from ftcalib.likelihood.session_noise import pose_times
-from ftcalib.likelihood.variance_components import FORCE, RESPONSE, TORQUE, Component, component
+from ftcalib.likelihood.variance_components import FORCE, RESPONSE, TORQUE, Component, channel_component
 from ftcalib.model import Array, jacobian, predict
 from tests.unit.calib.likelihood.sessions import NOTHING_KNOWN, R24, SIGMA_NM, TOOL, session
 
@@ -90,7 +90,12 @@ def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise(
     own = session(R24, residuals=residuals)
     problem = own.linearise(TOOL, np.arange(24) > 0)
     np.testing.assert_array_equal(own.start(problem, []), np.zeros(0))
-    groups = [component("white", FORCE), component("white", TORQUE), component("white", [4]), component("walk", FORCE)]
+    groups = [
+        channel_component("white", FORCE),
+        channel_component("white", TORQUE),
+        channel_component("white", [4]),
+        channel_component("walk", FORCE),
+    ]
     np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
 
 
@@ -101,7 +106,7 @@ def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise(
 def test_poses_are_taken_in_the_order_of_time(order: NDArray[np.intp]) -> None:
     t_s = np.arange(24.0)[order] * 3 + 100
     cov = np.eye(6) * (1 + order)[:, None, None]
-    own = Session(R24[order], predict(TOOL, R24)[order], cov, t_s, "auto", NOTHING_KNOWN)
+    own = SessionData(R24[order], predict(TOOL, R24)[order], cov, t_s, "auto", NOTHING_KNOWN)
     np.testing.assert_array_equal(own.R, R24)
     np.testing.assert_array_equal(own.wrench, predict(TOOL, R24))
     np.testing.assert_array_equal(own.cov[:, 0, 0], np.arange(1.0, 25))

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
-from ftcalib.likelihood.explanation import _prune, rivals, select, with_slopes_instead
+from ftcalib.likelihood.explanation import _prune, rivals, select_explanation, with_slopes_instead
 from ftcalib.likelihood.session_noise import Noise, centre, walk_times
 from ftcalib.likelihood.variance_components import (
     FORCE,
@@ -17,15 +17,15 @@ from ftcalib.likelihood.variance_components import (
     TORQUE,
     Component,
     Linearised,
-    component,
-    doubt,
-    estimates,
+    channel_component,
     estimates_of_unknown_variances,
     expected_variances,
     maximise,
+    mixture_covariance,
+    parameter_estimates,
     point,
     score,
-    units,
+    unit_variances,
 )
 from ftcalib.model import Array
 
@@ -98,11 +98,11 @@ def test_the_walk_multiplies_as_its_covariance() -> None:
 
 
 ALL = (
-    component("white", FORCE),
-    component("white", TORQUE),
+    channel_component("white", FORCE),
+    channel_component("white", TORQUE),
     ROTATION,
-    component("walk", FORCE),
-    component("walk", [5]),
+    channel_component("walk", FORCE),
+    channel_component("walk", [5]),
 )
 THETA = np.array([0.3, 0.2, 0.05 / 400, 0.4, 0.1])
 
@@ -137,7 +137,9 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
     )
 
 
-@pytest.mark.parametrize("components", [ALL, (*ALL[:3], component("slope", FORCE), component("slope", TORQUE))])
+@pytest.mark.parametrize(
+    "components", [ALL, (*ALL[:3], channel_component("slope", FORCE), channel_component("slope", TORQUE))]
+)
 def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
     rng = np.random.default_rng(5)
     p = problem(rng, N, ALL, THETA)
@@ -185,13 +187,13 @@ def test_variances_are_recovered() -> None:
 
 
 def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
-    candidates = [*ALL[:3], component("walk", FORCE), component("walk", TORQUE)]
+    candidates = [*ALL[:3], channel_component("walk", FORCE), channel_component("walk", TORQUE)]
     spurious, right = 0, 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        spurious += len(select(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
-        walk = component("walk", FORCE)
-        at = select(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
+        spurious += len(select_explanation(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
+        walk = channel_component("walk", FORCE)
+        at = select_explanation(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
         right += walk in at.components
     assert spurious <= 4  # 2 % each, of 100
     assert right >= 19
@@ -199,7 +201,7 @@ def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
 
 @pytest.mark.parametrize("walk_first", [False, True])
 def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
-    white, walk = component("white", FORCE), component("walk", FORCE)
+    white, walk = channel_component("white", FORCE), channel_component("walk", FORCE)
     both = (walk, white) if walk_first else (white, walk)
     rng = np.random.default_rng(7)
     for really, needed, kept in (
@@ -214,7 +216,7 @@ def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
 
 
 def test_what_is_always_needed_is_not_dropped() -> None:
-    three = (component("walk", FORCE), *ALL[:2])
+    three = (channel_component("walk", FORCE), *ALL[:2])
     p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
     at = maximise(p, three, np.full(3, 0.1))
     assert _prune(p, at, 1).components == three
@@ -233,19 +235,19 @@ def test_a_component_that_brings_little_is_not_dropped_with_one_that_brings_noth
 def test_a_turn_of_the_flange_is_distinguished_from_white_noise() -> None:
     rng = np.random.default_rng(8)
     turned = problem(rng, 40, (ROTATION,), np.array([0.3 / 400]))
-    assert select(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)
+    assert select_explanation(turned, [], np.zeros(0), list(ALL[:3])).components == (ROTATION,)
     white = problem(rng, 40, ALL[:1], np.array([0.3]))
-    assert select(white, [], np.zeros(0), list(ALL[:3])).components == ALL[:1]
+    assert select_explanation(white, [], np.zeros(0), list(ALL[:3])).components == ALL[:1]
 
 
 def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
     rng = np.random.default_rng(9)
     p = problem(rng, 30, (), np.zeros(0))
     p.r[:, :3] += centre(p.time)[:, None] * [2.0, -1.5, 1.0]
-    at = select(p, [], np.zeros(0), [component("walk", FORCE)])
+    at = select_explanation(p, [], np.zeros(0), [channel_component("walk", FORCE)])
     assert [c.kind for c in with_slopes_instead(p, at, 0).components] == ["slope"]
-    q = problem(rng, 30, (component("walk", FORCE),), np.array([0.2]))
-    at = select(q, [], np.zeros(0), [component("walk", FORCE)])
+    q = problem(rng, 30, (channel_component("walk", FORCE),), np.array([0.2]))
+    at = select_explanation(q, [], np.zeros(0), [channel_component("walk", FORCE)])
     assert with_slopes_instead(q, at, 0) is at
 
 
@@ -264,7 +266,7 @@ def test_unknown_noise_widens_sigma_like_students_distribution() -> None:
 def test_many_poses_show_their_noise() -> None:
     p = problem(np.random.default_rng(9), 1000, ALL[:2], THETA[:2])
     at = point(p, ALL[:2], THETA[:2])
-    np.testing.assert_array_equal(estimates_of_unknown_variances(at)[1], estimates(at)[1])
+    np.testing.assert_array_equal(estimates_of_unknown_variances(at)[1], parameter_estimates(at)[1])
 
 
 GAINS, CROSS_TALK = RESPONSE
@@ -291,46 +293,52 @@ def test_each_component_has_its_columns() -> None:
     for c in (GAINS, CROSS_TALK, HYSTERESIS):
         np.testing.assert_array_equal(p.X[..., p.columns(c)], p.effects[c.kind])
     for share, own in ((FORCE, slice(9)), (TORQUE, slice(9, 18))):  # three columns for each channel
-        np.testing.assert_array_equal(p.X[..., p.columns(component("cable", share))], p.effects["cable"][..., own])
+        np.testing.assert_array_equal(
+            p.X[..., p.columns(channel_component("cable", share))], p.effects["cable"][..., own]
+        )
     slopes = centre(p.time)[:, None, None] * np.eye(6)
-    np.testing.assert_array_equal(p.X[..., p.columns(component("slope", TORQUE))], slopes[..., 3:])
+    np.testing.assert_array_equal(p.X[..., p.columns(channel_component("slope", TORQUE))], slopes[..., 3:])
     np.testing.assert_array_equal(p.X[..., -1], p.r)
-    assert all(p.columns(component(kind, FORCE)) is None for kind in ("white", "walk"))
+    assert all(p.columns(channel_component(kind, FORCE)) is None for kind in ("white", "walk"))
     assert p.columns(ROTATION) is None
 
 
 def test_numbers_and_limits_of_the_components() -> None:
     p = small()
     sizes = {ROTATION: 20, GAINS: 5, CROSS_TALK: 6, HYSTERESIS: 12}
-    sizes |= {component("white", FORCE): 30, component("walk", [4]): 10, component("slope", TORQUE): 3}
+    sizes |= {
+        channel_component("white", FORCE): 30,
+        channel_component("walk", [4]): 10,
+        channel_component("slope", TORQUE): 3,
+    }
     assert {c: p.size(c) for c in sizes} == sizes
     limits = {ROTATION: np.radians(3), GAINS: 0.05, CROSS_TALK: 1.5 * 0.05, HYSTERESIS: 0.03}
     assert {c: p.largest(c) for c in limits} == pytest.approx({c: limit**2 for c, limit in limits.items()})
-    assert p.largest(component("walk", FORCE)) == np.inf
+    assert p.largest(channel_component("walk", FORCE)) == np.inf
     assert (ROTATION.needed, GAINS.needed, CROSS_TALK.needed, HYSTERESIS.needed) == (2, 3, 3, 3)
-    worth = point(p, (component("white", FORCE), GAINS), np.array([0.1, 0.05**2]))
+    worth = point(p, (channel_component("white", FORCE), GAINS), np.array([0.1, 0.05**2]))
     assert worth.worth == pytest.approx(worth.loglik - 5)
     assert worth.too_large
-    assert not point(p, (component("white", FORCE), GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
+    assert not point(p, (channel_component("white", FORCE), GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
 
 
 def test_in_units_a_component_is_as_large_as_the_white_noise_of_the_used_poses() -> None:
     p = small()
     at = point(p, (), np.zeros(0))
     expected = {
-        component("white", FORCE): 0.04,
-        component("white", range(6)): 0.025,
-        component("slope", TORQUE): 0.01,
-        component("walk", TORQUE): 0.01 / 10,
+        channel_component("white", FORCE): 0.04,
+        channel_component("white", range(6)): 0.025,
+        channel_component("slope", TORQUE): 0.01,
+        channel_component("walk", TORQUE): 0.01 / 10,
         ROTATION: min(0.04 / 2**2, 0.01 / 1**2),
         GAINS: 0.01 / (10 * 0.5**2),
     }
-    np.testing.assert_allclose(units(p, at, list(expected)), list(expected.values()))
+    np.testing.assert_allclose(unit_variances(p, at, list(expected)), list(expected.values()))
 
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 1e-3])
 def test_the_expected_white_noise_is_that_of_a_normal_likelihood_and_a_uniform_sigma(share: float) -> None:
-    white = component("white", FORCE)
+    white = channel_component("white", FORCE)
     p = problem(np.random.default_rng(12), 8, (white,), np.array([0.05]))
     best = maximise(p, (white,), np.array([0.05]))
     at = point(p, (white,), share * best.theta)
@@ -364,6 +372,8 @@ def test_other_variances_are_right_by_the_odds_of_their_likelihood() -> None:
     bonus = (0.0, 0.0, -1.0)  # hysteresis must bring more than the rotations in whose place it is
     for (other, share), less in zip(found, bonus, strict=True):
         assert share / rest == pytest.approx(np.exp(min(other.loglik - best.loglik + less, 0.0)))
-    x, C = estimates(best)
-    y, D = estimates(lagging)
-    np.testing.assert_allclose(doubt(best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12)
+    x, C = parameter_estimates(best)
+    y, D = parameter_estimates(lagging)
+    np.testing.assert_allclose(
+        mixture_covariance(best, [(lagging, 0.25)]), 0.25 * (D - C + np.outer(y - x, y - x)), atol=1e-12
+    )

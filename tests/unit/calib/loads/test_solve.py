@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ftcalib import NotObservable
-from ftcalib.loads.check import check_load
+from ftcalib.loads.check import check_hung_load
 from ftcalib.loads.model import KnownLoad, LoadModel, LoadRun, Mistake
 from ftcalib.loads.solve import LoadSolution, solve_loads
 from ftcalib.sensor_matrix import SensorMatrix
@@ -111,7 +111,7 @@ def test_one_weight_on_a_string_shows_the_scale_and_its_line(poses: int) -> None
     assert tip.dataset.wrench_cov is not None
     # The bias of another run is that of the tool after a tare.
     wrench = tip.dataset.wrench - tip_bias(sensor, tip, result.parameters.bias)
-    found = check_load(
+    found = check_hung_load(
         result,
         result,
         KnownLoad("tip", 1.0, 0.001, tuple(TIP_M)),

@@ -18,7 +18,7 @@ from ftcalib.motion.estimate import (
     _local,
     _untouched,
     _without_contact,
-    fit,
+    fit_motion,
     rough_delay,
 )
 from ftcalib.motion.model import (
@@ -28,14 +28,14 @@ from ftcalib.motion.model import (
     HEIGHT,
     INERTIA,
     SIZE,
-    Load,
+    MovingLoad,
     RowNoise,
-    jacobian,
     lever_columns,
+    motion_jacobian,
     wrench_of,
 )
 from ftcalib.motion.problem import DELAY_S, GYRATION_M, HEIGHT_M, KNOT_S, SLOW_S, Problem
-from ftcalib.motion.samples import Motion, Rows
+from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Truth, means_of, record, sweep
 from tests.unit.calib.motion.test_motion import load_of
@@ -47,8 +47,8 @@ ALL_ON = {"gain": 0.01, "cross_talk": 3e-3, "walk_N": 0.05, "walk_Nm": 2e-3}
 
 
 def rows_of(
-    n: int, load: Load, *, seed: int = 0, turn_rad: float = 3.0, sigma: Array = SIGMA, row_s: float = ROW_S
-) -> Rows:
+    n: int, load: MovingLoad, *, seed: int = 0, turn_rad: float = 3.0, sigma: Array = SIGMA, row_s: float = ROW_S
+) -> MotionRows:
     """Rows of a random motion of this load, with white noise."""
     rng = np.random.default_rng(seed)
     turns = Rotation.from_rotvec(turn_rad * rng.uniform(-1, 1, (n, 3)))
@@ -61,10 +61,10 @@ def rows_of(
     rate = Motion.of_columns(rng.normal(size=(n, 21)))
     wrench = wrench_of(load, motion.earlier(load.delay_s, rate)) + sigma * rng.normal(size=(n, 6))
     t: Array = np.arange(n) * np.float64(row_s)
-    return Rows(t, wrench, motion, rate, np.linalg.norm(omega, axis=1), 0.0, row_s)
+    return MotionRows(t, wrench, motion, rate, np.linalg.norm(omega, axis=1), 0.0, row_s)
 
 
-def all_kept(rows: Rows) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+def all_kept(rows: MotionRows) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return np.ones(len(rows), np.bool_)
 
 
@@ -74,7 +74,7 @@ WHITE = RowNoise(SIGMA[None], np.ones((1, 6, 1)), np.eye(6))
 class Dense:
     """The same problem as one matrix: readings in their noise, and the covariance of what is expected."""
 
-    def __init__(self, problem: Problem, load: Load, drift: Array) -> None:
+    def __init__(self, problem: Problem, load: MovingLoad, drift: Array) -> None:
         rows = problem.rows
         motion = rows.motion.earlier(load.delay_s, rows.rate)
         knots = len(problem.knots)
@@ -82,7 +82,7 @@ class Dense:
         self.r = ((rows.wrench - wrench_of(load, motion) - hats @ drift) / SIGMA).ravel()
         on_knots = np.einsum("nk,ij->nikj", hats, np.eye(6)).reshape(len(rows), 6, -1)
         lever = lever_columns(load, motion)
-        J = np.concatenate([jacobian(load, motion, rows.rate), on_knots, lever], axis=2)
+        J = np.concatenate([motion_jacobian(load, motion, rows.rate), on_knots, lever], axis=2)
         self.J = (J / SIGMA[:, None]).reshape(6 * len(rows), -1)
         self.steps = np.tril(np.ones((knots, knots)), -1)[:, :-1] * np.sqrt(np.diff(problem.knots)[0])
         self.since_end = np.eye(knots) - np.eye(knots)[-1]
@@ -118,7 +118,7 @@ class Dense:
 
 
 @pytest.fixture(scope="module")
-def posed() -> tuple[Problem, Load, Array]:
+def posed() -> tuple[Problem, MovingLoad, Array]:
     truth = replace(load_of(Truth(), 3e-3), delay_s=0.01)
     rows = rows_of(45, truth, row_s=0.4)
     problem = Problem(rows, None, G, point_mass=False)
@@ -130,7 +130,7 @@ def posed() -> tuple[Problem, Load, Array]:
     return problem, near, effects
 
 
-def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, Load, Array]) -> None:
+def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, MovingLoad, Array]) -> None:
     problem, _, _ = posed
     assert len(problem.knots) == 1 + round(44 * 0.4 / KNOT_S)
     assert (problem.knots[0], problem.knots[-1]) == (0.0, problem.rows.t_s[-1])
@@ -143,7 +143,9 @@ def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, Load, Arra
 
 
 @pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
-def test_a_step_is_that_of_generalised_least_squares(posed: tuple[Problem, Load, Array], off: tuple[str, ...]) -> None:
+def test_a_step_is_that_of_generalised_least_squares(
+    posed: tuple[Problem, MovingLoad, Array], off: tuple[str, ...]
+) -> None:
     problem, load, effects = posed
     sizes = {name: 0.0 if name in off else size for name, size in ALL_ON.items()}
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
@@ -177,7 +179,9 @@ def test_a_step_is_that_of_generalised_least_squares(posed: tuple[Problem, Load,
 
 
 @pytest.mark.parametrize("name", _SIZES)
-def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: tuple[Problem, Load, Array], name: str) -> None:
+def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(
+    posed: tuple[Problem, MovingLoad, Array], name: str
+) -> None:
     problem, load, effects = posed
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
     sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
@@ -188,7 +192,7 @@ def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: tuple[Pro
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def slowly_turned(rows: Rows) -> Rows:
+def slowly_turned(rows: MotionRows) -> MotionRows:
     """The same rows in the order of a smooth path through their orientations."""
     order = np.argsort(rows.motion.R_base_flange[:, 2, 0])
     return replace(rows, wrench=rows.wrench[order], motion=rows.motion[order], rate=rows.rate[order])
@@ -205,7 +209,7 @@ def smoothly_wrong(seed: int) -> tuple[Array, Array, float]:
     true = (Rotation.from_matrix(R) * turns).as_matrix()
     noise = SIGMA / 20 * np.random.default_rng([seed, 2]).normal(size=(220, 6))
     wrench = wrench_of(truth, replace(rows.motion, R_base_flange=true)) + noise
-    found = fit(replace(rows, wrench=wrench), None, G)
+    found = fit_motion(replace(rows, wrench=wrench), None, G)
     still = Motion(R, np.zeros((220, 3)), np.zeros((220, 3, 3)))
     left = wrench_of(truth, replace(still, R_base_flange=true)) - wrench_of(found.load, still)
     ratio = found.next_use / np.sqrt(np.mean(np.sum(left.reshape(-1, 2, 3) ** 2, axis=2), axis=0))
@@ -233,7 +237,7 @@ def noisy_for_seconds(seed: int) -> tuple[Array, float]:
     keeps = float(np.exp(-ROW_S / SLOW_S))
     white = np.random.default_rng([seed, 3]).normal(size=(700, 6))
     course = lfilter([np.sqrt(1 - keeps**2)], [1, -keeps], white, axis=0)[500:]
-    found = fit(replace(rows, wrench=rows.wrench + SIGMA / 2 * course), None, G)
+    found = fit_motion(replace(rows, wrench=rows.wrench + SIGMA / 2 * course), None, G)
     bias = [6, 7, 8, 12, 13, 14]
     error = load_of(Truth()).static.difference(found.load.static)[bias]
     return error / np.sqrt(np.diag(found.covariance))[bias], found.components["slow_N"]
@@ -252,7 +256,7 @@ def test_sigma_of_the_bias_is_right_beside_noise_of_seconds() -> None:
     assert 0.7 < np.sqrt(np.mean(errors**2)) < 2.2
 
 
-def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[Problem, Load, Array]) -> None:
+def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[Problem, MovingLoad, Array]) -> None:
     """More rows than are summed at once, noise that is correlated, and rows that are left out."""
     _, load, _ = posed
     rows = rows_of(1010, load, seed=4)
@@ -266,7 +270,7 @@ def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[Problem, Load, 
     state = np.arange(1010, dtype=np.intp) % 2
     H, b, chi2 = wide.sums(load, effects, noise, kept, state)
     unit = (rows.wrench - wide.predict(load, rows)) / noise.scale[state]
-    J = jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
+    J = motion_jacobian(load, rows.motion.earlier(load.delay_s, rows.rate), rows.rate) / noise.scale[state][:, :, None]
     white, derivative = unit.copy(), J.copy()
     for k in np.flatnonzero(kept):
         if k > 0 and kept[k - 1]:
@@ -330,7 +334,7 @@ def test_a_walk_of_the_bias_is_found() -> None:
     rows = rows_of(400, load_of(Truth()), seed=5, turn_rad=0.6, sigma=4 * SIGMA)
     steps = np.random.default_rng(6).normal(size=(400, 6)) * np.sqrt(ROW_S)
     walk = np.cumsum(steps, axis=0) * np.repeat([0.3, 0.012], 3)
-    found = fit(replace(rows, wrench=rows.wrench + walk), None, G)
+    found = fit_motion(replace(rows, wrench=rows.wrench + walk), None, G)
     assert 0.1 < found.components["walk_N"] < 0.5
     assert found.drift is not None
     change, sigma, course = found.drift.change, found.drift.sigma, found.drift.course
@@ -343,7 +347,7 @@ def test_a_walk_of_the_bias_is_found() -> None:
 
 def test_another_mounting_costs_what_its_own_fit_does() -> None:
     rows = rows_of(100, load_of(Truth()), seed=5, turn_rad=0.6, sigma=20 * SIGMA)
-    found = fit(rows, None, G)
+    found = fit_motion(rows, None, G)
     assert found.drift is None
     assert found.kept.all()
     np.testing.assert_allclose(found.sigma, np.tile(20 * SIGMA, (100, 1)), rtol=0.2)
@@ -356,7 +360,7 @@ def test_another_mounting_costs_what_its_own_fit_does() -> None:
         for _ in range(8):
             motion = rows.motion.earlier(load.delay_s, rows.rate)
             left = (rows.wrench - wrench_of(load, motion)) / found.sigma
-            J = jacobian(load, motion, rows.rate)[:, :, : GAINS.start] / found.sigma[:, :, None]
+            J = motion_jacobian(load, motion, rows.rate)[:, :, : GAINS.start] / found.sigma[:, :, None]
             rows_of_prior = np.hstack([np.zeros((8, 15)), np.diag(1 / expected)])
             y = np.append(left.ravel(), -load.vector[15 : GAINS.start] / expected)
             step = np.linalg.lstsq(np.vstack([J.reshape(-1, GAINS.start), rows_of_prior]), y, rcond=None)[0]

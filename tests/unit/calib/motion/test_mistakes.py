@@ -13,9 +13,15 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import Array, Parameters
 from ftcalib.motion import samples
 from ftcalib.motion.estimate import fit_freely
-from ftcalib.motion.mistakes import bias_steps, falls_to_zero, impossible, mistakes_in, stays
-from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, Load, wrench_of
-from ftcalib.motion.samples import Means, Motion, Rows, require_seconds
+from ftcalib.motion.mistakes import (
+    are_bias_steps,
+    find_impossible_body,
+    find_motion_mistakes,
+    find_zeroings,
+    fit_bias_steps,
+)
+from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, MovingLoad, wrench_of
+from ftcalib.motion.samples import Means, Motion, MotionRows, require_seconds
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import Recorded, Truth, means_of, programme, record
 from tests.unit.calib.motion.test_estimate import SIGMA, G, rows_of
@@ -26,19 +32,19 @@ RIGHT = rows_of(150, TRUTH, sigma=SIGMA / 5)
 SPREAD_M = 0.6
 
 
-def found(rows: Rows, spread_m: float = SPREAD_M) -> list[Finding]:
-    return mistakes_in(rows, fit_freely(rows, None, G), spread_m)[0]
+def found(rows: MotionRows, spread_m: float = SPREAD_M) -> list[Finding]:
+    return find_motion_mistakes(rows, fit_freely(rows, None, G), spread_m)[0]
 
 
-def undone(rows: Rows) -> Rows:
-    return mistakes_in(rows, fit_freely(rows, None, G), SPREAD_M)[1](rows)
+def undone(rows: MotionRows) -> MotionRows:
+    return find_motion_mistakes(rows, fit_freely(rows, None, G), SPREAD_M)[1](rows)
 
 
 def codes(findings: list[Finding]) -> list[str]:
     return [one.code for one in findings]
 
 
-def of_point(rows: Rows, p_flange_point_m: Array, turn_rad: Array) -> Rows:
+def of_point(rows: MotionRows, p_flange_point_m: Array, turn_rad: Array) -> MotionRows:
     """The same with poses of another point of the flange, with other axes."""
     X = Rotation.from_rotvec(turn_rad).as_matrix()
 
@@ -49,14 +55,14 @@ def of_point(rows: Rows, p_flange_point_m: Array, turn_rad: Array) -> Rows:
     return replace(rows, motion=seen(rows.motion), rate=seen(rows.rate))
 
 
-def with_motion(rows: Rows, acceleration: float, turning: float) -> Rows:
+def with_motion(rows: MotionRows, acceleration: float, turning: float) -> MotionRows:
     def seen(motion: Motion) -> Motion:
         return Motion(motion.R_base_flange, acceleration * motion.acceleration_m_s2, turning * motion.Omega_rad2_s2)
 
     return replace(rows, motion=seen(rows.motion), rate=seen(rows.rate))
 
 
-def torques_about(rows: Rows, p_sensor_point_m: Array) -> Rows:
+def torques_about(rows: MotionRows, p_sensor_point_m: Array) -> MotionRows:
     wrench = rows.wrench.copy()
     wrench[:, 3:] -= np.cross(p_sensor_point_m, wrench[:, :3])
     return replace(rows, wrench=wrench)
@@ -214,9 +220,9 @@ def test_a_contact_that_ends_in_the_pose_of_a_zeroing_is_none() -> None:
     start, end = stops[2]
     recorded = record(truth, joints, 20.0, 1, contacts={(start + 0.1, end - 0.2): np.array([0, 0, -25.0, 1.5, 0, 0])})
     wrench, poses = means_of(replace(recorded, wrench=recorded.wrench - _at(recorded, start)))
-    at_s, seen = falls_to_zero(wrench.result())
+    at_s, seen = find_zeroings(wrench.result())
     assert np.abs(at_s - (end - 0.2)).min() < 0.1
-    assert not stays(bias_steps(samples.rows_of(wrench.result(), poses.result()), at_s), seen).any()
+    assert not are_bias_steps(fit_bias_steps(samples.motion_rows(wrench.result(), poses.result()), at_s), seen).any()
 
 
 def _at(recorded: Recorded, t_s: float) -> Array:
@@ -227,7 +233,7 @@ def _at(recorded: Recorded, t_s: float) -> Array:
 # -- impossible bodies -------------------------------------------------------------------------------------------------
 
 
-def fit_with(load: Load, sigma_kg_m2: float = 1e-5, sigma_m: float = 1e-3) -> Any:
+def fit_with(load: MovingLoad, sigma_kg_m2: float = 1e-5, sigma_m: float = 1e-3) -> Any:
     covariance = np.zeros((SIZE, SIZE))
     covariance[INERTIA, INERTIA] = sigma_kg_m2**2 * np.eye(6)
     covariance[HEIGHT, HEIGHT] = sigma_m**2
@@ -239,17 +245,17 @@ def test_a_body_that_cannot_exist_is_named() -> None:
     turned = Rotation.from_rotvec([0.3, 0.5, -0.2]).as_matrix()
     J = turned @ np.diag(principal) @ turned.T
     inertia = J[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    (one,) = impossible(fit_with(replace(TRUTH, inertia=inertia)))
+    (one,) = find_impossible_body(fit_with(replace(TRUTH, inertia=inertia)))
     assert one.code == "inertia_impossible"
     np.testing.assert_allclose(one.values["principal_gm2"], 1e3 * principal)
-    assert impossible(fit_with(replace(TRUTH, inertia=inertia), sigma_kg_m2=1e-3)) == []
-    assert impossible(fit_with(TRUTH)) == []
-    assert impossible(fit_with(replace(TRUTH, inertia=np.zeros(6)))) == []  # a point mass
+    assert find_impossible_body(fit_with(replace(TRUTH, inertia=inertia), sigma_kg_m2=1e-3)) == []
+    assert find_impossible_body(fit_with(TRUTH)) == []
+    assert find_impossible_body(fit_with(replace(TRUTH, inertia=np.zeros(6)))) == []  # a point mass
 
 
 @pytest.mark.parametrize(
     ("height_m", "sigma_m", "named"), [(-0.01, 1e-3, True), (-0.01, 2e-3, False), (0.6, 0.01, True), (0.3, 1e-3, False)]
 )
 def test_a_height_that_no_sensor_has_is_named(height_m: float, sigma_m: float, named: bool) -> None:
-    findings = impossible(fit_with(replace(TRUTH, height_m=height_m), sigma_m=sigma_m))
+    findings = find_impossible_body(fit_with(replace(TRUTH, height_m=height_m), sigma_m=sigma_m))
     assert [one.code for one in findings] == ["height_impossible"] * named

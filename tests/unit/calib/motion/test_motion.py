@@ -9,8 +9,16 @@ from scipy.spatial.transform import Rotation
 from ftcalib import CalibrationResult, Known, NotObservable
 from ftcalib.errors import BadDataset
 from ftcalib.model import Parameters
-from ftcalib.motion.model import SIZE, Load, SmoothFunctions, jacobian, lever_columns, turn_columns, wrench_of
-from ftcalib.motion.samples import Means, Motion, rows_of
+from ftcalib.motion.model import (
+    SIZE,
+    MovingLoad,
+    SmoothFunctions,
+    lever_columns,
+    motion_jacobian,
+    turn_columns,
+    wrench_of,
+)
+from ftcalib.motion.samples import Means, Motion, motion_rows
 from ftcalib.motion.solve import solve_motion
 from tests.moving_load import HOME, Array, Recorded, Truth, means_of, programme, record, sweep
 
@@ -29,15 +37,15 @@ def result(swept: Recorded) -> CalibrationResult:
     return solve_motion(*means_of(swept), height_m=TRUTH.height_m)
 
 
-def load_of(truth: Truth, response: object = 0.0) -> Load:
+def load_of(truth: Truth, response: object = 0.0) -> MovingLoad:
     inertia = truth.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     static = Parameters(**truth.to_dict())
-    return Load(static, 9.80665, inertia, truth.height_m, 0.0, np.zeros(11) + np.asarray(response))
+    return MovingLoad(static, 9.80665, inertia, truth.height_m, 0.0, np.zeros(11) + np.asarray(response))
 
 
 def test_rows_follow_the_model_of_point_masses() -> None:
     wrench, poses = means_of(record(QUIET, sweep(SWEEP_S), SWEEP_S, 1))
-    rows = rows_of(wrench.result(), poses.result(), QUIET.delay_s)
+    rows = motion_rows(wrench.result(), poses.result(), QUIET.delay_s)
     left = rows.wrench - wrench_of(load_of(QUIET), rows.motion)
     assert np.abs(left[:, :3]).max() < 2e-3
     assert np.abs(left[:, 3:]).max() < 2e-4
@@ -54,7 +62,7 @@ def test_jacobian_is_the_derivative() -> None:
 
     steps = 1e-6 * np.eye(SIZE)
     numeric = np.stack([(read(step) - read(-step)) / 2e-6 for step in steps], axis=2)
-    np.testing.assert_allclose(jacobian(load, motion, rate), numeric, atol=1e-6)
+    np.testing.assert_allclose(motion_jacobian(load, motion, rate), numeric, atol=1e-6)
 
 
 def test_turns_and_lever_are_derivatives() -> None:

@@ -7,7 +7,7 @@ from scipy.linalg import solve_toeplitz
 from scipy.signal import lfilter
 
 from ftcalib.model import Array
-from ftcalib.motion.model import FEWEST, ORDER, RowNoise, _filters, _of_equal_order, runs, states
+from ftcalib.motion.model import FEWEST, ORDER, RowNoise, _filters, _of_equal_order, motion_states, places_in_runs
 
 REST, SLOW, QUICK = np.zeros(100), np.linspace(0.1, 0.5, 150), np.linspace(0.6, 2.0, 150)
 
@@ -18,28 +18,28 @@ def kept(count: int) -> NDArray[np.bool_]:
 
 def test_rest_is_a_state_and_classes_of_speed_have_as_many_rows_each() -> None:
     speed = np.concatenate([REST, SLOW, QUICK])
-    assert np.bincount(states(speed, kept(400))).tolist() == [100, 100, 100, 100]
-    assert states(speed, kept(400)).tolist() == sorted(states(speed, kept(400)))
+    assert np.bincount(motion_states(speed, kept(400))).tolist() == [100, 100, 100, 100]
+    assert motion_states(speed, kept(400)).tolist() == sorted(motion_states(speed, kept(400)))
     for moving, classes in ((2 * FEWEST - 1, 1), (2 * FEWEST, 2), (3 * FEWEST - 1, 2), (3 * FEWEST, 3)):
-        state = states(np.append(REST, np.linspace(0.03, 1, moving)), kept(100 + moving))
+        state = motion_states(np.append(REST, np.linspace(0.03, 1, moving)), kept(100 + moving))
         assert np.bincount(state)[0] == 100
         assert state.max() == classes
 
 
 def test_states_that_few_kept_rows_show_are_joined_with_others() -> None:
     speed = np.concatenate([REST[:FEWEST], SLOW])
-    assert np.bincount(states(speed, kept(len(speed)))).tolist() == [FEWEST, 50, 50, 50]
+    assert np.bincount(motion_states(speed, kept(len(speed)))).tolist() == [FEWEST, 50, 50, 50]
     unkept = kept(len(speed))
     unkept[0] = False
-    assert np.bincount(states(speed, unkept)).tolist() == [FEWEST + 50, 50, 50]
+    assert np.bincount(motion_states(speed, unkept)).tolist() == [FEWEST + 50, 50, 50]
     few_moving = np.concatenate([REST, SLOW[:FEWEST]])
-    assert np.bincount(states(few_moving, kept(100 + FEWEST))).tolist() == [100, FEWEST]
-    assert not states(few_moving[:-1], kept(99 + FEWEST)).any()
+    assert np.bincount(motion_states(few_moving, kept(100 + FEWEST))).tolist() == [100, FEWEST]
+    assert not motion_states(few_moving[:-1], kept(99 + FEWEST)).any()
 
 
 def test_a_run_ends_at_a_gap() -> None:
     t = np.cumsum([5.0, 0.1, 0.14, 0.1, 0.16, 0.1, 0.4, 0.1, 0.1])
-    assert runs(t, 0.1).tolist() == [0, 1, 2, 3, 0, 1, 0, 1, 2]
+    assert places_in_runs(t, 0.1).tolist() == [0, 1, 2, 3, 0, 1, 0, 1, 2]
 
 
 def correlated(rng: np.random.Generator, n: int, *poles: float) -> Array:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 from ftcalib.motion import samples
-from ftcalib.motion.samples import MEAN_S, NARROW_S, WIDE_S, Means, row_filter, rows_of
+from ftcalib.motion.samples import MEAN_S, NARROW_S, WIDE_S, Means, motion_rows, row_filter
 
 AXIS = np.array([0.36, 0.48, 0.8])
 TURN_RAD, TURN_HZ, SWING_HZ = 3.5, 0.05, np.array([0.11, 0.07, 0.09])
@@ -67,7 +67,7 @@ def mean_speed(t: Array, row_s: float, swing_rad_s: Array | float) -> Array:
 @pytest.mark.parametrize(("row_s", "seconds", "delay_s"), [(NARROW_S, 20.0, 0.0), (WIDE_S, 75.5, 0.03)])
 def test_motion_and_wrench_are_differentiated_and_filtered_alike(row_s: float, seconds: float, delay_s: float) -> None:
     wrench, poses = streams(seconds, delay_s)  # of 75 s are more rows than are filtered at once
-    rows = rows_of(wrench, poses, delay_s, row_s)
+    rows = motion_rows(wrench, poses, delay_s, row_s)
     assert len(rows) == int((seconds - MEAN_S - delay_s - 2 * reach_s(row_s)) / row_s)
     np.testing.assert_allclose(np.diff(rows.t_s), row_s)
     np.testing.assert_allclose(rows.t_s / MEAN_S, np.round(rows.t_s / MEAN_S), atol=1e-6)
@@ -100,12 +100,12 @@ def test_a_band_passes_motion_and_stops_vibration() -> None:
 def test_rows_near_a_gap_are_left_out() -> None:
     (t, values), poses = streams(12.0)
     reach = around(WIDE_S)[-1]
-    whole = rows_of((t, values), poses).t_s
+    whole = motion_rows((t, values), poses).t_s
     for gap, missing in ((0.05, False), (0.08, True)):
         beside = (t < 6.0) | (t >= 6.0 + gap - MEAN_S / 2)
         for some in (
-            rows_of((t[beside], values[beside]), poses),
-            rows_of((t, values), (t[beside], poses[1][beside])),
+            motion_rows((t[beside], values[beside]), poses),
+            motion_rows((t, values), (t[beside], poses[1][beside])),
         ):
             if not missing:
                 np.testing.assert_array_equal(some.t_s, whole)
@@ -122,7 +122,7 @@ def test_a_gap_of_hours_costs_no_work(monkeypatch: pytest.MonkeyPatch) -> None:
     later = np.where(t < 12.0, t, t + 80_000.0)
     chunk = Mock(side_effect=samples._chunk)
     monkeypatch.setattr(samples, "_chunk", chunk)
-    rows = rows_of((later, values), (later, poses))
+    rows = motion_rows((later, values), (later, poses))
     assert 100 < len(rows) < 200
     assert chunk.call_count <= 3
 
@@ -131,26 +131,26 @@ def test_a_slow_stream_has_longer_gaps() -> None:
     (t, values), poses = streams(12.0)
     for period in (4, 8):
         slow = slice(0, None, period)
-        rows = rows_of((t, values), (t[slow], poses[1][slow]))
-        assert len(rows) == pytest.approx(len(rows_of((t, values), poses)), abs=1)
+        rows = motion_rows((t, values), (t[slow], poses[1][slow]))
+        assert len(rows) == pytest.approx(len(motion_rows((t, values), poses)), abs=1)
         R, expected = rows.motion.R_base_flange.reshape(-1, 9), rows.wrench[:, :9]
         np.testing.assert_allclose(R, expected, atol=1e-4)
 
 
 def test_the_ends_that_both_streams_have_count() -> None:
     (t, values), (t_pose, poses) = streams(12.0)
-    rows = rows_of((t[150:], values[150:]), (t_pose[:1000], poses[:1000]), 0.02)
+    rows = motion_rows((t[150:], values[150:]), (t_pose[:1000], poses[:1000]), 0.02)
     assert rows.t_s[0] == pytest.approx(1.5 + reach_s(WIDE_S))
     assert 0 <= 9.99 + 0.02 - reach_s(WIDE_S) - rows.t_s[-1] < WIDE_S + 3 * MEAN_S
-    few = rows_of((t[:195], values[:195]), (t_pose, poses))
+    few = motion_rows((t[:195], values[:195]), (t_pose, poses))
     assert len(few) == 8
     with pytest.raises(BadDataset, match=r"have 1\.9 s in common"):
-        rows_of((t[:191], values[:191]), (t_pose, poses))
+        motion_rows((t[:191], values[:191]), (t_pose, poses))
 
 
 def test_without_positions_the_acceleration_is_unknown() -> None:
     wrench, (t, poses) = streams(10.0)
-    with_positions, without = (rows_of(wrench, (t, some)) for some in (poses, poses[:, :9]))
+    with_positions, without = (motion_rows(wrench, (t, some)) for some in (poses, poses[:, :9]))
     assert not without.motion.acceleration_m_s2.any()
     np.testing.assert_array_equal(without.motion.R_base_flange, with_positions.motion.R_base_flange)
     np.testing.assert_allclose(without.speed_rad_s, mean_speed(without.t_s, WIDE_S, 0.0), atol=1e-4)

@@ -12,7 +12,7 @@ from ftcalib import Known, NotObservable
 from ftcalib.errors import BadDataset
 from ftcalib.model import Array
 from ftcalib.motion.model import HEIGHT, INERTIA, SIZE, wrench_of
-from ftcalib.motion.samples import Motion, Rows
+from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.motion.solve import (
     SLOW_RAD_S,
     _coarse_delay,
@@ -34,7 +34,7 @@ TRUTH = load_of(Truth())
 WEIGHT_N = Truth().mass_kg * 9.80665
 
 
-def shifted(rows: Rows, by: int) -> Rows:
+def shifted(rows: MotionRows, by: int) -> MotionRows:
     """The same with the wrench so many rows later."""
     return replace(rows, wrench=np.roll(rows.wrench, by, axis=0))
 
@@ -80,7 +80,7 @@ def best_of(**values: Any) -> Any:
     return SimpleNamespace(**{**usual, **values})
 
 
-def about_one_axis() -> Rows:
+def about_one_axis() -> MotionRows:
     """The tool straight down, turned by the last joint alone."""
     rows = rows_of(60, TRUTH)
     spin = Rotation.from_euler("x", 180, degrees=True) * Rotation.from_euler("z", np.linspace(0, 2, 60)[:, None])
@@ -180,7 +180,7 @@ def test_what_the_motion_does_not_show_is_named() -> None:
     assert "motion_slow" not in found(best_of(prior_share=share), motion_result(), positions=False)
 
 
-def of_range(degrees: float) -> Rows:
+def of_range(degrees: float) -> MotionRows:
     rows = rows_of(41, TRUTH)
     turns = Rotation.from_rotvec(np.outer(np.linspace(-degrees / 2, degrees / 2, 41), [0.0, 0.6, 0.8]), degrees=True)
     return replace(rows, motion=replace(rows.motion, R_base_flange=turns.as_matrix()))

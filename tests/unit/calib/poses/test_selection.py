@@ -14,9 +14,9 @@ from ftcalib.poses.selection import (
     TOOL,
     USUAL_CHANGE,
     choose_verification_poses,
-    names_of,
-    numbers_of,
     paper_set,
+    set_names,
+    set_numbers,
 )
 
 CEILING = np.array([0.0, 0.0, 1.0])
@@ -50,10 +50,10 @@ def test_e_and_f_are_on_opposite_sides_and_never_point_up(down: np.ndarray) -> N
 
 
 def test_numbers_are_those_of_the_paper_for_a_and_unique_for_all() -> None:
-    assert numbers_of("A").tolist() == list(range(1, 25))
-    every = np.concatenate([numbers_of(name) for name in EVERY_SET.split("+")])
+    assert set_numbers("A").tolist() == list(range(1, 25))
+    every = np.concatenate([set_numbers(name) for name in EVERY_SET.split("+")])
     assert len(np.unique(every)) == len(every) == 294
-    assert set(numbers_of("H")) < set(numbers_of("E"))
+    assert set(set_numbers("H")) < set(set_numbers("E"))
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_numbers_are_those_of_the_paper_for_a_and_unique_for_all() -> None:
 )
 def test_names_that_are_no_sets_are_refused(sets: str, words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        names_of(sets)
+        set_names(sets)
 
 
 def test_an_unknown_set_is_refused() -> None:

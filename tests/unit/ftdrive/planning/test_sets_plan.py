@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ftcalib.poses.selection import EVERY_SET, numbers_of, paper_set
+from ftcalib.poses.selection import EVERY_SET, paper_set, set_numbers
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
@@ -22,7 +22,7 @@ def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
     made = _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "A+E", **HOW)
     assert made.certified
     assert made.arm_rests
-    assert sorted(step.number for step in made.steps) == [*range(1, 25), *numbers_of("E").tolist()]
+    assert sorted(step.number for step in made.steps) == [*range(1, 25), *set_numbers("E").tolist()]
     words = made.in_words()
     assert "48 poses: A 24, E 24" in words
     assert "48 moves all proven clear" in words

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ftcalib.errors import BadDataset
 from ftcalib.model import angle_between
-from ftcalib.motion.samples import RATE_TOLERANCE, Timeline
+from ftcalib.motion.samples import RATE_TOLERANCE, SampleClock
 from ftdrive.stream.pairing import DelayEstimator, Pairing, PoseTrack, pair_blocks
 from ftdrivers.interfaces import ArmStates, FtSamples
 from tests.moving_load import Truth, record, sweep
@@ -26,7 +26,7 @@ def received(seconds: float, rate_Hz: float, batch: int, seed: int = 1) -> tuple
     return count, T0_NS + np.repeat(at_s * 1e9, batch).astype(np.int64)
 
 
-def stamped(line: Timeline, count: np.ndarray, t_ns: np.ndarray) -> np.ndarray:
+def stamped(line: SampleClock, count: np.ndarray, t_ns: np.ndarray) -> np.ndarray:
     """Times of measurement of samples that arrive in batches of 8."""
     parts = [slice(i, i + 8) for i in range(0, len(count), 8)]
     return np.concatenate([line.stamp(count[part].astype(float), t_ns[part]) for part in parts])
@@ -35,7 +35,7 @@ def stamped(line: Timeline, count: np.ndarray, t_ns: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("true_Hz", [1000.0, 1004.0, 998.5])
 def test_times_are_those_of_the_measurement_though_batches_come_late(true_Hz: float) -> None:
     count, t_ns = received(20.0, true_Hz, 8)
-    line = Timeline(1 / 1000.0, RATE_TOLERANCE)  # the nominal rate is a little wrong
+    line = SampleClock(1 / 1000.0, RATE_TOLERANCE)  # the nominal rate is a little wrong
     stamps = stamped(line, count, t_ns)
     error_s = (stamps - T0_NS) * 1e-9 - count / true_Hz - 2e-4
     assert np.abs(error_s[5000:]).max() < 2e-4  # the batches scatter by 2 ms
@@ -44,7 +44,7 @@ def test_times_are_those_of_the_measurement_though_batches_come_late(true_Hz: fl
 
 def test_a_shift_is_followed_slowly_and_time_never_runs_backwards() -> None:
     count, t_ns = received(8.0, 1000.0, 8)
-    line, stamps = Timeline(1e-3, RATE_TOLERANCE), []
+    line, stamps = SampleClock(1e-3, RATE_TOLERANCE), []
     for i in range(0, len(count), 8):
         line.shift_s = 0.02 if i > 4000 else 0.0
         stamps.append(line.stamp(count[i : i + 8].astype(float), t_ns[i : i + 8]))
@@ -54,7 +54,7 @@ def test_a_shift_is_followed_slowly_and_time_never_runs_backwards() -> None:
 
 
 def test_a_restarted_device_begins_a_new_line() -> None:
-    line = Timeline(1.0)
+    line = SampleClock(1.0)
     first = line.stamp(np.array([5000.0, 5000.1]), T0_NS + np.array([0, 100_000_000]))
     again = line.stamp(np.array([3.0, 3.1]), T0_NS + np.array([900_000_000, 1_000_000_000]))
     np.testing.assert_array_equal(np.concatenate([first, again]) - T0_NS, [0, 100_000_000, 900_000_000, 1_000_000_000])
@@ -204,7 +204,7 @@ def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
     # more and more, then it catches up
     late_s = np.where(count < 3500, count * 4e-5, 0.14 * np.exp(-(count - 3500) / 300))
     t_ns = T0_NS + np.maximum.accumulate((count * 1e-3 + late_s) * 1e9).astype(np.int64)
-    line = Timeline(1e-3, RATE_TOLERANCE)
+    line = SampleClock(1e-3, RATE_TOLERANCE)
     stamps = stamped(line, count, t_ns)
     assert np.abs((stamps - T0_NS) * 1e-9 - count * 1e-3).max() < 5e-3
 
@@ -212,7 +212,7 @@ def test_a_busy_computer_at_the_beginning_does_not_bend_the_line() -> None:
 def test_lost_samples_that_nothing_counts_bend_the_line_for_some_seconds_only() -> None:
     count, t_ns = received(12.0, 1000.0, 8)
     t_ns[4000:] += 30_000_000  # 30 samples are missing
-    line = Timeline(1e-3, RATE_TOLERANCE)
+    line = SampleClock(1e-3, RATE_TOLERANCE)
     stamps = stamped(line, count, t_ns)
     error_s = (stamps - T0_NS) * 1e-9 - count * 1e-3 - 2e-4 - np.where(count < 4000, 0, 0.03)
     assert np.abs(error_s[7000:]).max() < 5e-4
@@ -238,7 +238,7 @@ def test_a_polled_sensor_keeps_its_times_of_receipt() -> None:
 def test_a_clock_of_coarse_steps_is_no_restart() -> None:
     _, t_ns = received(6.0, 1000.0, 1)
     coarse_s = np.floor(np.arange(len(t_ns)) / 4) * 4e-3
-    line = Timeline()
+    line = SampleClock()
     stamps = np.concatenate([line.stamp(coarse_s[i : i + 1], t_ns[i : i + 1]) for i in range(len(t_ns))])
     assert (np.diff(stamps) >= 0).all()
     assert np.abs((stamps - T0_NS)[3000:] * 1e-9 - coarse_s[3000:] - 2e-4).max() < 5e-4
