@@ -113,14 +113,14 @@ def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
 def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
     """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
     left = result.compensate(_free_tool_wrench(truth, _RANDOM), _RANDOM)
-    return {"force_rms_N": _rms(left[:, :3]), "torque_rms_Nm": _rms(left[:, 3:])}
+    return {"force_rms_N": _rms_length(left[:, :3]), "torque_rms_Nm": _rms_length(left[:, 3:])}
 
 
 def uncompensated(truth: Mapping[str, Any]) -> tuple[float, float]:
     """Rms of what the sensor of a free tool reads, N and N·m, over the same orientations."""
     raw = _free_tool_wrench(truth, _RANDOM)
-    return _rms(raw[:, :3]), _rms(raw[:, 3:])
+    return _rms_length(raw[:, :3]), _rms_length(raw[:, 3:])
 
 
-def _rms(vectors: Array) -> float:
+def _rms_length(vectors: Array) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

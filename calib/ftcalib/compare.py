@@ -209,7 +209,7 @@ def _describe(
     mass_kg = parameters.weight_N / g_m_s2
     angle_rad = float(angle_between(parameters.R_flange_sensor, reference.R_flange_sensor))
     residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
-    return MethodResult(method, None, parameters, mass_kg, angle_rad, *_rms(residuals))
+    return MethodResult(method, None, parameters, mass_kg, angle_rad, *_rms_of_force_and_torque(residuals))
 
 
 def _add_test(
@@ -254,9 +254,9 @@ def _cross_validate(
             left_out[out] = wrench[out] - predict(without, R_base_flange[out])
     except NotObservable:
         return parameters, np.nan, np.nan
-    return parameters, *_rms(left_out)
+    return parameters, *_rms_of_force_and_torque(left_out)
 
 
-def _rms(residuals: Array) -> tuple[float, float]:
+def _rms_of_force_and_torque(residuals: Array) -> tuple[float, float]:
     force, torque = (np.sqrt(np.mean(np.sum(part**2, axis=1))) for part in (residuals[:, :3], residuals[:, 3:]))
     return float(force), float(torque)

@@ -100,7 +100,7 @@ def brief(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if hasattr(value, "shape") and hasattr(value, "tolist"):
-        return _array(value)
+        return _format_array(value)
     if is_dataclass(value) and len(text := repr(value)) > _LONGEST:
         return type(value).__name__
     if isinstance(value, Mapping | Set | Sequence) and not isinstance(value, str | bytes):
@@ -111,10 +111,10 @@ def brief(value: object) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}…"
 
 
-def _array(value: Any) -> str:
+def _format_array(value: Any) -> str:
     if value.size > 9 or value.dtype.names:
         return f"array {value.shape}"
     if value.ndim == 0:
         return f"{value.item():.6g}"
-    elements = [_array(one) if getattr(one, "ndim", 0) else f"{one:.6g}" for one in value]
+    elements = [_format_array(one) if getattr(one, "ndim", 0) else f"{one:.6g}" for one in value]
     return f"[{' '.join(elements)}]"

@@ -83,15 +83,15 @@ def _refuse_existing(path: Path) -> None:
 
 def unused_path(path: Path) -> Path:
     """Return the first of name, name-2 and so on that does not exist."""
-    return next(one for one in _numbered(path) if not one.exists())
+    return next(one for one in _numbered_paths(path) if not one.exists())
 
 
 def newest_path(path: Path) -> Path:
     """Return the last of name, name-2 and so on that exists; the name itself if it does not."""
-    return [path, *takewhile(Path.exists, _numbered(path))][-1]
+    return [path, *takewhile(Path.exists, _numbered_paths(path))][-1]
 
 
-def _numbered(path: Path) -> Iterator[Path]:
+def _numbered_paths(path: Path) -> Iterator[Path]:
     yield path
     yield from (path.with_stem(f"{path.stem}-{number}") for number in count(2))
 

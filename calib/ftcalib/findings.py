@@ -77,7 +77,7 @@ class Finding(Displayed):
             raise ValueError(f"the severity of a finding is {self.severity!r}, expected one of {', '.join(_VERDICTS)}")
         if self.code in CODES and (missing := CODES[self.code].values - self.values.keys()):
             raise ValueError(f"the finding {self.code} lacks {', '.join(sorted(missing))}")
-        object.__setattr__(self, "values", MappingProxyType(_plain(self.values)))
+        object.__setattr__(self, "values", MappingProxyType(_json_value(self.values)))
 
     @classmethod
     def of(cls, code: str, severity: Severity | None = None, /, **values: Any) -> Self:
@@ -165,12 +165,12 @@ def _write(template: str, values: Mapping[str, Any]) -> str:
         name, form = place[1], place[2] or ""
         if form[:1] == "~" and None not in (values[name], sigma := values[form[1:]]):
             form = f".{decimals(sigma)}f"
-        return _value(name, values.get(name), form)
+        return _format_value(name, values.get(name), form)
 
     return _PLACE.sub(at, template)
 
 
-def _value(name: str, value: Any, form: str) -> str:
+def _format_value(name: str, value: Any, form: str) -> str:
     if form[:1] == "?":
         present, _, absent = form[1:].partition("|")
         return absent if value is None or value in ("", [], {}) else present
@@ -187,14 +187,14 @@ def _value(name: str, value: Any, form: str) -> str:
     return f"{format(value, form)}{unit}"
 
 
-def _poses(value: Any) -> str:
+def _format_poses(value: Any) -> str:
     """Write rows, from 1, as "pose 5" or "poses 5, 7", and names such as R05 as they are."""
     rows = value if isinstance(value, list) else [value]
     listed = ", ".join(map(str, rows))
     return listed if isinstance(rows[0], str) else f"pose{'s' if len(rows) > 1 else ''} {listed}"
 
 
-def _units(pairs: Sequence[Sequence[str]]) -> str:
+def _format_units(pairs: Sequence[Sequence[str]]) -> str:
     """Write suspected units of force and torque, such as [["lbf", "N·m"]]."""
     each = (
         " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
@@ -203,24 +203,24 @@ def _units(pairs: Sequence[Sequence[str]]) -> str:
     return f" (perhaps {', or '.join(each)})" if pairs else ""
 
 
-def _axes(corrections: Sequence[Sequence[Any]]) -> str:
+def _format_axes(corrections: Sequence[Sequence[Any]]) -> str:
     """Write from which channels axes should be taken, such as [["force", ["-x", "y", "z"]]]."""
-    return ", or ".join(f"{group} {_order(channels)}" for group, channels in corrections)
+    return ", or ".join(f"{group} {_format_channels(channels)}" for group, channels in corrections)
 
 
-def _order(channels: Sequence[str]) -> str:
+def _format_channels(channels: Sequence[str]) -> str:
     if [one[-1] for one in channels] == list("xyz"):
         return f"{' and '.join(one[1:] for one in channels if len(one) > 1)} reversed"
     return f"x, y, z taken from ({', '.join(channels)})"
 
 
-def _orders(orders: Sequence[str]) -> str:
+def _format_orders(orders: Sequence[str]) -> str:
     """Write the orders of quaternions that would make gravity point down."""
     each = " or ".join(f"({order})" for order in orders)
     return f", such as quaternions {each} read inverted and in another order" if orders else ""
 
 
-def _scale(unit_N: Sequence[float] | None) -> str:
+def _format_scale(unit_N: Sequence[float] | None) -> str:
     """Write what a unit of force is by a known mass, and its sigma, both in N."""
     if not unit_N:
         return ""
@@ -231,18 +231,19 @@ def _scale(unit_N: Sequence[float] | None) -> str:
 # Forms of values that files of earlier versions lack.
 _OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
-    "poses": _poses, "units": _units, "axes": _axes, "orders": _orders, "scale": _scale,
+    "poses": _format_poses, "units": _format_units, "axes": _format_axes, "orders": _format_orders,
+    "scale": _format_scale,
 }  # fmt: skip
 
 
-def _plain(value: Any) -> Any:
+def _json_value(value: Any) -> Any:
     """Return arrays and numpy's numbers as JSON has them; None for what is not finite."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {name: _plain(one) for name, one in value.items()}
+        return {name: _json_value(one) for name, one in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
+        return [_json_value(one) for one in value]
     return None if isinstance(value, float) and not isfinite(value) else value
 
 

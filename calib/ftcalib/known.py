@@ -115,7 +115,7 @@ class Constraints:
             fixed += [keep[k] for k in range(self._tilts)]
         b_hat = unit_vector(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
-            fixed += [np.concatenate([np.zeros(3), t, np.zeros(9)]) for t in _across(b_hat)]
+            fixed += [np.concatenate([np.zeros(3), t, np.zeros(9)]) for t in _perpendicular_axes(b_hat)]
         if self.weight_N is not None and self.weight_tolerance_N == 0:
             fixed.append(np.concatenate([np.zeros(3), b_hat, np.zeros(9)]))
         if not fixed:
@@ -149,7 +149,7 @@ class Constraints:
         b = p.gravity_force_base_N
         length = max(float(np.linalg.norm(b)), 1e-300)
         if self.direction is not None and self.direction_tolerance > 0:
-            across = _across(self.direction)
+            across = _perpendicular_axes(self.direction)
             off = across @ np.cross(turn_between(self.direction, b / length), self.direction)
             add(3, across / length, -off, self.direction_tolerance)
         if self.weight_N is not None and self.weight_tolerance_N > 0:
@@ -163,7 +163,7 @@ def turn_between(a: Array, b: Array) -> Array:
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, a @ b)
     if sine < 1e-12:
-        return np.asarray(axis if a @ b > 0 else np.pi * _across(a)[0])
+        return np.asarray(axis if a @ b > 0 else np.pi * _perpendicular_axes(a)[0])
     return np.asarray(axis * (angle / sine))
 
 
@@ -173,7 +173,7 @@ def unit_vector(v: Array) -> Array:
     return v / length if length > 0 else np.array([0.0, 0.0, -1.0])
 
 
-def _across(direction: Array) -> Array:
+def _perpendicular_axes(direction: Array) -> Array:
     """Two unit vectors (2, 3) at right angles to a unit vector and to each other."""
     first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     first /= np.linalg.norm(first)

@@ -125,8 +125,8 @@ def solve(
     assumed = known if estimator is None or method in BASELINES else None
     poses = dataset.R_base_flange, dataset.wrench, wrench_cov
     fit_poses = partial(fit, *poses, t_s=dataset.t_s, drift=drift, gain_sigma=setup.gain_sigma)
-    best = _fit(fit_poses, dataset, known, assumed, g_m_s2, setup)
-    found = best if estimator is None else _estimate(method, estimator, dataset, wrench_cov, best)
+    best = _fit_ml(fit_poses, dataset, known, assumed, g_m_s2, setup)
+    found = best if estimator is None else _fit_published(method, estimator, dataset, wrench_cov, best)
     free = best if estimator else None
     if assumed is not None:
         free = _fit_freely(fit_poses, dataset)
@@ -209,7 +209,7 @@ def _require_sense(dataset: CalibrationDataset) -> None:
         )
 
 
-def _fit(
+def _fit_ml(
     fit_poses: Callable[..., Fit],
     dataset: CalibrationDataset,
     known: Known | None,
@@ -307,7 +307,7 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
         raise ValueError(f"{method} cannot use a known {' or '.join(unused)}: leave it out, or use 'ml'")
 
 
-def _estimate(
+def _fit_published(
     method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
 ) -> Estimate:
     """Apply a published method; `best` gives the degrees of freedom and the second solution."""

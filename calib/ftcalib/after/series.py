@@ -188,7 +188,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
         t, d, w = t_days[first:], change[first:], weight[first:]
         chi2 = np.sum(w * d * d, axis=0) - np.sum(w * d, axis=0) ** 2 / (np.sum(w, axis=0) + known)
         ramp, slope, slope_sigma, t0 = _onsets(t, d, w, known, from_calibration=near and first == 0)
-        step, after = _steps(d, w, known)
+        step, after = _best_steps(d, w, known)
         p_ramp, p_step = (_p_value(one, chi2, len(t) - 3) for one in (ramp, step))
         ahead = np.where(p_step < SIGNIFICANT, step - ramp, -np.inf)
         if ahead.max() <= CLEARLY:
@@ -208,7 +208,7 @@ def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: boo
         t0 = t[:1]
     later = np.searchsorted(t, t0, side="right")  # the first verification after each onset
     x = t[:, None]
-    W, Wt, Wtt, Wd, Wtd = (_from_here(part)[later] for part in (w, w * x, w * x * x, w * d, w * x * d))
+    W, Wt, Wtt, Wd, Wtd = (_reversed_sums(part)[later] for part in (w, w * x, w * x * x, w * d, w * x * d))
     z = t0[:, None]
     A, B, D = np.sum(w, axis=0) + known, Wt - z * W, Wtt - 2 * z * Wt + z * z * W
     y = A * (Wtd - z * Wd) - B * np.sum(w * d, axis=0)
@@ -221,10 +221,10 @@ def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: boo
     return chi2[best, each], slope[best, each], np.sqrt(variance[best, each]), t0[best]
 
 
-def _steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
+def _best_steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
     """Return chi2 and row (k,) of the best step, which is the first verification after it."""
-    A, B = np.sum(w, axis=0) + known, _from_here(w)[:-1]
-    y = A * _from_here(w * d)[:-1] - B * np.sum(w * d, axis=0)
+    A, B = np.sum(w, axis=0) + known, _reversed_sums(w)[:-1]
+    y = A * _reversed_sums(w * d)[:-1] - B * np.sum(w * d, axis=0)
     determinant = B * (A - B)
     usable = determinant > 1e-9 * A * A
     chi2 = np.where(usable, y * y / (A * np.where(usable, determinant, 1.0)), 0.0)
@@ -232,7 +232,7 @@ def _steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
     return chi2[best, np.arange(d.shape[1])], best
 
 
-def _from_here(rows: Array) -> Array:
+def _reversed_sums(rows: Array) -> Array:
     """Return the sums (n + 1, k) of each row and all later ones, the last of which is none."""
     return np.concatenate([np.cumsum(rows[::-1], axis=0)[::-1], np.zeros((1, rows.shape[1]))])
 
@@ -396,7 +396,7 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
     return BiasTemperature(slope[0], slope[1], n, float(T.min()), float(T.max()), error, errors, p_values)
 
 
-class _Fit(NamedTuple):
+class _TemperatureFit(NamedTuple):
     # (k, 3) coefficients of the columns.
     x: Array
     # (3,) of the last coefficient.
@@ -405,7 +405,7 @@ class _Fit(NamedTuple):
     left_out: float
 
 
-def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
+def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _TemperatureFit:
     """Fit columns X (n, k) to the components y (n, 3); each scatter and walk counts by its likelihood."""
     spread = float(np.mean(np.square(y - X @ np.linalg.lstsq(X, y, rcond=None)[0])))
     tried, likelihood = list[tuple[Array, float, Array]](), list[float]()
@@ -425,4 +425,4 @@ def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _Fit:
     mean = np.tensordot(weights, x, 1)
     scattered = np.tensordot(weights, np.square(x[:, -1] - mean[-1]), 1)
     rms = float(np.sqrt(np.mean(np.square(np.tensordot(weights, left_out, 1)))))
-    return _Fit(mean, np.sqrt(weights @ variance + scattered), rms)
+    return _TemperatureFit(mean, np.sqrt(weights @ variance + scattered), rms)

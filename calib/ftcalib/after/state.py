@@ -109,14 +109,14 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
         raise NotObservable("the calibration has no weight, so the direction of gravity is unknown: calibrate first.")
     new = old
     for _ in range(MOST_STEPS):
-        estimated, kept = _directions(new, BLOCKS[kind]), _kept(old, new, BLOCKS[kind], len(C))
+        estimated, kept = _directions(new, BLOCKS[kind]), _kept_derivative(old, new, BLOCKS[kind], len(C))
         J = calibration.jacobian(R_base_flange, new)
         K = J.reshape(6 * n, -1) @ kept
         H = J[..., :15].reshape(6 * n, 15) @ estimated
         S = noise + K @ C @ K.T
         weighted = np.linalg.solve(S, H).T
         information = weighted @ H
-        inverse = _inverse(information, kind, n)
+        inverse = _invert_information(information, kind, n)
         G = inverse @ weighted
         left = np.asarray(Compensator(new, response=response).batch(wrench, R_base_flange), dtype=np.float64).ravel()
         x = G @ left
@@ -225,7 +225,7 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
     return np.concatenate(columns, axis=1)
 
 
-def _kept(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
+def _kept_derivative(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
     """Derivative (size, size) of the new errors by the old ones, where they are kept."""
     kept = np.eye(size)
     if "mounting" in blocks:
@@ -254,7 +254,7 @@ def _move(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) ->
     return p.moved(step)
 
 
-def _inverse(information: Array, kind: str, n: int) -> Array:
+def _invert_information(information: Array, kind: str, n: int) -> Array:
     """Invert; raise `NotObservable` if the poses leave a parameter free."""
     scale = np.sqrt(np.diag(information))
     units = np.outer(scale, scale)

@@ -218,7 +218,9 @@ def expected_with_smooth_errors(
     e = (fitted.wrench[rows] - predict(p, R)).ravel()
     J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
     T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
-    smooth, between, new = (_smooth_errors(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2))
+    smooth, between, new = (
+        _smooth_error_covariance(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2)
+    )
     alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
     coefficients = calibration.shown_response.coefficients
@@ -267,7 +269,7 @@ def _components(calibration: CalibrationResult) -> Mapping[str, float]:
     return found
 
 
-def _smooth_errors(p: Parameters, R_base_flange: Array, others: Array) -> Array:
+def _smooth_error_covariance(p: Parameters, R_base_flange: Array, others: Array) -> Array:
     """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
     correlated = alike(R_base_flange, others)
     turn, turn_other = (jacobian(p, R)[..., :3] * _TURN_RAD for R in (R_base_flange, others))
@@ -394,10 +396,10 @@ def verify_calibration(
     p_value = max(p_values)
     if p_value >= false_alarms:
         return _compare(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
-    changes = [_changes(calibration, one, R_base_flange, wrench) for one in likeliest]
+    changes = [_possible_updates(calibration, one, R_base_flange, wrench) for one in likeliest]
     best = min(range(len(changes)), key=lambda k: min((cost for cost, _ in changes[k].values()), default=np.inf))
     alarm = _compare(likeliest[best], p_value, R_base_flange, wrench, passed=False)
-    return _explain(alarm, calibration, changes[best])
+    return _explain_alarm(alarm, calibration, changes[best])
 
 
 def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: Array, *, passed: bool) -> Verification:
@@ -418,7 +420,7 @@ def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: A
     )
 
 
-def _changes(
+def _possible_updates(
     calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
 ) -> dict[str, tuple[float, Update]]:
     """Find the changes that explain the readings: -2 log likelihood plus the cost of the parameters, and the update."""
@@ -441,7 +443,7 @@ def _changes(
     return found
 
 
-def _explain(
+def _explain_alarm(
     alarm: Verification, calibration: CalibrationResult, found: Mapping[str, tuple[float, Update]]
 ) -> Verification:
     """Name the change, with the update that makes up for it."""
@@ -454,7 +456,7 @@ def _explain(
         # A payload includes its weight: such a pair is no alternative, but more of the same.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
         others = tuple(dict.fromkeys(_SINGLE[kind] for kind in apart if found[kind][0] < least + _INDISTINCT))
-        reason = f"{_in_words(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
+        reason = f"{_describe_update(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
         if others:
             reason += (
                 f"; these poses do not distinguish it from a change of {' or '.join(others)}: verify with more poses"
@@ -464,7 +466,7 @@ def _explain(
         if kind in found:
             update = found[kind][1]
             what = "bias and payload" if kind == "bias and payload" else "several quantities"
-            reason = f"{what} have changed: {_in_words(calibration, update)} ({misfit})"
+            reason = f"{what} have changed: {_describe_update(calibration, update)} ({misfit})"
             return replace(alarm, change="several", update=update, reason=reason)
     worst = int(np.argmax(np.linalg.norm(alarm.residual / alarm.predicted_sigma, axis=1)))
     force_N, torque_Nm = (float(np.linalg.norm(alarm.residual[worst, c])) for c in (slice(3), slice(3, 6)))
@@ -489,7 +491,7 @@ def _turned_shift(calibration: CalibrationResult, new: Parameters, R_base_flange
     return np.asarray(columns @ columns.T)
 
 
-def _in_words(calibration: CalibrationResult, update: Update) -> str:
+def _describe_update(calibration: CalibrationResult, update: Update) -> str:
     old, new = calibration.parameters, update.parameters
     error = old.difference(new)
     words = []

@@ -183,7 +183,7 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
     def covariance_of(x: Array, *, sensor: bool = True) -> Array:
         return _covariance(known, x * g_m_s2, R_base_flange, noise, drift, orientation_sigma_rad, sensor=sensor)
 
-    fit = _fit(left, A, covariance_of, p_sensor_near_m)
+    fit = _fit_load(left, A, covariance_of, p_sensor_near_m)
     x, S, dof = fit.x, fit.S, 6 * n - 1
     # A gain that depends on the load shows in none of its poses with the tool alone, and is no contact.
     loads = LOAD * response_columns(_part(tool, x * g_m_s2), R_base_flange).reshape(6 * n, -1)
@@ -196,7 +196,9 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
     if contact is not None:
         D = np.kron(np.eye(n), contact.decode(np.eye(6)).T)
         unit = _unit_readings(u)
-        true = _fit(contact.decode(left), unit, lambda x: D @ covariance_of(x, sensor=False) @ D.T, p_sensor_near_m)
+        true = _fit_load(
+            contact.decode(left), unit, lambda x: D @ covariance_of(x, sensor=False) @ D.T, p_sensor_near_m
+        )
         by_reading = true.covariance @ true.H.T @ np.linalg.inv(true.S)
         of_sensor = _by_sensor(by_reading, float(true.x[0]), contact, unit @ true.x)
     com_m, sigma_kg = true.x[1:] / (true.x[0] or 1.0), true.sigma_kg
@@ -220,7 +222,7 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class _LoadFit:
     """Mass and mass times centre of mass (4,), with what the estimate rests on."""
 
     x: Array
@@ -239,7 +241,7 @@ class _Fit:
         return float(np.sqrt(self.covariance[0, 0]))
 
 
-def _fit(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_sensor_near_m: Array) -> _Fit:
+def _fit_load(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_sensor_near_m: Array) -> _LoadFit:
     """Estimate by generalised least squares; the covariance of the readings depends on what is held."""
     n, x = len(left), np.zeros(4)
     for step in range(4):
@@ -256,7 +258,7 @@ def _fit(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_senso
         H = A.reshape(6 * n, 4)
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)
         x = covariance @ H.T @ W @ left.ravel()
-    return _Fit(x, covariance, S, H, near, left.ravel() - H @ x)
+    return _LoadFit(x, covariance, S, H, near, left.ravel() - H @ x)
 
 
 def _unit_readings(u: Array) -> Array:
@@ -337,7 +339,7 @@ def _covariance(
     tool, response = known.parameters, known.response
     n, held = len(noise), _part(tool, x_N)
     J, part = known.jacobian(R_base_flange), jacobian(held, R_base_flange)
-    across = _across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)
+    across = _projector_across(tool.gravity_force_base_N) * (x_N[0] / tool.weight_N)
     J[..., :3] += part[..., :3]
     J[..., 3:6] += part[..., 3:6] @ across
     turn = J[..., :3]
@@ -360,7 +362,7 @@ def _part(tool: Parameters, x_N: Array) -> Parameters:
     return Parameters(tool.R_flange_sensor, x_N[0] * tool.down, np.zeros(3), com_m, np.zeros(3))
 
 
-def _across(v: Array) -> Array:
+def _projector_across(v: Array) -> Array:
     return np.asarray(np.eye(3) - np.outer(v, v) / (v @ v))
 
 
@@ -377,7 +379,7 @@ def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Update:
     com_m = (W_N * tool.p_sensor_com_m + x_N[1:]) / total_N
     C = empty.joint_covariance
     T, B = np.eye(len(C)), np.zeros((len(C), 4))
-    T[3:6, 3:6] += x_N[0] / W_N * _across(along)
+    T[3:6, 3:6] += x_N[0] / W_N * _projector_across(along)
     T[9:12, 9:12] *= W_N / total_N
     T[9:12, 3:6] = np.outer(tool.p_sensor_com_m - com_m, along) / total_N
     B[3:6, 0], B[9:12, 0], B[9:12, 1:] = along, -com_m / total_N, np.eye(3) / total_N

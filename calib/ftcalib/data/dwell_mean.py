@@ -175,7 +175,7 @@ def is_quiet(wrench: Array, level: Array) -> bool:
 def restless_channels(wrench: Array, level: Array) -> NDArray[np.bool_]:
     """Find the channels (6,) of a dwell that scatter more than twice as much as the untouched sensor."""
     wrench = _require_samples(wrench)
-    flicker = _step(wrench) / 2  # between two neighbouring values, normal for a sensor with coarse steps
+    flicker = _resolution(wrench) / 2  # between two neighbouring values, normal for a sensor with coarse steps
     return np.asarray(wrench.std(axis=0, ddof=1) > RESTLESS * level + flicker + ROUNDING * np.abs(wrench).max(axis=0))
 
 
@@ -212,12 +212,12 @@ def _quantisation_variance(wrench: Array, std: Array) -> Array:
     Gaussian noise of sigma dithers the error away by exp(-4 pi² sigma² / q²) (Widrow, Kollar, Quantization Noise,
     2008); the rounded samples may add q²/4 to the observed variance.
     """
-    step = _step(wrench)
+    step = _resolution(wrench)
     dither = np.maximum(std**2 - step**2 / 4, 0) / np.where(step > 0, step, 1.0) ** 2
     return np.asarray(step**2 / 12 * np.exp(-4 * np.pi**2 * dither))
 
 
-def _step(wrench: Array) -> Array:
+def _resolution(wrench: Array) -> Array:
     """Smallest difference (6,) between two values of a channel, 0 for a constant channel."""
     gaps = np.diff(np.sort(wrench, axis=0), axis=0)
     step = np.where(gaps > ROUNDING * np.abs(wrench).max(axis=0), gaps, np.inf).min(axis=0)

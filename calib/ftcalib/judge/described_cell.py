@@ -75,14 +75,14 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
     if lean.is_other_mounting:
         undeclared = "mounting_undeclared" if lean.deg > HANGING_DEG else "gravity_tilted"
         code = "gravity_off_mounting" if is_declared else undeclared
-        values = {} if code == "gravity_tilted" else {"orders": _other_orders(along, setup.up, written)}
+        values = {} if code == "gravity_tilted" else {"orders": _quaternion_orders(along, setup.up, written)}
         findings.append(Finding.of(code, off_deg=lean.deg, direction=along, **values))
     elif is_declared and lean.is_significant:
         findings.append(Finding.of("base_leans", lean_deg=lean.deg, sigma_deg=lean.sigma_deg, side=lean.side))
     return findings
 
 
-def _other_orders(gravity_direction_base: Array, up: Array, written: str) -> list[str]:
+def _quaternion_orders(gravity_direction_base: Array, up: Array, written: str) -> list[str]:
     """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
 
     Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.
@@ -185,10 +185,10 @@ def payload(
 
 def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
     """Compare mass and centre of mass with the described tool."""
-    return [*_mass(parameters, covariance, setup, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
+    return [*_mass_findings(parameters, covariance, setup, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
 
 
-def _mass(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
+def _mass_findings(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
     weight_N, tool_kg = parameters.weight_N, setup.tool_mass_kg
     load_kg = weight_N / g_m_s2
     sigma_kg = parameters.weight_sigma_N(covariance) / g_m_s2

@@ -98,7 +98,7 @@ class _Rough:
             float(np.sqrt(np.mean(np.sum(part**2, axis=1)))) + ROUNDING * float(np.abs(read).max())
             for part, read in zip(np.hsplit(e, 2), np.hsplit(wrench, 2), strict=True)
         )
-        weight_N, spread_Nm = p.weight_N, _length(torque_Nm.std(axis=0))
+        weight_N, spread_Nm = p.weight_N, _vector_norm(torque_Nm.std(axis=0))
         shares = force_rms_N / (weight_N or 1.0), torque_rms_Nm / (spread_Nm or 1.0)
         return cls(p, gravity[:, :3], force_rms_N, torque_rms_Nm, shares)
 
@@ -113,7 +113,7 @@ class _Rough:
         Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
         """
         p = self.parameters
-        cosine = -float(p.gravity_force_base_N @ up_in_base) / (p.weight_N * _length(up_in_base) or 1.0)
+        cosine = -float(p.gravity_force_base_N @ up_in_base) / (p.weight_N * _vector_norm(up_in_base) or 1.0)
         implausible = (1 - cosine) / 2 + 0.5 * (not self.outwards)
         return float(np.log(self.force_rms_N * self.torque_rms_Nm)) + IMPLAUSIBLE * implausible
 
@@ -159,7 +159,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
         if code in READINGS:
             values = {**values, "also": [*also]}
         return [Finding.of(code, **values, residual_N=as_read.force_rms_N, corrected_N=corrected_N)]
-    return _axes(as_read, wrench[:, 3:], up)
+    return _axis_faults(as_read, wrench[:, 3:], up)
 
 
 def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
@@ -191,7 +191,7 @@ def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
     """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
     rough = _Rough.of(R_base_flange, wrench)
     p = rough.parameters
-    return units.too_light(p.weight_N, _length(p.p_sensor_com_m), rough.force_rms_N)
+    return units.too_light(p.weight_N, _vector_norm(p.p_sensor_com_m), rough.force_rms_N)
 
 
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
@@ -211,7 +211,7 @@ _Reading = tuple[str, Mapping[str, Any], Array, Array]
 def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
     """Yield each mistake as code and values, with the data as they are without it, the simplest first."""
     if written.lower() in EULER_ORDERS:
-        yield from _other_orders(R, wrench, written)
+        yield from _euler_orders(R, wrench, written)
     if written != "joints":
         yield "orientations_inverted", {}, np.swapaxes(R, 1, 2), wrench
     yield "columns_swapped", {}, R, np.roll(wrench, 3, axis=1)
@@ -222,7 +222,7 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
             yield "quaternion_order", {"order": order, "read_as": read_as}, exchanged, wrench
     # Matrices are often computed from angles.
     for read_as in EULER_ORDERS if written in ("", "matrix") else []:
-        yield from _other_orders(R, wrench, read_as)
+        yield from _euler_orders(R, wrench, read_as)
     in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
     yield "wrench_in_base", {}, R, in_flange
     for side, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
@@ -231,7 +231,7 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
     yield "zeroed_each_pose", {}, np.diff(R, axis=0), wrench[1:]
 
 
-def _other_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
+def _euler_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
     """Turn by the same angles about x, y and z in the other orders.
 
     The middle angle of the true order lies within 90°, as programs write it. Beyond, the other solution is meant.
@@ -249,7 +249,7 @@ def _other_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
             yield "euler_angles", values, Rotation.from_euler(order, turns).as_matrix(), wrench
 
 
-def _axes(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
+def _axis_faults(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
     fits = []
     for Q in SPECIAL_R_flange_base:
         P, T0 = com_and_torque_bias(as_read.weight_sensor_N, torque_Nm @ Q.T)
@@ -274,7 +274,7 @@ def channels(Q: Array) -> Sequence[str]:
     return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
 
 
-def _length(vector: Array) -> float:
+def _vector_norm(vector: Array) -> float:
     return float(np.linalg.norm(vector))
 
 
@@ -333,7 +333,7 @@ def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], cha
         expected = predict(rough_fit(R_base_flange, wrench), R_base_flange[rows])
         return bool((np.ptp(expected, axis=0) > UNEQUAL * np.ptp(wrench, axis=0))[channels].any())
     F_b = rough_fit(R_base_flange[others], wrench[others]).gravity_force_base_N
-    design = np.column_stack([F_b @ R_base_flange / (_length(F_b) or 1.0), np.ones(len(wrench))])
+    design = np.column_stack([F_b @ R_base_flange / (_vector_norm(F_b) or 1.0), np.ones(len(wrench))])
     X = design[others]
     slope = np.linalg.lstsq(X, wrench[others])[0]
     squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)

@@ -243,7 +243,7 @@ def _ambiguities(
         normal = normals[2]
         angle = np.rad2deg(np.arccos(np.clip(abs(float(gravity_flange.mean(axis=0) @ normal)), 0, 1)))
         return (
-            f"all poses keep {_axis(normal)} at one angle to gravity, {angle:.0f}° from the vertical",
+            f"all poses keep {_axis_name(normal)} at one angle to gravity, {angle:.0f}° from the vertical",
             "reversed gravity with the sensor turned by 180° about that axis explains them as well",
         )
     mean = gravity_flange.mean(axis=0)
@@ -294,7 +294,9 @@ def _one_axis(
             inseparable.append("the centre of mass cannot be separated from the torque bias")
     else:
         last = abs(axis_flange[2]) > _ALIGNED
-        reason = "only the last joint was turned" if last else f"the tool was turned about {_axis(axis_flange)} only"
+        reason = (
+            "only the last joint was turned" if last else f"the tool was turned about {_axis_name(axis_flange)} only"
+        )
         if unseen(-axis_flange, np.cross(axis_base, b), zero, zero, zero):
             inseparable.append(
                 "the sensor angle about that axis cannot be separated from the direction of gravity about it"
@@ -304,14 +306,14 @@ def _one_axis(
     return (reason, *inseparable)
 
 
-def _axis(axis_flange: Array) -> str:
+def _axis_name(axis_flange: Array) -> str:
     k = int(np.abs(axis_flange).argmax())
     if abs(axis_flange[k]) > _ALIGNED:
         return ("the flange's x axis", "the flange's y axis", "the tool's own axis (flange z)")[k]
     return f"the axis ({', '.join(f'{x:.2f}' for x in axis_flange)}) of the flange"
 
 
-def _motions() -> list[tuple[str, Array]]:
+def _suggested_motions() -> list[tuple[str, Array]]:
     """Motions of the tool from the last pose, as phrases and rotations, simple ones first."""
 
     def turn(axis: str, angle_deg: int) -> tuple[str, Array]:
@@ -330,7 +332,7 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
 
     Each step takes the first motion that does so, or else the most informative one.
     """
-    poses, words, motions = R_base_flange, list[str](), _motions()
+    poses, words, motions = R_base_flange, list[str](), _suggested_motions()
     while len(words) < MOST_ADVISED:
         trials = [np.concatenate([poses, [R_base_flange[-1] @ turn]]) for _, turn in motions]
         best = next((k for k, trial in enumerate(trials) if _is_sound(trial, parameters)), None)

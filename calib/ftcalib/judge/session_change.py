@@ -147,7 +147,7 @@ def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np
         return rows, []
     R, wrench = found.R_base_flange[rows], found.wrench[rows]
     used = found.residuals[rows][found.weights[rows] > 0.5]
-    likeliest = _likeliest_change(found.on_average, R, wrench, np.repeat(_rms(used), 3))
+    likeliest = _likeliest_change(found.on_average, R, wrench, np.repeat(_axis_rms(used), 3))
     stepped = bias_steps(R, wrench) if steps else None
     return rows, [one for one in (likeliest, stepped) if one is not None]
 
@@ -164,7 +164,7 @@ def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Ar
     residuals = wrench - predict(parameters, R)
     # A steady drift is no change: what remains beside it is the measure.
     without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
-    small = bool((_rms(residuals) < SMALL * _rms(gravity_wrench(parameters, R))).all())
+    small = bool((_axis_rms(residuals) < SMALL * _axis_rms(gravity_wrench(parameters, R))).all())
     changes = []
     for pure, groups in _groups(n):
         if pure is None:
@@ -179,7 +179,7 @@ def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Ar
     return change if change.misfit < CLEARLY * without else None
 
 
-def _rms(wrench: Array) -> Array:
+def _axis_rms(wrench: Array) -> Array:
     """Root mean square (2,) of the axes of force and of torque."""
     return np.asarray(np.sqrt(np.mean(wrench.reshape(-1, 2, 3) ** 2, axis=(0, 2))))
 
@@ -188,7 +188,7 @@ def _linear_misfits(
     p: Parameters, R: Array, J: Array, residuals: Array, scale: Array, groups: NDArray[np.bool_]
 ) -> dict[str, Array]:
     """Squared misfit (k,) of each kind of change of each group (k, n), together with the columns J (n, 6, m)."""
-    C, J, r = _columns(p, R) / scale[:, None], J / scale[:, None], residuals / scale
+    C, J, r = _change_columns(p, R) / scale[:, None], J / scale[:, None], residuals / scale
     J = J / column_scale(summed_products(J, J))
     inverse = np.linalg.pinv(summed_products(J, J), rcond=1e-12, hermitian=True)
     r = r - J @ (inverse @ np.tensordot(J, r, ([0, 1], [0, 1])))
@@ -295,7 +295,7 @@ def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
 
 def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:
     """Squared misfit (k,) of each kind of change of each group (k, n), in closed form; the parameters stay."""
-    y, g, C = (wrench - p.bias) / scale, gravity_wrench(p, R) / scale, _columns(p, R) / scale[:, None]
+    y, g, C = (wrench - p.bias) / scale, gravity_wrench(p, R) / scale, _change_columns(p, R) / scale[:, None]
     d, count = y - g, groups.sum(axis=1)[:, None, None]
 
     def sums(of_rows: Array) -> Array:
@@ -332,13 +332,13 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         mean_y, mean_g = (x[rows].mean(axis=0) if code == "sensor_changed" else np.zeros(6) for x in (y, g))
         parts = (((x[rows] - mean) / scale).reshape(-1, 2, 3) for x, mean in ((y, mean_y), (g, mean_g)))
         turn = nearest_rotation(np.einsum("npi,npj->ij", *parts))
-        step = mean_y - _turn(mean_g, turn)[0]
-        undone[rows] = _turn(y[rows] - step, turn.T)
+        step = mean_y - _turn_wrench(mean_g, turn)[0]
+        undone[rows] = _turn_wrench(y[rows] - step, turn.T)
     if code == "sensor_and_tool_turned":
         turn = nearest_rotation(y[rows, :3].T @ g[rows, :3])
         undone[rows, :3] = y[rows, :3] @ turn
         undone[rows, 3:] += np.cross(p.p_sensor_com_m, undone[rows, :3] - y[rows, :3])
-    C = _columns(p, R)[..., own] * rows[:, None, None]
+    C = _change_columns(p, R)[..., own] * rows[:, None, None]
     misfit, x = _least(np.concatenate([C, jacobian(p, R), response_columns(p, R)], axis=2), undone - g, scale)
     moved = np.zeros(16)
     moved[own] = x[: len(own)]
@@ -347,10 +347,10 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
     step += moved[BIAS]
     values = {
         "turn_deg": float(np.degrees(angle_between(turn, np.eye(3)))),
-        "force_N": _length(step[:3]),
-        "torque_Nm": _length(step[3:]),
+        "force_N": _norm(step[:3]),
+        "torque_Nm": _norm(step[3:]),
         "change_N": float(moved[9] if rows[-1] else -moved[9]),
-        "shift_mm": 1e3 * _length(moved[COM]),
+        "shift_mm": 1e3 * _norm(moved[COM]),
     }
     # BIC: kinds of change with more numbers must explain more.
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
@@ -368,7 +368,7 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
     return max(left, 0.0) / max(r.size - len(x), 1), x / unit
 
 
-def _columns(p: Parameters, R: Array) -> Array:
+def _change_columns(p: Parameters, R: Array) -> Array:
     """(n, 6, 16) derivative by a turn of the sensor, both biases, weight, centre of mass, and a turn with the tool."""
     J, g = jacobian(p, R), gravity_wrench(p, R)
     turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
@@ -376,11 +376,11 @@ def _columns(p: Parameters, R: Array) -> Array:
     return np.concatenate([turn, bias, (J[..., 3:6] @ p.down)[..., None], J[..., 9:12], J[..., :3]], axis=2)
 
 
-def _turn(wrench: Array, turn: Array) -> Array:
+def _turn_wrench(wrench: Array, turn: Array) -> Array:
     return np.asarray((wrench.reshape(-1, 2, 3) @ turn.T).reshape(-1, 6))
 
 
-def _length(vector: Array) -> float:
+def _norm(vector: Array) -> float:
     return float(np.linalg.norm(vector))
 
 

@@ -200,7 +200,7 @@ def statistics(case: Case) -> Quality:
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
     # The others predict one of a few poses badly, as the covariance of the prediction says.
     few = used.sum() < RECOMMENDED_POSES and np.mean(residual_sigma[used] ** 2) < _AS_PREDICTED
-    largest_share, errors, left_out_rms = _errors(found, used, few=bool(few))
+    largest_share, errors, left_out_rms = _error_findings(found, used, few=bool(few))
     unresolved = np.abs(found.residuals) <= finest
     accidents = _few_rejected(used) or bool(unresolved.all())
     measured = bool(np.isfinite(found.measured_chi2))
@@ -243,19 +243,19 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
         *broken,
         *causes,
         *(replace(one, severity="limit") if gain and one.severity == "reject" else one for one in quality.errors),
-        *_weight(found, case.setup),
+        *_weight_findings(found, case.setup),
         *_second_solution(found, free),
-        *_units(case, quality, contradicted),
+        *_unit_findings(case, quality, contradicted),
         *gain,
         *([] if needs_no_misfit else _misfit_of_known_values(found, free)),
-        *_noise(found, quality),
-        *_poses(found, quality, case.setup),
-        *_structure(found),
-        *_drift(found, quality.ahead, is_cause=verdict_of([*broken, *causes]) == "good"),
-        *_response(found.response, found.parameters.weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
+        *_noise_findings(found, quality),
+        *_pose_findings(found, quality, case.setup),
+        *_structure_findings(found),
+        *_drift_findings(found, quality.ahead, is_cause=verdict_of([*broken, *causes]) == "good"),
+        *_response_findings(found.response, found.parameters.weight_N, assumed=len(quality.used) < FEW_POSES_FOR_GAIN),
         *([] if cable is None else cable[:1]),
     ]
-    findings += _cell(case, quality, findings, mistaken=mistaken, broken=bool(broken))
+    findings += _cell_findings(case, quality, findings, mistaken=mistaken, broken=bool(broken))
     # Data with a mistake, or that fit as they are, say nothing against a known value.
     if not (broken or mistaken or quality.fits_measured_noise):
         harmless = verdict_of(findings) == "good"
@@ -279,12 +279,12 @@ def judge_motion(case: Case) -> Quality:
         *broken,
         *mistakes,
         *quality.errors,
-        *_weight(found, case.setup),
+        *_weight_findings(found, case.setup),
         *_second_solution(found),
-        *_units(case, quality),
+        *_unit_findings(case, quality),
         *_structure_in_motion(found),
     ]
-    findings += _cell(case, quality, findings, mistaken=bool(mistakes), broken=bool(broken))
+    findings += _cell_findings(case, quality, findings, mistaken=bool(mistakes), broken=bool(broken))
     return replace(quality, findings=tuple(folded(ordered(findings))))
 
 
@@ -346,21 +346,23 @@ def _broken(found: Estimate, quality: Quality, causes: Sequence[Finding]) -> lis
     return broken_channels(found.wrench, found.R_base_flange)
 
 
-def _units(case: Case, quality: Quality, contradicted: Sequence[Finding] = ()) -> list[Finding]:
+def _unit_findings(case: Case, quality: Quality, contradicted: Sequence[Finding] = ()) -> list[Finding]:
     """Name a bias, a weight or a centre of mass that only another unit would make usual."""
     found, setup = case.found, case.setup
     # A contradicted mass has it already.
     by_mass = any(one.code == "known_mass" for one in contradicted)
     return units.implausible(
         found.parameters,
-        _rms(found.residuals[quality.used, :3]),
+        _rms_norm(found.residuals[quality.used, :3]),
         described=bool(setup.cylinders_m),
         any_bias=setup.sensor_has_arbitrary_zero,
         unit_N=None if by_mass else described_cell.force_unit_of_cell(case.freest, case.known, setup, case.g_m_s2),
     )
 
 
-def _cell(case: Case, quality: Quality, findings: Sequence[Finding], *, mistaken: bool, broken: bool) -> list[Finding]:
+def _cell_findings(
+    case: Case, quality: Quality, findings: Sequence[Finding], *, mistaken: bool, broken: bool
+) -> list[Finding]:
     """Compare with the described cell, as far as the findings leave estimates that mean something."""
     parameters, covariance, setup = case.found.parameters, case.found.covariance, case.setup
     load_kg, named = parameters.weight_N / case.g_m_s2, list[Finding]()
@@ -397,7 +399,7 @@ def _unrelated_torques(found: Estimate, quality: Quality) -> list[Finding]:
     """Recognise torques that do not follow the weight while the forces do: another sensor's, or of one without load."""
     torque_Nm, codes = found.wrench[quality.used, 3:], {one.code: one.severity for one in quality.errors}
     is_near = float(np.linalg.norm(found.parameters.p_sensor_com_m)) < units.NEAREST_COM_M
-    left = _rms(found.residuals[quality.used, 3:]) / (_rms(torque_Nm - torque_Nm.mean(axis=0)) or 1.0)
+    left = _rms_norm(found.residuals[quality.used, 3:]) / (_rms_norm(torque_Nm - torque_Nm.mean(axis=0)) or 1.0)
     if left < UNRELATED or "force_error" in codes or not (is_near or codes.get("torque_error") == "reject"):
         return []
     return [Finding.of("torques_unrelated", "limit", left_percent=100 * min(left, 1.0))]
@@ -431,7 +433,9 @@ def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[t
     return tuple((PARAMETER_NAMES[i], PARAMETER_NAMES[j], value) for value, i, j in strong)
 
 
-def _errors(found: Estimate, used: NDArray[np.bool_], *, few: bool) -> tuple[float, list[Finding], tuple[float, float]]:
+def _error_findings(
+    found: Estimate, used: NDArray[np.bool_], *, few: bool
+) -> tuple[float, list[Finding], tuple[float, float]]:
     """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
 
     Of residual, cross-validated and expected error the first is named that exceeds the highest limit. With a `few`
@@ -443,7 +447,7 @@ def _errors(found: Estimate, used: NDArray[np.bool_], *, few: bool) -> tuple[flo
     largest, findings = 0.0, []
     for k, scale, unit in ((0, weight_N, "N"), (1, weight_N * lever_m, "Nm")):
         errors = (
-            ("residuals", _rms(found.residuals[used, 3 * k : 3 * k + 3])),
+            ("residuals", _rms_norm(found.residuals[used, 3 * k : 3 * k + 3])),
             ("cross-validation", left_out[k]),
             ("uncertainty over all orientations", expected[k]),
         )
@@ -462,7 +466,7 @@ def _errors(found: Estimate, used: NDArray[np.bool_], *, few: bool) -> tuple[flo
     return largest, findings, left_out
 
 
-def _weight(found: Estimate, setup: Setup) -> list[Finding]:
+def _weight_findings(found: Estimate, setup: Setup) -> list[Finding]:
     weight_N, sigma_N = found.parameters.weight_N, found.parameters.weight_sigma_N(found.covariance)
     if weight_N > SIGNIFICANT_SIGMAS * sigma_N:
         return []
@@ -489,9 +493,9 @@ def _gain_not_modelled(found: Estimate, free: Estimate | None) -> list[Finding]:
     if isinstance(found, Fit) or free is None or free.response is None:
         return []
     used = free.weights > 0.5
-    ours, best = (_rms(one.residuals[used, :3]) for one in (found, free))
+    ours, best = (_rms_norm(one.residuals[used, :3]) for one in (found, free))
     reads = free.response.wrench(free.parameters, found.R_base_flange[used])[:, :3]
-    if best > COLLAPSE * ours or _rms(reads - reads.mean(axis=0)) < ours / 2:
+    if best > COLLAPSE * ours or _rms_norm(reads - reads.mean(axis=0)) < ours / 2:
         return []
     gain_percent = 100 * float(np.abs(free.response.force_gain).max())
     return [Finding.of("gain_not_modelled", gain_percent=gain_percent, residual_N=ours, free_N=best)]
@@ -504,12 +508,12 @@ def _misfit_of_known_values(found: Estimate, free: Estimate | None) -> list[Find
     return [
         Finding.of(f"known_values_misfit_{kind}", **{f"residual_{unit}": ours, f"free_{unit}": best})
         for kind, unit, columns in (("force", "N", slice(0, 3)), ("torque", "Nm", slice(3, 6)))
-        for ours, best in [(_rms(found.residuals[used, columns]), _rms(free.residuals[used, columns]))]
+        for ours, best in [(_rms_norm(found.residuals[used, columns]), _rms_norm(free.residuals[used, columns]))]
         if best < COLLAPSE * ours
     ][:1]
 
 
-def _noise(found: Estimate, quality: Quality) -> list[Finding]:
+def _noise_findings(found: Estimate, quality: Quality) -> list[Finding]:
     if quality.chi2_p is None or quality.noise_factor is None:
         return [Finding.of("noise_unknown")]
     if quality.fits_measured_noise:
@@ -525,7 +529,7 @@ def _left_out_rms(found: Estimate, poses: NDArray[np.bool_]) -> tuple[float, flo
     checked = poses & ~_is_unchecked(found)
     if not checked.any():
         return found.predicted_error()
-    return _rms(found.left_out_residuals[checked, :3]), _rms(found.left_out_residuals[checked, 3:])
+    return _rms_norm(found.left_out_residuals[checked, :3]), _rms_norm(found.left_out_residuals[checked, 3:])
 
 
 def _is_unchecked(found: Estimate) -> NDArray[np.bool_]:
@@ -537,22 +541,29 @@ def _lever_m(found: Estimate) -> float:
     return max(USUAL_LEVER_M, float(np.linalg.norm(found.parameters.p_sensor_com_m)))
 
 
-def _structure(found: Estimate) -> list[Finding]:
+def _structure_findings(found: Estimate) -> list[Finding]:
     """Name errors that are smooth over the poses; large ones limit the result."""
-    load, pull = _sizes(found, "load_force", "load_torque"), _sizes(found, "cable_force_N", "cable_torque_Nm")
+    load, pull = (
+        _component_sizes(found, "load_force", "load_torque"),
+        _component_sizes(found, "cable_force_N", "cable_torque_Nm"),
+    )
     limits = (STRUCTURED_SHARE,) * 3
-    return _smooth_errors(found, load, pull, _sizes(found, "kinematics_rad"), limits, least=SMOOTH_SHARE)
+    return _smooth_error_findings(
+        found, load, pull, _component_sizes(found, "kinematics_rad"), limits, least=SMOOTH_SHARE
+    )
 
 
 def _structure_in_motion(found: Estimate) -> list[Finding]:
     """Name smooth errors that limit the result: at lower limits, because averaging leaves little noise."""
-    load, pull = (_sizes(found, f"{name}_N", f"{name}_Nm") for name in ("load", "cable"))
+    load, pull = (_component_sizes(found, f"{name}_N", f"{name}_Nm") for name in ("load", "cable"))
     # An orientation of the arm may be off by as much as calibrated arms are.
     limits = SMOOTH_SHARE, SMOOTH_SHARE, np.array([SMOOTH_SHARE, CALIBRATED_ARM_RAD])
-    return _smooth_errors(found, load / _per_N(found), pull, _sizes(found, "yielding_rad", "rotation_rad"), limits)
+    return _smooth_error_findings(
+        found, load / _per_N(found), pull, _component_sizes(found, "yielding_rad", "rotation_rad"), limits
+    )
 
 
-def _sizes(found: Estimate, *names: str) -> Array:
+def _component_sizes(found: Estimate, *names: str) -> Array:
     return np.array([found.components.get(name, 0.0) for name in names])
 
 
@@ -561,7 +572,7 @@ def _per_N(found: Estimate) -> Array:
     return np.array([1.0, _lever_m(found)]) * found.parameters.weight_N
 
 
-def _smooth_errors(
+def _smooth_error_findings(
     found: Estimate, load: Array, pull: Array, turn_rad: Array, limits: Sequence[Array | float], least: float = np.inf
 ) -> list[Finding]:
     """Name a load that is not linear (2,), a cable (2,) and turns (k,) beyond limits; note others from `least`."""
@@ -577,7 +588,7 @@ def _smooth_errors(
     return findings
 
 
-def _poses(found: Estimate, quality: Quality, setup: Setup) -> list[Finding]:
+def _pose_findings(found: Estimate, quality: Quality, setup: Setup) -> list[Finding]:
     """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
     findings, n = list[Finding](), int(quality.used.sum())
     if not quality.used.all():
@@ -603,7 +614,7 @@ def _poses(found: Estimate, quality: Quality, setup: Setup) -> list[Finding]:
     return findings
 
 
-def _drift(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> list[Finding]:
+def _drift_findings(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> list[Finding]:
     """Name a significant drift, 0 where it is not.
 
     It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.
@@ -622,7 +633,7 @@ def _drift(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> list[Findin
     return [Finding.of("drift", "limit" if matters else "note", **values)]
 
 
-def _response(response: Response | None, weight_N: float, *, assumed: bool = False) -> list[Finding]:
+def _response_findings(response: Response | None, weight_N: float, *, assumed: bool = False) -> list[Finding]:
     """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
     if response is None:
         return []
@@ -649,6 +660,6 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
-def _rms(vectors: Array) -> float:
+def _rms_norm(vectors: Array) -> float:
     """Root mean square of the lengths of (n, 3) vectors."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))

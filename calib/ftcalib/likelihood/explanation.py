@@ -431,7 +431,7 @@ def _explanations(session: SessionData, minima: list[Minimum], weights: Array) -
 def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
     """Improve parameters, variances, components and rejected poses in turn, until nothing changes."""
     always, candidates, structure = session.always(), session.candidates(), session.structure()
-    best, problem, at = session.once((p, kept.tobytes()), lambda: _begin(session, p, kept))
+    best, problem, at = session.once((p, kept.tobytes()), lambda: _first_explanation(session, p, kept))
     tried = not structure
     for _ in range(ROUNDS):
         chosen, kept = set(at.components), problem.kept
@@ -449,7 +449,7 @@ def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
     return best
 
 
-def _begin(session: SessionData, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
+def _first_explanation(session: SessionData, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
     """Choose the first components."""
     problem, always = session.linearise(p, kept), session.always()
     at = select_explanation(problem, always, session.start(problem, always), session.candidates(), len(always))

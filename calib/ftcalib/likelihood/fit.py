@@ -352,7 +352,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
     drifts = session.drift == "linear" or any(c.kind in ("walk", "slope") for c in e.components)
     found = dict(zip(e.components, e.theta, strict=True))
     Z = session.constraints.free(best.parameters)
-    given_noise = covariance = np.asarray(Z @ _inverse(Z.T @ best.information @ Z) @ Z.T)
+    given_noise = covariance = np.asarray(Z @ _regular_inverse(Z.T @ best.information @ Z) @ Z.T)
     response = lag = None
     measured_chi2 = static_chi2 if session.measured else float("nan")
     if found or drifts or session.n <= STRUCTURED_POSES:
@@ -397,7 +397,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
         second_basin_chi2=_second_basin_chi2([one.chi2 for one in minima], components, dof),
         weights=weights,
         components=components,
-        drift=_drift(session, best, noise, given_noise, found) if drifts else None,
+        drift=_drift_result(session, best, noise, given_noise, found) if drifts else None,
         noise=noise,
         order=session.order,
         R_base_flange=session.given[0],
@@ -427,7 +427,7 @@ def _deviation(session: SessionData, c: Component, variance: float) -> float:
     return float(np.sqrt(variance + least))
 
 
-def _drift(
+def _drift_result(
     session: SessionData, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]
 ) -> DriftResult:
     """Best linear prediction of the bias at every pose, and the error of its change."""
@@ -460,7 +460,7 @@ def _drift(
     return DriftResult(change, np.sqrt(np.maximum(np.diag(cov), 0.0)), bias)
 
 
-def _inverse(information: Array) -> Array:
+def _regular_inverse(information: Array) -> Array:
     scale = column_scale(information)
     value, vector = np.linalg.eigh(information / np.outer(scale, scale))
     value = np.maximum(value, 1e-14 * value[-1])

@@ -70,7 +70,10 @@ def force_cost_from_gram(gram: Array, *, with_bias: bool = True) -> Array:
     A bias of k times the weight costs `2 * log10(k)` of the 16 digits; `force_cost` sees the data and loses none.
     """
     force_square, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
-    Q = np.kron(force_square, np.eye(3)) - gravity_force.T @ _inverse(gravity_square, gram[12, 12]) @ gravity_force
+    Q = (
+        np.kron(force_square, np.eye(3))
+        - gravity_force.T @ _pseudo_inverse(gravity_square, gram[12, 12]) @ gravity_force
+    )
     return (Q + Q.T) / 2
 
 
@@ -93,7 +96,7 @@ def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array,
     """
     gram, offset = _centred_gram(R_base_flange, force_N, weights, with_bias=True)
     _, gravity_square, gravity_force = _blocks(gram, with_bias=True)
-    gravity_N = _inverse(gravity_square, gram[12, 12]) @ gravity_force @ R_sensor_flange.ravel()
+    gravity_N = _pseudo_inverse(gravity_square, gram[12, 12]) @ gravity_force @ R_sensor_flange.ravel()
     mean = gram[12, :12] / gram[12, 12] + offset[:12]
     return gravity_N, mean[:3] - R_sensor_flange @ mean[3:].reshape(3, 3).T @ gravity_N
 
@@ -228,7 +231,7 @@ def _blocks(gram: Array, *, with_bias: bool) -> tuple[Array, Array, Array]:
     return g[:3, :3], gravity_square, gravity_force
 
 
-def _inverse(square: Array, total_weight: float) -> Array:
+def _pseudo_inverse(square: Array, total_weight: float) -> Array:
     """Pseudo-inverse; per unit of weight, an eigenvalue is the squared spread of the poses in radians."""
     value, vector = np.linalg.eigh(square)
     keep = value > 1e-12 * total_weight
@@ -283,7 +286,7 @@ def _super_fibonacci(n: int) -> Array:
     return np.stack((inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)), axis=1)
 
 
-def _local(quartic: Array, q: Array) -> tuple[Array, Array, Array, Array]:
+def _local_quadratic(quartic: Array, q: Array) -> tuple[Array, Array, Array, Array]:
     """Cost (k,), gradient (k, 3) and Hessian (k, 3, 3) on the sphere, and the tangent basis (k, 4, 3) they refer to."""
     form = (_squares(q) @ quartic).reshape(-1, 4, 4)
     basis = (q @ _TANGENT).reshape(-1, 4, 3)
@@ -298,7 +301,7 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
     """Follow every start down: quaternions (k, 4), costs (k,) and smallest curvatures (k,) of the minima reached."""
     longest, kick, floor, arrived = 0.35, 0.05, 1e-7, 1e-8  # lengths on the sphere: half the angles of rotation
     reach = np.full(len(q), longest)
-    here: tuple[Array, ...] = (q, *_local(quartic, q))
+    here: tuple[Array, ...] = (q, *_local_quadratic(quartic, q))
     ends: list[tuple[Array, ...]] = []
     for _ in range(100):
         q, cost, gradient, hessian, basis = here
@@ -310,7 +313,7 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
         step *= np.minimum(1, reach / np.maximum(length, arrived))[:, None]
         ahead = q + (basis @ (axes @ step[:, :, None]))[:, :, 0]
         ahead /= np.linalg.norm(ahead, axis=1)[:, None]
-        there: tuple[Array, ...] = (ahead, *_local(quartic, ahead))
+        there: tuple[Array, ...] = (ahead, *_local_quadratic(quartic, ahead))
         down = there[1] <= cost + 1e-14
         reach = np.where(down, np.minimum(2 * reach, longest), reach / 4)
         done = (length < arrived) | (reach < arrived)
@@ -390,12 +393,12 @@ def _lower_bound(form: Array, enough: float, tolerance: float) -> float:
         d_slack = -(d_dual @ _ROWS).reshape(10, 10)
         change = primal @ d_slack @ inverse
         d_primal = target - (change + change.T) / 2
-        primal = primal + _step(primal_values, primal_axes, d_primal, margin) * d_primal
-        dual = dual + _step(slack_values, slack_axes, d_slack, margin) * d_dual
+        primal = primal + _feasible_step(primal_values, primal_axes, d_primal, margin) * d_primal
+        dual = dual + _feasible_step(slack_values, slack_axes, d_slack, margin) * d_dual
     return best
 
 
-def _step(values: Array, axes: Array, direction: Array, margin: float) -> float:
+def _feasible_step(values: Array, axes: Array, direction: Array, margin: float) -> float:
     """Length of the step that keeps a positive definite matrix so; at most 1."""
     root = axes / np.sqrt(values)
     lowest = float(np.linalg.eigvalsh(root.T @ direction @ root)[0])

@@ -64,7 +64,7 @@ class Noise:
         if time is not None and walk is not None and walk.any():
             self._walking = np.flatnonzero(walk)
             self._s = walk[self._walking]
-            self._add_walk(_steps(time)[1:], origin)
+            self._add_walk(_intervals(time)[1:], origin)
         if time is not None and slope is not None and slope.any():
             sloping = np.flatnonzero(slope)
             self.add_effects(centre(time, origin)[:, None, None] * np.eye(6)[:, sloping], slope[sloping] ** 2)
@@ -166,10 +166,10 @@ class Noise:
 
     def walk_trace(self, time: Array, channels: NDArray[np.intp], low_rank: tuple[Array, Array]) -> float:
         """Give tr(K (V^-1 + Q core Q')) for walks of these channels, where none walks yet."""
-        trace = float(np.cumsum(_steps(time)) @ self.W[:, channels, channels].sum(axis=1))
+        trace = float(np.cumsum(_intervals(time)) @ self.W[:, channels, channels].sum(axis=1))
         for Q, core in (*self._low_rank, low_rank):
-            F = _following(Q[:, channels])
-            trace += float(np.vdot(core, summed_products(_steps(time)[:, None, None] * F, F)))
+            F = _suffix_sums(Q[:, channels])
+            trace += float(np.vdot(core, summed_products(_intervals(time)[:, None, None] * F, F)))
         return trace
 
 
@@ -215,17 +215,17 @@ def pose_times(t_s: Array) -> Array:
     return np.asarray((t_s - t_s.min()) * (n - 1) / np.ptp(t_s))
 
 
-def _steps(time: Array) -> Array:
+def _intervals(time: Array) -> Array:
     """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
     return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
 
 
 def walk_times(time: Array, X: Array) -> Array:
     """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
-    return np.asarray(np.cumsum(_steps(time)[:, None] * _following(X), axis=0))
+    return np.asarray(np.cumsum(_intervals(time)[:, None] * _suffix_sums(X), axis=0))
 
 
-def _following(X: Array) -> Array:
+def _suffix_sums(X: Array) -> Array:
     return np.asarray(np.cumsum(X[::-1], axis=0)[::-1])
 
 

@@ -33,7 +33,7 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
     away = (R_base_flange - middle).reshape(-1, 9) / np.sqrt(3)
     turn = jacobian(parameters, R_base_flange)[..., :3]
     return {
-        "load": _load_columns(parameters, R_base_flange),
+        "load": _load_response_columns(parameters, R_base_flange),
         "cable": _of_each_channel(away),
         "kinematics": np.einsum("nck,ni->ncki", turn, away).reshape(len(turn), 6, -1),
     }
@@ -124,7 +124,7 @@ def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> A
     return np.asarray(force_N * np.array([1.0, np.sqrt(2 / 3) * np.linalg.norm(parameters.p_sensor_com_m)]))
 
 
-def _load_columns(parameters: Parameters, R_base_flange: Array) -> Array:
+def _load_response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
     """Give the derivative (n, 6, 54) of the wrench by the coefficients of a response that is not linear.
 
     Each channel has squares and products of the axes of the force, and their third powers. In the torque they count at

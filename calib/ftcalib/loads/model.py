@@ -243,9 +243,9 @@ class LoadModel:
             J[..., at["rotation"]] = N @ np.concatenate([skew(w[:, :3]), skew(w[:, 3:])], axis=1)
             J[..., at["matrix"]] = np.einsum("ab,nj->nabj", np.eye(6), read).reshape(n, 6, 36)
             J[..., at["tilt"]] = N @ np.concatenate([M * du, skew(s) @ du], axis=1)
-            J[..., at["tool"]] = N @ _load_columns(tool_kg, tool_m, u)
+            J[..., at["tool"]] = N @ _known_load_columns(tool_kg, tool_m, u)
             if run.load is not None:
-                J[..., at[f"load {load}"]] = N @ _load_columns(own[0], place, u)
+                J[..., at[f"load {load}"]] = N @ _known_load_columns(own[0], place, u)
                 J[..., at["origin"]] = J[..., at[f"load {load}"]][..., 1:]
                 load += 1
             J[..., at[f"bias {k}"]] = np.eye(6)
@@ -261,7 +261,7 @@ class LoadModel:
             result.J.append(J.reshape(6 * n, -1))
             result.readout.append(N)
             result.residual.append((run.dataset.wrench - model).ravel())
-            result.noise.append(_noise(off, read, self.prior.lever_m))
+            result.noise.append(_disturbance_covariances(off, read, self.prior.lever_m))
             result.wrench.append(read)
         return result
 
@@ -341,14 +341,14 @@ def sizes_of(logarithms: Array) -> dict[str, float]:
     return {name: usual * float(np.exp(y)) for (name, (usual, _)), y in zip(SIZES.items(), logarithms, strict=True)}
 
 
-def _load_columns(mass_kg: float, place_m: Array, u: Array) -> Array:
+def _known_load_columns(mass_kg: float, place_m: Array, u: Array) -> Array:
     """Return the derivative (n, 6, 4) of the wrench by mass and place of a load, flange axes."""
     columns = np.zeros((len(u), 6, 4))
     columns[:, :3, 0], columns[:, 3:, 0], columns[:, 3:, 1:] = u, cross(place_m, u), -mass_kg * skew(u)
     return columns
 
 
-def _noise(by_orientation: Array, wrench: Array, lever_m: float) -> dict[str, Array]:
+def _disturbance_covariances(by_orientation: Array, wrench: Array, lever_m: float) -> dict[str, Array]:
     n, F = len(wrench), ranges(lever_m)
     before = np.minimum.outer(np.arange(n), np.arange(n)).astype(float)
     turned = np.zeros((n, 6, n, 6))

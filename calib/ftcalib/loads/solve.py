@@ -118,8 +118,8 @@ def solve_loads(
     if not any(run.load is not None for run in runs):
         raise NotObservable("no run has a known load: calibrate with --load, and give that run too.")
     setup, prior = setup or Setup(), prior or SensorMatrix.usual()
-    begun = _begin(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
-    model, logarithms, at = _fit(copy(begun), np.zeros(len(SIZES)))
+    begun = _first_model(runs, prior, p_flange_sensor_m, g_m_s2, setup, tool_mass_kg)
+    model, logarithms, at = _fit_loads(copy(begun), np.zeros(len(SIZES)))
     while len(model.mistakes) < _MOST_MISTAKES and (better := _best_mistake(begun, model, logarithms, at)):
         model, logarithms, at = better
     swapped = _swapped(begun, at)
@@ -139,7 +139,9 @@ def solve_loads(
     tool = model.at["tool"].start
     return LoadSolution(
         sensor=sensor,
-        findings=ordered([swapped] if swapped else [*_findings(model, at), *_limits(model, prior, remaining)]),
+        findings=ordered(
+            [swapped] if swapped else [*_load_findings(model, at), *_accuracy_limits(model, prior, remaining)]
+        ),
         loads=tuple(_loads(model, at, p_flange_sensor_m)),
         sizes=sizes,
         remaining=tuple(remaining),
@@ -148,7 +150,7 @@ def solve_loads(
     )
 
 
-def _begin(
+def _first_model(
     runs: Sequence[LoadRun],
     prior: SensorMatrix,
     p_flange_sensor_m: Array | None,
@@ -173,7 +175,7 @@ def _begin(
     )
 
 
-def _fit(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
+def _fit_loads(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
     """Move a model to its best values, with the sizes of the disturbances that explain them best."""
     for _ in range(2):
         for _ in range(3):
@@ -195,7 +197,7 @@ def _best_sizes(model: LoadModel, logarithms: Array) -> Array:
     return np.asarray(found.x)
 
 
-def _candidates(model: LoadModel, run: int) -> list[Mistake]:
+def _mistake_candidates(model: LoadModel, run: int) -> list[Mistake]:
     n, load = len(model.runs[run].dataset), model.runs[run].load
     found = [Mistake("touched", run, pose) for pose in range(n)]
     found += [Mistake("bumped", run, pose) for pose in range(2, n - 1)]
@@ -219,7 +221,7 @@ def _best_mistake(
     gains: dict[Mistake, float] = {}
     for run, (flat, readout) in enumerate(zip(linear.J, linear.readout, strict=True)):
         J = flat.reshape(-1, 6, flat.shape[1])
-        for one in _candidates(model, run):
+        for one in _mistake_candidates(model, run):
             columns = model.columns_of(one, run, J, readout).reshape(6 * len(J), -1)
             gains[one] = plain.gain_of(run, columns, one.sigma) - _penalty(one, model)
     weighed = Mistake("tool_mass")
@@ -228,7 +230,7 @@ def _best_mistake(
         gains[weighed] = plain.cost - other.evaluate(usual, other.linear()).cost
     for mistake in model.mistakes:
         begun = begun.with_mistake(mistake)
-    tried = [_fit(begun.with_mistake(one), usual) for one in _most(gains)]
+    tried = [_fit_loads(begun.with_mistake(one), usual) for one in _most(gains)]
     if not tried:
         return None
     best = min(tried, key=lambda one: one[2].cost + _penalty(one[0].mistakes[-1], model))
@@ -289,7 +291,7 @@ def _loads(model: LoadModel, at: Evaluated, p_flange_sensor_m: Array | None) -> 
     return rows
 
 
-def _findings(model: LoadModel, at: Evaluated) -> list[Finding]:
+def _load_findings(model: LoadModel, at: Evaluated) -> list[Finding]:
     findings = []
     touched: dict[int, list[int]] = {}
     for i, mistake in enumerate(model.mistakes):
@@ -346,13 +348,13 @@ def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
         exchanged.x, exchanged.expected = begun.x.copy(), begun.expected.copy()
         for values in (exchanged.x, exchanged.expected):
             values[one][1:], values[other][1:] = values[other][1:].copy(), values[one][1:].copy()
-        if at.cost - _fit(exchanged, np.zeros(len(SIZES)))[2].cost > _CLEARLY:
+        if at.cost - _fit_loads(exchanged, np.zeros(len(SIZES)))[2].cost > _CLEARLY:
             names = [load.name for row in (a, b) if (load := begun.runs[row].load) is not None]
             return Finding.of("loads_swapped", first=names[0], second=names[1])
     return None
 
 
-def _limits(model: LoadModel, prior: SensorMatrix, remaining: list[float]) -> list[Finding]:
+def _accuracy_limits(model: LoadModel, prior: SensorMatrix, remaining: list[float]) -> list[Finding]:
     """Judge whether the sensor is linear, and its change."""
     if model.mistakes:
         return []

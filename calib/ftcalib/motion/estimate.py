@@ -166,7 +166,7 @@ def fit_motion(
         order = ORDER if stage > _ALWAYS else 0
         noise = RowNoise.of(r[kept], absorbed, state[kept], places_in_runs(rows.t_s[kept], rows.row_s), order=order)
         if guarded:
-            local = _local(r / noise.scale[state], kept)[:, None]
+            local = _local_noise(r / noise.scale[state], kept)[:, None]
             place = places_in_runs(rows.t_s[kept], rows.row_s)
             noise = RowNoise.of((r / local)[kept], absorbed / local[kept][:, :, None], state[kept], place, bursts=True)
             noise, state = replace(noise, scale=noise.scale[state] * local), np.arange(len(rows))
@@ -371,7 +371,7 @@ def _untouched(residuals: Array) -> NDArray[np.bool_]:
     return _without_contact(np.where((force_N > TOUCH_N) | (torque_Nm > TOUCH_NM), np.inf, 0.0))
 
 
-def _local(unit: Array, kept: NDArray[np.bool_]) -> Array:
+def _local_noise(unit: Array, kept: NDArray[np.bool_]) -> Array:
     """Noise (n,) of each row in that of its state, from the residuals around it."""
     square, window = np.where(kept, np.mean(unit**2, axis=1), 0.0), np.ones(_AROUND)
     rows = np.convolve(kept.astype(np.float64), window, "same")

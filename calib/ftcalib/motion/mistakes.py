@@ -146,7 +146,7 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
         Of the positions.
     """
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
-    if (free.residual > _SUSPECT * change).any() and (named := _axes(rows, change)):
+    if (free.residual > _SUSPECT * change).any() and (named := _axis_findings(rows, change)):
         return named, unchanged
     # A wrench without weight gives any scale.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
@@ -168,7 +168,7 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
     weight_N = load.static.weight_N
     parted = {"weight_N": weight_N, "mass_kg": found * weight_N / load.g_m_s2} if found > 1 else None
     if off > _SIGMAS and share > _CLOCK_SHARE:
-        scale, unit = found, _unit(found, spread_m)
+        scale, unit = found, _position_unit(found, spread_m)
         turning = 1.0 if unit else found
         if unit:
             findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m))
@@ -197,7 +197,7 @@ def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping
     return [*compensated, Finding.of("clock_rate", severity, **of_clock)]
 
 
-def _axes(rows: MotionRows, change: Array) -> list[Finding]:
+def _axis_findings(rows: MotionRows, change: Array) -> list[Finding]:
     """Find wrong axes and orientations in what is left of the motion at rest, whose axes do not count."""
     static, left = static_wrench(rows)
     if (left > _EXPLAINED * change).any():
@@ -218,7 +218,7 @@ def static_wrench(rows: MotionRows) -> tuple[Array, Array]:
     return np.asarray(rows.wrench - X[:, 10:] @ linear[10:]), np.asarray(left)
 
 
-def _unit(scale: float, spread_m: float) -> str | None:
+def _position_unit(scale: float, spread_m: float) -> str | None:
     near = (unit for unit, size in _LENGTHS_M.items() if abs(scale / size - 1) < _SAME_UNIT)
     return next(near, None) if spread_m > _FARTHEST_M else None
 

@@ -176,7 +176,7 @@ def _line_below(points: Sequence[tuple[float, float]]) -> tuple[float, float, fl
     """
     hull: list[tuple[float, float]] = []
     for point in sorted(points):
-        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
+        while len(hull) > 1 and _cross_of_edges(hull[-2], hull[-1], point) <= 0:
             hull.pop()
         hull.append(point)
     middle = sum(x for x, _ in points) / len(points)
@@ -185,7 +185,7 @@ def _line_below(points: Sequence[tuple[float, float]]) -> tuple[float, float, fl
     return x_0, y_0, (y_1 - y_0) / (x_1 - x_0) if x_1 > x_0 else 0.0
 
 
-def _turn(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
+def _cross_of_edges(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> float:
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
@@ -392,7 +392,7 @@ def interpolation_error_rad(poses: tuple[Array, Array]) -> float:
         return 0.0
     t_s, quaternion = poses[0], _continuous_quaternions(poses[1])
     inner = slice(1, len(t_s) - 1 - len(t_s) % 2, 2)
-    between = _at(t_s[inner], t_s[::2], quaternion[::2])[0]
+    between = _interpolate(t_s[inner], t_s[::2], quaternion[::2])[0]
     between /= np.linalg.norm(between, axis=1, keepdims=True)
     return float(np.sqrt(np.mean(np.sum((2 * _conjugate_product(between, quaternion[inner])) ** 2, axis=1))))
 
@@ -418,7 +418,7 @@ def _chunk(
     """Return time, wrench, columns of the motion, their rates and the speed, where no gap is near."""
     rate_kernel = np.convolve(kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
     kernel = np.pad(kernel, 1)
-    (y, whole_w), (pose, whole_p) = _at(grid, *wrench), _at(grid, *poses)
+    (y, whole_w), (pose, whole_p) = _interpolate(grid, *wrench), _interpolate(grid, *poses)
     fits = np.einsum("nkw,wd->dnk", sliding_window_view(pose, len(_FIT), axis=0), _FIT)
     length = np.linalg.norm(fits[0, :, :4], axis=1, keepdims=True)
     unit = fits[:, :, :4] / length
@@ -443,7 +443,7 @@ def _chunk(
     )
 
 
-def _at(grid: Array, t_s: Array, values: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _interpolate(grid: Array, t_s: Array, values: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Interpolate with the cubic through the four samples around each time, and say where no gap is."""
     steps = np.diff(t_s)
     after = np.clip(np.searchsorted(t_s, grid), 1, len(t_s) - 1)

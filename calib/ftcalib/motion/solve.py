@@ -147,8 +147,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
 
     delay_s += rough_delay(_select_rows(undo(rows), limit_rad_s), known, g_m_s2)
     fit_rows = partial(fit_motion, known=known, g_m_s2=g_m_s2, prior=prior, guarded=guarded, zeroed_s=zeroed_s)
-    rows, used, best = _fit(rows_at, delay_s, partial(fit_rows, point_mass=point_mass or not positions))
-    _require_determined(used, best, known)
+    rows, used, best = _fit_at_delay(rows_at, delay_s, partial(fit_rows, point_mass=point_mass or not positions))
+    _require_enough_motion(used, best, known)
     start_s, delay_s = data[0][0][0], rows.delay_s + best.load.delay_s
     motion = MotionResult(
         best.load.inertia_kg_m2,
@@ -161,7 +161,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     causes = _causes(mistakes, ratio, zeroed_s - start_s, coarse_rad, len(used) / len(rows))
     places = np.flatnonzero(best.kept)
     places = places[:: max(1, len(places) // JUDGED_ROWS)]
-    quality = judge_motion(Case(_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
+    quality = judge_motion(Case(_static_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
     findings = list(causes)
     if verdict_of(causes) != "rejected":  # which would explain all others
         # A point of another device puts the load behind the sensor, as reversed torques do.
@@ -169,8 +169,8 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         findings += [one for one in quality.findings if not (elsewhere and one.code == "torques_reversed")]
         aligned = used if abs(best.load.delay_s) <= LINEAR_S else rows_at(delay_s)[1]
         findings += _other_wrench(used, aligned, best, quality.findings)
-        findings += _narrow(used, best, explained=verdict_of(findings) == "rejected")
-        findings += _findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
+        findings += _narrow_findings(used, best, explained=verdict_of(findings) == "rejected")
+        findings += _motion_findings(rows, used, best, motion, height_m, positions=positions, is_coarse=is_coarse)
         findings += find_impossible_body(best) if positions and verdict_of(findings) != "rejected" else []
     findings += [] if earlier is None else [Finding.of("earlier_cell", parent=earlier.id)]
     responding = best.components.keys() & {"gain", "cross_talk"} or (prior is not None and prior.has_response)
@@ -180,7 +180,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         parameters=best.load.static,
         mean_bias=best.mean_bias,
         covariance=best.covariance[:15, :15],
-        hidden_covariance=_hidden_covariance(used, best, setup.orientation_rad),
+        hidden_covariance=_unseen_covariance(used, best, setup.orientation_rad),
         residuals=best.residuals[places],
         chi2=best.chi2,
         dof=max(6 * int(best.kept.sum()) - 23, 1),
@@ -203,7 +203,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     )
 
 
-def _fit(
+def _fit_at_delay(
     rows_at: Callable[[float], tuple[MotionRows, MotionRows]],
     delay_s: float,
     fit_rows: Callable[[MotionRows], MotionFit],
@@ -297,7 +297,7 @@ def _select_rows(rows: MotionRows, limit_rad_s: float) -> MotionRows:
     return slow
 
 
-def _require_determined(rows: MotionRows, best: MotionFit, known: Known | None) -> None:
+def _require_enough_motion(rows: MotionRows, best: MotionFit, known: Known | None) -> None:
     """Raise `NotObservable` where the error over all orientations would be as large as the weight."""
     mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
     weight_N = best.load.static.weight_N
@@ -312,7 +312,7 @@ def _require_determined(rows: MotionRows, best: MotionFit, known: Known | None) 
         raise NotObservable(f"{reason}; turn wrist 1 and wrist 2 by 60° or more, wrist 3 too, and record again.")
 
 
-def _hidden_covariance(rows: MotionRows, best: MotionFit, orientation_rad: float) -> Array:
+def _unseen_covariance(rows: MotionRows, best: MotionFit, orientation_rad: float) -> Array:
     """Return the covariance (15, 15) from errors that the motion does not show: of arm, mounts and a soft tool.
 
     The smooth errors of the arm are a part of the fit.
@@ -344,14 +344,14 @@ def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
     return static_wrench(rows)[0]
 
 
-def _estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
+def _static_estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
     """Return the estimates, with what they leave of the rows at these places.
 
     Each row has the mean residual of a second around it: what is quicker is vibration.
     """
     # An odd number of rows, so that the mean lies on its row.
     second = round(1 / rows.row_s / 2) * 2 + 1
-    best = replace(best, residuals=_means(best, second), sigma=best.sigma / np.sqrt(second))
+    best = replace(best, residuals=_residual_means(best, second), sigma=best.sigma / np.sqrt(second))
     return Estimate.independent(
         best.load.static,
         best.covariance[:15, :15],
@@ -365,14 +365,14 @@ def _estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]) -> Es
     )
 
 
-def _means(best: MotionFit, rows: int) -> Array:
+def _residual_means(best: MotionFit, rows: int) -> Array:
     """Residuals (n, 6) averaged over the kept ones of so many rows."""
     window, weight = np.ones(rows), best.kept.astype(np.float64)
     count = np.maximum(np.convolve(weight, window, "same"), 1.0)
     return np.stack([np.convolve(column * weight, window, "same") / count for column in best.residuals.T], axis=1)
 
 
-def _findings(
+def _motion_findings(
     rows: MotionRows,
     used: MotionRows,
     best: MotionFit,
@@ -406,7 +406,7 @@ def _findings(
     weak = best.prior_share > MEASURED
     weak[:6] &= sigma[INERTIA] > 0
     if positions and weak.any():
-        findings.append(Finding.of("motion_slow", names=_list_names([NAMES[k] for k in np.flatnonzero(weak)])))
+        findings.append(Finding.of("motion_slow", names=_format_names([NAMES[k] for k in np.flatnonzero(weak)])))
     return findings
 
 
@@ -460,7 +460,7 @@ def _other_wrench(used: MotionRows, aligned: MotionRows, best: MotionFit, named:
     return []
 
 
-def _narrow(rows: MotionRows, best: MotionFit, *, explained: bool) -> list[Finding]:
+def _narrow_findings(rows: MotionRows, best: MotionFit, *, explained: bool) -> list[Finding]:
     """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
     error = Calibrated(best.load.static, best.covariance[:15, :15]).predicted_error()[0]
@@ -502,7 +502,7 @@ def _contacts(rows: MotionRows, best: MotionFit, first_s: float) -> tuple[Mappin
     return tuple(contacts)
 
 
-def _list_names(names: Sequence[str]) -> str:
+def _format_names(names: Sequence[str]) -> str:
     axes = [name.partition(".")[2] for name in names if name.startswith("inertia")]
     rest = [name.removesuffix("_m").removesuffix("_s") for name in names if not name.startswith("inertia")]
     return ", ".join(([f"the inertia ({', '.join(axes)})"] if axes else []) + [f"the {name}" for name in rest])

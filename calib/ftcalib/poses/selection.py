@@ -125,7 +125,7 @@ def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
         total = np.zeros(len(R_candidates))
         for candidates, M in terms:  # trace(M C), with C the covariance of some parameters
             rows = candidates[chosen].reshape(-1, len(M))
-            total += _gains(candidates, _inverse(PRIOR * np.eye(len(M)) + rows.T @ rows), M)
+            total += _gains(candidates, _covariance_from(PRIOR * np.eye(len(M)) + rows.T @ rows), M)
         return total
 
     pinned: list[int] = []
@@ -167,7 +167,7 @@ def next_pose(R_done: Array, R_candidates: Array, guess: Guess) -> Indices:
     if not len(R_candidates):
         raise ValueError("no candidates for the next pose: pass orientations that the arm can reach")
     done = whitened_jacobian(R_done, guess).reshape(-1, 15)
-    C = _inverse(PRIOR * np.eye(15) + done.T @ done)
+    C = _covariance_from(PRIOR * np.eye(15) + done.T @ done)
     weight = sum(prediction_weights(special(range(1, 25)), guess), np.zeros((15, 15)))
     worth = _gains(whitened_jacobian(R_candidates, guess), C, weight)
     if len(R_done) >= FEWEST - 1:
@@ -218,7 +218,7 @@ def _gains(rows: Array, C: Array, M: Array) -> Array:
     return np.asarray(np.einsum("mrp,mrp->m", solved, JC @ M))
 
 
-def _inverse(information: Array) -> Array:
+def _covariance_from(information: Array) -> Array:
     return np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 

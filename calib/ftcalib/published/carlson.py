@@ -363,10 +363,12 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     BadDataset
         The forces point against the given gravity.
     """
-    eq, down = _equations(R_base_flange, force_N, gravity_direction_base, 3, bias=bias, method="the relaxation")
+    eq, down = _equations_of_known_direction(
+        R_base_flange, force_N, gravity_direction_base, 3, bias=bias, method="the relaxation"
+    )
     a = eq.A @ down
     R_sensor_flange = nearest_rotation(np.asarray(np.linalg.lstsq(eq.f, a)[0], dtype=np.float64))
-    return eq.fit(R_sensor_flange.T, _weight(eq.f, a, R_sensor_flange) * down)
+    return eq.fit(R_sensor_flange.T, _least_squares_factor(eq.f, a, R_sensor_flange) * down)
 
 
 def cayley(
@@ -398,7 +400,7 @@ def cayley(
         The forces point against the given gravity.
     """
     gravity = np.array(gravity_force_base_N, dtype=np.float64)
-    eq, _ = _equations(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
+    eq, _ = _equations_of_known_direction(R_base_flange, force_N, gravity, 2, bias=bias, method="the Cayley transform")
     a = eq.A @ gravity
     turns = [np.diag(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))]
     candidates = [cayley_rotation(eq.f, a @ turn) @ turn for turn in turns[: 1 if as_published else 4]]
@@ -451,7 +453,7 @@ def centre_of_mass(R_base_flange: Array, torque_Nm: Array, fit: ForceFit) -> Arr
     return np.asarray(r @ fit.R_flange_sensor, dtype=np.float64)
 
 
-def _equations(
+def _equations_of_known_direction(
     R_base_flange: Array, force_N: Array, gravity_base: Array, needed: int, *, bias: bool, method: str
 ) -> tuple[ForceEquations, Array]:
     """Form the equations of a method that needs as many poses and gravity axes; also the unit vector (3,) of gravity.
@@ -474,7 +476,7 @@ def _equations(
     return eq, down
 
 
-def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
+def _least_squares_factor(f: Array, a: Array, R_sensor_flange: Array) -> float:
     """Least-squares factor from R a_i to f_i."""
     return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
 
@@ -482,7 +484,7 @@ def _weight(f: Array, a: Array, R_sensor_flange: Array) -> float:
 def _require_pull_downwards(f: Array, a: Array) -> None:
     """Reject forces f (n, 3) that a rotation explains much better with gravity -a than with a (n, 3)."""
     residual, reversed_residual = (
-        float(np.sum((f - _weight(f, side, R) * side @ R.T) ** 2))
+        float(np.sum((f - _least_squares_factor(f, side, R) * side @ R.T) ** 2))
         for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))
     )
     if residual > 4 * reversed_residual + 1e-12 * float(np.sum(f**2)):

@@ -21,7 +21,7 @@ from ftcalib.judge.verdict import (
     _errors,
     _noise,
     _poses,
-    _response,
+    _response_findings,
     _second_solution,
     _some_runs,
     _structure,
@@ -636,7 +636,7 @@ def test_a_response_is_named_from_three_sigmas_on(sigmas: float, certain: bool) 
     covariance = np.diag(np.append(np.zeros(15), np.full(SIZE, 0.001**2)))
     for k, code in ((2, "axes_mixed"), (8, "cross_talk")):
         coefficients = sigmas * 0.001 * np.eye(SIZE)[k]
-        (finding,) = _response(Response(coefficients, covariance), WEIGHT_N)
+        (finding,) = _response_findings(Response(coefficients, covariance), WEIGHT_N)
         assert finding.code == (code if certain else "response_small")
 
 
@@ -668,7 +668,7 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
 @pytest.mark.parametrize(("share", "codes"), [(1e-3, ["gain_x", "gain_y"]), (1e-6, ["response_small"])])
 def test_a_gain_that_no_sensor_resolves_is_not_named(share: float, codes: list[str]) -> None:
     covariance = 1e-16 * np.eye(15 + SIZE)
-    found = _response(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
+    found = _response_findings(Response(share * np.eye(SIZE)[0], covariance), 20.0)  # a sensor resolves 1 mN
     assert [one.code for one in found] == codes
 
 

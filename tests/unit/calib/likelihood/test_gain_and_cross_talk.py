@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, Parameters, Setup, solve
-from ftcalib.judge.verdict import _response
+from ftcalib.judge.verdict import _response_findings
 from ftcalib.known import RANGE_LEVER_M, Constraints, Known
 from ftcalib.likelihood.explanation import with_walks_instead
 from ftcalib.likelihood.fit import Fit, fit
@@ -238,15 +238,15 @@ def test_forces_are_not_called_noisy_where_the_torques_alone_determine_the_mount
 def test_it_is_found_along_the_axes_that_have_it() -> None:
     coefficients = np.zeros(11)
     coefficients[1], coefficients[2] = -0.03, 0.01  # low along x and y, high along z; x mixed with y
-    found = {one.code: one.values for one in _response(Response(coefficients, 1e-8 * np.eye(26)), 10.0)}
+    found = {one.code: one.values for one in _response_findings(Response(coefficients, 1e-8 * np.eye(26)), 10.0)}
     assert found.keys() == {"gain_x", "gain_y", "gain_z", "axes_mixed"}
     assert found["gain_y"]["gain_percent"] == pytest.approx(-1.22, abs=0.01)
     assert found["gain_z"]["gain_percent"] == pytest.approx(2.45, abs=0.01)
     assert found["axes_mixed"]["axes"] == "x and y"
     coefficients[:], coefficients[5] = 0.0, 0.1
-    (finding,) = _response(Response(coefficients, 1e-8 * np.eye(26)), 10.0)
+    (finding,) = _response_findings(Response(coefficients, 1e-8 * np.eye(26)), 10.0)
     assert (finding.code, finding.values["torque_mNm"]) == ("cross_talk", pytest.approx(5))
-    (finding,) = _response(Response(coefficients, np.eye(26)), 10.0)
+    (finding,) = _response_findings(Response(coefficients, np.eye(26)), 10.0)
     assert finding.code == "response_small"
 
 

@@ -22,7 +22,7 @@ from ftcalib.motion.solve import (
     _narrow,
     _other_wrench,
     _range_deg,
-    _require_determined,
+    _require_enough_motion,
     _select_rows,
 )
 from ftcalib.result import MotionResult
@@ -94,14 +94,14 @@ def test_a_fit_with_large_errors_is_not_determined(place: int, sigma: float, eno
     covariance = np.zeros((SIZE, SIZE))
     covariance[place, place] = (sigma if place < 3 else sigma * WEIGHT_N) ** 2
     best = best_of(covariance=covariance)
-    _require_determined(about_one_axis(), best, Known())
+    _require_enough_motion(about_one_axis(), best, Known())
     if enough:
-        _require_determined(about_one_axis(), best, None)
+        _require_enough_motion(about_one_axis(), best, None)
         return
     with pytest.raises(NotObservable, match="turn wrist 1 and wrist 2"):
-        _require_determined(about_one_axis(), best, None)
+        _require_enough_motion(about_one_axis(), best, None)
     if place == 2:
-        _require_determined(rows_of(60, TRUTH), best, None)  # the orientations would show it: the verdict names it
+        _require_enough_motion(rows_of(60, TRUTH), best, None)  # the orientations would show it: the verdict names it
 
 
 def test_residuals_are_averaged_over_the_kept_rows_around() -> None:
