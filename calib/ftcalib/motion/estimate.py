@@ -1,8 +1,8 @@
-"""The load that explains rows in motion: Gauss-Newton from each mounting that forces allow, contact left out.
+"""Gauss-Newton fit of a moving load: started from each mounting that the forces allow, rows in contact left out.
 
-Each stage solves the normal equations of `ftcalib.motion.problem` with the noise and the rows without contact of the
-stage before. Some stages choose the sizes of the components: of walk, gain and cross-talk by the restricted likelihood,
-of what noise always hides by their posterior mean square, with a log-normal prior and a probability of being absent.
+Each stage solves the normal equations of `ftcalib.motion.problem`, with the noise and the rows without contact from the
+previous stage. Some stages also choose the standard deviations of the components: those of walk, gain and cross-talk by
+restricted likelihood, those of `EXPECTED` by their posterior mean square (log-normal prior with a probability of 0).
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,31 +41,31 @@ from ftcalib.motion.problem import (
 )
 from ftcalib.motion.samples import MotionRows
 
-# Squared distance of a row in contact.
+# Squared Mahalanobis distance from which a row is in contact.
 _CONTACT = float(chi2_isf(6, 1e-7))
-# Least residual of a row in contact, in a motion that a guard has watched.
+# Smallest force or torque residual of a row in contact, in a motion with a contact guard.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
-# Quantile of the residuals of a state that has no contact.
+# Quantile of the residuals of a state of motion that is assumed to be free of contact.
 QUIET = 0.4
-# Share of rows; beyond it the model does not fit at all.
+# Largest share of rows in contact; beyond it the model does not fit at all.
 _MOST_CONTACT = 0.8
-# Rows left out on both sides of a contact, which the filter spreads.
+# Rows left out on both sides of a contact, because the filter spreads the contact.
 _MARGIN = 2
-# A component is kept if it lowers -2 log restricted likelihood by this.
+# A component is kept if it lowers -2 log restricted likelihood by at least this.
 _WORTH = 4.0
 
-# Sizes of components at first.
+# Initial standard deviations of components.
 _ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
 _SAME_RAD = 0.2
-# Rows of a moving average of the variance, and rows of the whole state that count as its prior.
+# Length of the moving average of the variance, rows, and weight of the whole state as a prior, rows.
 _AROUND, _PRIOR_ROWS = 3, 1.0
-# Steps of the fit with a prior, and the change of its cost that ends it.
+# Largest number of steps of the fit with a prior, and the change of its cost at which the fit has converged.
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
-# Solutions, each with the noise and the contacts of the one before, and those before which components are chosen.
+# Number of stages, and the stages that first choose the components.
 _STAGES, _CHOICES = 6, (1, 2, 4)
-# The stage from which what noise hides is part of the model: before, contact would be taken for it.
+# First stage whose model has the components of `EXPECTED`. Earlier, they would absorb contact.
 _ALWAYS = 1
-# Sizes that are tried: of the entries of gain and cross-talk, and of the walk of the bias in a second.
+# Candidate standard deviations of each component; of a walk, the change of the bias per square root of a second.
 _SIZES: Mapping[str, Array] = {
     "gain": np.geomspace(5e-4, 5e-2, 9),
     "cross_talk": np.geomspace(5e-4, 2e-1, 11),
@@ -80,44 +80,46 @@ _SIZES: Mapping[str, Array] = {
     "load_N": np.geomspace(1e-4, 1.0, 41),
     "load_Nm": np.geomspace(4e-6, 4e-2, 41),
 }
-# Prior of a size: probability that a cell has none of it, and one sigma of its logarithm otherwise, as a factor.
+# Prior of a standard deviation: probability that it is 0, and one sigma of its logarithm otherwise, as a factor.
 _ABSENT, _WITHIN = 0.7, 3.0
-# Squared distance of a row that counts a quarter where a robust fit has settled.
+# Squared distance of a row with weight 1/4 in a converged robust fit.
 LIMIT = 22.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionFit:
-    """The best fit."""
+    """Best fit of a load to the rows of a motion."""
 
     load: MovingLoad
     covariance: Array
-    """(34, 34)"""
+    """(34, 34) covariance of the error vector of `MovingLoad.moved`."""
     kept: NDArray[np.bool_]
-    """(n,) rows without contact."""
+    """(n,) whether a row is free of contact."""
     residuals: Array
-    """(n, 6) of all rows, drift included in the prediction, and of the other effects none."""
+    """(n, 6) measured minus predicted wrench of all rows; the prediction has the drift, but no other random effect."""
     next_use: Array
-    """(2,) root mean square error of compensating a free tool at rest in these poses, N and N·m."""
+    """(2,) rms error of compensating a free tool at rest in the recorded orientations, N and N·m."""
     sigma: Array
-    """(n, 6) of a row's noise."""
+    """(n, 6) standard deviation of the noise of each row, N and N·m."""
     distance: Array
-    """(n,) squared, of each residual from 0: chi2 with 6 degrees of freedom without contact."""
+    """(n,) squared Mahalanobis distance of each residual: chi-square with 6 degrees of freedom without contact."""
     drift: DriftResult | None
-    """From the first row to the last, with the course of the bias minus that of the load, which is the last one; None
+    """Drift from the first to the last row; its course is relative to the bias of `load`, which is the last one. None
     without a walk."""
     mean_bias: Array | None = None
-    """(6,) with drift, over the rows."""
+    """(6,) mean of the bias over the rows, N and N·m; None without drift."""
     components: Mapping[str, float] = field(default_factory=dict)
+    """Standard deviations of the components, by name and unit."""
     second_basin_chi2: float | None = None
+    """Increase of chi2 at the second best mounting; None if there is no other."""
     chi2: float = 0.0
-    """Chi2 of the kept rows, made independent: about 6 a row."""
+    """Chi2 of the whitened residuals of the kept rows: about 6 per row."""
     contradiction: str = ""
-    """What rows and prior contradict each other in; empty where they agree."""
+    """Sentence naming the contradiction between rows and prior; empty if they agree."""
 
     @property
     def prior_share(self) -> Array:
-        """Sigma (8,) of inertia, height and delay, in that of what is expected of any tool."""
+        """(8,) posterior over prior standard deviation of inertia, height and delay."""
         expected = np.r_[np.full(6, max(self.load.mass_kg, 0.1) * GYRATION_M**2), HEIGHT_M, DELAY_S]
         return np.asarray(np.sqrt(np.diag(self.covariance)[15:23]) / expected)
 
@@ -132,27 +134,30 @@ def fit_motion(
     guarded: bool = False,
     zeroed_s: Array = NEVER,
 ) -> MotionFit:
-    """Fit all unknowns to rows.
+    """Fit a load, the drift of the bias and other random effects to the rows of a motion.
 
     Parameters
     ----------
-    rows : Rows
+    rows : MotionRows
     known : Known, optional
-        As for `ftcalib.solve`.
+        Known values, as in `ftcalib.solve`.
     g_m_s2 : float
     prior : CellPrior, optional
-        It joins the last stage: noise and contact are those of the rows alone, so a wrong prior leaves no row out.
+        Earlier calibration of the cell, added after the last stage. Noise and contact are determined from the rows
+        alone, so a wrong prior causes no row to be left out.
     point_mass : bool
         Whether the inertia about the centre of mass is known to be 0.
     guarded : bool
-        Whether a contact guard has watched the motion. Then bursts of noise, as of gears at the reversal of a joint,
-        are no contact: only rows above `TOUCH_N` or `TOUCH_NM` are, and each row has the noise of its surroundings.
+        Whether a contact guard watched the motion. Then bursts of noise, for example from gears where a joint
+        reverses, are not taken for contact: only rows with residuals above `TOUCH_N` or `TOUCH_NM` are, and the noise
+        of each row is estimated from its neighbours.
     zeroed_s : array, shape (k,)
-        Times after which the sensor has another bias, all but removed from the rows. That of the load is the last.
+        Times at which the sensor was zeroed; the steps of the bias are already nearly removed from the rows. The bias
+        of the load is that after the last zeroing.
     """
     problem = Problem(rows, known, g_m_s2, point_mass=point_mass, zeroed_s=zeroed_s)
-    # Forces alone allow several mountings: the residuals of a robust fit, with the torques, decide.
-    roughs = sorted((_rough(problem, start) for start in problem.starts()), key=lambda one: one[1])
+    # Forces alone allow several mountings: the robust fit of forces and torques with the smallest residuals is chosen.
+    roughs = sorted((_rough(problem, start) for start in problem.starts()), key=lambda rough: rough[1])
     load, _ = roughs[0]
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
@@ -162,7 +167,7 @@ def fit_motion(
         state = motion_states(rows.speed_rad_s, kept)
         r = problem.residuals(load, effects)
         absorbed = problem.absorb(load, rows[kept], solved)
-        # An autoregression would take the noise of seconds before its size is chosen.
+        # At first an autoregression would absorb the slow noise whose standard deviation is chosen later.
         order = ORDER if stage > _ALWAYS else 0
         noise = RowNoise.of(r[kept], absorbed, state[kept], places_in_runs(rows.t_s[kept], rows.row_s), order=order)
         if guarded:
@@ -192,7 +197,7 @@ def fit_motion(
     for other, _ in roughs[1:] if prior is None else ():
         if angle_between(other.static.R_flange_sensor, load.static.R_flange_sensor) > _SAME_RAD:
             there = problem.sums(other, effects, noise, kept, state)
-            # What one linear step would leave at the other mounting, less the chi2 of this one.
+            # Chi2 after one linear step at the other mounting, minus the chi2 of this one.
             others.append(there[2] - float(there[1] @ problem.solve(sizes, there, other, effects).step) - chi2)
     walk, course = None, problem.hats(rows.t_s) @ problem.drift(effects)
     if sizes.get("walk_N") or sizes.get("walk_Nm"):
@@ -228,13 +233,13 @@ def _join(
     start: tuple[MovingLoad, Array],
     weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
 ) -> tuple[MovingLoad, Array, NormalSolution, str]:
-    """Fit rows and a prior from the load and effects of the rows alone, and name what they contradict in the prior.
+    """Fit rows and prior together, starting from the fit of the rows alone; also return the contradiction to the prior.
 
-    `weighed` is the noise, with the rows that count and their states, as the rows show it alone.
+    `weighed` holds the noise, the kept rows and the states of motion, as determined from the rows alone.
     """
 
     def fitted(kept: Sequence[int]) -> tuple[MovingLoad, Array, NormalSolution]:
-        """Fit; `kept` as of `CellPrior.rows`."""
+        """Return load, effects and solution; `kept` as in `CellPrior.rows`."""
         (load, effects), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
             sums = problem.sums(load, effects, *weighed)
@@ -260,7 +265,7 @@ def _join(
 
 
 def _rough(problem: Problem, load: MovingLoad) -> tuple[MovingLoad, float]:
-    """Fit robustly with white noise; return the load and the logarithm of its residuals' size."""
+    """Fit robustly with white noise; return the load and the sum of the logarithms of the residual scales."""
     rows = problem.rows[:: max(1, len(problem.rows) // ROUGH_ROWS)]
     limit, size = np.inf, SIZE + problem.basis.shape[1]
     no_effects, H, b = np.zeros(len(problem.basis)), np.zeros((size, size)), np.zeros(size)
@@ -278,11 +283,11 @@ def _rough(problem: Problem, load: MovingLoad) -> tuple[MovingLoad, float]:
 
 
 def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[Array, Array, float]:
-    """Weigh rows for the next step of a robust fit, which begins with a limit of infinity and ends at `LIMIT`.
+    """Return scales (6,), weights (n,) and the next limit of a robust fit, for the residuals (n, 6) of its last step.
 
-    `limit` is the squared distance of a row that counted a quarter in the step before. `alike` successive channels
-    have one scale: 3 for forces and torques, 1 for each by itself. Returns the standard deviations (6,) by the median,
-    the weights (n,), and the next limit.
+    A row whose squared distance equals the limit has weight 1/4. The fit starts with an infinite `limit` and ends at
+    `LIMIT`. The scales are standard deviations from the median; `alike` successive channels share one: 3 for one
+    scale of the forces and one of the torques, 1 for a scale of each channel.
     """
     size = np.median(np.abs(residuals).reshape(len(residuals), -1, alike), axis=(0, 2))
     scale = np.repeat(1.4826 * size + 1e-12, alike)
@@ -292,28 +297,29 @@ def robust_weights(residuals: Array, limit: float, *, alike: int = 3) -> tuple[A
 
 
 def rough_delay(rows: MotionRows, known: Known | None, g_m_s2: float) -> float:
-    """Delay of the wrench beyond that of the rows, by a robust fit."""
+    """Return the delay of the wrench in addition to that of the rows, s, from a robust fit."""
     problem = Problem(rows, known, g_m_s2, point_mass=False)
-    return min((_rough(problem, start) for start in problem.starts()), key=lambda one: one[1])[0].delay_s
+    return min((_rough(problem, start) for start in problem.starts()), key=lambda rough: rough[1])[0].delay_s
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeFit:
-    """A robust fit in which the poses may have an error."""
+    """Robust fit of a load and of an error of the poses."""
 
     load: MovingLoad
     error: PoseError
     covariance: Array
-    """(37, 37) of the load, as of `Load.moved`, then of scale and aside, with what smooth errors do to them."""
+    """(37, 37) of the error vector of `MovingLoad.moved`, then of scale and lateral offset, including the effect of
+    smooth errors."""
     residual: Array
-    """(2,) of force and torque: the median, as a standard deviation."""
+    """(2,) standard deviation of the force and torque residuals, from their median, N and N·m."""
 
 
 def fit_freely(rows: MotionRows, known: Known | None, g_m_s2: float) -> FreeFit:
-    """Fit load and error of the poses, robustly and with white noise, from each mounting that forces allow."""
+    """Fit a load and an error of the poses, robustly and with white noise, from each mounting that the forces allow."""
     problem = Problem(rows[:: max(1, len(rows) // ROUGH_ROWS)], known, g_m_s2, point_mass=False)
     return min(
-        (_freely(problem, start) for start in problem.starts()), key=lambda one: float(np.log(one.residual).sum())
+        (_freely(problem, start) for start in problem.starts()), key=lambda free: float(np.log(free.residual).sum())
     )
 
 
@@ -338,7 +344,7 @@ def _freely(problem: Problem, load: MovingLoad) -> FreeFit:
         H[:15, :15] += known.T @ known
         b[:15] += known.T @ residuals
         basis = problem.free(load)
-        # Gain and cross-talk stay 0: they would take part of a scale.
+        # Gain and cross-talk stay 0, because they would absorb part of the scale.
         Z = block_diag(basis[:, ~basis[GAINS.start :].any(axis=0)], np.eye(3))
         H = Z.T @ H @ Z
         size = np.sqrt(np.diag(H)) + 1e-12
@@ -354,7 +360,10 @@ def _freely(problem: Problem, load: MovingLoad) -> FreeFit:
 
 
 def _first_kept(problem: Problem, load: MovingLoad) -> NDArray[np.bool_]:
-    """Rows without contact, by the quiet rows of each state; at rest there is no more noise than in motion."""
+    """Return which rows (n,) have no contact, judged by the quiet rows of each state of motion.
+
+    A slower state is assumed to have no more noise than a faster one.
+    """
     rows = problem.rows
     r = rows.wrench - problem.predict(load, rows)
     state = motion_states(rows.speed_rad_s, np.ones(len(rows), bool))
@@ -366,13 +375,13 @@ def _first_kept(problem: Problem, load: MovingLoad) -> NDArray[np.bool_]:
 
 
 def _untouched(residuals: Array) -> NDArray[np.bool_]:
-    """Rows without contact in a motion that a guard has watched."""
+    """Return which rows (n,) have no contact, in a motion with a contact guard."""
     force_N, torque_Nm = (np.linalg.norm(residuals[:, k : k + 3], axis=1) for k in (0, 3))
     return _without_contact(np.where((force_N > TOUCH_N) | (torque_Nm > TOUCH_NM), np.inf, 0.0))
 
 
 def _local_noise(unit: Array, kept: NDArray[np.bool_]) -> Array:
-    """Noise (n,) of each row in that of its state, from the residuals around it."""
+    """Return the noise (n,) of each row relative to the noise of its state, from the neighbouring residuals."""
     square, window = np.where(kept, np.mean(unit**2, axis=1), 0.0), np.ones(_AROUND)
     rows = np.convolve(kept.astype(np.float64), window, "same")
     return np.asarray(np.sqrt((_PRIOR_ROWS + np.convolve(square, window, "same")) / (_PRIOR_ROWS + rows)))
@@ -382,15 +391,15 @@ def _without_contact(distance: Array) -> NDArray[np.bool_]:
     near = distance > _CONTACT
     for _ in range(_MARGIN):
         near = near | np.append(near[1:], False) | np.append(False, near[:-1])
-    return ~near if near.mean() < _MOST_CONTACT else np.ones(len(near), bool)  # nothing fits: all is of no use alike
+    return ~near if near.mean() < _MOST_CONTACT else np.ones(len(near), bool)  # the model fits no row: keep all
 
 
 def _choose_sizes(
     problem: Problem, sizes: Mapping[str, float], sums: tuple[Array, Array, float], load: MovingLoad, effects: Array
 ) -> dict[str, float]:
-    """Choose the sizes of the components by restricted likelihood, one after the other.
+    """Return the standard deviations of the components, chosen one after the other by restricted likelihood.
 
-    What is always part of the model has its mean square, as the data and what is expected allow it.
+    The components of `EXPECTED` get their posterior root mean square instead.
     """
     chosen = dict(sizes)
 
@@ -409,7 +418,7 @@ def _choose_sizes(
             continue
         worth, slow = -_WORTH, name.replace("walk", "slow")
         of_sizes = values(name, **{slow: 0.0})
-        if name != slow:  # noise of seconds looks like a walk
+        if name != slow:  # slow noise looks like a walk
             worth = min(worth, float(values(slow, **{name: 0.0}).min()))
         best = int(np.argmin(of_sizes))
         chosen[name] = float(tried[best]) if of_sizes[best] < worth else 0.0

@@ -1,8 +1,9 @@
-"""Mistakes that the motion shows, each found before the load is fitted, and undone so that its consequences vanish.
+"""Mistakes in a recording in motion, found before the load is fitted and then corrected in the rows.
 
-`fit_freely` separates them: the scale of the acceleration against gravity is that of clock or positions, its sign that
-of the forces, the sign of the moments of mass that of the torques, and the lever shows of which point the poses are.
-Angular velocities alone show none of this: inertia and lever absorb their scale.
+The quantities of `fit_freely` separate the mistakes. The scale of the acceleration relative to gravity shows a wrong
+clock or unit of the positions, its sign reversed forces, the sign of the moments of inertia reversed torques, and the
+lever the point to which the poses belong. Angular velocities alone show none of these, because inertia and lever absorb
+their scale.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,68 +24,72 @@ from ftcalib.motion.estimate import FreeFit, MotionFit, robust_weights
 from ftcalib.motion.model import HEIGHT, INERTIA, SECOND_MOMENTS, SIZE, PoseError
 from ftcalib.motion.samples import MotionRows
 
-# Positions that spread farther may be in another unit, if their acceleration agrees with it by this share.
+# Positions that spread farther may be in another unit, if the scale of the acceleration agrees with that unit.
 _FARTHEST_M: Final = 3.0
 _LENGTHS_M: Final[Mapping[str, float]] = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254}
+# Largest relative difference between the scale of the acceleration and a unit.
 _SAME_UNIT: Final = 0.2
-# Shares of the change of force and torque that a fit with the right causes leaves, and that may be those of axes.
+# Largest residuals, as shares of the change of force and torque, of a fit that explains the data, and the residuals
+# from which wrong axes are suspected.
 _EXPLAINED: Final = np.array([0.15, 0.3])
 _SUSPECT: Final = 0.05
-# A weight below this share of the inertial mass was subtracted before.
+# A weight below this share of the inertial mass means that the wrench was gravity-compensated.
 COMPENSATED: Final = 0.2
-# A mistake is larger than its sigma by this factor, and than the errors of a calibrated arm, which sigma lacks.
+# A mistake must exceed this many sigmas, and also the errors of a calibrated arm, which are not part of sigma.
 _SIGMAS: Final = 6.0
 _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
-# Channels are not reversed if what reversed ones would make negative is so many sigma above 0.
+# The signs of channels are certain if scale and moment are this many sigmas above 0.
 _SIGNED: Final = 3.0
-# A scale of the clock that is larger, but less certain, limits a result if it is the only mistake. It is not undone.
+# A clock scale that deviates by this share, but only by this many sigmas, limits a result if it is the only mistake.
+# It is not corrected.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
-# A sensor whose axis is farther from that of the flange is none.
+# Largest plausible distance between the axes of sensor and flange.
 _FAR_ASIDE_M: Final = 0.03
-# The origin of a sensor is at most this high above the flange, and at least so.
+# Largest and smallest plausible height of the sensor origin above the flange.
 _HIGHEST_M: Final = 0.5
 _LOWEST_M: Final = -5e-3
-# Torques about a point beyond the centre of mass are about a TCP from this height on.
+# Height from which a reference point of the torques beyond the centre of mass is taken for a TCP.
 _TCP_M: Final = 0.1
-# Moments of mass of a body are not below 0 by more than 3 sigma and this radius of gyration.
+# Tolerance of negative second moments of mass: 3 sigma plus the mass times the square of this radius of gyration.
 _GYRATION_M: Final = 0.01
-# Means of 10 ms beside a step that are averaged, and those in it.
+# Number of 10 ms means averaged on each side of a step, and number within the step.
 _BESIDE, _WITHIN = 5, 1
-# Where the sensor was zeroed, readings fall to this share, so many times farther than in the means around.
+# A zeroing reduces the readings to this share, by this multiple of the usual change among this many means around it,
+# and by at least this force.
 _ZERO_SHARE, _STEPS, _AROUND, _LEAST_STEP_N = 0.25, 4.0, 101, 1.0
-# Share of a step that stays: a contact that ends where the sensor was zeroed leaves none.
+# Share of a step of the reading that must be a step of the bias. A contact that ends leaves no step of the bias.
 _STAYS: Final = 0.6
-# Places of aside and height in a free fit.
+# Indices of lateral offset and height in the covariance of a free fit.
 _POINT: Final = np.r_[SIZE + 1, SIZE + 2, HEIGHT]
 
-# Rows that are judged as poses.
+# Number of rows that are judged like static poses.
 JUDGED_ROWS: Final = 300
-# Mistakes of axes and orientations, which explain whatever else is wrong.
+# Codes of wrong axes and orientations, which explain all other findings.
 OF_AXES: Final = frozenset(
     ("orientations_inverted", "quaternion_order", "wrench_in_base", "constant_force", "axes_disagree")
 )
 
 Correction = Callable[[MotionRows], MotionRows]
-"""What gives rows without mistakes."""
+"""Function that returns rows without the mistakes."""
 
 
 def unchanged(rows: MotionRows) -> MotionRows:
-    """Undo nothing."""
+    """Return the rows as they are: the correction of data without mistakes."""
     return rows
 
 
 Stream = tuple[Array, Array]
-"""Times (n,) and values (n, k)."""
+"""Times (n,) and values (n, k) of a recorded stream."""
 
 
 # ------------------------------------------------------------------------------------------------------------- zeroing
 
 
 def find_zeroings(wrench: Stream) -> tuple[Array, Array]:
-    """Return the times (k,) at which all channels step to about 0, and the steps (k, 6).
+    """Return the times (k,) at which all channels step to about 0, and the steps (k, 6) of the reading.
 
-    The sensor was zeroed there, or a contact ended that began after it was zeroed in the same pose.
+    Either the sensor was zeroed at that time, or a contact ended in a pose in which the sensor had been zeroed before.
     """
     t_s, y = wrench
     if len(t_s) < 4 * (_BESIDE + _WITHIN):
@@ -95,17 +100,17 @@ def find_zeroings(wrench: Stream) -> tuple[Array, Array]:
     after, steps = means[apart:], means[apart:] - means[:-apart]
     left, sizes = (np.linalg.norm(each.reshape(-1, 2, 3), axis=2) for each in (after, steps))
     usual = median_filter(sizes, (_AROUND, 1))
-    # The reading after it moves on as it does without.
+    # After a step, the reading changes no faster than usual.
     to_zero = (left < np.maximum(_ZERO_SHARE * sizes, usual)).all(axis=1)
-    found = np.flatnonzero(to_zero & (sizes[:, 0] > np.maximum(_STEPS * usual[:, 0], _LEAST_STEP_N)))
-    groups = np.split(found, np.flatnonzero(np.diff(found) > 2 * apart) + 1) if len(found) else []
+    steep = np.flatnonzero(to_zero & (sizes[:, 0] > np.maximum(_STEPS * usual[:, 0], _LEAST_STEP_N)))
+    groups = np.split(steep, np.flatnonzero(np.diff(steep) > 2 * apart) + 1) if len(steep) else []
     # In the middle of a group the means lie on both sides of the step.
     best = np.array([group[len(group) // 2] for group in groups], np.intp)
     return t_s[best + _BESIDE + _WITHIN], steps[best]
 
 
 def fit_bias_steps(rows: MotionRows, at_s: Array) -> Array:
-    """Return the steps (k, 6) of the bias at these times (k,), by a robust fit of all that is linear in the motion."""
+    """Return the steps (k, 6) of the bias at the times (k,), from a robust fit that is linear in the motion."""
     apart = np.abs(rows.t_s[:, None] - at_s).min(axis=1) > 4 * rows.row_s
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns(), rows.t_s[:, None] > at_s])[apart]
     y, weight, limit = rows.wrench[apart], np.ones(int(apart.sum())), np.inf
@@ -118,13 +123,13 @@ def fit_bias_steps(rows: MotionRows, at_s: Array) -> Array:
 
 
 def are_bias_steps(steps: Array, seen: Array) -> Array:
-    """Return which steps (k,) of the reading are steps of the bias."""
+    """Return which steps `seen` (k, 6) of the reading are steps of the bias, given the fitted `steps` (k, 6)."""
     agree = np.sum(steps[:, :3] * seen[:, :3], axis=1)
     return np.asarray(agree > _STAYS * np.sum(seen[:, :3] ** 2, axis=1))
 
 
 def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
-    """Return the wrench with the bias that it has after the last step."""
+    """Return the wrench with the steps removed: with the bias after the last step throughout."""
     t_s, y = wrench
     return t_s, y + (t_s[:, None] <= at_s).astype(np.float64) @ steps
 
@@ -133,22 +138,23 @@ def without_steps(wrench: Stream, at_s: Array, steps: Array) -> Stream:
 
 
 def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tuple[list[Finding], Correction]:
-    """Find the mistakes of signs, clock and poses that explain the rows, and what undoes them in any rows.
+    """Find mistakes of signs, clock and poses that explain the rows; also return the correction of any rows.
 
-    Where they do not fit even so, axes and orientations are judged by what is linear in the motion, and not undone.
+    If no such mistake explains the rows, axes and orientations are judged by the linear function of the motion that
+    fits best. Their mistakes are not corrected.
 
     Parameters
     ----------
-    rows : Rows
+    rows : MotionRows
     free : FreeFit
-        To these rows.
+        Fit to these rows.
     spread_m : float
-        Of the positions.
+        Spread of the positions.
     """
     change = np.sqrt(np.mean(rows.wrench.reshape(-1, 2, 3).var(axis=0), axis=1))
     if (free.residual > _SUSPECT * change).any() and (named := _axis_findings(rows, change)):
         return named, unchanged
-    # A wrench without weight gives any scale.
+    # Without a weight in the wrench the scale is arbitrary.
     if (free.residual > _EXPLAINED * change).any() or abs(free.error.scale) > 1 / COMPENSATED:
         return [], unchanged
     load, Q, sigma = free.load, free.load.static.R_flange_sensor, np.sqrt(np.diag(free.covariance))
@@ -160,26 +166,26 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
         names = np.array(["forces", "torques"])[signs < 0]
         findings.append(Finding.of("reversed_in_motion", channels=" and ".join(names)))
     scale = turning = 1.0
-    found, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
-    factor = 1 / float(np.sqrt(max(found, 1e-12)))
-    off, share = abs(found - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
-    values = {"factor": factor, "sigma": factor * sigma_scale / max(found, 1e-12) / 2, "rate": 1 / factor}
-    # A weight that is too small for the acceleration has two causes, and times are rarely wrong.
+    fitted, sigma_scale = abs(free.error.scale), float(sigma[SIZE])
+    factor = 1 / float(np.sqrt(max(fitted, 1e-12)))
+    off, share = abs(fitted - 1) / max(sigma_scale, 1e-12), abs(factor - 1)
+    values = {"factor": factor, "sigma": factor * sigma_scale / max(fitted, 1e-12) / 2, "rate": 1 / factor}
+    # A weight too small for the acceleration has two possible causes. Compensation is more likely than wrong times.
     weight_N = load.static.weight_N
-    parted = {"weight_N": weight_N, "mass_kg": found * weight_N / load.g_m_s2} if found > 1 else None
+    parted = {"weight_N": weight_N, "mass_kg": fitted * weight_N / load.g_m_s2} if fitted > 1 else None
     if off > _SIGMAS and share > _CLOCK_SHARE:
-        scale, unit = found, _position_unit(found, spread_m)
-        turning = 1.0 if unit else found
+        scale, unit = fitted, _position_unit(fitted, spread_m)
+        turning = 1.0 if unit else fitted
         if unit:
             findings.append(Finding.of("positions_unit", unit=unit, spread_m=spread_m))
         else:
             findings += _by_clock("reject", values, parted)
-    # Forces have the lever to the centre of mass, torques that from their own point.
+    # Forces show the lever from the recorded point to the centre of mass, torques that from their reference point.
     seen = Q @ load.static.p_sensor_com_m
     to_com, com = signs[0] * (np.append(free.error.aside_m, load.height_m) + seen) / turning, signs.prod() * seen
     of_com = np.sqrt(np.diag(Q @ free.covariance[9:12, 9:12] @ Q.T))
-    are_signed = abs(moment) > _SIGNED * sigma_moment and found > _SIGNED * sigma_scale
-    # Behind the sensor rather than beside it.
+    are_signed = abs(moment) > _SIGNED * sigma_moment and fitted > _SIGNED * sigma_scale
+    # The centre of mass must lie behind the sensor rather than beside it.
     behind_m = max(INSIDE_M, SIGNIFICANT_SIGMAS * of_com[2], float(np.linalg.norm(com[:2])))
     behind = are_signed and bool(-com[2] > behind_m)
     other = _other_point(to_com, com, sigma[_POINT] / turning, behind=behind, upright=bool(Q[2, 2] > 0))
@@ -192,25 +198,26 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
 
 
 def _by_clock(severity: Severity, of_clock: Mapping[str, float], parted: Mapping[str, float] | None) -> list[Finding]:
-    """Name a controller that takes a part of the weight away, where that may be the cause, and then the clock."""
+    """Return findings for a wrong clock, preceded by a partly compensated weight where that is possible too."""
     compensated = [] if parted is None else [Finding.of("wrench_compensated", severity, **parted)]
     return [*compensated, Finding.of("clock_rate", severity, **of_clock)]
 
 
 def _axis_findings(rows: MotionRows, change: Array) -> list[Finding]:
-    """Find wrong axes and orientations in what is left of the motion at rest, whose axes do not count."""
+    """Find wrong axes and orientations in the wrench with the effect of acceleration removed."""
     static, left = static_wrench(rows)
     if (left > _EXPLAINED * change).any():
         return []
     some = slice(None, None, max(1, len(rows) // JUDGED_ROWS))
     named = faults(nearest_rotation(rows.motion.R_base_flange)[some], static[some])
-    return [one for one in named if one.code in OF_AXES]
+    return [finding for finding in named if finding.code in OF_AXES]
 
 
 def static_wrench(rows: MotionRows) -> tuple[Array, Array]:
-    """Return the wrench (n, 6) at rest in the orientations, and what is left (2,) of force and torque.
+    """Return the wrench (n, 6) without the effect of acceleration, and the median residuals (2,) of force and torque.
 
-    The linear function of the motion that fits best has the rest, whatever axes and signs are.
+    The effect of acceleration is taken from the linear function of the motion that fits best, so the result does not
+    depend on correct axes and signs.
     """
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
     linear = np.linalg.lstsq(X, rows.wrench, rcond=1e-9)[0]
@@ -224,17 +231,18 @@ def _position_unit(scale: float, spread_m: float) -> str | None:
 
 
 def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, upright: bool) -> list[Finding]:
-    """Find poses or torques of another point than they should be.
+    """Find poses that are not those of the flange, or torques that are not about the sensor origin.
 
-    `to_com` and `com` lead to the centre of mass from the point of the poses and from that of the torques, in the axes
-    of the poses; `sigma` is that of their difference. `behind` says that the centre of mass lies on the robot's side
-    of the sensor, though no channel is reversed, and `upright` that z of the sensor points along that of the poses.
+    `to_com` and `com` are the vectors to the centre of mass from the point of the poses and from the reference point
+    of the torques, in the axes of the poses, and `sigma` is the standard deviation of their difference. `behind` means
+    that the centre of mass lies on the robot's side of the sensor although no channel is reversed, `upright` that the
+    z axes of sensor and poses point in the same direction.
     """
     point = to_com - com
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])
     beside = aside_m > max(_ASIDE_M, _SIGMAS * float(sigma[:2].max()))
     elsewhere = not _is_height(height_m, float(sigma[2]))
-    # The units of a centre of mass so far away are named by its distance.
+    # A centre of mass this far away means wrong units, which the verdict reports.
     if not (beside or elsewhere or behind) or np.linalg.norm(com) > FAR_COM_M:
         return []
     along = height_m > _LOWEST_M - SIGNIFICANT_SIGMAS * sigma[2] and (not beside or height_m > aside_m)
@@ -246,7 +254,7 @@ def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, uprig
 
 
 def _wrong_units(to_com: Array, com: Array) -> list[tuple[str, str]]:
-    """Return units of force and torque that put the sensor on the axis of the flange, as the true ones would."""
+    """Return pairs of force and torque units with which the sensor would lie on the flange axis."""
     suspects = []
     for force, torque in units.by_com(float(np.linalg.norm(com))):
         point = to_com - com * units.TORQUE_UNITS_NM[torque] / units.FORCE_UNITS_N[force]
@@ -264,10 +272,10 @@ def _is_height(height_m: float, sigma_m: float) -> bool:
 
 
 def find_impossible_body(best: MotionFit) -> list[Finding]:
-    """Find an inertia or a height that no body and no sensor has, whatever the cause."""
+    """Find an inertia that no body can have, and a height that no sensor has."""
     findings, sigma_m = list[Finding](), float(np.sqrt(best.covariance[HEIGHT, HEIGHT]))
     moments, axes = np.linalg.eigh(np.tensordot(best.load.inertia, SECOND_MOMENTS, 1))
-    # The least second moment of mass is below 0 where a principal moment exceeds the sum of the others.
+    # The smallest second moment of mass is negative if one principal moment exceeds the sum of the others.
     along = np.einsum("i,kij,j->k", axes[:, 0], SECOND_MOMENTS, axes[:, 0])
     sigma = float(np.sqrt(along @ best.covariance[INERTIA, INERTIA] @ along))
     if moments[0] < -SIGNIFICANT_SIGMAS * sigma - best.load.mass_kg * _GYRATION_M**2:

@@ -1,4 +1,4 @@
-"""The wrench of a moving load, as a linear function of its motion.
+"""The wrench of a moving load as a linear function of its motion.
 
 With R = R_base_flange, a the acceleration of the flange origin and Omega = [alpha]x + [omega]x², both in flange axes,
 Q = R_flange_sensor, c = p_sensor_com_m, l = (0, 0, height) + Q c from the flange to the centre of mass, m = weight / g,
@@ -9,7 +9,8 @@ and S the second moment of mass about the centre, S = tr(J) / 2 - J for the iner
     torque_Nm = c x u - vee(Q^T Omega Q S) + cross_talk u + torque_bias_Nm
 
 vee(M) = (M21 - M12, M02 - M20, M10 - M01): the sum of r x (Omega r) over the mass is vee(Omega S), which are Euler's
-equations. At rest this is the static model. The delay moves the motion to an earlier time.
+equations. At rest the equations reduce to the static model. A delay of the wrench is applied to the motion: the wrench
+at time t depends on the motion at t - delay.
 """
 
 from dataclasses import dataclass, field, replace
@@ -24,9 +25,9 @@ from ftcalib.motion.samples import Motion, MotionRows
 from ftcalib.sensor_matrix import CROSS_TALK_M, GAIN
 
 INERTIA_NAMES = ("xx", "yy", "zz", "xy", "xz", "yz")
-# Names of what motion adds to the 15 static coordinates.
+# Names of the coordinates that a recording in motion adds to the 15 static ones.
 NAMES = (*(f"inertia_kg_m2.{axes}" for axes in INERTIA_NAMES), "height_m", "delay_s")
-# Places in an error vector.
+# Indices in the error vector of `MovingLoad.moved`.
 INERTIA, HEIGHT, DELAY, GAINS, CROSS_TALK = slice(15, 21), 21, 22, slice(23, 28), slice(28, 34)
 SIZE = 34
 
@@ -36,27 +37,27 @@ for _k, (_i, _j) in enumerate(_PLACES):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 SECOND_MOMENTS = np.trace(_BASIS, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(3) - _BASIS
 _TURNS = skew(np.eye(3))
-# Each entry of Omega as 1: what is linear in it is a product with what these give, instead of one for each row.
+# Unit matrices for the nine entries of Omega: a linear function is evaluated once per entry, not once per row.
 _UNITS = np.eye(9).reshape(9, 3, 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MovingLoad:
-    """All that is estimated from motion."""
+    """Parameters of a load that are estimated from a recording in motion."""
 
     static: Parameters
     g_m_s2: float
     inertia: Array = field(default_factory=lambda: np.zeros(6))
-    """(6,) in the order of `INERTIA_NAMES`, about the centre of mass, in sensor axes."""
+    """(6,) inertia about the centre of mass, in sensor axes, in the order of `INERTIA_NAMES`, kg·m²."""
     height_m: float = 0.0
-    """Height of the sensor origin above the flange face."""
+    """Height of the sensor origin above the flange face, m."""
     delay_s: float = 0.0
-    """Delay of the wrench beyond that of the rows."""
+    """Delay of the wrench in addition to the delay assumed in the rows, s."""
     response: Array = field(default_factory=lambda: np.zeros(11))
-    """Coefficients of gain and cross-talk."""
+    """(11,) coefficients of gain and cross-talk."""
 
     def moved(self, step: Array) -> Self:
-        """Apply an error vector (34,): 15 as in `Parameters.moved`, as `NAMES`, then the response."""
+        """Return the load after an error vector (34,): 15 as in `Parameters.moved`, then `NAMES`, then the response."""
         return replace(
             self,
             static=self.static.moved(step[:15]),
@@ -68,41 +69,41 @@ class MovingLoad:
 
     @property
     def vector(self) -> Array:
-        """(34,) values for priors about zero; the static ones are 0."""
+        """(34,) present values of the coordinates with a prior about zero; 0 for the 15 static ones."""
         return np.concatenate([np.zeros(15), self.inertia, [self.height_m, self.delay_s], self.response])
 
     @property
     def mass_kg(self) -> float:
-        """Weight divided by gravity."""
+        """Weight divided by the acceleration of gravity, kg."""
         return self.static.weight_N / self.g_m_s2
 
     @property
     def lever_m(self) -> Array:
-        """(3,) from the flange to the centre of mass, in flange axes."""
+        """(3,) vector from the flange origin to the centre of mass, in flange axes, m."""
         return np.asarray(self.static.R_flange_sensor @ self.static.p_sensor_com_m + [0.0, 0.0, self.height_m])
 
     @property
     def inertia_kg_m2(self) -> Array:
-        """The inertia as a matrix (3, 3)."""
+        """(3, 3) inertia matrix about the centre of mass, in sensor axes, kg·m²."""
         return np.asarray(np.tensordot(self.inertia, _BASIS, 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseError:
-    """How poses differ from those of the flange: they are of another point, or their times or positions have a scale.
+    """Error of recorded poses: they belong to a point beside the flange, or their times or positions are scaled.
 
-    The acceleration of the flange axis is `scale` times that of the poses, plus that of a point at `aside_m` beside it.
-    An orientation of the point is part of the mounting, and its distance along z of the height.
+    The acceleration of the flange axis is `scale` times the recorded one, plus the acceleration due to the lateral
+    offset `aside_m`. A rotation of the recorded frame is absorbed by the mounting, an offset along z by the height.
     """
 
     scale: float = 1.0
     aside_m: Array = field(default_factory=lambda: np.zeros(2))
-    """(2,) from the point of the poses to the axis through the sensor origin, in the axes of the poses."""
+    """(2,) offset from the recorded point to the axis through the sensor origin, in the axes of the poses, m."""
     turning: float = 1.0
-    """Scale of `Omega`: that of the acceleration if the times are wrong, 1 if only the positions are."""
+    """Scale of `Omega`: equal to `scale` if the times are wrong, 1 if only the positions are wrong."""
 
     def undone(self, motion: Motion) -> Motion:
-        """Return the motion, or its rate, without the error."""
+        """Return a motion, or the rate of change of a motion, without the error."""
         Omega = self.turning * motion.Omega_rad2_s2
         acceleration = self.scale * motion.acceleration_m_s2 + Omega[:, :, :2] @ self.aside_m
         return Motion(motion.R_base_flange, acceleration, Omega)
@@ -113,7 +114,7 @@ class PoseError:
 
     @staticmethod
     def jacobian(load: MovingLoad, motion: Motion) -> Array:
-        """Derivative (n, 6, 3) of the wrench by scale and aside, given the motion with the error."""
+        """Return the derivative (n, 6, 3) of the wrench by `scale` and `aside_m`, for the motion with the error."""
         static, Omega = load.static, motion.Omega_rad2_s2
         moved = np.concatenate([motion.acceleration_m_s2[:, :, None], Omega[:, :, :2]], axis=2)
         dU = -load.mass_kg * static.R_flange_sensor.T @ moved
@@ -121,12 +122,12 @@ class PoseError:
 
 
 def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
-    """Wrench (n, 6) that the sensor reads without contact.
+    """Return the wrench (n, 6) that the sensor reads without contact, N and N·m.
 
     Parameters
     ----------
-    load : Load
-        Its delay is not applied: `Motion.earlier` does that.
+    load : MovingLoad
+        The delay of the load is not applied here; use `Motion.earlier`.
     motion : Motion
     bias : bool
         Whether to add the bias.
@@ -141,9 +142,9 @@ def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
 
 
 def turn_columns(load: MovingLoad, motion: Motion) -> Array:
-    """Derivative (n, 6, 3) of the wrench by a small turn of gravity, in flange axes.
+    """Return the derivative (n, 6, 3) of the wrench by a small rotation of gravity about the flange axes.
 
-    An error of a joint turns the pose with its acceleration, which is the same in the axes of the flange.
+    An error of a joint angle rotates the pose and its acceleration together, so the acceleration in flange axes stays.
     """
     static = load.static
     dU = static.R_flange_sensor.T @ skew(static.gravity_force_base_N @ motion.R_base_flange)
@@ -151,37 +152,38 @@ def turn_columns(load: MovingLoad, motion: Motion) -> Array:
 
 
 def lever_columns(load: MovingLoad, motion: Motion) -> Array:
-    """Derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
+    """Return the derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
 
-    Antisymmetric cross-talk shifts the centre of mass that the torques of the weight show, and not this one.
+    Antisymmetric cross-talk shifts the centre of mass seen in the torques of the weight, but not the one seen in the
+    inertial forces.
     """
     static = load.static
     dU = -load.mass_kg * static.R_flange_sensor.T @ motion.Omega_rad2_s2 @ static.R_flange_sensor
     return np.concatenate([dU, skew(static.p_sensor_com_m) @ dU], axis=1)
 
 
-# Share of the variance below which a component is left out, and most orientations of the kernel matrix.
+# Share of the variance below which a component is dropped, and largest number of orientations in the kernel matrix.
 _NEGLIGIBLE, _RESTING_ON = 1e-3, 200
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SmoothFunctions:
-    """Principal components of a Gaussian process on the orientations of a recording, centred there.
+    """Principal components of a Gaussian process over the orientations of a recording, with zero mean there.
 
-    A sum with independent coefficients of unit variance is a smooth function of the orientation, with the correlation
-    of `alike`. At other orientations it is extended by the kernel (Nyström).
+    A sum of the components with independent coefficients of unit variance is a random smooth function of the
+    orientation, with the correlation `alike`. The Nyström method extends it to other orientations.
     """
 
     R_base_flange: Array
-    """(m, 3, 3)"""
+    """(m, 3, 3) orientations of the kernel matrix."""
     weights: Array
-    """(m, k)"""
+    """(m, k) weights of these orientations in each component."""
     mean: Array
-    """(m,)"""
+    """(m,) mean of the kernel, subtracted before weighting."""
 
     @classmethod
     def of(cls, R_base_flange: Array) -> Self:
-        """Compute the components for the orientations (n, 3, 3) of a recording."""
+        """Return the components for the orientations (n, 3, 3) of a recording."""
         at = R_base_flange[:: -(-len(R_base_flange) // _RESTING_ON)]
         correlated = alike(at, at)
         centred = correlated - correlated.mean(axis=0)
@@ -198,7 +200,10 @@ class SmoothFunctions:
 
 
 def motion_jacobian(load: MovingLoad, motion: Motion, rate: Motion) -> Array:
-    """Derivative (n, 6, 34) of the wrench by the error vector of `Load.moved`, at the motion that the delay gives."""
+    """Return the derivative (n, 6, 34) of the wrench by the error vector of `MovingLoad.moved`.
+
+    `motion` is the motion after the delay of the load was applied, and `rate` its rate of change.
+    """
     static, m, Q = load.static, load.mass_kg, load.static.R_flange_sensor
     Qt, F_b, c = Q.T, static.gravity_force_base_N, static.p_sensor_com_m
     second = np.tensordot(load.inertia, SECOND_MOMENTS, 1)
@@ -231,7 +236,7 @@ def motion_jacobian(load: MovingLoad, motion: Motion, rate: Motion) -> Array:
 
 
 def _force(load: MovingLoad, motion: Motion) -> Array:
-    """Force (n, 3) of the load in flange axes."""
+    """Return the force (n, 3) of weight and inertia in flange axes, N."""
     weight = load.static.gravity_force_base_N @ motion.R_base_flange
     return np.asarray(weight - load.mass_kg * (motion.acceleration_m_s2 + motion.Omega_rad2_s2 @ load.lever_m))
 
@@ -240,12 +245,13 @@ def _vee(M: Array) -> Array:
     return np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
 
 
-# Noise of the rows, from their residuals: scaled by state of motion, autoregressive, correlated between channels.
+# Noise model of the rows, from their residuals: autoregressive, correlated between channels, with one scale for each
+# state of motion (at rest, or a class of speed).
 
 REST_RAD_S = 0.02
-# Classes of speed, beside rest.
+# Number of speed classes of moving rows.
 CLASSES = 3
-# Fewest rows of a state of motion: with fewer it joins the next faster state.
+# Minimum number of rows of a state of motion; a state with fewer rows is merged with the next faster one.
 FEWEST = 40
 # Largest order of the autoregression.
 ORDER = 6
@@ -255,7 +261,10 @@ _MOST = 0.98
 
 
 def motion_states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Return the state of motion (n,) of each row: rest, then classes of speed that have as many kept rows each."""
+    """Return the state of motion (n,) of each row: at rest, or one of several speed classes with equal numbers of rows.
+
+    `kept` (n,) selects the rows without contact, from which the limits of the classes are computed.
+    """
     moving = speed_rad_s[kept & (speed_rad_s > REST_RAD_S)]
     limits = [REST_RAD_S]
     if len(moving) >= 2 * FEWEST:
@@ -268,26 +277,27 @@ def motion_states(speed_rad_s: Array, kept: NDArray[np.bool_]) -> NDArray[np.int
 
 
 def places_in_runs(t_s: Array, row_s: float) -> NDArray[np.intp]:
-    """Return the place (n,) of each row in its run of rows without a gap, from 0."""
+    """Return the index (n,) of each row within its run of rows without a gap, from 0."""
     breaks = np.flatnonzero(np.diff(t_s, prepend=-np.inf) > 1.5 * row_s)
     return np.asarray(np.arange(len(t_s)) - np.repeat(breaks, np.diff(np.append(breaks, len(t_s)))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RowNoise:
-    """Autoregressive model of the noise, whose filter makes rows independent and of unit variance.
+    """Autoregressive noise model. Its filter makes the residuals of rows independent, with unit variance.
 
-    With z_t the row divided by the scale of its state, for each channel, and a_k of the order of least BIC,
+    With z_t the residual divided by the scale of the row's state, for each channel, and a_k of the order of least BIC,
 
         e_t = root (z_t - sum_k a_k z_(t-k)) / sigma_a
     """
 
     scale: Array
-    """(states, 6) standard deviation of a row."""
+    """(states, 6) standard deviation of a row in each state, N and N·m."""
     filters: Array
-    """(order + 1, 6, order + 1) by rows before in the run, channel, and lag: (1, -a_1, …) / sigma_a."""
+    """(order + 1, 6, order + 1) prediction-error filters (1, -a_1, …) / sigma_a, indexed by the number of earlier rows
+    in the run, channel and lag."""
     root: Array
-    """(6, 6) inverse root of the correlation between the channels of the innovations."""
+    """(6, 6) inverse square root of the correlation between the channels of the innovations."""
 
     @classmethod
     def of(
@@ -300,18 +310,18 @@ class RowNoise:
         bursts: bool = False,
         order: int = ORDER,
     ) -> Self:
-        """Estimate from kept rows.
+        """Return the noise model estimated from the residuals of kept rows.
 
         Parameters
         ----------
         residuals : array, shape (n, 6)
         absorbed : array, shape (n, 6, k)
-            Root of the covariance of the prediction, by which the fit has lowered the variance of the residuals.
+            Root of the covariance of the prediction, by which the fit has reduced the variance of the residuals.
         state, place : array, shape (n,)
-            As `states` and `runs` return them.
+            Results of `motion_states` and `places_in_runs`.
         bursts : bool
-            Whether noise whose spectrum rises with the frequency counts as white: gears shake the tool quickly where a
-            joint reverses, and unequal weights of the rows carry that to low frequencies.
+            Whether to treat noise whose spectrum rises with frequency as white. Gears shake the tool quickly where a
+            joint reverses, and unequal weights of the rows would alias these vibrations to low frequencies.
         order : int
             Largest order of the autoregression.
         """
@@ -329,7 +339,7 @@ class RowNoise:
         return cls(scale, noise.filters, np.linalg.inv(np.linalg.cholesky(correlation + 1e-9 * np.eye(6))))
 
     def whiten(self, X: Array, state: NDArray[np.intp], place: NDArray[np.intp]) -> Array:
-        """Return the innovations of values (n, 6, k) of rows; at the beginning of a run the order is lower."""
+        """Return the innovations (n, 6, k) of values (n, 6, k); the filter order is lower at the start of a run."""
         X = X / self.scale[state][:, :, None]
         order = self.filters.shape[0] - 1
         filters = self.filters[np.minimum(place, order)]
@@ -340,7 +350,7 @@ class RowNoise:
 
 
 def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool, order: int = ORDER) -> Array:
-    """Prediction error filters (order + 1, order + 1) of a channel by Levinson's recursion; the order has least BIC."""
+    """Return prediction-error filters (order + 1, order + 1) of one channel: Levinson recursion, order of least BIC."""
     most, size = min(order, len(unit) // _ROWS_PER_ORDER), len(unit)
     lags = np.empty(most + 1)
     for lag in range(most + 1):
@@ -361,9 +371,9 @@ def _filters(unit: Array, place: NDArray[np.intp], *, bursts: bool, order: int =
 
 
 def _of_equal_order(channels: list[Array]) -> Array:
-    """Stack filters (order + 1, channels, order + 1): beyond its order a channel keeps its last filter."""
-    size = max(len(one) for one in channels)
-    padded = [np.pad(one, ((0, size - len(one)), (0, size - len(one))), mode="constant") for one in channels]
-    for one, wide in zip(channels, padded, strict=True):
-        wide[len(one) :, : len(one)] = one[-1]
+    """Stack the filters of all channels to (order + 1, channels, order + 1), each padded with its last filter."""
+    size = max(len(filters) for filters in channels)
+    padded = [np.pad(filters, (0, size - len(filters)), mode="constant") for filters in channels]
+    for filters, wide in zip(channels, padded, strict=True):
+        wide[len(filters) :, : len(filters)] = filters[-1]
     return np.stack(padded, axis=1)

@@ -1,32 +1,34 @@
 """The unknowns of a load in motion, their priors, and the normal equations of one Gauss-Newton step.
 
-The unknowns are the error vector x of the load (34 coordinates, `Load.moved`) and random effects with Gaussian priors.
+The unknowns are the error vector x of the load (34 coordinates, `MovingLoad.moved`) and Gaussian random effects.
 The wrench of row i at time t_i in orientation R_i is, with h of `ftcalib.motion.model`,
 
     y_i = h(x, motion(t_i - delay)) + B_i beta + Z_i u + e_i,    e_i: autoregressive noise, `RowNoise`
 
-    beta   bias at knots every 5 s: a random walk, with increments N(0, walk² dt) a channel. The last knot is 0, so that
-           the bias in x is that of the end. For each zeroing, one more bias of the rows before it.
-    u      slow      noise of seconds: an Ornstein-Uhlenbeck process of 5 s at knots every 2.5 s
-           rotation  turns of the arm about the flange axes: smooth functions of R_i, cov(u) = size² I. What is constant
-                     in flange or base axes belongs to x. With them a shift (3) of the flange, at links of 0.3 m
-           yielding  turns of a mount that yields in proportion to the torque, 3 x 3
+    beta   bias at knots every 5 s: a random walk with increments N(0, walk² dt) in each channel. The last knot is 0,
+           so the bias in x is the bias at the end. Each zeroing adds an offset of the bias in the rows before it.
+    u      slow      slow noise: an Ornstein-Uhlenbeck process with a time constant of 5 s, at knots every 2.5 s
+           rotation  errors of the arm's orientation about the flange axes: smooth functions of R_i, cov(u) = size² I.
+                     Parts that are constant in flange or base axes belong to x. A shift (3) of the flange, for links
+                     of 0.3 m, is included
+           yielding  rotation of a compliant mount in proportion to the torque, 3 x 3
            cable     wrench of a cable: smooth functions of R_i, for each channel
            load      gain that depends on the load: weight and its squares in sensor axes, for each channel
-           lever     antisymmetric cross-talk (3): it moves the centre of mass that torques show, not that of forces
+           lever     antisymmetric cross-talk (3): it shifts the centre of mass seen in the torques, not in the forces
 
-Gain and cross-talk in x have priors of the same kind, inertia, height and delay those of a usual tool. With J the
-derivative of all y by v = (x, beta, u), r = y - prediction, W the inverse covariance of the noise, and P(s) the
-precision of the priors for the sizes s of the components, a step and its covariance are (Henderson, Biometrics 31,
-1975)
+Gain and cross-talk in x have priors of the same kind; inertia, height and delay have the priors of a usual tool. With
+J the derivative of all y by v = (x, beta, u), r = y - prediction, W the inverse covariance of the noise, and P(s) the
+precision of the priors for the standard deviations s of the components, a step and its covariance are (Henderson,
+Biometrics 31, 1975)
 
     H = J' W J + P(s),    b = J' W r - P(s) v,    step = H^-1 b,    cov = H^-1
 
-and the sizes have the restricted likelihood (Patterson and Thompson, Biometrika 58, 1971)
+and the restricted likelihood of s is (Patterson and Thompson, Biometrika 58, 1971)
 
     -2 log L(s) = r' W r + v' P v - b' H^-1 b + log det H - log det P(s).
 
-Exact constraints of `Known` leave a basis Z of x: H becomes Z' H Z. Rows J, r of a `CellPrior` are added to H and b.
+Exact constraints of `Known` restrict x to a basis Z, and H becomes Z' H Z. Rows (J, r) of a `CellPrior` are added to H
+and b.
 """
 
 from collections.abc import Mapping
@@ -58,20 +60,20 @@ from ftcalib.motion.model import (
 )
 from ftcalib.motion.samples import Motion, MotionRows
 
-# Prior of a tool, one sigma: radius of gyration, sensor height, delay beyond that of the rows.
+# Prior of a tool, one sigma: radius of gyration, sensor height, and delay in addition to that of the rows.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
-# Distance and largest number of the knots of the bias.
+# Interval and largest number of the knots of the bias.
 KNOT_S, _MOST_KNOTS = 5.0, 25
-# Lever at which turns of the arm move the flange.
+# Lever at which orientation errors of the arm shift the flange.
 _REACH_M = 0.3
-# Noise of seconds: time constant, distance and largest number of the knots.
+# Slow noise: time constant, interval of the knots and their largest number.
 SLOW_S, _SLOW_KNOT_S, _MOST_SLOW = 5.0, 2.5, 48
-# Prior of what remains of a step by a zeroing, which was removed from the rows: one sigma.
+# Prior of the rest of a zeroing step after its removal from the rows, one sigma.
 _ZEROED_N, _ZEROED_NM = 10.0, 1.0
 # Ridge term of the scaled equations: directions that the data do not determine get a standard deviation of 1e6 times
 # their scale instead of infinity.
 RIDGE = 1e-12
-# Sizes that are expected of components that are always part of the model, because noise hides them.
+# Expected standard deviations of the components that are always part of the model, because noise can hide them.
 EXPECTED: Mapping[str, float] = {
     "slow_N": 5e-3,
     "slow_Nm": 2e-4,
@@ -84,18 +86,18 @@ EXPECTED: Mapping[str, float] = {
 }
 NEVER: Array = np.zeros(0)
 
-# Most rows of a robust fit.
+# Largest number of rows in a robust fit.
 ROUGH_ROWS = 600
-# Coordinates of a result at rest, gain and cross-talk last.
+# Indices of the coordinates of a static result: parameters, then gain and cross-talk.
 _RESPONDING = np.r_[0:15, GAINS.start : SIZE]
-# Rows that are summed at once.
+# Number of rows summed at once.
 _CHUNK = 1000
-# From so many rows on, the fit absorbs a negligible part of the noise.
+# With more rows the fit absorbs a negligible part of the noise.
 _MANY = 1000
 
 
 class Problem:
-    """Rows of a motion with the unknowns that explain them; arguments as of `ftcalib.motion.estimate.fit`."""
+    """Least-squares problem of the rows of a motion; arguments as in `ftcalib.motion.estimate.fit_motion`."""
 
     def __init__(
         self, rows: MotionRows, known: Known | None, g_m_s2: float, *, point_mass: bool, zeroed_s: Array = NEVER
@@ -107,7 +109,7 @@ class Problem:
         self.fixed[INERTIA] = point_mass
         count = int(np.clip(round(self.duration_s / KNOT_S), 1, _MOST_KNOTS - 1)) + 1
         self.knots = np.linspace(rows.t_s[0], rows.t_s[-1], count)
-        before_end = np.eye(count)[:, :-1]  # a drift that ends at 0: the bias is that of the end
+        before_end = np.eye(count)[:, :-1]  # the drift ends at 0, so the bias of the load is the bias at the end
         steps = np.diff(np.eye(count), axis=0) @ before_end
         self.walk = steps.T @ steps / (self.knots[1] - self.knots[0])
         self.courses = count + len(zeroed_s)
@@ -119,9 +121,10 @@ class Problem:
         self.basis = block_diag(np.kron(courses, np.eye(6)), np.eye(self.others))
 
     def _group(self) -> tuple[dict[str, tuple[NDArray[np.intp], Array]], int]:
-        """Places of each component in load and effects, with their precision at size 1, and how many effects are other.
+        """Return for each component its indices in (load, effects) and its precision at size 1; also the other effects.
 
-        Effects are the courses of the bias without its end, then the others: noise of seconds, turns, cable and lever.
+        The effects are the values of the bias (without the last knot), then the others: slow noise, rotations, cable
+        and lever. The second result is the number of the others.
         """
         distance = self.slow_knots[1] - self.slow_knots[0]
         lags = np.abs(np.subtract.outer(self.slow_knots, self.slow_knots))
@@ -148,7 +151,7 @@ class Problem:
         return groups, at + 3 - start
 
     def residuals(self, load: MovingLoad, effects: Array) -> Array:
-        """Wrench (n, 6) of all rows less that of load and effects."""
+        """Return the measured wrenches (n, 6) of all rows minus the prediction of load and effects."""
         rows, others = self.rows, effects[6 * self.courses :]
         wrench = self.hats(rows.t_s) @ self.drift(effects)
         if others.any():
@@ -158,16 +161,16 @@ class Problem:
         return np.asarray(rows.wrench - self.predict(load, rows) - wrench)
 
     def hats(self, t_s: Array) -> Array:
-        """Weight (n, courses) of each knot, and of the bias before each zeroing."""
+        """Return the weights (n, courses) of the bias knots, and of the bias before each zeroing, at these times."""
         knots = _hats(self.knots, t_s)
         return np.hstack([knots, t_s[:, None] <= self.zeroed_s]) if len(self.zeroed_s) else knots
 
     def predict(self, load: MovingLoad, rows: MotionRows) -> Array:
-        """Wrench (n, 6) of the load alone."""
+        """Return the wrench (n, 6) of the load alone."""
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
 
     def smooth_columns(self, load: MovingLoad, motion: Motion) -> Array:
-        """Derivative (n, 6, k) of the wrench by turns, by what they move, by a cable and by the gain of the load."""
+        """Return the derivative (n, 6, k) of the wrench by the effects rotation and yielding, shift, cable and load."""
         R = nearest_rotation(motion.R_base_flange)
         turned = turn_columns(load, motion) @ self.turns(load, R)
         moved = _REACH_M * lever_columns(load, motion)
@@ -176,10 +179,10 @@ class Problem:
         return np.concatenate([turned, moved, _on_channels(self.functions(R)), _on_channels(gained)], axis=2)
 
     def turns(self, load: MovingLoad, R_base_flange: Array) -> Array:
-        """Turns (n, 3, k) of poses, in flange axes: smooth ones, and those of a mount that yields to the torque.
+        """Return orientation errors (n, 3, k) about the flange axes: smooth ones, and those of a compliant mount.
 
-        What no session can separate belongs to the parameters: a turn that is constant in flange axes to the mounting,
-        and one in base to the direction of gravity.
+        Constant parts are removed, because they belong to the parameters: a rotation that is constant in flange axes
+        to the mounting, one that is constant in base axes to the direction of gravity.
         """
 
         def of(R: Array) -> tuple[Array, Array]:
@@ -194,25 +197,26 @@ class Problem:
         return np.asarray(smooth - constant @ share)
 
     def columns(self, load: MovingLoad, rows: MotionRows) -> tuple[Array, Array]:
-        """Derivative (n, 6, 34) of the wrench by the load, and by the effects without the courses of the bias."""
+        """Return the derivatives of the wrench by the load (n, 6, 34), and by the effects other than the bias."""
         motion = rows.motion.earlier(load.delay_s, rows.rate)
         J, slow = motion_jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
         return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)
 
     def drift(self, effects: Array) -> Array:
-        """Bias (courses, 6) at the knots and before each zeroing."""
+        """Return the bias (courses, 6) at the knots and before each zeroing."""
         return effects[: 6 * self.courses].reshape(-1, 6)
 
     @property
     def smooth_effects(self) -> slice:
-        """Places of turns and cable among the numbers of `basis`."""
+        """Slice of the smooth effects (rotation, yielding, shift, cable, load) in the columns of `basis`."""
         start = self.basis.shape[1] - self.others + 6 * len(self.slow_knots)
         return slice(start, self.basis.shape[1] - 3)
 
     def unseen(self, load: MovingLoad, residuals: Array) -> Array:
-        """Root (n, 6, k) of the covariance that smooth errors give the rows: of an arm, and of a cable.
+        """Return a root (n, 6, k) of the covariance of the rows due to smooth errors of the arm and a cable.
 
-        The arm has the expected one, and the cable pulls by as much as residuals (n, 6) are smooth beyond noise.
+        The arm's error has its expected standard deviation. That of the cable is the smooth part of the residuals
+        (n, 6) that exceeds the noise.
         """
         motion = self.rows.motion.earlier(load.delay_s, self.rows.rate)
         values = np.linalg.qr(self.functions(nearest_rotation(motion.R_base_flange)))[0]
@@ -226,9 +230,9 @@ class Problem:
         return np.asarray(self.smooth_columns(load, motion) * np.sqrt(variance[SIZE:][self.smooth_effects]))
 
     def next_use(self, load: MovingLoad, effects: Array, solved: "NormalSolution") -> Array:
-        """Root mean square error (2,) of compensating a free tool at rest in the poses of the rows, N and N·m.
+        """Return the rms error (2,) of compensating a free tool at rest in the orientations of the rows, N and N·m.
 
-        Turns and cable act then as they did in the recording, and no compensation knows them.
+        Orientation errors and the cable act as in the recording, and the compensation does not model them.
         """
         R = self.functions.R_base_flange
         still = Motion(R, np.zeros((len(R), 3)), np.zeros((len(R), 3, 3)))
@@ -241,38 +245,38 @@ class Problem:
         return np.asarray(np.sqrt(square.mean(axis=0).reshape(2, 3).sum(axis=1)))
 
     def prior(self, load: MovingLoad) -> tuple[Array, Array]:
-        """Precision (34,) of the values that are not static, beside that of the components, and the present values."""
+        """Return the prior precision (34,) of inertia, height and delay, 0 for the others, and the present values."""
         sigma = np.full(SIZE, np.inf)
         sigma[INERTIA] = max(load.mass_kg, 0.1) * GYRATION_M**2
         sigma[HEIGHT], sigma[DELAY] = HEIGHT_M, DELAY_S
         return 1 / sigma**2, load.vector
 
     def starts(self) -> list[MovingLoad]:
-        """Loads for each mounting that explains the forces as a weight."""
+        """Return starting loads: one for each mounting that explains the forces as a weight."""
         rows = self.rows[:: max(1, len(self.rows) // ROUGH_ROWS)]
         R, force, ones = nearest_rotation(rows.motion.R_base_flange), rows.wrench[:, :3], np.ones(len(rows))
         cost = force_cost(R, force, ones)
-        found = []
-        for Q in self.constraints.rotations([one.R.T for one in minima(cost)], cost)[:4]:
+        loads = []
+        for Q in self.constraints.rotations([minimum.R.T for minimum in minima(cost)], cost)[:4]:
             F_b, bias = given_rotation(Q.T, R, force, ones)
             c, torque_bias = com_and_torque_bias(F_b @ R @ Q, rows.wrench[:, 3:])
-            found.append(MovingLoad(self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias)), self.g_m_s2))
-        return found
+            loads.append(MovingLoad(self.constraints.satisfy(Parameters(Q, F_b, bias, c, torque_bias)), self.g_m_s2))
+        return loads
 
     def free(self, load: MovingLoad) -> Array:
-        """Basis (34, m) of what is estimated, without the response."""
+        """Return a basis (34, m) of the coordinates of the load that are not exactly known."""
         Z = block_diag(self.constraints.free(load.static), np.eye(SIZE - 15))
         return np.asarray(Z[:, ~np.concatenate([np.zeros(Z.shape[1] - (SIZE - 15), bool), self.fixed[15:]])])
 
     def estimated(self, load: MovingLoad, on: NDArray[np.bool_]) -> tuple[Array, NDArray[np.intp]]:
-        """Basis (34, m) of what is estimated of the load, and places of the effects that are."""
+        """Return a basis (34, m) of the estimated coordinates of the load, and the indices of the estimated effects."""
         Z = self.free(load)
         return Z[:, on[np.argmax(np.abs(Z), axis=0)]], SIZE + np.flatnonzero(on[SIZE:])
 
     def sums(
         self, load: MovingLoad, effects: Array, noise: RowNoise, kept: NDArray[np.bool_], state: NDArray[np.intp]
     ) -> tuple[Array, Array, float]:
-        """Information, gradient and chi2 of load and effects, over kept rows as the noise weighs them."""
+        """Return information matrix, gradient and chi2 of load and effects over the whitened kept rows."""
         rows, order = self.rows[kept], noise.filters.shape[0] - 1
         state, place = state[kept], places_in_runs(rows.t_s, rows.row_s)
         size = SIZE + len(self.basis)
@@ -297,7 +301,10 @@ class Problem:
         return T.T @ H @ T, T.T @ b, chi2
 
     def absorb(self, load: MovingLoad, rows: MotionRows, solved: "NormalSolution") -> Array:
-        """Root (n, 6, k) of the covariance of the prediction; none before the first solution, nor for so many rows."""
+        """Return a root (n, 6, k) of the covariance of the prediction.
+
+        It has no columns before the first solution, or if there are so many rows that the covariance is negligible.
+        """
         if not solved.step.size or len(rows) > _MANY:
             return np.zeros((len(rows), 6, 0))
         basis, inverse_root = solved.root
@@ -306,7 +313,7 @@ class Problem:
         return np.asarray(np.concatenate([J, by_effects @ self.basis], axis=2) @ (basis @ inverse_root))
 
     def components(self, sizes: Mapping[str, float], load: MovingLoad) -> tuple[Array, NDArray[np.bool_], float]:
-        """Prior precision of load and effects, which of them are estimated, and -log det of that of the components."""
+        """Return the prior precision of load and effects, which are estimated, and -log det for the components."""
         total = SIZE + self.basis.shape[1]
         P, on, log_det = np.zeros((total, total)), np.ones(total, np.bool_), 0.0
         for name, (places, precision) in self.groups.items():
@@ -330,11 +337,11 @@ class Problem:
         effects: Array,
         prior: tuple[Array, Array] | None = None,
     ) -> "NormalSolution":
-        """Solve the sums for load and effects with these sizes of the components, and rows of a prior."""
+        """Solve the normal equations for load and effects, given the component sizes and optional rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
         value = np.concatenate([load.vector, self.basis.T @ effects])
-        removed = np.where(on, 0.0, -value)  # a component that is off goes to 0
+        removed = np.where(on, 0.0, -value)  # the coefficients of an absent component are set to 0
         chi2 += float(removed @ H @ removed - 2 * b @ removed)
         b, value = b - H @ removed, np.where(on, value, 0.0)
         rows, residuals = self.constraints.measurements(load.static)
@@ -367,13 +374,13 @@ class Problem:
         load: MovingLoad,
         effects: Array,
     ) -> Array:
-        """-2 log restricted likelihood (k,) of a component's sizes beside those of the others, less that of size 0."""
+        """Return -2 log restricted likelihood (k,) of trial sizes of one component, relative to size 0."""
         H, b, _ = sums
         places, precision = self.groups[name]
         P, on, _ = self.components({**sizes, name: 0.0}, load)
         value = np.concatenate([load.vector, self.basis.T @ effects])
         rows, residuals = self.constraints.measurements(load.static)
-        # About the present load and effects of 0.
+        # Linearised at the present load, with all effects 0.
         value[:15] = 0.0
         b, H = b + H @ value, H + P
         H[:15, :15] += rows.T @ rows
@@ -394,47 +401,47 @@ class Problem:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NormalSolution:
-    """Solution of the normal equations."""
+    """Solution of the normal equations for load and effects."""
 
     step: Array
-    """(34 + effects,) of load and effects."""
+    """(34 + effects,) step of load and effects."""
     cost: float
     """Chi2 of rows and priors after the step."""
     criterion: float
-    """-2 log restricted likelihood of the sizes, up to a constant."""
+    """-2 log restricted likelihood of the component sizes, up to a constant."""
     basis: Array
-    """Columns of what is estimated, scaled."""
+    """Scaled basis of the estimated unknowns, one column each."""
     factor: tuple[Array, bool]
-    """Cholesky factor of the scaled information."""
+    """Cholesky factor of the scaled information matrix."""
 
     @classmethod
     def none(cls) -> Self:
-        """Return that before the first solution."""
+        """Return an empty solution, for use before the first step."""
         nothing = np.zeros((0, 0))
         return cls(np.zeros(0), 0.0, 0.0, nothing, (nothing, False))
 
     @property
     def root(self) -> tuple[Array, Array]:
-        """Two matrices, whose product times its transpose is the covariance."""
+        """Matrices A and B for which A B (A B)' is the covariance of load and effects."""
         return self.basis, np.asarray(np.linalg.inv(np.triu(self.factor[0])))
 
     @property
     def covariance(self) -> Array:
-        """Of load and effects."""
+        """Covariance of load and effects."""
         return np.asarray(self.basis @ cho_solve(self.factor, self.basis.T))
 
 
 def _among(H: Array, Z: Array, rest: NDArray[np.intp]) -> Array:
-    """Information of what is estimated: of the load in the basis Z, and of these effects."""
+    """Return the information matrix of the estimated unknowns: the load in the basis Z, and the effects `rest`."""
     beside = Z.T @ H[:SIZE, rest]
     return np.block([[Z.T @ H[:SIZE, :SIZE] @ Z, beside], [beside.T, H[np.ix_(rest, rest)]]])
 
 
 def _hats(knots: Array, t_s: Array) -> Array:
-    """Weight (n, k) of each knot."""
+    """Return the weights (n, k) of linear interpolation between evenly spaced knots."""
     return np.asarray(np.maximum(1 - np.abs(t_s[:, None] - knots) / (knots[1] - knots[0]), 0))
 
 
 def _on_channels(values: Array) -> Array:
-    """Derivative (n, 6, 6 k) of a wrench that is the sum of values (n, k), each with weights of its own a channel."""
+    """Return the derivative (n, 6, 6 k) of a wrench whose channels are independent combinations of values (n, k)."""
     return np.asarray(np.einsum("nk,ij->nikj", values, np.eye(6)).reshape(len(values), 6, -1))

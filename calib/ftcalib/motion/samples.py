@@ -1,14 +1,14 @@
-"""Samples of sensor and arm in motion: their times of measurement, and what the estimator needs of them.
+"""Samples of sensor and arm in motion: their measurement times, and their reduction to the rows of the estimator.
 
-A sample is received some time after it was measured, and never before. `Timeline` and `measured_s` therefore lay a
-straight line under the times of receipt over the device's own count; the device's clock may drift slowly.
+A sample is received some time after it was measured, and never before. `SampleClock` and `measured_s` therefore fit a
+straight line below the times of receipt, as a function of the device's own count. The device's clock may drift slowly.
 
-Two steps reduce a recording while it is read. `Means` averages each stream over 10 ms, in constant memory a second of
-recording. `rows_of` puts both on one clock, differentiates the poses, and passes wrench and motion through the same
-zero-phase filter to 8 rows a second.
+Two steps reduce a recording while it is read. `Means` averages each stream over 10 ms, so memory per second of
+recording is constant. `motion_rows` converts both streams to one clock, differentiates the poses, and applies the same
+zero-phase filter to wrench and motion, which gives 8 rows per second.
 
 The wrench is linear in the orientation R, the acceleration a of the flange origin and `Omega` = [alpha]x + [omega]x²
-(all in flange axes). Products of poses are taken before the filter, so what it cuts, it cuts on both sides alike.
+(all in flange axes). Products of poses are formed before filtering, so the filter affects both sides equally.
 """
 
 from collections import deque
@@ -27,24 +27,25 @@ from ftcalib.errors import BadDataset
 from ftcalib.model import Array, skew
 
 MEAN_S = 0.01
-# Rows whose filter spans a longer gap, or one of three periods of a slower stream, are left out.
+# Rows whose filter window contains a longer gap (or, in a slower stream, a gap of three periods) are left out.
 GAP_S = 0.06
 
-# Longer ones are refused: the times are of two recordings, or wrong.
+# Longer gaps are rejected: the times belong to two recordings, or are wrong.
 LONGEST_GAP_S = 86400.0
-# A longer step from sample to sample is one in a unit of this list, with the longest step of each.
+# A longer typical step between samples means that the times are in one of these units; the second number of each entry
+# is the longest step for that unit, s.
 LONGEST_STEP_S = 0.25
 _TIME_UNITS = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
-# Times count in units of 10 ms, which 64 bits must hold.
+# Largest time, s: the number of 10 ms intervals must fit in 64 bits.
 LATEST_S = 1e11
 
-# (11, 3) value and two derivatives of a quartic through 110 ms: flat over the band.
+# (11, 3) value and first two derivatives of a quartic fitted to 110 ms of poses; the response is flat over the band.
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
-# A mean with less weight of samples than this is none.
+# A mean with a smaller total weight of samples is discarded.
 _LEAST_WEIGHT = 1e-3
-# Rows that are filtered at once.
+# Number of rows filtered at once.
 _CHUNK = 600
-# Translation counts as a rotation about a point this far away.
+# Lever that converts a translational speed to an angular speed, m.
 _LEVER_M = 0.5
 
 _BUCKET_S, _BUCKETS = 0.25, 40
@@ -52,55 +53,56 @@ _LEAST_SCATTER_NS = 1e4
 CLOCK_TOLERANCE, RATE_TOLERANCE = 2e-4, 3e-3
 """Relative error of a device's clock, and of the nominal rate of a sensor without one, one sigma."""
 _IMPLAUSIBLE = 4.0
-# Times never jump and never run backwards: they approach a better estimate at this fraction of the time passing.
+# Times never jump and never run backwards: they approach a better estimate at this fraction of the elapsed time.
 _SLEW = 0.05
-# They approach one that is farther away faster.
+# Distance from which the times approach a better estimate faster, and the fastest approach.
 _FAR_NS, _FASTEST_SLEW = 2e8, 0.9
-# If so many buckets in a row are later than this, and alike, the line before them is no longer true.
+# If this many successive buckets are later than the line by more than this, and by similar amounts, the line is
+# discarded: samples were lost without being counted.
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
-# A device whose count is so far from the line has restarted.
+# A device whose count deviates from the line by more has restarted.
 _LOST_S = 1.0
-# Parts of a recording, of each of which the one sample counts that is received the soonest.
+# Number of parts of a recording; of each part only the least delayed sample is used.
 _PARTS = 200
 
-# Seconds from row to row, multiples of `MEAN_S`. To 4.7 Hz: below the ripple of gears and the vibration of an arm,
-# above its motion. A contact is short in such rows.
+# Interval between rows, a multiple of `MEAN_S`. The bandwidth of 4.7 Hz is below gear ripple and arm vibration, and
+# above the motion of the arm. A contact affects only a few such rows.
 WIDE_S = 0.12
-# To 2 Hz: gears of joints that turn slowly shake the tool at 2 to 5 Hz.
+# Interval for a bandwidth of 2 Hz: gears of slowly turning joints shake the tool at 2 to 5 Hz.
 NARROW_S = 0.28
 
 
 class SampleClock:
-    """Time of measurement of every sample of one device: the supporting line below its times of receipt.
+    """Measurement times of the samples of one device: a line below the times of receipt, updated while samples arrive.
 
-    Each quarter of a second contributes its least delayed sample; the line is below those of the last ten seconds.
-    `measured_s` takes a whole recording at once.
+    Each quarter of a second contributes its least delayed sample. The line is fitted below those of the last ten
+    seconds. For a complete recording use `measured_s`.
 
     Parameters
     ----------
     period_s : float
         Nominal duration of one count: 1 for a clock in seconds, 1 / rate for a sample number.
     tolerance : float
-        Relative error of that duration, one standard deviation. It counts as long as the times of receipt scatter too
-        much to show the rate, as on a computer that is too busy.
+        Relative error of that duration, one standard deviation. The nominal duration is used as long as the times of
+        receipt scatter too much to show the rate, for example on a busy computer.
     """
 
     def __init__(self, period_s: float = 1.0, tolerance: float = CLOCK_TOLERANCE) -> None:
         self.shift_s = 0.0
-        """Subtracted from every time; a change is followed slowly."""
+        """Offset subtracted from every time, s; a change takes effect gradually."""
         self._nominal_ns = period_s * 1e9
         self._tolerance = tolerance
         self.restart()
 
     def restart(self) -> None:
-        """Forget the line, after an interruption: a device may not have counted meanwhile."""
+        """Discard the line after an interruption, during which the device may not have counted."""
         self._points: deque[tuple[float, float]] = deque(maxlen=_BUCKETS)
         self._origin: tuple[float, int] | None = None
         self._slope, self._offset = self._nominal_ns, 0.0
         self._last: tuple[float, float] | None = None
 
     def stamp(self, count: Array, t_host_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the times of measurement (n,) of samples with these counts (n,) and times of receipt (n,)."""
+        """Return the measurement times (n,), ns, of samples with counts (n,) and times of receipt (n,) in ns."""
         if self._origin is None:
             self._origin = float(count[0]), int(t_host_ns[0])
         x, y = count - self._origin[0], (t_host_ns - self._origin[1]).astype(np.float64)
@@ -129,14 +131,14 @@ class SampleClock:
         return np.asarray(self._origin[1] + np.rint(times).astype(np.int64))
 
     def _note(self, x: float, y: float) -> None:
-        """Keep the least delayed sample of each bucket, and fit the line."""
+        """Keep the least delayed sample of each bucket, and fit the line below these samples."""
         width = _BUCKET_S * 1e9 / self._slope
         if not self._points or x // width > self._points[-1][0] // width:
             self._points.append((x, y))
             late = list(self._points)[-_STEP_BUCKETS - 1 : -1]
             by_ns = [b - self._slope * a - self._offset for a, b in late]
             if len(late) == _STEP_BUCKETS and min(by_ns) > max(_STEP_NS, 0.7 * max(by_ns)):
-                # samples were lost that nothing has counted
+                # samples were lost without being counted
                 self._points = deque([*late, (x, y)], maxlen=_BUCKETS)
         elif y - self._slope * x < self._points[-1][1] - self._slope * self._points[-1][0]:
             self._points[-1] = x, y
@@ -148,16 +150,16 @@ class SampleClock:
             error = (above_ns + _LEAST_SCATTER_NS) / ((self._points[-1][0] - self._points[0][0]) * self._nominal_ns)
             weight = 1 / (1 + (error / self._tolerance) ** 2)
             if abs(slope / self._nominal_ns - 1) > _IMPLAUSIBLE * self._tolerance:
-                # no drift of a clock, but a growing delay
+                # too fast for a clock drift: the delay is growing
                 weight = 0.0
             self._slope = weight * slope + (1 - weight) * self._nominal_ns
         self._offset = min(b - self._slope * a for a, b in self._points)
 
 
 def measured_s(count: Array, t_host_ns: NDArray[np.int64], start_ns: int) -> Array:
-    """Return the times of measurement (n,) of a recording, in s from `start_ns`: one line below all times of receipt.
+    """Return the measurement times (n,) of a recording, s after `start_ns`: one line below all times of receipt.
 
-    A computer that starves receives samples late, for seconds on end, but none early.
+    An overloaded computer may receive samples late for several seconds, but never early.
     """
     x, y = count - float(count[0]), (t_host_ns - start_ns) * 1e-9
     rough = (y[-1] - y[0]) / max(x[-1], 1.0)
@@ -169,10 +171,10 @@ def measured_s(count: Array, t_host_ns: NDArray[np.int64], start_ns: int) -> Arr
 
 
 def _line_below(points: Sequence[tuple[float, float]]) -> tuple[float, float, float]:
-    """Return a point (x, y) and the slope of the line below all points with the least mean distance from them.
+    """Return a point (x, y) and the slope of the line below all points with the smallest mean distance to them.
 
-    It is the edge of their lower convex hull at their middle, which is the clock skew estimator of Moon, Skelly,
-    Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
+    The line is the edge of the lower convex hull at the mean x of the points: the clock skew estimator of Moon,
+    Skelly, Towsley, "Estimation and removal of clock skew from network delay measurements", INFOCOM 1999.
     """
     hull: list[tuple[float, float]] = []
     for point in sorted(points):
@@ -190,9 +192,9 @@ def _cross_of_edges(a: tuple[float, float], b: tuple[float, float], c: tuple[flo
 
 
 def row_filter(row_s: float) -> Array:
-    """Zero-phase filter (2 k + 1,) of means over 10 ms, of unit sum, in whose rows white noise is white.
+    """Return the weights (2 k + 1,), with sum 1, of the zero-phase filter that turns means over 10 ms into rows.
 
-    Half the amplitude is left at .56 of the rate of the rows.
+    White noise of the means stays white in the rows. The amplitude is halved at 0.56 times the row rate.
     """
     step = round(row_s / MEAN_S)
     half = round(3.36 * step)
@@ -201,9 +203,10 @@ def row_filter(row_s: float) -> Array:
 
 
 class Means:
-    """Means of one stream around every 10 ms, added piece by piece.
+    """Weighted means of one stream at every multiple of 10 ms, accumulated piece by piece.
 
-    Weights fall linearly to 0 in 10 ms: what is quicker than 50 Hz is cut alike wherever the samples lie.
+    The weights of samples fall linearly to 0 within 10 ms, so frequencies above 50 Hz are attenuated equally, whatever
+    the times of the samples.
     """
 
     def __init__(self) -> None:
@@ -217,18 +220,18 @@ class Means:
         Parameters
         ----------
         t_s : array, shape (n,)
-            Not before those added earlier.
+            Times in ascending order, not before the samples added earlier.
         values : array, shape (n, k)
 
         Raises
         ------
         BadDataset
-            The time goes back or leaps by more than a day, or a number is not finite or too large for a sensor.
+            The time goes back or jumps by more than a day, or a number is not finite or too large for a sensor.
         """
         if not len(t_s):
             return
         if t_s[0] < self._last_s or (np.diff(t_s) < 0).any():
-            raise BadDataset("the time goes back: give the samples in the order of their times")
+            raise BadDataset("the times decrease: sort the samples by time")
         if not (np.isfinite(t_s).all() and np.isfinite(values).all()):
             raise BadDataset("a time or a value is not a finite number: remove these samples")
         if (bad := np.flatnonzero((np.abs(t_s) > LATEST_S) | (np.abs(values) > LARGEST).any(axis=1))).size:
@@ -254,27 +257,27 @@ class Means:
         self._parts.append(_sum_cells(np.concatenate([cell, cell + 1]), sums))
 
     def result(self) -> tuple[Array, Array]:
-        """Return the mean time (m,) and the means (m, k) around each 10 ms that have samples."""
+        """Return the mean times (m,) and the means (m, k) of all 10 ms intervals that contain samples."""
         if not self._parts:
-            raise BadDataset("there are no samples")
+            raise BadDataset("the recording has no samples: record again")
         _, sums = _sum_cells(*(np.concatenate(each) for each in zip(*self._parts, strict=True)))
-        # Weights fall to 0 at the ends of a mean: one with almost none says nothing.
+        # A mean with almost no weight, from samples at the edge of its interval, carries no information.
         sums = sums[sums[:, 0] > _LEAST_WEIGHT]
         t_s = sums[:, 1] / sums[:, 0]
-        own = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # a sample of a slow stream is alone in two means
-        return t_s[own], sums[own, 2:] / sums[own, :1]
+        new = np.diff(t_s, prepend=-np.inf) > MEAN_S / 10  # in a slow stream two means may hold the same single sample
+        return t_s[new], sums[new, 2:] / sums[new, :1]
 
 
 def require_seconds(t_s: Array, name: str) -> None:
-    """Raise `BadDataset` if the times (n,) of a stream cannot be in seconds."""
+    """Raise `BadDataset` if the steps between the times (n,) of a stream are too long for times in seconds."""
     step = float(np.quantile(np.diff(t_s), 0.25, method="lower")) if len(t_s) > 1 else 0.0
     if step > LONGEST_STEP_S:
         unit = next(unit for unit, longest in _TIME_UNITS if step < longest)
-        raise BadDataset(f"{name} step by {step:.3g} s, as if they were in {unit}: give them in seconds")
+        raise BadDataset(f"{name} increase in steps of {step:.3g} s and look like {unit}: give them in seconds")
 
 
 def _sum_cells(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64], Array]:
-    """Add the sums of equal cells; return both in the order of the cells."""
+    """Add up the sums that belong to the same cell; return the cells in ascending order, and the sums of each."""
     order = np.argsort(cell, kind="stable")
     cell = cell[order]
     first = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
@@ -283,21 +286,21 @@ def _sum_cells(cell: NDArray[np.int64], sums: Array) -> tuple[NDArray[np.int64],
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """What the wrench of a load depends on, n rows; linear filters apply to each number."""
+    """Motion of the flange, n rows: the 21 numbers on which the wrench of a load depends linearly."""
 
     R_base_flange: Array
-    """(n, 3, 3)"""
+    """(n, 3, 3) filtered orientations."""
     acceleration_m_s2: Array
-    """(n, 3) of the flange origin, in flange axes, gravity not included."""
+    """(n, 3) acceleration of the flange origin in flange axes, without gravity."""
     Omega_rad2_s2: Array
     """(n, 3, 3) skew(angular acceleration) + skew(angular velocity)², in flange axes."""
 
     def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
-        """Return some rows."""
+        """Return the selected rows."""
         return type(self)(self.R_base_flange[rows], self.acceleration_m_s2[rows], self.Omega_rad2_s2[rows])
 
     def earlier(self, by_s: float, rate: "Motion") -> "Motion":
-        """Return the motion a little before, from its rate of change."""
+        """Return the motion `by_s` seconds earlier, to first order, from its rate of change."""
         return Motion(
             self.R_base_flange - by_s * rate.R_base_flange,
             self.acceleration_m_s2 - by_s * rate.acceleration_m_s2,
@@ -305,38 +308,39 @@ class Motion:
         )
 
     def columns(self) -> Array:
-        """Return all 21 numbers of each row."""
+        """Return the 21 numbers of each row as an array (n, 21)."""
         n = len(self.acceleration_m_s2)
         return np.hstack([self.R_base_flange.reshape(n, 9), self.acceleration_m_s2, self.Omega_rad2_s2.reshape(n, 9)])
 
     @classmethod
     def of_columns(cls, columns: Array) -> Self:
-        """Build from `columns`."""
+        """Return the motion from the array (n, 21) that `columns` returns."""
         return cls(columns[:, :9].reshape(-1, 3, 3), columns[:, 9:12], columns[:, 12:].reshape(-1, 3, 3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionRows:
-    """Wrench and motion on one clock, filtered alike, where both are complete."""
+    """Wrench and motion on one clock, with the same filter, wherever both have no gap."""
 
     t_s: Array
+    """(n,) times, s."""
     wrench: Array
-    """(n, 6)"""
+    """(n, 6) N and N·m."""
     motion: Motion
     rate: Motion
     """Rate of change of the motion, per second."""
     speed_rad_s: Array
-    """(n,) angular speed, plus that of the flange origin at 0.5 m: the state of motion."""
+    """(n,) angular speed, plus the speed of the flange origin divided by 0.5 m."""
     delay_s: float
-    """Assumed delay of the wrench after the poses."""
+    """Assumed delay of the wrench relative to the poses, s."""
     row_s: float
-    """From row to row."""
+    """Interval between rows, s."""
 
     def __len__(self) -> int:
         return len(self.t_s)
 
     def __getitem__(self, rows: slice | NDArray[np.intp] | NDArray[np.bool_]) -> Self:
-        """Return some rows."""
+        """Return the selected rows."""
         parts = self.t_s[rows], self.wrench[rows], self.motion[rows], self.rate[rows], self.speed_rad_s[rows]
         return type(self)(*parts, self.delay_s, self.row_s)
 
@@ -344,24 +348,24 @@ class MotionRows:
 def motion_rows(
     wrench: tuple[Array, Array], poses: tuple[Array, Array], delay_s: float = 0.0, row_s: float = WIDE_S
 ) -> MotionRows:
-    """Put wrench and poses on one clock.
+    """Return wrench and motion as filtered rows on one clock.
 
     Parameters
     ----------
     wrench : tuple of array, shapes (n,) and (n, 6)
-        Times and wrenches, `Means.result`.
+        Times and wrenches, from `Means.result`.
     poses : tuple of array, shapes (m,) and (m, 9) or (m, 12)
-        Times, R_base_flange row by row, and the position of the flange where it is known. Without it the acceleration
-        counts as 0.
+        Times, R_base_flange row by row, and the position of the flange if it is known. Without positions the
+        acceleration is taken as 0.
     delay_s : float
-        Delay of the wrench after the pose at which it arose.
+        Delay of the wrench relative to the poses.
     row_s : float
-        From row to row.
+        Interval between rows.
 
     Raises
     ------
     BadDataset
-        The two have less than a second in common.
+        Wrench and poses overlap by less than a second.
     """
     t_w, t_p = wrench[0], poses[0] + delay_s
     first, last = MEAN_S * np.ceil(max(t_w[0], t_p[0]) / MEAN_S), min(t_w[-1], t_p[-1])  # where the means are
@@ -370,7 +374,7 @@ def motion_rows(
     count = int((last - first) / MEAN_S) - 2 * reach
     if count < 1 / MEAN_S:
         raise BadDataset(
-            f"wrench and poses have {max(last - first, 0):.1f} s in common: give files of one recording, on one clock"
+            f"wrench and poses overlap by {max(last - first, 0):.1f} s: give files of one recording, on one clock"
         )
     poses = t_p, np.hstack([_continuous_quaternions(poses[1]), poses[1][:, 9:]])
     parts = [
@@ -384,9 +388,9 @@ def motion_rows(
 
 
 def interpolation_error_rad(poses: tuple[Array, Array]) -> float:
-    """Return the error of the orientations, root mean square, where each second sample is interpolated from the others.
+    """Return the rms error, rad, of every second orientation when it is interpolated from the others.
 
-    It is large where the poses are too few for their motion, and where their times are not those of the samples.
+    The error is large if the pose rate is too low for the motion, or if the times do not belong to the samples.
     """
     if len(poses[0]) < 9:
         return 0.0
@@ -398,16 +402,16 @@ def interpolation_error_rad(poses: tuple[Array, Array]) -> float:
 
 
 def _continuous_quaternions(values: Array) -> Array:
-    """Return quaternions (m, 4) of orientations that are given row by row, with equal signs of neighbours."""
+    """Return the quaternions (m, 4) of rotation matrices (m, 9); neighbours have consistent signs."""
     quaternion = Rotation.from_matrix(values[:, :9].reshape(-1, 3, 3)).as_quat()
-    # q and -q are one rotation: interpolation needs neighbours of equal sign.
+    # q and -q are the same rotation, but interpolation needs neighbours of equal sign.
     turned = np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0
     quaternion[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
     return np.asarray(quaternion)
 
 
 def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
-    """Whether a sample lies there: a gap of hours costs no work."""
+    """Whether a sample lies between the two times; parts of a long gap are skipped."""
     before, after = np.searchsorted(t_s, [start_s, end_s])
     return bool(after > before)
 
@@ -415,7 +419,7 @@ def _has_samples(t_s: Array, start_s: float, end_s: float) -> bool:
 def _chunk(
     wrench: tuple[Array, Array], poses: tuple[Array, Array], grid: Array, kernel: Array, step: int
 ) -> tuple[Array, ...]:
-    """Return time, wrench, columns of the motion, their rates and the speed, where no gap is near."""
+    """Return times, wrenches, motion columns, their rates and speeds of the rows without a gap in the filter window."""
     rate_kernel = np.convolve(kernel, [-0.5 / MEAN_S, 0.0, 0.5 / MEAN_S])  # filters and differentiates
     kernel = np.pad(kernel, 1)
     (y, whole_w), (pose, whole_p) = _interpolate(grid, *wrench), _interpolate(grid, *poses)
@@ -444,7 +448,7 @@ def _chunk(
 
 
 def _interpolate(grid: Array, t_s: Array, values: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Interpolate with the cubic through the four samples around each time, and say where no gap is."""
+    """Interpolate with a cubic through the four samples around each time; also return where there is no gap (n,)."""
     steps = np.diff(t_s)
     after = np.clip(np.searchsorted(t_s, grid), 1, len(t_s) - 1)
     whole = steps[after - 1] < max(GAP_S, 3 * float(np.median(steps)))
@@ -457,6 +461,6 @@ def _interpolate(grid: Array, t_s: Array, values: Array) -> tuple[Array, NDArray
 
 
 def _conjugate_product(q: Array, r: Array) -> Array:
-    """Vector part (n, 3) of conj(q) r for quaternions x, y, z, w."""
+    """Return the vector part (n, 3) of conj(q) r for quaternions (x, y, z, w)."""
     v, w = q[:, :3], q[:, 3:]
     return np.asarray(w * r[:, :3] - r[:, 3:] * v - np.cross(v, r[:, :3]))

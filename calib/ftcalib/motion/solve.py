@@ -1,4 +1,4 @@
-"""A calibration from a recording in motion."""
+"""Calibration from a recording of a moving arm."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -48,34 +48,36 @@ from ftcalib.motion.samples import (
 from ftcalib.result import CalibrationResult, MotionResult
 from ftcalib.sensor_matrix import Calibrated, Response
 
+# Shortest usable motion without a gap.
 LEAST_S = 5.0
-# Largest delay that is found.
+# Largest delay that is searched.
 FARTHEST_S = 1.5
-# A longer delay is a mistake of a clock.
+# A longer delay is reported as a clock error.
 OFFSET_S = 0.1
-# So far from the delay of the rows scale and signs of the motion are right.
+# Largest residual delay at which scale and signs of the motion are reliable.
 ALIGNED_S = 0.02
-# So far from the delay of the rows the model is linear in it.
+# Largest residual delay at which the model is linear in the delay.
 LINEAR_S = 2e-3
-# Fastest parts that count without positions, because their acceleration is unknown.
+# Without positions the acceleration is unknown, and only rows slower than this are used.
 SLOW_RAD_S = 0.15
-# Share of its change that a wrench leaves which follows the poses, and of what another rate of one clock leaves.
+# Residual, as a share of the change of the wrench, below which the clocks agree; and the share of the residual that
+# must remain for another clock rate to be accepted.
 _FOLLOWS, _OTHER_RATE = 0.03, 0.5
-# Rates of two clocks that differ by more, and how far their ratio may be from that of the durations.
+# Smallest difference of clock rates that is corrected; ratios that are tried, relative to the ratio of the durations.
 _SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
-# Poses whose neighbours miss them by more are too coarse for their motion. Then only parts at rest count.
+# Interpolation error from which poses are too coarse for their motion; then only rows slower than this are used.
 _COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
-# Radius at which an arm swings the flange: bounds the acceleration that is unknown without positions.
+# Radius on which an arm moves the flange: bounds the unknown acceleration if positions are missing.
 REACH_M = 1.0
 NARROW_DEG = 45.0
-# A parameter is determined if its sigma is below this share of what is expected of any tool.
+# A parameter is determined if its sigma is below this share of its prior sigma.
 MEASURED = 0.3
 WRONG_HEIGHT_M = 3e-3
-# Share of contact that limits a result.
+# Share of rows in contact that limits a result.
 MOSTLY = 0.5
-# Share of the change of the force that a wrong recording leaves.
+# Residual, as a share of the change of the force, from which wrench and poses do not belong together.
 _UNEXPLAINED = 0.3
-# Components that are smooth over the poses.
+# Beginnings of the names of components that are smooth functions of the pose.
 _SMOOTH = ("load", "cable", "rotation", "yielding")
 
 
@@ -92,26 +94,26 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     setup: Setup = NOTHING,
     provenance: Mapping[str, Any] | None = None,
 ) -> CalibrationResult:
-    """Calibrate from a free tool in motion.
+    """Calibrate from a recording of a free tool in motion.
 
     Parameters
     ----------
     wrench : Means
         Means of fx, fy, fz, tx, ty, tz in N and N·m, as measured, in the sensor frame.
     poses : Means
-        Of R_base_flange row by row, and of the position of the flange in base, m, if it is known: 12 or 9 columns. Both
-        on one clock, s, each at its own rate.
+        Means of R_base_flange row by row, followed by the position of the flange in base, m, if it is known: 12 or 9
+        columns. Wrench and poses share one clock, s, but may have different rates.
     known : Known, optional
         Known mounting, direction of gravity and mass.
     earlier : CalibrationResult, optional
-        Accepted, of the same sensor, mounting and base with any tool: its mounting, direction of gravity, gain and
-        cross-talk are a prior, with their covariance. The result's `provenance` names it as `parent`.
+        Accepted result of the same sensor, mounting and base, with any tool. Its mounting, direction of gravity, gain
+        and cross-talk are a prior with their covariance. The result's `provenance` names it as `parent`.
     point_mass : bool
         Whether the inertia of the load about its centre of mass is known to be 0.
     guarded : bool
-        As for `ftcalib.motion.estimate.fit`.
+        Whether a contact guard watched the motion, see `ftcalib.motion.estimate.fit_motion`.
     height_m : float, optional
-        Height of the sensor origin above the flange face, as configured, to be checked.
+        Configured height of the sensor origin above the flange face, which is compared with the estimate.
     g_m_s2 : float
     setup : Setup
         The described cell, for the verdict.
@@ -121,9 +123,9 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     Raises
     ------
     BadDataset
-        Too short, or without a common time.
+        The recording is too short, or wrench and poses do not overlap in time.
     NotObservable
-        The motion does not determine the parameters, or the earlier result holds no more; the message names what is
+        The motion does not determine the parameters, or contradicts the earlier result. The message names what is
         missing or has changed.
     """
     prior = None if earlier is None else CellPrior(earlier)
@@ -132,7 +134,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         require_seconds(t_s, f"the times of the {name}")
     coarse_rad = interpolation_error_rad(data[1])
     is_coarse = coarse_rad > _COARSE_RAD
-    # At rest positions say nothing.
+    # Rows at rest contain no information about positions.
     positions = data[1][1].shape[1] == 12 and not is_coarse
     limit_rad_s = _REST_RAD_S if is_coarse else np.inf if positions else SLOW_RAD_S
     data, zeroed_s = _without_zeroing(*data)
@@ -141,7 +143,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     mistakes, undo = _find_mistakes(data, rows, known, g_m_s2) if positions else ([], unchanged)
 
     def rows_at(delay_s: float) -> tuple[MotionRows, MotionRows]:
-        """Rows without the mistakes, and those that count."""
+        """Return the corrected rows at a delay, and those of them that are used."""
         others = undo(motion_rows(*data, float(np.clip(delay_s, -FARTHEST_S, FARTHEST_S)), rows.row_s))
         return others, _select_rows(others, limit_rad_s)
 
@@ -163,10 +165,10 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     places = places[:: max(1, len(places) // JUDGED_ROWS)]
     quality = judge_motion(Case(_static_estimate(used, best, places), setup=setup, known=known, g_m_s2=g_m_s2))
     findings = list(causes)
-    if verdict_of(causes) != "rejected":  # which would explain all others
-        # A point of another device puts the load behind the sensor, as reversed torques do.
-        elsewhere = any(one.code in ("torques_about_tcp", "poses_of_tcp") for one in causes)
-        findings += [one for one in quality.findings if not (elsewhere and one.code == "torques_reversed")]
+    if verdict_of(causes) != "rejected":  # a rejecting cause would explain all other findings
+        # Torques about a TCP put the load behind the sensor, as reversed torques do.
+        elsewhere = any(cause.code in ("torques_about_tcp", "poses_of_tcp") for cause in causes)
+        findings += [each for each in quality.findings if not (elsewhere and each.code == "torques_reversed")]
         aligned = used if abs(best.load.delay_s) <= LINEAR_S else rows_at(delay_s)[1]
         findings += _other_wrench(used, aligned, best, quality.findings)
         findings += _narrow_findings(used, best, explained=verdict_of(findings) == "rejected")
@@ -208,7 +210,7 @@ def _fit_at_delay(
     delay_s: float,
     fit_rows: Callable[[MotionRows], MotionFit],
 ) -> tuple[MotionRows, MotionRows, MotionFit]:
-    """Fit rows at a delay, and again at that of the fit: the model is linear in it only near that of the rows."""
+    """Fit rows at a delay, and again at the fitted delay, because the model is linear only in a small change of it."""
     for _ in range(3):
         rows, used = rows_at(delay_s)
         best = fit_rows(used)
@@ -223,9 +225,9 @@ def _fit_at_delay(
 def _causes(
     mistakes: list[Finding], ratio: float, zeroed_at_s: Array, coarse_rad: float, share: float
 ) -> list[Finding]:
-    """Name what was undone or left out before the fit."""
-    if ratio != 1:  # the other clock has that of the motion
-        mistakes = [one for one in mistakes if one.code not in ("clock_rate", "wrench_compensated")]
+    """Return findings about what was corrected or left out before the fit."""
+    if ratio != 1:  # different clock rates explain a scale of the acceleration
+        mistakes = [each for each in mistakes if each.code not in ("clock_rate", "wrench_compensated")]
         mistakes.append(Finding.of("clocks_differ", ratio=ratio))
     zeroed = [Finding.of("zeroed", at_s=zeroed_at_s)] if len(zeroed_at_s) else []
     coarse = {"off_deg": np.degrees(coarse_rad), "share_percent": 100 * share}
@@ -233,9 +235,9 @@ def _causes(
 
 
 def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], float, float]:
-    """Return the streams with times that run alike, how many times as long those of the wrench were, and their delay.
+    """Return both streams at one clock rate, the ratio of the original rates, and the delay of the wrench, s.
 
-    Files of one recording begin and end together within some seconds, so another rate shows in their durations.
+    Files of one recording begin and end within seconds of each other, so different rates show in their durations.
     """
     t_w, t_p = wrench[0], poses[0]
     delay_s, left = _coarse_delay(motion_rows(wrench, poses))
@@ -252,12 +254,12 @@ def _on_one_clock(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream],
 
 
 def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
-    """Return the delay, in whole rows, at which a linear function of the motion explains the wrench best.
+    """Return the delay, s, at which a linear function of the motion explains the wrench best, and the median residual.
 
-    Also how much it leaves, as a share of the change.
+    The delay is searched in whole rows. The residual is relative to the standard deviation of each channel.
     """
     if len(rows) * rows.row_s < LEAST_S:
-        raise BadDataset(f"{len(rows) * rows.row_s:.1f} s of motion without a gap are too short: record 20 s or more")
+        raise BadDataset(f"only {len(rows) * rows.row_s:.1f} s of motion have no gap: record 20 s or more")
     index = np.round((rows.t_s - rows.t_s[0]) / rows.row_s).astype(np.int64)
     place = np.full(index[-1] + 1, -1)
     place[index] = np.arange(len(rows))
@@ -279,33 +281,33 @@ def _coarse_delay(rows: MotionRows) -> tuple[float, float]:
 
 
 def _select_rows(rows: MotionRows, limit_rad_s: float) -> MotionRows:
-    """Return the rows that count: without positions the slow ones, and of poses that are too coarse those at rest."""
+    """Return the rows slower than a limit; raise if they are too few."""
     if np.isinf(limit_rad_s):
         return rows
     slow = rows[rows.speed_rad_s < limit_rad_s]
     if len(slow) * rows.row_s < LEAST_S and limit_rad_s < SLOW_RAD_S:
         raise NotObservable(
-            "the poses are too few for their motion, or their times are not those of the samples, and the parts at "
-            f"rest are only {len(slow) * rows.row_s:.1f} s long: record at 50 Hz or more, or rest for a second in each "
-            "of six orientations"
+            "the pose rate is too low for the motion, or the times do not belong to the poses, and the arm is at rest "
+            f"for only {len(slow) * rows.row_s:.1f} s: record at 50 Hz or more, or rest for a second in each of six "
+            "orientations"
         )
     if len(slow) * rows.row_s < LEAST_S:
         raise BadDataset(
-            f"without positions only slow parts count, and these are {len(slow) * rows.row_s:.1f} s long: give the "
-            "position of the flange (x, y, z), or record a slower motion"
+            f"positions are missing, so only slow motion is usable, and it lasts {len(slow) * rows.row_s:.1f} s: give "
+            "the position of the flange (x, y, z), or record a slower motion"
         )
     return slow
 
 
 def _require_enough_motion(rows: MotionRows, best: MotionFit, known: Known | None) -> None:
-    """Raise `NotObservable` where the error over all orientations would be as large as the weight."""
+    """Raise `NotObservable` if mounting or gravity force are so uncertain that a prediction would be useless."""
     mounting_rad = float(np.sqrt(np.diag(best.covariance)[:3].max()))
     weight_N = best.load.static.weight_N
     sigma_N = float(np.sqrt(np.diag(best.covariance)[3:6].max()))
     if mounting_rad < 0.3 and sigma_N < 0.5 * weight_N:
         return
     if known is not None:
-        return  # the verdict names it
+        return  # the verdict reports the uncertainty
     observability = assess(_orientations(rows), best.load.static)
     if observability.ambiguities:
         reason = ": ".join(observability.ambiguities[:2])
@@ -313,9 +315,9 @@ def _require_enough_motion(rows: MotionRows, best: MotionFit, known: Known | Non
 
 
 def _unseen_covariance(rows: MotionRows, best: MotionFit, orientation_rad: float) -> Array:
-    """Return the covariance (15, 15) from errors that the motion does not show: of arm, mounts and a soft tool.
+    """Return the covariance (15, 15) due to errors that the motion does not show: of arm, mounts and a compliant tool.
 
-    The smooth errors of the arm are a part of the fit.
+    Smooth errors of the arm are part of the fit instead.
     """
     static, R = best.load.static, _orientations(rows)
     if orientation_rad == 0:
@@ -332,10 +334,10 @@ def _orientations(rows: MotionRows) -> Array:
 
 
 def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
-    """Wrench (n, 6) at rest in the orientation of each row.
+    """Return the wrench (n, 6) that the sensor would read at rest in the orientation of each row.
 
-    A fit that fails has the wrong share of the motion. Then the linear function of the motion that fits best has it,
-    whatever axes and signs are.
+    If the fit is poor, its inertial wrench is wrong. Then that of the best linear function of the motion is subtracted
+    instead, which does not depend on correct axes and signs.
     """
     static = predict(best.load.static, nearest_rotation(rows.motion.R_base_flange)) + best.residuals
     kept = best.residuals[best.kept, :3]
@@ -345,11 +347,11 @@ def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
 
 
 def _static_estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]) -> Estimate:
-    """Return the estimates, with what they leave of the rows at these places.
+    """Return the fit as an estimate from static poses: the rows at the indices `places`.
 
-    Each row has the mean residual of a second around it: what is quicker is vibration.
+    The residual of each row is averaged over one second, because faster changes are vibration.
     """
-    # An odd number of rows, so that the mean lies on its row.
+    # An odd number of rows, so that the average is centred on the row.
     second = round(1 / rows.row_s / 2) * 2 + 1
     best = replace(best, residuals=_residual_means(best, second), sigma=best.sigma / np.sqrt(second))
     return Estimate.independent(
@@ -366,7 +368,7 @@ def _static_estimate(rows: MotionRows, best: MotionFit, places: NDArray[np.intp]
 
 
 def _residual_means(best: MotionFit, rows: int) -> Array:
-    """Residuals (n, 6) averaged over the kept ones of so many rows."""
+    """Return residuals (n, 6), each averaged over the kept rows among the `rows` rows around it."""
     window, weight = np.ones(rows), best.kept.astype(np.float64)
     count = np.maximum(np.convolve(weight, window, "same"), 1.0)
     return np.stack([np.convolve(column * weight, window, "same") / count for column in best.residuals.T], axis=1)
@@ -382,9 +384,9 @@ def _motion_findings(
     positions: bool,
     is_coarse: bool = False,
 ) -> list[Finding]:
-    """Findings that only a recording in motion has."""
+    """Return the findings that only a recording in motion can have."""
     sigma, findings = np.sqrt(np.diag(best.covariance)), list[Finding]()
-    if abs(motion.delay_s) > OFFSET_S and not is_coarse:  # which rests do not show
+    if abs(motion.delay_s) > OFFSET_S and not is_coarse:  # rows at rest do not show a delay
         findings.append(Finding.of("clock_offset", delay_s=motion.delay_s))
     if not (positions or is_coarse):
         turned = np.linalg.norm(used.motion.Omega_rad2_s2, ord=2, axis=(1, 2))
@@ -399,8 +401,8 @@ def _motion_findings(
         values = {"height_mm": 1e3 * best.load.height_m, "sigma_mm": 1e3 * sigma[HEIGHT]}
         findings.append(Finding.of("height_differs", **values, configured_mm=1e3 * height_m))
     if motion.contacts:
-        share = sum(one["duration_s"] for one in motion.contacts) / max(len(used) * used.row_s, 1e-9)
-        largest_N = max(one["force_N"] for one in motion.contacts)
+        share = sum(contact["duration_s"] for contact in motion.contacts) / max(len(used) * used.row_s, 1e-9)
+        largest_N = max(contact["force_N"] for contact in motion.contacts)
         values = {"count": len(motion.contacts), "share_percent": 100 * share, "force_N": largest_N}
         findings.append(Finding.of("mostly_contact" if share > MOSTLY else "contacts_left_out", **values))
     weak = best.prior_share > MEASURED
@@ -411,7 +413,7 @@ def _motion_findings(
 
 
 def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], Array]:
-    """Return the streams with one bias, that of the end, and the times at which the sensor was zeroed."""
+    """Return both streams with the bias of the end throughout, and the times at which the sensor was zeroed."""
     at_s, seen = find_zeroings(wrench)
     if len(at_s):
         steps = fit_bias_steps(motion_rows(wrench, poses), at_s)
@@ -427,7 +429,7 @@ def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Strea
 def _find_mistakes(
     data: tuple[Stream, Stream], rows: MotionRows, known: Known | None, g_m_s2: float
 ) -> tuple[list[Finding], Correction]:
-    """Find the mistakes of signs, clock, axes and poses, in rows whose delay is almost right, and what undoes them."""
+    """Find mistakes of signs, clock, axes and poses after aligning the delay; also return their correction."""
     free = fit_freely(rows, known, g_m_s2)
     for _ in range(2):
         if abs(free.load.delay_s) < ALIGNED_S:
@@ -440,9 +442,9 @@ def _find_mistakes(
 
 
 def _other_wrench(used: MotionRows, aligned: MotionRows, best: MotionFit, named: Sequence[Finding]) -> list[Finding]:
-    """Name a wrench that follows the acceleration but not gravity, or that does not follow the motion at all.
+    """Return a finding for a gravity-compensated wrench, or for one that does not follow the motion at all.
 
-    `aligned` has the delay of the fit, which wrong data may not have come near.
+    `aligned` holds the rows at the fitted delay, because with wrong data that delay may be far from that of `used`.
     """
     X, y = np.column_stack([np.ones(len(aligned)), aligned.motion.columns()]), aligned.wrench[:, :3]
     linear, _, rank, _ = np.linalg.lstsq(X, y, rcond=1e-9)
@@ -455,13 +457,13 @@ def _other_wrench(used: MotionRows, aligned: MotionRows, best: MotionFit, named:
         return [Finding.of("wrench_compensated", "reject", weight_N=weight_N, mass_kg=mass_kg)]
     change = used.wrench[best.kept, :3].var(axis=0)
     left = float(np.sqrt(np.mean(best.residuals[best.kept, :3] ** 2) / np.mean(change)))
-    if left > _UNEXPLAINED and not any(one.code in OF_AXES for one in named):
+    if left > _UNEXPLAINED and not any(finding.code in OF_AXES for finding in named):
         return [Finding.of("other_recording", left_percent=100 * min(left, 1.0))]
     return []
 
 
 def _narrow_findings(rows: MotionRows, best: MotionFit, *, explained: bool) -> list[Finding]:
-    """Name too little motion: by its range, or where nothing else explains a large uncertainty."""
+    """Return a finding if the range of motion is too small, or if a large uncertainty has no other explanation."""
     sigma, range_deg = np.sqrt(np.diag(best.covariance)), _range_deg(rows)
     error = Calibrated(best.load.static, best.covariance[:15, :15]).predicted_error()[0]
     error /= max(best.load.static.weight_N, 1e-9)
@@ -474,7 +476,7 @@ def _narrow_findings(rows: MotionRows, best: MotionFit, *, explained: bool) -> l
 
 
 def _range_deg(rows: MotionRows) -> float:
-    """Largest angle between the orientation in the middle of the motion and the others, doubled."""
+    """Return twice the largest angle between the mean orientation and the others, deg; at most 360."""
     R = _orientations(rows)
     turned = np.einsum("ji,njk->nik", nearest_rotation(R.mean(axis=0)), R)
     cosine = np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)
@@ -482,7 +484,7 @@ def _range_deg(rows: MotionRows) -> float:
 
 
 def _contacts(rows: MotionRows, best: MotionFit, first_s: float) -> tuple[Mapping[str, float], ...]:
-    """Rows that do not fit, without those beside them that the filter or the margin adds, as contacts."""
+    """Return the contacts: runs of rows left out, without the rows that only filter or margin added."""
     force, torque = (np.where(best.kept, 0.0, np.linalg.norm(best.residuals[:, k : k + 3], axis=1)) for k in (0, 3))
     half = round(0.5 / rows.row_s)
     largest = (sliding_window_view(np.pad(each, half), 2 * half + 1).max(axis=1) for each in (force, torque))
