@@ -1,4 +1,4 @@
-"""Descent to every minimum of the joint cost of forces and torques, and rejection of poses that do not belong to it.
+"""Descent to every minimum of the joint cost of forces and torques, and rejection of outlier poses.
 
 The noise is independent from pose to pose.
 """
@@ -17,16 +17,16 @@ from ftcalib.likelihood import rotation_minima
 from ftcalib.likelihood.session_noise import CHUNK, Noise
 from ftcalib.model import Array, Parameters, angle_between, skew
 
-# Sufficient statistics: a cost that is quadratic in the sixty coefficients of the model, however many poses there are.
+# Sufficient statistics: the cost is quadratic in the sixty coefficients of the model, for any number of poses.
 #
 # The model is linear in `features`, phi = (R_base_flange row by row, 1): predicted wrench = Theta phi with
 #
 #     Theta = [[b^T (x) R, F0], [[P]x (b^T (x) R), T0]]    (6, 10),    R = R_flange_sensor.T, b = gravity_force_base_N
 #
-# so the weighted squares of a million poses are one 60 x 60 matrix, and a Gauss-Newton step costs the same for any
-# number of them.
+# so the weighted squares of a million poses are one 60 x 60 matrix, and the time of a Gauss-Newton step does not depend
+# on the number of poses.
 
-# Rows of 100 products per matrix product, so that they stay in the cache.
+# Number of poses per matrix product, so that their products stay in the cache.
 FEW = 256
 
 _CROSS = skew(np.eye(3))
@@ -35,12 +35,12 @@ _CONSTANT[range(6, 9), range(3), 9] = _CONSTANT[range(12, 15), range(3, 6), 9] =
 
 
 def features(R_base_flange: Array) -> Array:
-    """Give phi (n, 10)."""
+    """Return the features phi (n, 10) of the linear model."""
     return np.concatenate([R_base_flange.reshape(-1, 9), np.ones((len(R_base_flange), 1))], axis=1)
 
 
 def coefficients(p: Parameters) -> Array:
-    """Give Theta (6, 10)."""
+    """Return the coefficients Theta (6, 10) of the linear model."""
     Theta = np.empty((6, 10))
     Theta[:3, :9] = _kron(p.gravity_force_base_N, p.R_flange_sensor.T)
     Theta[3:, :9] = skew(p.p_sensor_com_m) @ Theta[:3, :9]
@@ -49,7 +49,7 @@ def coefficients(p: Parameters) -> Array:
 
 
 def coefficients_derivative(p: Parameters) -> Array:
-    """Give the derivative (15, 6, 10) of Theta by the error vector of `Parameters.moved`."""
+    """Return the derivative (15, 6, 10) of Theta by the error vector of `Parameters.moved`."""
     R, b = p.R_flange_sensor.T, p.gravity_force_base_N
     T = _CONSTANT.copy()
     T[0:3, :3, :9] = ((R @ _CROSS)[:, :, None, :] * b[:, None]).reshape(3, 3, 9)
@@ -66,19 +66,19 @@ def _kron(b: Array, R: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statistics:
-    """Weighted squares of the residuals as a function of Theta = reference + D: `square - 2 B.D + D.A.D`."""
+    """Weighted sum of squared residuals as a function of Theta = reference + D: `square - 2 B.D + D.A.D`."""
 
     reference: Array
-    """(6, 10) close to the answer, so that no digits are lost."""
+    """(6, 10) value of Theta close to the solution, so that no digits are lost."""
     A: Array
-    """(60, 60)"""
+    """(60, 60) quadratic coefficients."""
     B: Array
-    """(60,)"""
+    """(60,) linear coefficients."""
     square: float
 
     @classmethod
     def of(cls, phi: Array, wrench: Array, weights: Array, reference: Array) -> Self:
-        """Sum up.
+        """Return the statistics of poses with independent noise.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Statistics:
 
     @classmethod
     def of_noise(cls, phi: Array, wrench: Array, noise: Noise, reference: Array) -> Self:
-        """Sum up for noise that may be correlated between poses."""
+        """Return the statistics of poses whose noise may be correlated between poses."""
         if noise.independent:
             return cls.of(phi, wrench, noise.W, reference)
         e = wrench - phi @ reference.T
@@ -114,12 +114,12 @@ class Statistics:
 
     @classmethod
     def of_gram(cls, gram: Array, weight: Array, reference: Array) -> Self:
-        """Take the sums of `wrench_gram` for one common inverse noise covariance (6, 6)."""
+        """Return the statistics from the sums of `wrench_gram`, for one common inverse noise covariance (6, 6)."""
         A = np.einsum("cd,ml->cdml", weight, gram[6:, 6:]).reshape(36, 100)
         return cls(reference, _sixty(A), (weight @ gram[:6, 6:]).ravel(), float(np.vdot(weight, gram[:6, :6])))
 
     def normal_equations(self, p: Parameters) -> tuple[Array, Array, float]:
-        """Give information (15, 15), its right-hand side (15,) and the cost."""
+        """Return information matrix (15, 15), right-hand side (15,) and cost at given parameters."""
         T = coefficients_derivative(p).reshape(15, 60)
         D = (coefficients(p) - self.reference).ravel()
         rest = self.B - self.A @ D
@@ -131,10 +131,10 @@ def _sixty(A: Array) -> Array:
 
 
 def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
-    """Sum up all that the model needs to know of poses with common noise; sums of disjoint data add up.
+    """Return the sum (16, 16) of row.T @ row with row = (wrench - offset, features), for poses with common noise.
 
-    Of `reference` (6, 10) only the last column may differ from zero: an offset. Returns the sum (16, 16) of row.T @
-    row with row = (wrench - offset, features).
+    The offset is the last column of `reference` (6, 10), whose other columns must be zero. Sums of disjoint data can be
+    added.
     """
     n = len(wrench)
     gram = np.zeros((16, 16))
@@ -148,7 +148,7 @@ def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
 
 
 MAX_STEPS = 100
-# In standard deviations of the noise: a descent that ends with one is slow, not lost.
+# A descent whose last step is smaller, in standard deviations of the noise, counts as converged.
 SMALL_STEP = 1e-4
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
@@ -156,19 +156,19 @@ SAME_ROTATION_RAD = np.deg2rad(1.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Minimum:
-    """One solution that fits better than all of its neighbours."""
+    """Local minimum of the joint cost."""
 
     parameters: Parameters
     chi2: float
-    """Under the noise model of the fit, on the same poses for all minima."""
+    """Chi2 under the noise model of the fit, for the same poses at all minima."""
     information: Array
-    """(15, 15) Fisher information there, priors included."""
+    """(15, 15) Fisher information at the minimum, including priors."""
     settled: bool = True
-    """Whether the descent came to rest."""
+    """Whether the descent converged."""
 
 
 class Descent:
-    """The ways down for one set of poses.
+    """Descent of the joint cost for one set of poses.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ class Descent:
         self.R, self.wrench, self.constraints = R_base_flange, wrench, constraints
 
     def minima(self, weights: Array) -> list[Minimum]:
-        """Find all minima of the joint cost that lie below minima of the force cost, lowest first.
+        """Return the minima of the joint cost reached from the minima of the force cost, lowest first.
 
         Parameters
         ----------
@@ -193,7 +193,7 @@ class Descent:
         common = len(weights) == 1 or weights.strides[0] == 0
         separate = _without_correlation(weights[:1] if common else weights)
         if common and n > CHUNK:
-            # Sums about a mean keep the digits that a large bias would take.
+            # Sums about a mean keep the digits that a large bias would cost.
             reference[:, 9] = self.wrench[:CHUNK].mean(axis=0)
             gram = wrench_gram(self.R, self.wrench, reference)
             rows = [0, 1, 2, *range(6, 16)]
@@ -209,28 +209,28 @@ class Descent:
         for R_flange_sensor in self.constraints.rotations([m.R.T for m in rotation_minima.minima(Q)[:MOST_MINIMA]], Q):
             start = self.constraints.satisfy(_linear_start(start_from, R_flange_sensor))
             ends.append(self.down(statistics, start))
-        found = self.distinct(ends)
-        if n <= CHUNK:  # once more from close by: without noise every digit counts
-            statistics = Statistics.of(phi, self.wrench, weights, coefficients(found[0].parameters))
-            found[0] = self.down(statistics, found[0].parameters)
-        return found
+        minima = self.distinct(ends)
+        if n <= CHUNK:  # repeat with a close reference, so that data without noise are fitted to the last digit
+            statistics = Statistics.of(phi, self.wrench, weights, coefficients(minima[0].parameters))
+            minima[0] = self.down(statistics, minima[0].parameters)
+        return minima
 
     @staticmethod
     def distinct(ends: list[Minimum]) -> list[Minimum]:
-        """Sort, and leave out those that ended in the same minimum."""
-        found: list[Minimum] = []
+        """Return the distinct minima by ascending chi2."""
+        minima: list[Minimum] = []
         for end in sorted(ends, key=lambda end: end.chi2):
-            if not any(Descent.same(end.parameters, other.parameters) for other in found):
-                found.append(end)
-        return found
+            if not any(Descent.same(end.parameters, other.parameters) for other in minima):
+                minima.append(end)
+        return minima
 
     @staticmethod
     def same(p: Parameters, q: Parameters) -> bool:
-        """Whether two points belong to one minimum."""
+        """Whether two points belong to the same minimum: their mountings differ by less than 1°."""
         return bool(angle_between(p.R_flange_sensor, q.R_flange_sensor) <= SAME_ROTATION_RAD)
 
     def normal_equations(self, statistics: Statistics, p: Parameters) -> tuple[Array, Array, float]:
-        """Add what was known before."""
+        """Return the normal equations of statistics and priors: information, right-hand side and cost."""
         H, g, cost = statistics.normal_equations(p)
         if self.constraints.any:
             A, residual = self.constraints.measurements(p)
@@ -238,7 +238,7 @@ class Descent:
         return H, g, cost
 
     def down(self, statistics: Statistics, p: Parameters, steps: int = MAX_STEPS) -> Minimum:
-        """Levenberg-Marquardt with scaled columns."""
+        """Return the minimum that Levenberg-Marquardt steps reach from given parameters."""
         H, g, cost = self.normal_equations(statistics, p)
         b, F0, T0 = p.gravity_force_base_N, p.force_bias_N, p.torque_bias_Nm
         prediction = np.concatenate([np.zeros(3), b, F0, np.zeros(3), T0])  # times the Jacobian is the predicted wrench
@@ -268,7 +268,7 @@ class Descent:
 
 
 def _solve(H: Array, g: Array, damping: float) -> Array:
-    """Solve `(H + damping) x = g`; where the matrix lacks rank, the shortest such step."""
+    """Return the solution of `(H + damping) x = g`, the shortest one if the matrix lacks rank."""
     _, x, failed = dposv(H + damping * np.eye(len(H)) if damping else H, g)
     if failed:
         eigenvalues, V = np.linalg.eigh(H)
@@ -277,13 +277,13 @@ def _solve(H: Array, g: Array, damping: float) -> Array:
 
 
 def column_scale(information: Array) -> Array:
-    """Root of the diagonal, 1 where it vanishes: dividing by it makes eigenvalues independent of units."""
+    """Return the square root of the diagonal, 1 where it is 0: scaling by it makes eigenvalues independent of units."""
     diagonal = np.sqrt(np.maximum(information.diagonal(), 0.0))
     return np.asarray(np.where(diagonal > 0, diagonal, 1.0))
 
 
 def _without_correlation(weights: Array) -> Array:
-    """Inverse covariances as they would be for forces alone and torques alone; poses without weight keep none."""
+    """Return the inverse covariances without the correlation of forces and torques; zero weights stay zero."""
     if not weights[:, :3, 3:].any():
         return weights
     separate = np.zeros_like(weights)
@@ -295,7 +295,10 @@ def _without_correlation(weights: Array) -> Array:
 
 
 def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
-    """For a fixed rotation: gravity force and force bias, then centre of mass and torque bias, each linear."""
+    """Return the parameters for a given mounting: first gravity and force bias, then centre of mass and torque bias.
+
+    Both steps are linear.
+    """
     p = Parameters(R_flange_sensor, *np.zeros((4, 3)))
     for unknowns in (slice(3, 9), slice(9, 15)):
         H, g, _ = statistics.normal_equations(p)
@@ -305,32 +308,33 @@ def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
     return p
 
 
-# Poses that belong to no rigid tool at rest: bumped, touched, or taken while something slipped.
+# Outliers: poses in which the tool was bumped or touched, or something slipped.
 #
-# Graduated non-convexity with the Geman-McClure cost (Yang, Antonante, Tzoumas, Carlone 2020), from every minimum of
-# the plain cost, then a plain fit of the poses that remain. The basin with the lowest truncated cost wins.
+# Graduated non-convexity with the Geman-McClure cost (Yang, Antonante, Tzoumas, Carlone 2020) starts from every minimum
+# of the least-squares cost. A least-squares fit of the remaining poses follows. The solution with the lowest truncated
+# cost is chosen.
 
 Kept = NDArray[np.bool_]
 
 # Share of good poses that are rejected.
 FALSE_REJECTION = 1e-3
-# Squared distance, in noise, beyond which a pose is rejected: 22.5.
+# Squared Mahalanobis distance beyond which a pose is rejected: 22.5.
 FARTHEST = float(chi2_isf(6, FALSE_REJECTION))
-# With fewer poses, one that disagrees with the others and others that disagree with it look alike.
+# With fewer poses an outlier cannot be told from good poses.
 FEWEST_TO_REJECT_FROM = 8
 ANNEALING = 1.6
 
 
 def fewest_kept(n: int) -> int:
-    """Give the number of poses that must agree with each other before the rest may be called wrong."""
+    """Return the number of poses that must agree with each other before the others may be rejected."""
     return n if n < FEWEST_TO_REJECT_FROM else max(FEWEST_TO_REJECT_FROM - 1, int(np.ceil(0.6 * n)))
 
 
 def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters]) -> tuple[Parameters, Kept] | None:
-    """Find the largest set of poses that one calibration explains, from several starts.
+    """Return parameters and the poses (n,) that agree with them, by a robust fit from several starts.
 
-    `weights` (n, 6, 6) are inverse noise covariances. Returns the parameters and which poses are kept (n,), or None
-    for these when fewer than `fewest_kept` agree, from every start.
+    `weights` (n, 6, 6) are inverse noise covariances. The result is None if fewer than `fewest_kept` poses agree from
+    every start.
     """
     phi, wrench = features(descent.R), descent.wrench
 
@@ -346,7 +350,7 @@ def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters
     for start in starts:
         p = start
         d2 = squared_distances(p)
-        # So soft at first that the cost is convex; then poses that do not fit lose their weight.
+        # The cost is convex at first. As it becomes less convex, outliers lose their weight.
         softness = max(1.0, 2 * float(d2.max()) / FARTHEST)
         while softness > 1:
             soft = softness * FARTHEST

@@ -1,17 +1,17 @@
-"""What explains the data: which poses are outliers, and which variance components act on the others.
+"""Model selection: which poses are outliers, and which variance components act on the others.
 
-With the restricted likelihood L of `variance_components` on the kept poses, at its best parameters and variances, an
-explanation has the criterion
+With the maximum L of the restricted likelihood of `variance_components` on the kept poses, the criterion of an
+explanation is
 
     -2 (log L - sum_k gain_k) + sum_j (log det S_j + c + 6 log(max(d_j², c) / c))
 
-over the components k and the rejected poses j. gain_k is the least gain of a component, a penalty as of an information
-criterion. S_j is the leave-one-out covariance of pose j, d_j² its squared distance in it, and c the limit that one good
-pose in a thousand exceeds: at the limit, a rejected pose costs what it would if it were kept, and beyond it has a
-variance of its own (variance inflation: Cook, Holschuh and Weisberg, Technometrics 24, 1982).
+over the components k and the rejected poses j. gain_k is the smallest gain required of a component, a penalty like that
+of an information criterion. S_j is the leave-one-out covariance of pose j, d_j its Mahalanobis distance, and c the
+limit that one good pose in a thousand exceeds. A rejected pose has an inflated variance of its own (Cook, Holschuh and
+Weisberg, Technometrics 24, 1982). At the limit, its cost is the same as that of a kept pose.
 
-From two starts, all poses and those that a robust fit keeps, parameters, variances, components (forward selection,
-then backward elimination) and rejected poses are improved in turn until nothing changes.
+Parameters, variances, components (forward selection, then backward elimination) and rejected poses are improved in turn
+until nothing changes, starting from all poses and from those that a robust fit keeps.
 """
 
 from collections.abc import Sequence
@@ -60,12 +60,12 @@ from ftcalib.model import Array, Parameters, predict
 
 # Selection of the components: forward, backward and by exchange.
 
-# Change of the log-likelihood that no other component makes up for.
+# Change of the log-likelihood that no other component can compensate.
 SURE = 20.0
-# Least gain, predicted from score and information at zero, of a component that is tried.
+# Smallest gain, predicted from score and information at zero, of a component that is tried.
 WORTH_A_TRY = 1.0
 USUAL_HYSTERESIS = 0.001
-# Gain and cross-talk of real sensors.
+# Standard deviations of gain and cross-talk of real sensors: a small one, and the usual one.
 SMALL_RESPONSE, USUAL_RESPONSE = 0.005, 0.02
 
 
@@ -76,18 +76,18 @@ def select_explanation(
     candidates: Sequence[Component],
     needed: int | None = None,
 ) -> Point:
-    """Add the candidates that raise the likelihood, one by one, then drop those that others make needless.
+    """Add candidates that increase the likelihood, one by one, then drop components that have become unnecessary.
 
     Parameters
     ----------
     problem : Linearised
     components : sequence of Component
-        To start from.
+        Components of the initial model.
     theta : array, shape (k,)
-        Their variances.
+        Variances of these components.
     candidates : sequence of Component
     needed : int, optional
-        How many of the components, the first, are part of the model; by default all.
+        Number of initial components, the first ones, that must not be dropped; by default all.
     """
     needed = len(components) if needed is None else needed
     best = _prune(problem, maximise(problem, components, theta), needed)
@@ -97,7 +97,7 @@ def select_explanation(
         k = int(np.argmax(gains))
         if gains[k] < WORTH_A_TRY:
             break
-        # What is as good as certain comes in together: the needless among them are dropped in the end.
+        # Almost certain components are added together; the unnecessary ones among them are dropped at the end.
         wanted = best.loglik + waiting[k].needed
         for together in ([int(i) for i in np.argsort(-gains) if i == k or gains[i] > SURE], [k]):
             components = [*best.components, *(waiting[i] for i in together)]
@@ -111,9 +111,10 @@ def select_explanation(
 
 
 def _with_response_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
-    """Try gain and cross-talk together in place of white noise as large as a small gain.
+    """Return the better of the model and one with gain and cross-talk instead of its white noise.
 
-    A mounting that fits the torques alone makes the forces look noisy, and the gain that would explain them useless.
+    A mounting that fits only the torques makes the forces look noisy, so a gain that would explain them does not help.
+    The exchange is tried if the white noise is at least as large as a small gain.
     """
     added = [c for c in RESPONSE if c in candidates]
     if not added or all(c.kind != "white" for c in best.components):
@@ -127,9 +128,9 @@ def _with_response_instead(problem: Linearised, best: Point, candidates: Sequenc
 
 
 def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Component], needed: int) -> Point:
-    """Try a walk, gain and cross-talk together in place of the white noise of a group.
+    """Return the better of the model and one with a walk, gain and cross-talk instead of the white noise of a group.
 
-    One at a time they may bring less than white noise, which then takes their place.
+    Added one at a time, they may increase the likelihood less than white noise, and would not be selected.
     """
     for group in (FORCE, TORQUE):
         walk = channel_component("walk", group)
@@ -146,7 +147,7 @@ def with_walks_instead(problem: Linearised, best: Point, candidates: Sequence[Co
 
 
 def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
-    """Try a linear drift of the same groups in place of random walks; keep what is likelier."""
+    """Return the likelier of the model and one with linear drifts instead of the random walks of the same groups."""
     walks = [k for k, c in enumerate(best.components) if c.kind == "walk"]
     if not walks:
         return best
@@ -157,7 +158,7 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
         len(problem.r) * max(best.theta[k] for k in walks if any(best.components[k].share[c] for c in g))
         for g in groups
     ]
-    # Without the walk white noise is larger.
+    # Without the walk the white noise is larger.
     noise = [
         best.theta[k] + sum(best.theta[w] for w in walks if np.dot(best.components[w].share, best.components[k].share))
         for k in rest
@@ -168,7 +169,7 @@ def with_slopes_instead(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _better(problem: Linearised, best: Point, components: Sequence[Component], theta: Array, needed: int) -> Point:
-    """Try other components; keep what is worth more."""
+    """Return the better of the model and one with other components, by penalised log-likelihood."""
     trial = maximise(problem, components, theta, best.worth)
     if trial.loglik > best.worth:
         trial = _prune(problem, trial, needed)
@@ -176,7 +177,7 @@ def _better(problem: Linearised, best: Point, components: Sequence[Component], t
 
 
 def _prune(problem: Linearised, best: Point, needed: int) -> Point:
-    """Drop components that raise the likelihood too little: those without effect at once, then one at a time."""
+    """Drop components that increase the likelihood too little: negligible ones together, then one at a time."""
     if best.components:
         seen = best.theta >= NEGLIGIBLE * unit_variances(problem, best, best.components)
         seen[:needed] = True
@@ -188,7 +189,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
     while k < len(best.components):
         rest = [i for i in range(len(best.components)) if i != k]
         components, theta = [best.components[i] for i in rest], best.theta[rest]
-        without = point(best.problem, components, theta, best)  # the others can regain a part of what is lost
+        without = point(best.problem, components, theta, best)  # other variances may compensate part of the loss
         if best.loglik - without.loglik < SURE:
             without = maximise(problem, components, theta, best.loglik - best.components[k].needed)
         if without.worth > best.worth:
@@ -199,7 +200,7 @@ def _prune(problem: Linearised, best: Point, needed: int) -> Point:
 
 
 def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Component]) -> tuple[Array, Array]:
-    """Gain in log-likelihood that each candidate alone promises, and where to start climbing."""
+    """Return the predicted gain in log-likelihood (k,) of each candidate alone, and initial variances (k,)."""
     start = unit_variances(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, NEGLIGIBLE * start])
     problem = problem.with_only(components)
@@ -221,17 +222,17 @@ def _predicted_gains(problem: Linearised, best: Point, waiting: Sequence[Compone
 
 
 def _where_all_are_seen(problem: Linearised, best: Point, components: Sequence[Component], theta: Array) -> Point:
-    """Give a point as good as the best one at which the score of further components can be taken."""
+    """Return a point equivalent to the best one at which the score of further components can be evaluated."""
     if best.own.walks:
         return point(problem, components, theta)
     return best if best.problem is problem else point(problem, best.components, best.theta)
 
 
 def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) -> list[tuple[Point, float]]:
-    """Give other explanations that the data do not exclude, with their shares of the probability; `best` has the rest.
+    """Return rival models that the data do not exclude, with their probabilities; `best` has the rest.
 
-    They are: all candidates that were not found, as large as slope and curvature at zero promise; gain and cross-talk
-    as large as the larger of both; hysteresis in place of inexact orientations; no drift, or white noise in its place.
+    The rivals are: all candidates that were not selected, with variances from score and information at zero; gain and
+    cross-talk with equal variances; hysteresis instead of orientation errors; no drift, or white noise instead.
     """
     waiting = [c for c in candidates if c not in best.components]
     found = dict(zip(best.components, best.theta, strict=True))
@@ -253,12 +254,12 @@ def rivals(problem: Linearised, best: Point, candidates: Sequence[Component]) ->
             start = np.where(start > 0, start, NEGLIGIBLE * unit_variances(problem, best, components))
             bonus = sum(c.needed for c in drifts) - sum(c.needed for c in instead)
             others.append((maximise(problem, components, start), bonus))
-    odds = [float(np.exp(min(one.loglik - best.loglik + bonus, 0.0))) for one, bonus in others]
-    return [(one, odd / (1 + sum(odds))) for (one, _), odd in zip(others, odds, strict=True)]
+    odds = [float(np.exp(min(rival.loglik - best.loglik + bonus, 0.0))) for rival, bonus in others]
+    return [(rival, odd / (1 + sum(odds))) for (rival, _), odd in zip(others, odds, strict=True)]
 
 
 def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) -> Point:
-    """Add the candidates whose variance is positive where the likelihood, as a parabola from zero, is largest."""
+    """Add the candidates with a positive variance at the maximum of the quadratic model of the likelihood at zero."""
     start = NEGLIGIBLE * unit_variances(problem, best, waiting)
     components, theta = [*best.components, *waiting], np.concatenate([best.theta, start])
     at = _where_all_are_seen(problem, best, components, theta)
@@ -276,48 +277,48 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
     return point(problem, [*best.components, *chosen], np.append(best.theta, variances))
 
 
-# From here on single poses are looked at only when chi2 or `drift` asks for it.
+# With more poses, single poses are examined only if chi2 or `drift` requires it.
 MANY_POSES = 20_000
-# Poses, drawn from more than 1000, in which walks and errors that have a structure are searched.
+# Size of the subset of more than 1000 poses in which walks and structured errors are searched.
 SEARCHED = 300
-# With fewer poses the distribution of the distances is not tested.
+# With fewer poses the distribution of the Mahalanobis distances is not tested.
 POSES_FOR_THE_SHAPE = 500
 # P-value of chi2 below which components are searched.
 SUSPICIOUS = 0.01
 # Ratio of median to mean of the squared distances, relative to that of Gaussian noise.
 LIGHT_TAIL = 0.6
-# Most rounds of the outer loop.
+# Largest number of iterations of the outer loop.
 ROUNDS = 20
-# Squared step, in standard deviations of the estimates.
+# Convergence: squared step, in standard deviations of the estimates.
 SETTLED = 1e-4
-# Difference of chi2 beyond which a minimum is excluded under any noise.
+# Difference of chi2 from which a minimum is excluded under any noise model.
 FAR = 1000.0
 MEDIAN_DISTANCE = float(chi2_isf(6, 0.5))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Explanation:
-    """One way to explain the data: which poses belong together, and what acts on them."""
+    """One explanation of the data: parameters, kept poses and variance components."""
 
     parameters: Parameters
     kept: Kept
     components: tuple[Component, ...] = ()
     theta: Array = field(default_factory=lambda: np.zeros(0))
     criterion: float = np.inf
-    """-2 log restricted likelihood, plus what each component and each rejected pose must bring."""
+    """-2 log restricted likelihood plus the penalties of components and rejected poses."""
     noticed: bool = False
-    """Whether bumped poses may be hidden in it."""
+    """Whether outliers may still be among the kept poses."""
     noise: Noise | None = None
-    """At the parameters."""
+    """Noise model at `parameters`."""
 
     @property
     def noise_moves(self) -> bool:
-        """Whether the noise depends on the parameters."""
+        """Whether the noise model depends on the parameters."""
         return not {"rotation", *EFFECTS}.isdisjoint(c.kind for c in self.components)
 
 
 def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
-    """Find the likeliest explanation, its minima in ascending order, and chi2 without components on the same poses."""
+    """Return the best explanation, its minima in ascending order, and chi2 of its poses without components."""
     weights = inverses(session.cov if session.measured else np.broadcast_to(white(1.0, LEVER_M), session.cov.shape))
     minima = session.once("minima", lambda: session.descent.minima(weights))
     plain = Explanation(minima[0].parameters, session.everything)
@@ -340,24 +341,24 @@ def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
     of_kept, key = weights * chosen.kept[:, None, None], chosen.kept.tobytes()
     static = minima if chosen.kept.all() else session.once(key, lambda: session.descent.minima(of_kept))
     for _ in range(len(static)):
-        found = _with_all_minima(session, chosen, static)
-        if session.descent.same(found[0].parameters, chosen.parameters):
+        ends = _with_all_minima(session, chosen, static)
+        if session.descent.same(ends[0].parameters, chosen.parameters):
             break
         if of_some is None:
-            other = _with_expected_noise(session, _improve(session, found[0].parameters, chosen.kept))
+            other = _with_expected_noise(session, _improve(session, ends[0].parameters, chosen.kept))
         else:
-            other = _of_all_poses(session, replace(chosen, parameters=found[0].parameters))
+            other = _of_all_poses(session, replace(chosen, parameters=ends[0].parameters))
         if other.criterion > chosen.criterion:
             break
         chosen = other
-    return chosen, found, static[0].chi2
+    return chosen, ends, static[0].chi2
 
 
 def _explanation_of_some(session: SessionData) -> Explanation | None:
-    """Explain some of many poses; return None if they show neither a walk nor an error that has a structure.
+    """Explain a subset of many poses; return None if the subset shows neither a walk nor structured errors.
 
-    Errors that neighbouring poses share look like walks of many axes, which take long to try in many poses. More poses
-    do not show the variance of errors with a structure any better.
+    Structured errors look like walks of many axes, which are slow to fit with many poses. The variance of structured
+    errors is not determined better by more poses.
     """
     some = session.some(SEARCHED)
     e, _, _ = explain(some)
@@ -366,13 +367,13 @@ def _explanation_of_some(session: SessionData) -> Explanation | None:
     smooth = {"walk", "slope", *(c.kind for c in STRUCTURE)}
     if not few_enough or smooth.isdisjoint(c.kind for c in e.components):
         return None
-    # The variance of a walk is per mean interval, which is shorter between more poses.
+    # The variance of a walk is per mean interval, which is shorter with more poses.
     shorter = np.array([(some.n - 1) / (session.n - 1) if c.kind == "walk" else 1.0 for c in e.components])
     return Explanation(e.parameters, session.everything, e.components, e.theta * shorter)
 
 
 def _of_all_poses(session: SessionData, e: Explanation) -> Explanation:
-    """Estimate parameters and variances from all poses, and reject poses, with the components of an explanation."""
+    """Return an explanation of all poses with given components: estimate parameters and variances, reject outliers."""
     p, kept = e.parameters, e.kept
     problem = session.linearise(p, kept)
     at = select_explanation(problem, e.components, e.theta, (), len(session.always()))
@@ -390,7 +391,7 @@ def _of_all_poses(session: SessionData, e: Explanation) -> Explanation:
 
 
 def _with_expected_noise(session: SessionData, e: Explanation) -> Explanation:
-    """Take the white noise that is expected instead of the likeliest, if it was not measured."""
+    """Replace the likeliest white noise by its posterior mean, if the noise was not measured."""
     if session.measured:
         return e
     problem = session.linearise(e.parameters, e.kept)
@@ -399,14 +400,14 @@ def _with_expected_noise(session: SessionData, e: Explanation) -> Explanation:
 
 
 def _is_quiet(session: SessionData, best: Minimum) -> bool:
-    """Whether the measured noise explains everything, so that nothing more would be found."""
+    """Whether the measured noise explains the residuals, so that no component or outlier would be found."""
     always, candidates = session.always(), [*session.candidates(), *session.structure()]
     if not session.measured or always or session.drift == "linear":
         return False
     if best.chi2 > float(chi2_isf(session.dof(session.everything), SUSPICIOUS)):
         return False
     if session.n > MANY_POSES and session.drift == "none":
-        return True  # a pose that could do harm among so many would show in chi2
+        return True  # an outlier that matters among so many poses would increase chi2
     problem = session.linearise(best.parameters, session.everything)
     at = maximise(problem, (), np.zeros(0))
     if _stand_out(session, squared_length(*at.left_out())):
@@ -415,17 +416,17 @@ def _is_quiet(session: SessionData, best: Minimum) -> bool:
 
 
 def _explanations(session: SessionData, minima: list[Minimum], weights: Array) -> list[Explanation]:
-    """Explain the data with all poses; and, where these may hide bumped ones, with those that agree."""
+    """Return explanations that start from all poses and, if these may contain outliers, from poses that agree."""
     p = minima[0].parameters
-    found = [_improve(session, p, session.everything)]
-    if found[0].noticed:
-        tried = [(p, session.everything), (found[0].parameters, found[0].kept)]
+    explanations = [_improve(session, p, session.everything)]
+    if explanations[0].noticed:
+        tried = [(p, session.everything), (explanations[0].parameters, explanations[0].kept)]
         for robust in session.once("agreeing", lambda: _find_agreeing(session, weights, minima)):
             if any(session.descent.same(robust[0], q) and (robust[1] == k).all() for q, k in tried):
                 continue
-            found.append(_improve(session, *robust))
-            tried += [robust, (found[-1].parameters, found[-1].kept)]
-    return found
+            explanations.append(_improve(session, *robust))
+            tried += [robust, (explanations[-1].parameters, explanations[-1].kept)]
+    return explanations
 
 
 def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
@@ -438,9 +439,9 @@ def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
         best, p, problem, at, ends = session.once((best, at), partial(_improve_once, session, best, p, problem, at))
         if (problem.kept != kept).any():
             continue
-        if ends or (tried and set(at.components) == chosen):  # all others have been tried
+        if ends or (tried and set(at.components) == chosen):
             break
-        # What compensation knows has been tried first: structured errors would take its place.
+        # Components that the compensation models are tried first, because structured errors would displace them.
         tried = True
         again = select_explanation(problem, at.components, at.theta, [*candidates, *structure], len(always))
         if set(again.components) == set(at.components):
@@ -450,7 +451,7 @@ def _improve(session: SessionData, p: Parameters, kept: Kept) -> Explanation:
 
 
 def _first_explanation(session: SessionData, p: Parameters, kept: Kept) -> tuple[Explanation, Linearised, Point]:
-    """Choose the first components."""
+    """Return the initial explanation, from a first selection of components."""
     problem, always = session.linearise(p, kept), session.always()
     at = select_explanation(problem, always, session.start(problem, always), session.candidates(), len(always))
     return Explanation(p, kept), problem, at
@@ -459,7 +460,7 @@ def _first_explanation(session: SessionData, p: Parameters, kept: Kept) -> tuple
 def _improve_once(
     session: SessionData, best: Explanation, p: Parameters, problem: Linearised, at: Point
 ) -> tuple[Explanation, Parameters, Linearised, Point, bool]:
-    """Improve all but the choice of further components; the last value says that nothing else needs to be tried."""
+    """Improve all but the choice of further components; the last result is whether the search may stop."""
     candidates, needed, kept = session.candidates(), len(session.always()), problem.kept
     at = _with_response_instead(problem, at, candidates, needed)
     if session.drift == "auto":
@@ -470,7 +471,7 @@ def _improve_once(
     criterion = _criterion(session, at, distances)
     if not criterion < best.criterion - 1e-3:
         return best, p, problem, at, False
-    # Many poses distributed as the noise would have them hide no bumped one.
+    # Many poses with Gaussian residuals contain no hidden outliers.
     if kept.all() and _are_gaussian(session, distances):
         return Explanation(p, kept, at.components, at.theta, criterion, noise=at.noise), p, problem, at, True
     noise_found = {"white", "rotation"} & {c.kind for c in at.components[needed:]}
@@ -486,35 +487,35 @@ def _improve_once(
 def _settle(
     session: SessionData, p: Parameters, kept: Kept, problem: Linearised, at: Point
 ) -> tuple[Parameters, Linearised, Point]:
-    """Go down with the noise as it is and estimate it again, until they agree."""
+    """Alternate between a descent of the parameters and an estimate of the variances, until convergence."""
     for _ in range(ROUNDS):
         if at.squared_step < SETTLED:
             break
         p = session.descent.down(session.statistics(at.noise, p), p).parameters
         problem = session.linearise(p, kept)
         at = maximise(problem, at.components, at.theta)
-        if at.squared_step < SETTLED and not kept.all():  # drop what only rejected poses needed
+        if at.squared_step < SETTLED and not kept.all():  # drop components that only rejected poses needed
             at = select_explanation(problem, at.components, at.theta, (), len(session.always()))
     return p, problem, at
 
 
 def _membership(session: SessionData, kept: Kept, distances: Array, at: Point) -> Kept:
-    """Reject the poses that stand out, the worst first; take back those that do not any more."""
+    """Return which poses are kept: reject outliers, the worst first, and readmit poses that fit again."""
     limit = _limit(session, at)
-    # The worst first: a bumped pose bends the fit, and good poses beside it look wrong.
+    # The worst first, because an outlier distorts the fit and makes good poses look wrong.
     out = kept & (distances > max(limit, float(distances[kept].max()) / 4))
     after = (kept & ~out) | (~kept & (distances < limit))
     return after if after.sum() >= fewest_kept(session.n) else kept
 
 
 def _limit(session: SessionData, at: Point) -> float:
-    """Squared distance of a good pose that one in a thousand exceeds."""
+    """Return the squared Mahalanobis distance that one good pose in a thousand exceeds."""
     estimated = any(c.kind == "white" for c in at.components)
     return 6 * float(f_ppf(6, session.dof(at.problem.kept), 1 - FALSE_REJECTION)) if estimated else FARTHEST
 
 
 def _criterion(session: SessionData, at: Point, distances: Array) -> float:
-    """A rejected pose has noise of its own size. At the limit it costs what it would if it counted."""
+    """Return the criterion of the module docstring: penalised -2 log likelihood plus the costs of rejected poses."""
     value, rejected, limit = -2 * at.worth, ~at.problem.kept, _limit(session, at)
     if rejected.any():
         far = np.maximum(distances[rejected], limit)
@@ -524,20 +525,20 @@ def _criterion(session: SessionData, at: Point, distances: Array) -> float:
 
 
 def _with_all_minima(session: SessionData, e: Explanation, others: list[Minimum]) -> list[Minimum]:
-    """Find the minima again, under the noise of the explanation."""
+    """Return all minima under the noise model of the explanation."""
     noise = noise_under(session, e, e.parameters)
     statistics, logdet = session.statistics(noise, e.parameters), noise.logdet
     ends = [
         session.descent.down(statistics, start) for start in (e.parameters, *(minimum.parameters for minimum in others))
     ]
-    if e.noise_moves:  # and matters for the minima between which it may decide
+    if e.noise_moves:  # compare the competing minima each with its own noise
         least = ends[0].chi2
         ends = [_under_own_noise(session, e, end, logdet) if end.chi2 < least + FAR else end for end in ends]
     return session.descent.distinct(ends)
 
 
 def _under_own_noise(session: SessionData, e: Explanation, end: Minimum, logdet: float) -> Minimum:
-    """Descend with the noise that an explanation has at the minimum; its logarithm less `logdet` counts as chi2."""
+    """Descend with the noise model at the minimum; the change of its log-determinant from `logdet` is added to chi2."""
     for _ in range(2):
         noise = noise_under(session, e, end.parameters)
         end = session.descent.down(session.statistics(noise, end.parameters), end.parameters)
@@ -545,14 +546,14 @@ def _under_own_noise(session: SessionData, e: Explanation, end: Minimum, logdet:
 
 
 def noise_under(session: SessionData, e: Explanation, p: Parameters) -> Noise:
-    """Give the noise that an explanation has at parameters."""
+    """Return the noise model of an explanation at given parameters."""
     if e.noise is not None and not e.noise_moves:
         return e.noise
     return noise_of(session.linearise(p, e.kept), e.components, e.theta)
 
 
 def _are_gaussian(session: SessionData, distances: Array) -> bool:
-    """Whether so many poses are distributed as the noise alone would have them (Kolmogorov and Smirnov)."""
+    """Whether the squared distances have a chi-square distribution (Kolmogorov-Smirnov test); False for few poses."""
     if session.n < POSES_FOR_THE_SHAPE or _stand_out(session, distances):
         return False
     share = chi2_cdf(6, np.sort(distances))
@@ -561,7 +562,7 @@ def _are_gaussian(session: SessionData, distances: Array) -> bool:
 
 
 def _stand_out(session: SessionData, distances: Array) -> bool:
-    """Whether poses stand out, or so many of them that none does."""
+    """Whether some poses are outliers, or so many that no single one stands out."""
     if session.n < FEWEST_TO_REJECT_FROM:
         return False
     tail = float(np.median(distances)) / MEDIAN_DISTANCE / (float(distances.mean()) / 6)
@@ -569,11 +570,11 @@ def _stand_out(session: SessionData, distances: Array) -> bool:
 
 
 def _find_agreeing(session: SessionData, weights: Array, minima: list[Minimum]) -> list[tuple[Parameters, Kept]]:
-    """Find poses that agree within the noise, and those that agree within one that fits half of all poses."""
+    """Return sets of poses that agree within the noise, and within a noise scaled so that half of all poses fit."""
     starts = [m.parameters for m in minima]
     problem, always = session.linearise(starts[0], session.everything), session.always()
     at = maximise(problem, always, session.start(problem, always))
-    found = [agreeing_poses(session.descent, weights, starts)] if session.measured else []
+    sets = [agreeing_poses(session.descent, weights, starts)] if session.measured else []
     if not session.measured:
         weights = np.asarray(at.own.W, dtype=np.float64)
     scale, robust = float(np.median(squared_length(*at.left_out()))) / MEDIAN_DISTANCE, None
@@ -587,4 +588,4 @@ def _find_agreeing(session: SessionData, weights: Array, minima: list[Minimum]) 
         before, scale = scale, float(np.median(d2)) / MEDIAN_DISTANCE * session.n / (session.n - 2.5)
         if scale > 0.7 * before:
             break
-    return [one for one in (*found, robust) if one is not None]
+    return [agreeing for agreeing in (*sets, robust) if agreeing is not None]

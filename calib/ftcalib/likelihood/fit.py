@@ -1,4 +1,4 @@
-"""Maximum likelihood: joint weighted least squares of forces and torques, under the noise the data show."""
+"""Maximum likelihood: joint weighted least squares of forces and torques, with noise estimated from the data."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,56 +37,56 @@ from ftcalib.likelihood.variance_components import (
 from ftcalib.model import BIASES, STANDARD_GRAVITY_M_S2, Array, DriftResult, Parameters, jacobian, predict
 from ftcalib.sensor_matrix import SIZE, Calibrated, Response, sensor_columns
 
-# From this difference of the criterion on the data show a structure: real ones have 250 and more in 24 poses.
+# Difference of the criterion from which structured errors are certain; real ones give 250 or more in 24 poses.
 _SURE = 40.0
-# Difference of two left-out errors that is no accident, as the logarithm of their squares.
+# Significant difference between two leave-one-out errors, as the logarithm of their mean squares.
 _CLEARLY = 0.05
-# Such squares are rounding of data without noise.
+# Smaller mean squares are rounding errors of data without noise.
 _EXACT = 1e-18
-# Compensation does not know them.
+# Components that the compensation does not model.
 UNCOMPENSATED = (HYSTERESIS, *STRUCTURE)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Estimate(Calibrated):
-    """Estimates by any method, and what they leave of each pose. Rejected poses count only in arrays with n rows.
+    """Estimates by any method, with the residuals of all poses. Rejected poses appear only in arrays with n rows.
 
-    A pose is off by its own noise alone; a `Fit` may have found more.
+    Poses have independent noise here; a `Fit` may have further components.
     """
 
     parameters: Parameters
-    """With drift the biases are those at the last pose that counts."""
+    """Estimates; with drift, the biases are those at the last used pose."""
     on_average: Parameters
-    """The same with the mean of the bias over the poses."""
+    """Estimates with the mean bias over the poses instead of the last bias."""
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`; zero along what is exactly known, without meaning where the
-    information lacks rank."""
+    """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`; zero along exactly known directions, meaningless
+    if the information matrix lacks rank."""
     free: Array
-    """(15, m) orthonormal basis of what is not exactly known: the identity without a `Known`."""
+    """(15, m) orthonormal basis of the directions that are not exactly known; the identity without a `Known`."""
     noise: Noise
-    """Covariance of all wrenches under the noise model; of a `Fit`, poses in the order of `order`."""
+    """Covariance of all wrenches under the noise model; in a `Fit` the poses are sorted by `order`."""
     R_base_flange: Array
-    """(n, 3, 3)"""
+    """(n, 3, 3) orientations of the flange."""
     wrench: Array
-    """(n, 6)"""
+    """(n, 6) measured wrenches, N and N·m."""
     weights: Array
     """(n,) 1 = used, 0 = rejected because it does not fit the others."""
     chi2: float
-    """Under the noise model: measured or estimated white noise plus `components`. About dof by construction."""
+    """Chi2 under the noise model, white noise plus `components`; about `dof` by construction."""
     dof: int
     measured_chi2: float
-    """Chi2 of the same poses, best fit without drift, with gain and cross-talk where they were found, weighted by the
-    measured noise alone; NaN without it."""
+    """Chi2 of the same poses weighted by the measured noise alone, for the best fit without drift, with gain and
+    cross-talk if they were found; NaN if the noise was not measured."""
     second_basin_chi2: float | None = None
-    """How much worse the second best minimum fits: it is right with the odds exp(-half of this). None: no other."""
+    """Increase of chi2 at the second best minimum, whose odds are exp(-increase / 2); None if there is no other."""
     components: Mapping[str, float] = field(default_factory=dict)
-    """Standard deviations of what was found, by name and unit: beyond the measured noise, or all of the noise
-    where it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
+    """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
+    if it was not measured. A `walk` is per mean interval between poses, a `slope` per session."""
     drift: DriftResult | None = None
     response: Response | None = None
-    """Gain and cross-talk of the sensor, best linear prediction; None where none was found."""
+    """Gain and cross-talk of the sensor as best linear prediction; None if they were not found."""
     may_bend: bool = False
-    """Whether noise stands for a response that is not linear, which the data show, but not clearly."""
+    """Whether the data show weakly a nonlinear response, which this fit treats as noise."""
 
     @classmethod
     def independent(  # noqa: PLR0913 - what an estimate rests on
@@ -103,10 +103,10 @@ class Estimate(Calibrated):
         components: Mapping[str, float] | None = None,
         free: Array | None = None,
     ) -> Self:
-        """Take the estimates of another method, for poses with independent noise `wrench_cov` (n, 6, 6).
+        """Return the estimates of another method, for poses with independent noise `wrench_cov` (n, 6, 6).
 
-        `measured` says whether this was measured, not estimated from the residuals. `free` (15, m) is the identity
-        unless the method assumes mounting or gravity.
+        `measured` tells measured noise from noise estimated from the residuals. `free` (15, m) is the identity unless
+        the method assumes mounting or gravity.
         """
         r = np.asarray(wrench - predict(parameters, R_base_flange))[..., None]
         chi2 = float(weights @ np.sum(r * np.linalg.solve(wrench_cov, r), axis=(1, 2)))
@@ -129,56 +129,56 @@ class Estimate(Calibrated):
 
     @cached_property
     def residuals(self) -> Array:
-        """(n, 6) measured minus predicted with the mean bias, gain and cross-talk included."""
+        """(n, 6) measured minus predicted wrench; the prediction has the mean bias, gain and cross-talk."""
         added = 0.0 if self.response is None else self.response.wrench(self.parameters, self.R_base_flange)
         return np.asarray(self.wrench - predict(self.on_average, self.R_base_flange) - added)
 
     @cached_property
     def _left_out(self) -> tuple[Array, Array]:
-        """Left-out residuals and their covariance, without fitting again: exact for a linear model."""
+        """Leave-one-out residuals and their covariance, without refitting: exact for a linear model."""
         J = jacobian(self.parameters, self.R_base_flange) @ self.free
         WJ = self.noise.solve(J)
         information = summed_products(J, WJ)
-        # Radians, newtons and metres stand side by side: without the scale the smallest eigenvalues count as zero.
+        # The parameters have different units: without scaling the smallest eigenvalues would be taken for zero.
         scale = column_scale(information)
         C = np.asarray(np.linalg.pinv(information / np.outer(scale, scale), hermitian=True)) / np.outer(scale, scale)
         return left_out(self.noise, WJ, self.noise.solve(self.residuals[..., None])[..., 0], C)
 
     @property
     def left_out_residuals(self) -> Array:
-        """(n, 6) measured minus what all other poses predict for this one, drift included, hysteresis not."""
+        """(n, 6) leave-one-out residuals: measured minus predicted from all other poses, with drift."""
         return self._left_out[0]
 
     @property
     def left_out_cov(self) -> Array:
-        """(n, 6, 6) covariance of these: noise of the pose and uncertainty of its prediction."""
+        """(n, 6, 6) covariance of the leave-one-out residuals: noise of the pose plus uncertainty of its prediction."""
         return self._left_out[1]
 
     @cached_property
     def elsewhere(self) -> Array:
-        """(6,) mean square error of predicting the wrench in any orientation, less that in those of the poses."""
+        """(6,) mean square error of predictions over all orientations minus that over the orientations of the poses."""
         return np.zeros(6)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Estimate):
-    """Estimates by maximum likelihood, under the noise that the data show."""
+    """Estimates by maximum likelihood, with variance components from the data."""
 
     information: Array
-    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, priors included."""
+    """(15, 15) Fisher information of the error coordinates `PARAMETER_NAMES`, including priors."""
     order: NDArray[np.intp]
-    """(n,) row numbers by time."""
+    """(n,) indices that sort the rows by time."""
     given_noise: Array
     """(15, 15) covariance of the parameters if the noise model is taken as known."""
     lag: tuple[Array, Array] | None
-    """Hysteresis and errors that have a structure (n, 6) of each pose, and their variance (n, 6, 6): compensation does
-    not know them; None where none were found."""
+    """Hysteresis and structured errors (n, 6) of each pose with their variance (n, 6, 6), which the compensation does
+    not model; None if there are none."""
     at: Point | None
-    """Restricted likelihood of all unknowns; None in many poses."""
+    """Restricted likelihood at the solution; None for many poses."""
 
     @property
     def wrench_cov(self) -> Array:
-        """(n, 6, 6) noise of each pose by itself, without drift."""
+        """(n, 6, 6) noise covariance of each pose, without drift."""
         cov = np.empty_like(self.noise.D)
         cov[self.order] = self.noise.D
         return cov
@@ -191,7 +191,7 @@ class Fit(Estimate):
             R = self.R_base_flange[rows]
             r = self.wrench[rows] - predict(self.on_average, R)
             WX = noise.solve(np.concatenate([jacobian(self.parameters, R), r[..., None]], axis=2))
-            # With a prior the best parameters leave some of J' W r.
+            # With a prior, J' W r is not zero at the best parameters.
             e[rows], S[rows] = left_out(noise, WX[..., :15], WX[..., 15], self.given_noise)
         if self.lag is not None:
             e, S = e + self.lag[0], S + self.lag[1]
@@ -199,7 +199,7 @@ class Fit(Estimate):
 
     @cached_property
     def elsewhere(self) -> Array:
-        """(6,) as of an `Estimate`; zero in many poses, where it is small."""
+        """(6,) see `Estimate.elsewhere`; zero for many poses, where the difference is small."""
         if self.at is None:
             return np.zeros(6)
         R, middle = Rotation.create_group("O").as_matrix(), self.R_base_flange[self.order].mean(axis=0)
@@ -210,7 +210,7 @@ class Fit(Estimate):
         return everywhere - self.at.squares(problem.J, {kind: problem.effects[kind] for kind in effects})
 
     def hidden_covariance(self, orientation_rad: float) -> Array:
-        """Return the covariance (15, 15) of the estimates from errors of arm and mounts, which the poses do not show.
+        """Return the covariance (15, 15) of the estimates due to errors of arm and mounts that the poses do not show.
 
         Parameters
         ----------
@@ -228,7 +228,7 @@ class Fit(Estimate):
 
     @property
     def minus_two_log_likelihood(self) -> float:
-        """Restricted, with what its components and its rejected poses cost."""
+        """Minus twice the restricted log-likelihood, plus the penalties of components and rejected poses."""
         information = self.free.T @ self.information @ self.free
         value = self.noise.logdet + float(np.linalg.slogdet(information)[1]) + self.chi2
         value += sum(2 * (GAIN_OF_RESPONSE if name.startswith(EFFECTS) else GAIN) for name in self.components)
@@ -241,7 +241,7 @@ class Fit(Estimate):
 
 
 def standardize(residuals: Array, covariance: Array) -> Array:
-    """Divide residuals (n, 6) by a root of their covariance (n, 6, 6): independent, of unit variance."""
+    """Return residuals (n, 6) divided by a root of their covariance (n, 6, 6): independent, with unit variance."""
     unit = np.empty_like(residuals)
     for first in range(0, len(residuals), CHUNK):
         part = slice(first, first + CHUNK)
@@ -250,7 +250,7 @@ def standardize(residuals: Array, covariance: Array) -> Array:
 
 
 def _root(covariance: Array) -> Array:
-    """Give roots A with A A' = covariance (n, 6, 6), which rounding may have made indefinite."""
+    """Return matrices A (n, 6, 6) with A A' = covariance; a covariance that rounding made indefinite is allowed."""
     try:
         return np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
     except np.linalg.LinAlgError:
@@ -269,38 +269,38 @@ def fit(
     g_m_s2: float = STANDARD_GRAVITY_M_S2,
     gain_sigma: float = USUAL_GAIN,
 ) -> Fit:
-    """Fit all 15 parameters and, where the likelihood rises enough, components of the noise.
+    """Fit all 15 parameters, and variance components that increase the likelihood enough.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-        Rotations, not checked again.
+        Rotation matrices, assumed to be valid.
     wrench : array, shape (n, 6)
         N and N·m, in the sensor frame.
     wrench_cov : array, shape (n, 6, 6) or (6, 6), or None
-        Covariance of each pose's wrench, or of all of them. Without it one standard deviation for all forces and one
-        for all torques are estimated; from fewer than six poses a single one for both.
+        Covariance of the wrench of each pose, or one covariance for all poses. Without it, one standard deviation of
+        all forces and one of all torques are estimated; with fewer than six poses their ratio is assumed.
     t_s : array, shape (n,), optional
-        When each pose was taken; without it, or with NaN in it, their order counts.
+        Time of each pose. Without times, or if one is NaN, the poses are taken as equally spaced in their order.
     drift : {"auto", "none", "linear", "random-walk"}
-        How the bias may move: "auto": the restricted likelihood decides. The others: not at all, or always.
+        Model of the bias during the session. "auto": chosen by restricted likelihood.
     known : Known, optional
     g_m_s2 : float
-        Only to turn a known mass into a weight.
+        Used only to convert a known mass to a weight.
     gain_sigma : float
-        One standard deviation of the entries of the sensor's gain, for fewer than 12 poses.
+        One standard deviation of the entries of the sensor's gain, used with fewer than 12 poses.
 
     Raises
     ------
     NotObservable
-        The lowest point reached is not a minimum. Poor information is not refused here: see `Fit.information`.
+        The descent did not converge. A singular information matrix is not rejected here: see `Fit.information`.
     """
     session = SessionData(
         R_base_flange, wrench, wrench_cov, t_s, drift, Constraints(known or Known(), g_m_s2), gain_sigma
     )
     e, minima, static_chi2 = explain(session)
     has_structure = any(c in STRUCTURE for c in e.components)
-    # Structure explains wrong data so well that no weight remains.
+    # Structured errors can explain wrong data so well that no weight remains.
     best = _fit_of(session, e, minima, static_chi2) if minima[0].settled or not session.structure() else None
     if best is not None and not (has_structure and session.n <= STRUCTURED_POSES):
         return best
@@ -309,14 +309,14 @@ def fit(
     plain = _fit_of(session, without, minima, static_chi2)
     if best is None:
         return plain
-    # Compensation knows gain and cross-talk, and no structure. A few numbers more of it may only take their place.
+    # Structured errors that are not certain may only displace gain and cross-talk, which the compensation does model.
     is_unsure = without.criterion - e.criterion < _SURE
     displaced = is_unsure and _left_out_error(plain) < _left_out_error(best) - _CLEARLY
     return _beside(plain, best) if displaced else best
 
 
 def _beside(found: Fit, other: Fit) -> Fit:
-    """Return a fit with a covariance that another one, which may be the right one as well, has a half of."""
+    """Return a fit whose covariance includes another fit that is equally probable."""
     off, Z = found.parameters.difference(other.parameters), found.free
     more = Z.T @ (other.covariance - found.covariance + np.outer(off, off)) @ Z / 2
     scale = column_scale(Z.T @ found.covariance @ Z)
@@ -326,23 +326,23 @@ def _beside(found: Fit, other: Fit) -> Fit:
     joint = found.joint_covariance.copy()
     joint[:15, :15] += more
     response = found.with_joint(joint)
-    bends = any(name.startswith("load") for name in other.components)  # and adds to the bias
+    bends = any(name.startswith("load") for name in other.components)
     return replace(found, covariance=found.covariance + more, response=response, may_bend=bends)
 
 
 def _left_out_error(found: Fit) -> float:
-    """Sum the logarithms of the left-out errors of force and torque, mean squares."""
+    """Return the sum of the logarithms of the mean square leave-one-out errors of force and torque."""
     square = (found.left_out_residuals[found.weights > 0] ** 2).reshape(-1, 2, 3).mean(axis=(0, 2))
     return float(np.log(np.maximum(square, _EXACT)).sum())
 
 
 def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_chi2: float) -> Fit:
-    """Put together what follows from an explanation; arguments as `explain` returns them."""
+    """Return the fit that follows from an explanation; the arguments are the results of `explain`."""
     best = minima[0]
     if not best.settled:
         weight_N = best.parameters.weight_N
         raise NotObservable(
-            f"the fit has not settled in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
+            f"the fit has not converged in {MAX_STEPS} steps, at a weight of {weight_N:.2g} N: "
             "hang something heavier on the sensor, or add poses with other orientations."
         )
     plain = not e.components and e.kept.all() and session.drift != "linear"
@@ -357,13 +357,13 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
     measured_chi2 = static_chi2 if session.measured else float("nan")
     if found or drifts or session.n <= STRUCTURED_POSES:
         problem = session.linearise(best.parameters, e.kept)
-        if drifts:  # what is handed on is the bias at the end
+        if drifts:  # the result has the bias at the end
             problem = replace(problem, origin=int(np.flatnonzero(e.kept)[-1]))
         at = point(problem, e.components, e.theta)
     if session.measured and found.keys() & {*RESPONSE}:
         of_sensor = [c for c in e.components if c in RESPONSE]
         measured_chi2 = point(problem, of_sensor, np.array([found[c] for c in of_sensor])).chi2
-    # Many poses show the variances so well that their uncertainty does not widen that of the estimates.
+    # Many poses determine the variances so well that their uncertainty is negligible.
     parameters = best.parameters
     if drifts or found.keys() & {*RESPONSE, *UNCOMPENSATED} or (found and session.n < POSES_THAT_SHOW_THE_NOISE):
         x, C = estimates_of_unknown_variances(at)
@@ -371,14 +371,14 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
         if session.n < POSES_THAT_SHOW_THE_NOISE:
             others = rivals(problem, at, [*session.candidates(), *session.structure()])
             C = C + mixture_covariance(at, others)
-            # A drift that the data show hardly better than none counts for its share.
-            step = step + sum(share * (Z @ one.step - step) for one, share in others)
+            # Models without a drift that are almost as likely contribute to the estimate with their probability.
+            step = step + sum(share * (Z @ rival.step - step) for rival, share in others)
         if drifts:
             parameters = parameters.moved(np.where(np.isin(np.arange(15), BIASES), step, 0.0))
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
-    # In the order of the components: a sum over a set would differ in the last digit from process to process.
+    # In the order of the components, because a sum over a set would depend on the process in its last digit.
     if hidden := [c for c in found if c in UNCOMPENSATED]:
         lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
         for c in hidden:
@@ -394,7 +394,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
         chi2=best.chi2,
         dof=dof,
         measured_chi2=measured_chi2,
-        second_basin_chi2=_second_basin_chi2([one.chi2 for one in minima], components, dof),
+        second_basin_chi2=_second_basin_chi2([minimum.chi2 for minimum in minima], components, dof),
         weights=weights,
         components=components,
         drift=_drift_result(session, best, noise, given_noise, found) if drifts else None,
@@ -411,9 +411,9 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
 
 
 def _second_basin_chi2(minima: Sequence[float], components: Iterable[str], dof: int) -> float | None:
-    """Compare the two least minima of chi2; None if there is one.
+    """Return the difference between the two smallest minima of chi2; None if there is only one.
 
-    Where white noise was estimated from the same residuals a larger one makes up for part of the difference.
+    If white noise was estimated from the same residuals, a larger noise would compensate part of the difference.
     """
     if len(minima) == 1:
         return None
@@ -422,7 +422,7 @@ def _second_basin_chi2(minima: Sequence[float], components: Iterable[str], dof: 
 
 
 def _deviation(session: SessionData, c: Component, variance: float) -> float:
-    """Standard deviation that the fit used: estimated white noise includes its lower bound."""
+    """Return the standard deviation of a component; estimated white noise includes its lower bound."""
     least = 0.0 if session.measured or c.kind != "white" else session.cov[0][np.argmax(c.share), np.argmax(c.share)]
     return float(np.sqrt(variance + least))
 
@@ -430,13 +430,13 @@ def _deviation(session: SessionData, c: Component, variance: float) -> float:
 def _drift_result(
     session: SessionData, best: Minimum, noise: Noise, C: Array, found: Mapping[Component, float]
 ) -> DriftResult:
-    """Best linear prediction of the bias at every pose, and the error of its change."""
+    """Return the best linear prediction of the bias at every pose, and the standard deviation of its total change."""
     J, r = jacobian(best.parameters, session.R), session.wrench - predict(best.parameters, session.R)
     problem = session.linearise(best.parameters, noise.kept)
     others = [(problem.columns(c), value) for c, value in found.items() if c in (*RESPONSE, *UNCOMPENSATED)]
 
     def not_drift(X: Array) -> Array:
-        """Multiply by the covariance of all but the drift."""
+        """Return the covariance of all components except the drift, times X."""
         Y = np.asarray(noise.D @ X)
         for columns, value in others:
             T = problem.X[..., columns]

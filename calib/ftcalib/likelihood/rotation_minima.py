@@ -1,10 +1,10 @@
-"""The force-only problem: every minimum over the rotations, and the proof that the best one is global.
+"""The force-only problem: all minima over the rotations, and a certificate that the best one is global.
 
-For a known mount the rest of the force model is linear. With gravity and bias eliminated, what is left is
-`min r.T @ Q @ r` over the rotations, where `r = R.ravel()` and `R = R_flange_sensor.T` maps flange to sensor
-coordinates (`s_eR` in Yu et al.). Written in unit quaternions this is a quartic on the sphere, which makes it small
-enough to solve completely: Newton descents from a fixed set of starts find all minima, and a sum of squares proves
-that no rotation costs less. `given_rotation` and `com_and_torque_bias` then solve the linear rest.
+For a known mounting the force model is linear in gravity and bias. Eliminating them leaves `min r.T @ Q @ r` over the
+rotations, where `r = R.ravel()` and `R = R_flange_sensor.T` maps flange to sensor coordinates (`s_eR` in Yu et al.).
+In unit quaternions the cost is a quartic on the sphere. Newton descents from a fixed set of starts find all minima, and
+a sum-of-squares relaxation proves that no rotation costs less. `given_rotation` and `com_and_torque_bias` then solve
+for the linear unknowns.
 """
 
 from dataclasses import dataclass
@@ -15,15 +15,16 @@ from ftcalib.model import Array, skew
 
 # Rows per matrix product: 0.4 MB, so that a chunk stays in the cache.
 _CHUNK = 4096
-# Of 16000 problems 24 starts miss some minimum in 93, 60 in 8, 120 in 2: neither the best, nor of usable poses.
+# In 16000 problems 24 starts missed a minimum in 93, 60 starts in 8, and 120 starts in 2, where neither was the best
+# minimum or from usable poses.
 _STARTS = 120
-# A curvature below this share of the cost's variation is none: the poses leave that direction open.
+# A curvature below this share of the variation of the cost is zero: the poses do not determine that direction.
 _FLAT = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RotationMinimum:
-    """One local minimum of the cost over the rotations."""
+    """Local minimum of the cost over the rotations."""
 
     R: Array
     """(3, 3) rotation, flange to sensor."""
@@ -32,7 +33,7 @@ class RotationMinimum:
 
 
 def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bias: bool = True) -> Array:
-    """Eliminate gravity and bias from weighted least squares.
+    """Return the quadratic form of the force cost after elimination of gravity and bias.
 
     Parameters
     ----------
@@ -42,8 +43,8 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
         Measured force, sensor frame.
     weights : (n,) or (n, 3, 3)
         1 / variance of each pose's force, or its information matrix (inverse covariance). Of a matrix only the mean of
-        its diagonal is used: turning the residual into the flange frame, which makes the cost quadratic, keeps a
-        multiple of the identity and no other metric. Then the cost is an approximation, good for starting points.
+        its diagonal is used, because the cost is quadratic only if the weights do not depend on the rotation. The
+        cost is then an approximation, sufficient for starting points.
     with_bias : bool
         Whether the sensor has an unknown force bias.
 
@@ -64,10 +65,10 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
 
 
 def force_cost_from_gram(gram: Array, *, with_bias: bool = True) -> Array:
-    """Do the same as `force_cost` from sums over the poses.
+    """Return the result of `force_cost`, computed from sums over the poses.
 
-    The sums (13, 13) are of `w * row.T @ row` with row = (force, R_base_flange row by row, 1).
-    A bias of k times the weight costs `2 * log10(k)` of the 16 digits; `force_cost` sees the data and loses none.
+    `gram` (13, 13) is the sum of `w * row.T @ row` with row = (force, R_base_flange row by row, 1). A bias of k times
+    the weight costs `2 * log10(k)` of the 16 digits; `force_cost` loses none, because it centres the data.
     """
     force_square, gravity_square, gravity_force = _blocks(gram, with_bias=with_bias)
     Q = (
@@ -78,19 +79,19 @@ def force_cost_from_gram(gram: Array, *, with_bias: bool = True) -> Array:
 
 
 def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array, weights: Array) -> tuple[Array, Array]:
-    """Give back the unknowns that `force_cost` eliminated, with bias.
+    """Return the unknowns that `force_cost` eliminated, gravity force and force bias.
 
     Parameters
     ----------
     R_sensor_flange : (3, 3)
-        A rotation of the mount, flange to sensor: `R_flange_sensor.T`, as in `Minimum`.
+        Mounting as a rotation from flange to sensor, `R_flange_sensor.T`, as in `RotationMinimum`.
     R_base_flange, force_N, weights
         As in `force_cost`.
 
     Returns
     -------
     gravity_force_base_N : (3,)
-        Weight of what hangs on the sensor, base frame. The shortest one, if the poses do not determine it.
+        Weight of the load on the sensor in the base frame; the shortest solution if the poses do not determine it.
     force_bias_N : (3,)
         Sensor frame.
     """
@@ -102,12 +103,10 @@ def given_rotation(R_sensor_flange: Array, R_base_flange: Array, force_N: Array,
 
 
 def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array]:
-    """Centre of mass and torque bias by linear least squares: Yu eqs 43-45.
+    """Return centre of mass (3,) and torque bias (3,) by linear least squares: Yu eqs 43-45.
 
-    The paper's regressor is the measured force without bias, whose noise makes P too short by
-    sigma^2 / (sigma^2 + mg^2 / 3).
-
-    `weight_N` (n, 3) is the measured force minus the force bias, in the sensor frame; both results are (3,).
+    `weight_N` (n, 3) is the weight in the sensor frame. The paper uses the measured force minus the bias, whose noise
+    shortens P by the share sigma^2 / (sigma^2 + mg^2 / 3).
     """
     P_x_F = -skew(weight_N)
     C = np.concatenate([P_x_F, np.broadcast_to(np.eye(3), P_x_F.shape)], axis=2)
@@ -116,23 +115,23 @@ def com_and_torque_bias(weight_N: Array, torque_Nm: Array) -> tuple[Array, Array
 
 
 def minima(Q: Array) -> list[RotationMinimum]:
-    """Find all local minima of `r.T @ Q @ r` over the rotations.
+    """Return all local minima of `r.T @ Q @ r` over the rotations.
 
     Parameters
     ----------
     Q : (9, 9)
-        From `force_cost`; any symmetric matrix will do.
+        Symmetric matrix, from `force_cost`.
 
     Returns
     -------
-    list of Minimum
-        By ascending cost, never empty. Where the cost is flat along a curve (the poses leave a direction open), the
-        curve is represented by rotations at least 90 degrees apart.
+    list of RotationMinimum
+        By ascending cost, never empty. If the cost is constant along a curve (the poses leave a direction
+        undetermined), the curve is represented by rotations at least 90 degrees apart.
 
     Notes
     -----
-    Deterministic. Newton's method with limited steps from evenly spread starts, all at once; along a negative curvature
-    it goes down by the same length.
+    Deterministic: Newton's method with limited steps, from evenly spread starts at the same time. Along a direction of
+    negative curvature the absolute curvature is used.
     """
     quartic, _ = _quartic(Q)
     q, cost, curvature = _descend(quartic, _super_fibonacci(_STARTS))
@@ -145,25 +144,25 @@ def minima(Q: Array) -> list[RotationMinimum]:
         if not same.any():
             kept.append(int(i))
     r = _squares(q[kept]) @ _R_OF_Q.T
-    found = [RotationMinimum(R.reshape(3, 3), float(R @ Q @ R)) for R in r]
-    return sorted(found, key=lambda minimum: minimum.cost)
+    return sorted((RotationMinimum(R.reshape(3, 3), float(R @ Q @ R)) for R in r), key=lambda minimum: minimum.cost)
 
 
 def certificate(Q: Array, R: Array) -> float:
-    """Bound how far a rotation can be from the global minimum of `r.T @ Q @ r`.
+    """Return a bound on the gap between the cost of a rotation and the global minimum of `r.T @ Q @ r`.
 
     Parameters
     ----------
     Q : (9, 9)
         From `force_cost`.
     R : (3, 3)
-        The rotation in question, as in `Minimum`.
+        The rotation to certify, as in `RotationMinimum`.
 
     Returns
     -------
     float
-        At least 0: no rotation costs less than `cost(R) - gap * trace(Q) / 3`. The unit `trace(Q) / 3` is the mean cost
-        of all rotations, so it stays meaningful when the best cost is zero. Below 1e-8 R is a global minimum.
+        Gap of at least 0: no rotation costs less than `cost(R) - gap * trace(Q) / 3`. The unit `trace(Q) / 3` is the
+        mean cost of all rotations, so it is meaningful even if the lowest cost is zero. Below 1e-8 R is a global
+        minimum.
 
     Raises
     ------
@@ -174,11 +173,11 @@ def certificate(Q: Array, R: Array) -> float:
     -----
     With phi the ten scaled quadratic monomials of the unit quaternion, the cost is `phi.T @ P @ phi`; if
     `P - gamma * I - sum(mu_k * N_k)` is positive semidefinite, where the N_k vanish on every phi, no cost is below
-    gamma. The largest gamma is a semidefinite program of 21 variables, solved by a primal-dual interior-point method
-    (the direction of Helmberg, Rendl, Vanderbei and Wolkowicz 1996). The bound is read from the smallest
-    eigenvalue of that matrix, less a margin for rounding: it holds however far the method came, so the answer can be
-    too large, never too small. A quartic need not be such a sum of squares: all of 8000 simulated calibrations were, 4
-    of 6000 other random Q were not.
+    gamma. The largest gamma is the solution of a semidefinite program of 21 variables, by a primal-dual interior-point
+    method (the direction of Helmberg, Rendl, Vanderbei and Wolkowicz 1996). The bound is the smallest eigenvalue of
+    that matrix minus a margin for rounding. It is valid even if the method stops early, so the gap can be too large,
+    but never too small. A quartic need not be such a sum of squares: all of 8000 simulated calibrations were, 4 of 6000
+    other random Q were not.
     """
     if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
         raise ValueError(f"the certificate needs a 3x3 rotation matrix, not {R.tolist()}")
@@ -195,7 +194,7 @@ def certificate(Q: Array, R: Array) -> float:
 
 
 def _gram(R_base_flange: Array, force_N: Array, weights: Array, offset: Array) -> Array:
-    """Weighted sum of `row.T @ row` for rows less an offset, in chunks."""
+    """Return the weighted sum (13, 13) of `row.T @ row` over rows minus an offset."""
     gram = np.zeros((13, 13))
     for first in range(0, len(weights), _CHUNK):
         part = slice(first, first + _CHUNK)
@@ -206,9 +205,9 @@ def _gram(R_base_flange: Array, force_N: Array, weights: Array, offset: Array) -
 
 
 def _centred_gram(R: Array, force_N: Array, weights: Array, *, with_bias: bool) -> tuple[Array, Array]:
-    """Gram matrix of the rows less their mean over the first chunk, and that mean.
+    """Return the Gram matrix of the rows minus an offset, their mean over the first chunk, and the offset.
 
-    A bias takes up any constant, so this changes no result and keeps all digits when the bias is large.
+    The bias absorbs any constant, so the offset changes no result, but keeps all digits if the bias is large.
     """
     if weights.ndim == 3:
         weights = np.trace(weights, axis1=1, axis2=2) / 3
@@ -219,7 +218,7 @@ def _centred_gram(R: Array, force_N: Array, weights: Array, *, with_bias: bool) 
 
 
 def _blocks(gram: Array, *, with_bias: bool) -> tuple[Array, Array, Array]:
-    """Least-squares blocks: force by force (3, 3), gravity by gravity (3, 3), gravity by R (3, 9).
+    """Return least-squares blocks: force by force (3, 3), gravity by gravity (3, 3), gravity by R (3, 9).
 
     In the flange frame the residual is `R.T @ force - R_base_flange.T @ gravity`: linear in r and in gravity.
     """
@@ -232,7 +231,7 @@ def _blocks(gram: Array, *, with_bias: bool) -> tuple[Array, Array, Array]:
 
 
 def _pseudo_inverse(square: Array, total_weight: float) -> Array:
-    """Pseudo-inverse; per unit of weight, an eigenvalue is the squared spread of the poses in radians."""
+    """Return the pseudo-inverse; an eigenvalue per unit of weight is the squared spread of the poses in radians."""
     value, vector = np.linalg.eigh(square)
     keep = value > 1e-12 * total_weight
     inverse: Array = (vector[:, keep] / value[keep]) @ vector[:, keep].T
@@ -258,14 +257,14 @@ _R_OF_Q = np.einsum("idb,daj,b->ijab", _PRODUCT, _PRODUCT, _CONJUGATE)[1:, 1:].r
 
 
 def _squares(q: Array) -> Array:
-    """(k, 16) of kron(q, q) for (k, 4) quaternions."""
+    """Return kron(q, q) (k, 16) of quaternions (k, 4)."""
     return (q[:, :, None] * q[:, None, :]).reshape(-1, 16)
 
 
 def _quartic(Q: Array) -> tuple[Array, float]:
-    """Write the cost as a symmetric tensor: its excess over the mean, in units of its variation; and that unit.
+    """Return the cost minus its mean as a symmetric tensor, in units of its variation, and that unit.
 
-    The (16, 16) matrix T gives `kron(q, q) @ T @ kron(q, q)` and is the same under all orders of its four indices.
+    The tensor is a matrix T (16, 16), symmetric in its four indices, with the value `kron(q, q) @ T @ kron(q, q)`.
     """
     if Q.shape != (9, 9) or not np.isfinite(Q).all():
         raise ValueError(f"the cost matrix needs 9x9 finite numbers, not {Q.tolist()}")
@@ -279,7 +278,7 @@ def _quartic(Q: Array) -> tuple[Array, float]:
 
 
 def _super_fibonacci(n: int) -> Array:
-    """(n, 4) unit quaternions spread evenly over all rotations (Alexa, CVPR 2022, algorithm 1)."""
+    """Return unit quaternions (n, 4) spread evenly over all rotations (Alexa, CVPR 2022, algorithm 1)."""
     s = np.arange(n) + 0.5
     alpha, beta = 2 * np.pi * s / np.sqrt(2), 2 * np.pi * s / 1.533751168755204288118041
     inner, outer = np.sqrt(s / n), np.sqrt(1 - s / n)
@@ -287,7 +286,7 @@ def _super_fibonacci(n: int) -> Array:
 
 
 def _local_quadratic(quartic: Array, q: Array) -> tuple[Array, Array, Array, Array]:
-    """Cost (k,), gradient (k, 3) and Hessian (k, 3, 3) on the sphere, and the tangent basis (k, 4, 3) they refer to."""
+    """Return cost (k,), gradient (k, 3), Hessian (k, 3, 3) on the sphere, and their tangent basis (k, 4, 3)."""
     form = (_squares(q) @ quartic).reshape(-1, 4, 4)
     basis = (q @ _TANGENT).reshape(-1, 4, 3)
     half = form @ q[:, :, None]
@@ -298,7 +297,7 @@ def _local_quadratic(quartic: Array, q: Array) -> tuple[Array, Array, Array, Arr
 
 
 def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
-    """Follow every start down: quaternions (k, 4), costs (k,) and smallest curvatures (k,) of the minima reached."""
+    """Return quaternions (k, 4), costs (k,) and smallest curvatures (k,) of the minima reached from the starts q."""
     longest, kick, floor, arrived = 0.35, 0.05, 1e-7, 1e-8  # lengths on the sphere: half the angles of rotation
     reach = np.full(len(q), longest)
     here: tuple[Array, ...] = (q, *_local_quadratic(quartic, q))
@@ -322,7 +321,7 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
             there = tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in both)
         here = there
         near = np.abs(here[0] @ here[0].T) > 1 - 1e-6
-        same = (near.argmax(axis=1) < np.arange(len(near))) & (curvature[:, 0] > 0)  # goes where another start goes
+        same = (near.argmax(axis=1) < np.arange(len(near))) & (curvature[:, 0] > 0)  # converges with another start
         if done.any():
             ends.append(tuple(x[done] for x in here[:4]))
         if (gone := done | same).any():
@@ -331,9 +330,9 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
             break
     q, cost, gradient, hessian = (np.concatenate(parts) for parts in zip(*ends, here[:4], strict=True))
     curvature = np.linalg.eigvalsh(hessian)[:, 0]
-    found = (curvature > -_FLAT) & (np.linalg.norm(gradient, axis=1) < 1e-9)
-    found[np.argmin(cost)] = True
-    return q[found], cost[found], curvature[found]
+    is_minimum = (curvature > -_FLAT) & (np.linalg.norm(gradient, axis=1) < 1e-9)
+    is_minimum[np.argmin(cost)] = True
+    return q[is_minimum], cost[is_minimum], curvature[is_minimum]
 
 
 # The proof
@@ -346,7 +345,7 @@ for _column, (_a, _b) in enumerate(_MONOMIALS):
 
 
 def _constraints() -> Array:
-    """(21, 10, 10): the identity, and 20 forms that vanish on every phi because `(ab)(cd) = (ac)(bd)`."""
+    """Return the identity and 20 forms that vanish on every phi because `(ab)(cd) = (ac)(bd)`, shape (21, 10, 10)."""
     ways: dict[tuple[int, ...], list[Array]] = {}
     for i, first in enumerate(_MONOMIALS):
         for j, second in enumerate(_MONOMIALS[: i + 1]):
@@ -366,7 +365,7 @@ _MOMENTS = (np.outer(_TRACE, _TRACE) + 2 * np.eye(10)) / 24
 
 
 def _lower_bound(form: Array, enough: float, tolerance: float) -> float:
-    """Largest gamma found with `phi @ form @ phi >= gamma` for all phi; the search ends at `enough - tolerance`."""
+    """Return the largest gamma found with `phi @ form @ phi >= gamma` for all phi; stop at `enough - tolerance`."""
     centring, margin = 0.1, 0.95
     primal, dual = _MOMENTS, np.zeros(21)
     dual[0] = np.linalg.eigvalsh(form)[0] - 0.3
@@ -399,7 +398,7 @@ def _lower_bound(form: Array, enough: float, tolerance: float) -> float:
 
 
 def _feasible_step(values: Array, axes: Array, direction: Array, margin: float) -> float:
-    """Length of the step that keeps a positive definite matrix so; at most 1."""
+    """Return the step length, at most 1, that keeps a positive definite matrix positive definite."""
     root = axes / np.sqrt(values)
     lowest = float(np.linalg.eigvalsh(root.T @ direction @ root)[0])
     return 1.0 if lowest > -margin else -margin / lowest

@@ -1,16 +1,16 @@
-"""The data of one session: poses in the order of time, priors, and the components that may act on the poses.
+"""Data of one session: poses sorted by time, priors, and the variance components that may act on the poses.
 
-`Session.linearise` gives the mixed model of `variance_components` at parameters p. With the wrench h of `ftcalib.model`
-and its derivative J_i, pose i at time t_i leaves
+`SessionData.linearise` returns the mixed model of `variance_components` at parameters p. With the wrench h of
+`ftcalib.model` and its derivative J_i, the residual of pose i at time t_i is
 
     r_i = wrench_i - h(p, R_i) = J_i Z x + b(t_i) + T_i u + J_i[:, :3] d_i + e_i,    e_i ~ N(0, D_i)
 
-    x    step of the free parameters: Z is the basis that exact constraints leave, tolerances are priors
+    x    step of the free parameters; Z is a basis of the directions without exact constraints, tolerances are priors
     b    drift of the bias: random walk, or linear in time
-    u    coefficients of gain, cross-talk, hysteresis and errors that have a structure
-    d_i  error of the orientation, which adds size² J J' to D_i (effective variance: Orear, Am. J. Phys. 50, 1982)
+    u    coefficients of gain, cross-talk, hysteresis and structured errors
+    d_i  orientation error, which adds size² J J' to D_i (effective variance: Orear, Am. J. Phys. 50, 1982)
 
-D_i is the measured covariance of the mean; where it was not measured, white noise is a component too.
+D_i is the measured covariance of the mean. If it was not measured, white noise is a further component.
 """
 
 from collections.abc import Callable, Sequence
@@ -50,30 +50,30 @@ FEW_POSES = 6
 FEW_POSES_FOR_RESPONSE = 7
 # With fewer poses the variances of gain and cross-talk are at least those of usual sensors.
 FEW_POSES_FOR_GAIN = 12
-# With fewer poses drift is not separated from unknown noise.
+# With fewer poses drift is not separated from noise that was not measured.
 FEW_POSES_WITHOUT_NOISE = 12
 # With fewer poses hysteresis is not separated from gain and noise.
 FEW_POSES_FOR_HYSTERESIS = 12
 # With fewer poses the axes of a group share one drift.
 POSES_FOR_EACH_AXIS = 50
-# Residuals of a fit to data without noise, relative to their rounding.
+# Largest residuals of a fit to data without noise, in units of the rounding error.
 EXACT = 100
-# Low-discrepancy sequence.
+# Ratio of the low-discrepancy sequence that selects a subset of poses.
 GOLDEN_RATIO = (1 + 5**0.5) / 2
-# Least ratio of the residuals of one kind to those of the other, at the usual ratio.
+# Smallest assumed ratio of force to torque residuals or the reverse, in units of their usual ratio.
 UNEQUAL = 0.01
-# Noise floor where the noise was not measured, as a share of the residuals.
+# Noise floor, as a share of the residuals, if the noise was not measured.
 FLOOR = 1e-3
 
 
 def _rounding(wrench: Array) -> Array:
-    """Noise (2,) of force and torque of data (n, 6) that have none."""
+    """Return the noise (2,) of force and torque that is assumed for wrenches (n, 6) without noise."""
     largest_N, largest_Nm = np.abs(wrench).reshape(-1, 2, 3).max(axis=(0, 2))
     return 1e-12 * np.array([largest_N, max(largest_Nm, LEVER_M * largest_N)])
 
 
 class SessionData:
-    """Arguments as in `ftcalib.likelihood.fit.fit`."""
+    """Poses, noise, times and constraints of one session; arguments as in `ftcalib.likelihood.fit.fit`."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class SessionData:
     ) -> None:
         self.n = len(wrench)
         self.gain_sigma, self.structured = gain_sigma, True
-        # Of many poses: the components that some of them show; no other walk or structure is looked for.
+        # Components found in a subset of many poses; no other walk or structured error is searched.
         self.shown: Sequence[Component] | None = None
         self.given = R_base_flange, wrench
         self.drift, self.constraints = drift, constraints
@@ -104,18 +104,18 @@ class SessionData:
         self._done = dict[object, Any]()
 
     def once(self, key: object, call: Callable[[], _T]) -> _T:
-        """Return what a call gives, kept where the explanation without structure may have to repeat it."""
+        """Return the result of a call, cached if a second explanation without structured errors may repeat it."""
         value: _T = self._done[key] if key in self._done else call()
         if self.structure():
             self._done[key] = value
         return value
 
     def dof(self, kept: Kept) -> int:
-        """Degrees of freedom of chi2, from the poses that count."""
+        """Return the degrees of freedom of chi2 for the kept poses."""
         return 6 * int(kept.sum()) - 15 + self.constraints.dof - (6 if self.drift == "linear" else 0)
 
     def lacks_rank(self, minimum: Minimum) -> bool:
-        """Whether the poses leave a combination of parameters open."""
+        """Whether the poses leave a combination of parameters undetermined."""
         Z = self.constraints.free(minimum.parameters)
         H = Z.T @ minimum.information @ Z
         scale = column_scale(H)
@@ -123,7 +123,7 @@ class SessionData:
         return bool(eigenvalues[0] < RANK_TOLERANCE * eigenvalues[-1]) or self.dof(np.ones(self.n, bool)) <= 0
 
     def is_exact(self, p: Parameters) -> bool:
-        """Whether the parameters fit to rounding, or to what no sensor resolves if the noise is unknown."""
+        """Whether the residuals are only rounding errors or, if the noise is unknown, below the sensor's resolution."""
         first_poses, all_poses = slice(1000), slice(None)  # the first decide nearly always
         return self._fits_exactly(p, first_poses) and self._fits_exactly(p, all_poses)
 
@@ -134,24 +134,24 @@ class SessionData:
         return bool((residuals < (rounding if self.measured else np.maximum(rounding, RESOLUTION[::3]))).all())
 
     def noise_left(self, p: Parameters) -> Array:
-        """Take the residuals as white noise."""
+        """Return white noise (n, 6, 6) as large as the residuals."""
         return self._white(self._rms(p) * np.sqrt(6 * self.n / self.dof(self.everything)))
 
     def least_noise(self, p: Parameters) -> Array:
-        """Give a small share of the residuals, so that a random walk never explains them all."""
+        """Return white noise (n, 6, 6) of a small share of the residuals, so that a walk never explains them all."""
         return self._white(FLOOR * self._rms(p))
 
     def _white(self, sigma: Array) -> Array:
         return np.broadcast_to(white(*np.maximum(sigma, _rounding(self.wrench))), self.cov.shape)
 
     def _rms(self, p: Parameters) -> Array:
-        """Residuals (2,) of force and torque; rounding may hide one kind, which must not outweigh the other."""
+        """Return the rms residuals (2,) of force and torque, with a lower bound of each relative to the other."""
         e = (self.wrench - predict(p, self.R)).reshape(-1, 2, 3)
         rms = np.sqrt(np.mean(e**2, axis=(0, 2)))
         return np.asarray(np.maximum(rms, UNEQUAL * rms[::-1] * [1 / LEVER_M, LEVER_M]))
 
     def start(self, problem: Linearised, components: Sequence[Component]) -> Array:
-        """Give variances to start from: the mean square residual of the group, or its noise where that is more."""
+        """Return initial variances: the mean square residual of the group, or its noise if that is larger."""
         if not components:
             return np.zeros(0)
         noise = np.diagonal(problem.D, axis1=1, axis2=2)
@@ -165,11 +165,11 @@ class SessionData:
         return np.array([variance(c) for c in components])
 
     def statistics(self, noise: Noise, p: Parameters) -> Statistics:
-        """Sum up under any noise, around parameters."""
+        """Return the sufficient statistics for a noise model, with the parameters as reference."""
         return Statistics.of_noise(features(self.R), self.wrench, noise, coefficients(p))
 
     def linearise(self, p: Parameters, kept: Kept) -> Linearised:
-        """Linearise at parameters."""
+        """Return the mixed model linearised at parameters, for the kept poses."""
         J = jacobian(p, self.R)
         turn = J[..., :3]
         r = self.wrench - predict(p, self.R)
@@ -192,11 +192,11 @@ class SessionData:
 
     @property
     def assumes_response(self) -> bool:
-        """Whether gain and cross-talk are at least as large as usual, because too few poses show how large."""
+        """Whether usual values are lower bounds of gain and cross-talk, because too few poses determine them."""
         return self.gain_sigma > 0 and self.n < FEW_POSES_FOR_GAIN
 
     def always(self) -> list[Component]:
-        """Components that are part of the model."""
+        """Return the components that are always part of the model."""
         always = []
         if not self.measured and self.n < FEW_POSES:
             always = [Component("white_force_N", "white", (1.0, 1.0, 1.0, *[LEVER_M**2] * 3))]
@@ -209,7 +209,7 @@ class SessionData:
         return always
 
     def candidates(self) -> list[Component]:
-        """Components that the data may show."""
+        """Return the components that are added if they increase the likelihood enough."""
         found = list(RESPONSE) if self.n >= FEW_POSES_FOR_RESPONSE and not self.assumes_response else []
         if self.n >= (FEW_POSES if self.measured else FEW_POSES_WITHOUT_NOISE):
             white = [channel_component("white", FORCE), channel_component("white", TORQUE)] if self.measured else []
@@ -222,14 +222,14 @@ class SessionData:
         return found
 
     def structure(self) -> tuple[Component, ...]:
-        """Errors with a structure that the data may show."""
+        """Return the structured errors that are added if they increase the likelihood enough."""
         if not self.structured or self.n < FEW_POSES_FOR_HYSTERESIS:
             return ()
         return STRUCTURE if self.n <= STRUCTURED_POSES else tuple(c for c in STRUCTURE if c in (self.shown or ()))
 
     def some(self, count: int) -> "SessionData":
-        """Return the session of so many poses, one from each of as many parts of equal length."""
-        # At uneven places within the parts, because a tour may have been repeated at the pace of the parts.
+        """Return the session of a subset of `count` poses, one from each of `count` parts of equal length."""
+        # The places within the parts vary, because a tour may have been repeated with the period of the parts.
         k = np.arange(count)
         places = ((k + k * GOLDEN_RATIO % 1) * self.n / count).astype(np.intp)
         R, wrench = (x[self.order[places]] for x in self.given)
@@ -240,12 +240,12 @@ class SessionData:
 
 
 def white(sigma_N: float, sigma_Nm: float) -> Array:
-    """Give the covariance (6, 6) of white noise."""
+    """Return the covariance (6, 6) of white noise."""
     return np.diag(np.repeat([sigma_N**2, sigma_Nm**2], 3))
 
 
 def inverses(cov: Array) -> Array:
-    """Invert (n, 6, 6) matrices, once when they are all the same."""
+    """Return the inverses of matrices (n, 6, 6); a broadcast matrix is inverted once."""
     if cov.strides[0] == 0:
         return np.broadcast_to(np.linalg.inv(cov[:1]), cov.shape)
     return np.asarray(np.linalg.inv(cov))

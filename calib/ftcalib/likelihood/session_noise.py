@@ -1,10 +1,10 @@
-"""The noise of a whole session: every pose its own, and a bias that drifts from pose to pose.
+"""Noise model of a session: independent noise of every pose, and a bias that drifts from pose to pose.
 
     V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
-K is the covariance of a random walk less its mean over the poses, so that "the bias" is the mean bias; or less its
-value at one pose, so that it is the bias there. It follows from the stiffness of the path, a tridiagonal matrix.
-Woodbury's identity makes every operation O(n).
+K is the covariance of a random walk minus its mean over the poses, if the bias is the mean bias, or minus its value at
+one pose, if the bias is that of the pose. Its inverse is tridiagonal, and Woodbury's identity makes every operation
+O(n).
 """
 
 from collections.abc import Iterator
@@ -18,19 +18,19 @@ from ftcalib.model import Array
 
 # Rows per matrix product, so that a chunk stays in the cache.
 CHUNK = 4096
-# In mean intervals: two poses at the same time have nearly the same bias.
+# Shortest interval, in mean intervals, so that two poses at the same time have nearly the same bias.
 SHORTEST_STEP = 1e-3
-# Weight of a rejected pose: too little to count, enough for the others to predict it.
+# Weight of a rejected pose: too small to influence the fit, but enough to compute its prediction.
 FAINT = 1e-9
 
 
 class Noise:
-    """Covariance of all wrenches, and its inverse applied.
+    """Covariance of the wrenches of all poses, and products with its inverse.
 
     Parameters
     ----------
     D : array, shape (n, 6, 6)
-        Independent noise of each pose.
+        Covariance of the independent noise of each pose.
     time : array, shape (n,), or None
         Ascending, in mean intervals between poses. Not needed without drift.
     walk : array, shape (6,), or None
@@ -38,11 +38,11 @@ class Noise:
     slope : array, shape (6,), or None
         Standard deviation of each channel's linear change over the session; infinite = unknown.
     effects : tuple of array, shapes (n, 6, k) and (k,), or None
-        What acts on all poses at once, and the variances with which it does.
+        Columns of coefficients common to all poses, and the variances of these coefficients.
     kept : bool array, shape (n,), or None
-        The poses that count. The others are as good as deleted: a walk sees a longer interval.
+        Poses that are used. The others have almost no weight, as if they were deleted.
     origin : int or None
-        Pose at which walk and slope are zero; None: their mean over all poses is.
+        Index of the pose at which walk and slope are zero; None: their mean over all poses is zero.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Noise:
 
     @cached_property
     def W(self) -> Array:
-        """(n, 6, 6) inverse noise of each pose by itself."""
+        """(n, 6, 6) inverse of the independent noise covariance of each pose."""
         if self.D.strides[0] == 0:
             W = np.broadcast_to(np.linalg.inv(self.D[:1]), self.D.shape)
         else:
@@ -81,7 +81,7 @@ class Noise:
         return np.asarray(W if self.kept.all() else W * np.where(self.kept, 1.0, FAINT)[:, None, None])
 
     def parts(self) -> Iterator[tuple[slice, "Noise"]]:
-        """Split into poses that are independent of those of other parts, few enough for the caches."""
+        """Yield slices of poses with their noise; independent poses are split into parts that fit into the cache."""
         if not self.independent or self.n <= CHUNK:
             yield slice(None), self
             return
@@ -90,7 +90,7 @@ class Noise:
             yield part, Noise(self.D[part], kept=self.kept[part])
 
     def _add_walk(self, dt: Array, origin: int | None) -> None:
-        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then keep mean or origin at zero."""
+        """Factorise M = K^+ + S W S, unknowns ordered by pose, then channel; then constrain mean or origin to zero."""
         n, k, s = self.n, self._walking.size, self._s
         stiffness = 1 / dt
         blocks = s[:, None] * self.W[:, self._walking[:, None], self._walking] * s
@@ -110,23 +110,23 @@ class Noise:
         Q = self.W[:, :, self._walking] @ (s[:, None] * M_zero)
         self._low_rank.append((Q, np.linalg.inv(total)))
         self._logdet += 2 * float(np.log(self._cholesky[-1]).sum()) + float(np.linalg.slogdet(total)[1])
-        # The determinant of the path, of which one combination is fixed.
+        # Log-determinant of the walk with one combination fixed.
         self._logdet += k * (float(np.log(dt).sum()) - 2 * float(np.log(n if origin is None else 1)))
 
     def add_effects(self, T: Array, variance: Array) -> None:
-        """Add what acts on all poses at once: T (n, 6, k), and the variances (k,) with which it does."""
+        """Add coefficients common to all poses: their columns T (n, 6, k) and variances (k,)."""
         Q = self.solve(T)
         core = np.diag(1 / variance) + summed_products(T, Q)
         self._low_rank.append((Q, -np.asarray(np.linalg.inv(core), dtype=np.float64)))
         self._logdet += float(np.linalg.slogdet(core)[1]) + float(np.log(variance[np.isfinite(variance)]).sum())
 
     def _solve_walk(self, X: Array) -> Array:
-        """Give M^-1 X for X (n, k, m)."""
+        """Return M^-1 X for X (n, k, m)."""
         Z = dpbtrs(self._cholesky, X.reshape(-1, X.shape[2]))[0]
         return np.asarray(Z.reshape(X.shape))
 
     def solve(self, X: Array) -> Array:
-        """Give V^-1 X for X (n, 6, m)."""
+        """Return V^-1 X for X (n, 6, m)."""
         Y = np.asarray(self.W @ X)
         if self._walking.size:
             s = self._s[:, None]
@@ -137,14 +137,14 @@ class Noise:
 
     @cached_property
     def logdet(self) -> float:
-        """Logarithm of the determinant of V; with slopes of infinite variance what depends on the rest of it."""
+        """Log-determinant of V; infinite variances are left out."""
         common = self.D.strides[0] == 0
         each = np.broadcast_to(np.linalg.slogdet(self.D[:1] if common else self.D)[1], self.n)
         return self._logdet + float(each[self.kept].sum())
 
     @cached_property
     def blocks(self) -> Array:
-        """(n, 6, 6) the diagonal blocks of V^-1."""
+        """(n, 6, 6) diagonal blocks of V^-1."""
         W = self.W
         if self._walking.size:
             WS = self.W[:, :, self._walking] * self._s
@@ -156,16 +156,16 @@ class Noise:
 
     @property
     def independent(self) -> bool:
-        """Whether the poses have nothing in common."""
+        """Whether the noise is independent from pose to pose."""
         return not self._low_rank
 
     @property
     def walks(self) -> bool:
-        """Whether the bias of some channel walks."""
+        """Whether the bias of any channel is a random walk."""
         return self._walking.size > 0
 
     def walk_trace(self, time: Array, channels: NDArray[np.intp], low_rank: tuple[Array, Array]) -> float:
-        """Give tr(K (V^-1 + Q core Q')) for walks of these channels, where none walks yet."""
+        """Return tr(K (V^-1 + Q core Q')) for walks of these channels; V itself has no walk."""
         trace = float(np.cumsum(_intervals(time)) @ self.W[:, channels, channels].sum(axis=1))
         for Q, core in (*self._low_rank, low_rank):
             F = _suffix_sums(Q[:, channels])
@@ -174,9 +174,10 @@ class Noise:
 
 
 def inverse_blocks(diagonal: Array, above: Array) -> tuple[Array, Array]:
-    """Invert a symmetric block-tridiagonal matrix as far as its own blocks: diagonal (n, k, k), above it (n-1, k, k).
+    """Return the tridiagonal blocks of the inverse of a symmetric block-tridiagonal matrix, by cyclic reduction.
 
-    Every second block is eliminated at once, and the rest is inverted in the same way (cyclic reduction).
+    Arguments and results are the blocks on the diagonal (n, k, k) and above it (n - 1, k, k). Every second block is
+    eliminated at once, and the remaining matrix is inverted recursively.
     """
     if len(diagonal) == 1:
         return np.asarray(np.linalg.inv(diagonal)), above
@@ -202,13 +203,13 @@ def _transposed(X: Array) -> Array:
 
 
 def summed_products(X: Array, Y: Array) -> Array:
-    """Sum of X_i' Y_i over the poses, shape (k, l), for X (n, m, k) and Y (n, m, l)."""
+    """Return the sum over the poses of X_i' Y_i, shape (k, l), for X (n, m, k) and Y (n, m, l)."""
     rows = X.shape[0] * X.shape[1]
     return np.asarray(X.reshape(rows, X.shape[2]).T @ Y.reshape(rows, Y.shape[2]))
 
 
 def pose_times(t_s: Array) -> Array:
-    """Return times (n,) in mean intervals between poses, from 0; the poses counted if t_s lacks a time."""
+    """Return times (n,) in mean intervals between poses, from 0; the indices of the poses if a time is missing."""
     n = len(t_s)
     if np.isnan(t_s).any() or np.ptp(t_s) == 0:
         return np.arange(n, dtype=np.float64)
@@ -216,12 +217,12 @@ def pose_times(t_s: Array) -> Array:
 
 
 def _intervals(time: Array) -> Array:
-    """Intervals (n,) before each pose; the first is one unit, which the mean bias takes up."""
+    """Return the intervals (n,) before each pose; the first is one unit, which the mean bias absorbs."""
     return np.maximum(np.diff(time, prepend=time[0] - 1.0), SHORTEST_STEP)
 
 
 def walk_times(time: Array, X: Array) -> Array:
-    """Multiply X (n, k) by the covariance of a random walk of unit variance per unit time."""
+    """Return the covariance of a random walk, with unit variance per unit of time, times X (n, k)."""
     return np.asarray(np.cumsum(_intervals(time)[:, None] * _suffix_sums(X), axis=0))
 
 
@@ -230,6 +231,6 @@ def _suffix_sums(X: Array) -> Array:
 
 
 def centre(time: Array, origin: int | None = None) -> Array:
-    """Scale time to unit length, and shift it to mean zero or to zero at one pose."""
+    """Return time scaled to unit duration and shifted to mean zero, or to zero at one pose."""
     zero = time.mean() if origin is None else time[origin]
     return np.asarray((time - zero) / max(np.ptp(time), 1e-300))

@@ -1,14 +1,14 @@
-"""Errors that have a structure: smooth functions of load and orientation, which no number of poses averages away.
+"""Structured errors: smooth functions of load and orientation, which do not average out over many poses.
 
-    load         readings that are no linear function of the load: its second and third powers
-    cable        force and torque of a cable or hose: a linear function of the entries of the orientation
-    kinematics   an error of the orientation of the arm: the same, times the derivative by the orientation
+    load         nonlinear response of the sensor: second and third powers of the load
+    cable        force and torque of a cable or hose: a linear function of the entries of the orientation matrix
+    kinematics   orientation error of the arm: a linear function of the same entries
 
-The coefficients of a kind are unknowns of mean zero with one variance. Each basis has about the length 1 in every
-orientation, so that the standard deviation is that of the error itself: a share of the weight, N and N·m, rad.
+The coefficients of a kind are random with mean zero and one variance. The basis functions have a norm of about 1 in
+every orientation, so the standard deviation is that of the error itself: a share of the weight, N and N·m, or rad.
 
-Errors of arm and mounts that resemble the parameters do not show in the data. Their sizes are assumed, and they belong
-to the sigmas of the parameters (`hidden_columns`). Hysteresis is no smooth error: see `hysteresis_columns`.
+Errors of arm and mounts that resemble a change of the parameters do not show in the data. Their sizes are assumed, and
+they are part of the sigmas of the parameters (`hidden_columns`). Hysteresis is not smooth: see `hysteresis_columns`.
 """
 
 import numpy as np
@@ -16,19 +16,19 @@ import numpy as np
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
-# Of more poses only the kinds that some of them show, because so many unknowns take memory and time.
+# With more poses only the kinds found in a subset are modelled, to save memory and time.
 MOST_POSES = 1000
 
 
 def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Array) -> dict[str, Array]:
-    """Give the derivatives (n, 6, k) of the wrench by the coefficients of each kind.
+    """Return the derivatives (n, 6, k) of the wrench by the coefficients of each kind.
 
     Parameters
     ----------
     parameters : Parameters
     R_base_flange : array, shape (n, 3, 3)
     middle : array, shape (3, 3)
-        Mean of the orientations of the session: what a cable or the arm does there is part of bias and mounting.
+        Mean of the orientations of the session, where errors of cable and arm are part of bias and mounting.
     """
     away = (R_base_flange - middle).reshape(-1, 9) / np.sqrt(3)
     turn = jacobian(parameters, R_base_flange)[..., :3]
@@ -39,19 +39,20 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
     }
 
 
-# Angle over which an error of the arm, or the pull of a cable, changes.
+# Correlation length of orientation errors of the arm and of cable forces.
 SMOOTH_RAD = 1.2
 
 
 def alike(R_base_flange: Array, others: Array) -> Array:
-    """Return the correlation (n, m) of smooth errors at two orientations."""
+    """Return the correlation (n, m) of smooth errors between orientations (n, 3, 3) and others (m, 3, 3)."""
     cosine = R_base_flange.reshape(-1, 9) @ others.reshape(-1, 9).T
     return np.asarray(np.exp((cosine - 3) / (2 * SMOOTH_RAD**2)))
 
 
-# Errors of the orientation that a session hides, in sigmas of the flange: on the side of the base, and smooth ones.
+# Orientation errors that a session cannot show, relative to the sigma of the flange: constant in base, and smooth ones.
 _OF_BASE, _SMOOTH = 5 / 3, 2 / 3
-# One sigma of the sag of adapter and mount under the moment of the tool, and of the shift of a soft tool's centre.
+# One sigma of the sag of adapter and mount under the moment of the tool, and of the shift of a compliant tool's centre
+# of mass under its weight.
 _SAG_RAD_PER_NM, _SOFT_M = 3e-4, 1e-4
 
 
@@ -61,9 +62,9 @@ def hidden_columns(
     middle: Array,
     orientation_rad: float,
 ) -> Array:
-    """Give what arm and mounts do to the wrenches (n, 6, k), each column for one standard deviation of its cause.
+    """Return the effects (n, 6, k) of errors of arm and mounts on the wrenches, one column per standard deviation.
 
-    It resembles a change of mounting, direction of gravity, bias and centre of mass, so that a session shows little.
+    They resemble a change of mounting, direction of gravity, bias and centre of mass, so a session hardly shows them.
 
     Parameters
     ----------
@@ -89,12 +90,12 @@ def hidden_columns(
 
 
 def yielding_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Give what mounts and tool do to the wrenches (n, 6, 9) that yield to the weight, as `hidden_columns`."""
+    """Return the effects (n, 6, 9) of compliant mounts and of a compliant tool, as in `hidden_columns`."""
     turn = jacobian(parameters, R_base_flange)[..., :3]
     weight = gravity_wrench(parameters, R_base_flange)
     moment_flange_Nm = weight[:, None, 3:] @ parameters.R_flange_sensor.T
     direction = weight[:, :3] / max(parameters.weight_N, 1e-12)
-    # A force along i shifts the centre along j by as much as one along j along i.
+    # The compliance is symmetric: a force along i shifts the centre along j as much as a force along j does along i.
     i, j = np.triu_indices(3)
     soft, across = np.zeros((len(turn), 6, 6)), -skew(weight[:, :3])
     soft[:, 3:] = across[..., i] * direction[:, None, j] + (i != j) * across[..., j] * direction[:, None, i]
@@ -102,9 +103,9 @@ def yielding_columns(parameters: Parameters, R_base_flange: Array) -> Array:
 
 
 def hidden_in_any_poses(parameters: Parameters, orientation_rad: float) -> Array:
-    """Return the covariance (15, 15) of mounting and gravity from errors of the arm's orientation, whatever the poses.
+    """Return the covariance (15, 15) of mounting and gravity due to orientation errors of the arm, for any poses.
 
-    Arguments as in `hidden_columns`, which also has what the mounts do in given poses.
+    Arguments as in `hidden_columns`, which also includes the mounts, for given poses.
     """
     hidden = np.zeros((15, 15))
     gravity = skew(parameters.gravity_force_base_N)
@@ -114,10 +115,10 @@ def hidden_in_any_poses(parameters: Parameters, orientation_rad: float) -> Array
 
 
 def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> Array:
-    """Return the error (2,) of force and torque, root mean square, where the base joints are not those of the session.
+    """Return the rms error (2,) of force and torque at base joint angles that differ from those of the session.
 
-    The error of the orientation on the side of the base was part of the direction of gravity in the session. Half of
-    its variance, and the smooth errors of both places, are others there. Arguments as in `hidden_columns`.
+    In the session, the orientation error that is constant in base is part of the direction of gravity. At other base
+    joints half of its variance, and the smooth errors of both places, are different. Arguments as in `hidden_columns`.
     """
     turn_rad = orientation_rad * np.sqrt(_OF_BASE**2 / 2 + 2 * _SMOOTH**2)
     force_N = parameters.weight_N * turn_rad * np.sqrt(2.0)  # two axes across the weight
@@ -125,10 +126,10 @@ def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> A
 
 
 def _load_response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Give the derivative (n, 6, 54) of the wrench by the coefficients of a response that is not linear.
+    """Return the derivative (n, 6, 54) of the wrench by the coefficients of a nonlinear response.
 
-    Each channel has squares and products of the axes of the force, and their third powers. In the torque they count at
-    the lever of the centre of mass, or at that of cross-talk if it is longer.
+    Each channel has squares, products and third powers of the components of the force. In the torque they are scaled by
+    the lever of the centre of mass, or by that of cross-talk if it is longer.
     """
     u = gravity_wrench(parameters, R_base_flange)[:, :3] / max(parameters.weight_N, 1e-12)
     squares = np.column_stack([u**2, np.sqrt(2) * u * u[:, [1, 2, 0]]])
@@ -138,24 +139,24 @@ def _load_response_columns(parameters: Parameters, R_base_flange: Array) -> Arra
 
 
 def _of_each_channel(basis: Array) -> Array:
-    """Give columns (n, 6, 6 k) that have the basis (n, k) in one channel each."""
+    """Return columns (n, 6, 6 k) with the basis (n, k) in each of the six channels separately."""
     return np.asarray(np.einsum("cd,nk->ncdk", np.eye(6), basis).reshape(len(basis), 6, -1))
 
 
-# How a sensor with hysteresis reads: each axis lags behind by a share of its last swing.
-# Reading i is wrench i less a share of its step, wrench i minus wrench i - 1.
+# Hysteresis: each axis lags behind by a share of its last change. Reading i is wrench i minus a share of its step,
+# wrench i minus wrench i - 1.
 #
-# Six shares, one for each axis, have one variance. Where the arm came from before the first pose is unknown, so that
-# pose is off by a share of a usual swing. Compensation knows no swing: hysteresis is part of the noise of a reading.
+# The six shares, one for each axis, have one variance. The step to the first pose is unknown, so a usual step is assumed
+# for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
 
-# More poses need no allowance for the first.
+# With more poses the unknown step to the first pose is negligible.
 FEW = 1000
 
 
 def hysteresis_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Give the derivative (n, 6, 12) of the wrench by the shares, and by those of the swing to the first pose.
+    """Return the derivative (n, 6, 12) of the wrench by the shares, and by the shares of the step to the first pose.
 
-    The poses are in the order of measuring. More than 1000 have only the first 6 columns.
+    The poses are in the order of measurement. With more than 1000 poses only the first 6 columns are returned.
     """
     wrench = gravity_wrench(parameters, R_base_flange)
     n, axis = len(wrench), range(6)

@@ -1,16 +1,16 @@
-"""Variance components by restricted maximum likelihood: what acts on the wrenches beyond the measured noise.
+"""Variance components by restricted maximum likelihood: error sources beyond the measured noise of each pose.
 
 The residuals r of all poses at the present parameters follow a linear mixed model,
 
     r = J x + T u + e,    e ~ N(0, V),    u_k ~ N(0, theta_k I),    V = blockdiag(D_i + white + rotation) + walk
 
-with x the step of the parameters, u the coefficients of what acts on all poses (`EFFECTS`), and the components of V
-linear in their variances theta. With X = (J, T), W = V^-1 and the prior information H0, g0 of x, the mixed model
+with x the step of the parameters, u the coefficients of errors common to all poses (`EFFECTS`), and V linear in the
+variances theta of its components. With X = (J, T), W = V^-1 and the prior information H0, g0 of x, the mixed model
 equations (Henderson, Biometrics 31, 1975) estimate x and u together,
 
     H = X' W X + blockdiag(H0, I / theta_k),    C = H^-1,    (x, u) = C g,    g = X' W r + (g0, 0)
 
-and the restricted likelihood (Patterson and Thompson, Biometrika 58, 1971) allows for the estimates in the same data,
+and the restricted likelihood (Patterson and Thompson, Biometrika 58, 1971), which corrects for the estimation of x, is
 
     -2 log L(theta) = log det V + sum_k size_k log theta_k + log det H + r' W r - g' C g.
 
@@ -19,7 +19,7 @@ It is maximised over log theta with score and average information (Gilmour, Thom
     P = W - W X C X' W,    V_k = theta_k dV / dtheta_k, or theta_k T_k T_k' for a component of u
     score_k = (r' P V_k P r - tr(P V_k)) / 2,    information_kl = r' P V_k P V_l P r / 2,
 
-all in O(n). A slope of unknown size is a part of u with infinite variance.
+all in O(n). A linear drift of unknown size is a part of u with infinite variance.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,15 +35,15 @@ from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.session_noise import Noise, centre, summed_products, walk_times
 from ftcalib.model import Array
 
-# Least gain in restricted log-likelihood of a component that is kept: 2 % pass by chance.
+# Smallest gain in restricted log-likelihood of a component that is kept; 2 % of absent components pass by chance.
 GAIN = 2.0
-# The same for gain, cross-talk and hysteresis, which have 5 or 6 coefficients: 0.4 % pass by chance.
+# Smallest gain of components with several coefficients, such as gain and cross-talk; 0.4 % pass by chance.
 GAIN_OF_RESPONSE = 3.0
 # Convergence: squared distance to the maximum, in standard deviations of the log variances.
 SETTLED = 1e-2
-# Levenberg-Marquardt damping that shortens a step noticeably.
+# Levenberg-Marquardt damping that noticeably shortens a step.
 CAREFUL = 0.3
-# Most that an ascent gains, relative to the quadratic prediction from score and information.
+# Largest possible gain of an ascent, relative to the quadratic prediction from score and information.
 HOPE = 10.0
 # Variance, relative to the white noise, at which score and information of an absent component are evaluated.
 NEGLIGIBLE = 1e-4
@@ -56,41 +56,41 @@ LARGEST = {
     "kinematics": float(np.deg2rad(1.0)) ** 2,
     "load": 0.05**2,
 }
-# With fewer poses the covariance allows for the uncertainty of the variances.
+# With fewer poses the covariance of the estimates includes the uncertainty of the variances.
 POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 
 Kind = Literal["white", "walk", "slope", "rotation", "gain", "cross_talk", "hysteresis", "load", "cable", "kinematics"]
-# Those that act on all poses, except a slope.
+# Kinds with coefficients common to all poses, except a slope.
 EFFECTS = ("gain", "cross_talk", "hysteresis", "load", "cable", "kinematics")
 
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One unknown variance, common to some channels."""
+    """Variance component: one unknown variance, shared by some channels."""
 
     name: str
     kind: Kind
     share: tuple[float, ...]
-    """(6,) by which the variance is multiplied in each channel."""
+    """(6,) factors of the variance in each channel."""
 
     @property
     def needed(self) -> float:
-        """Least gain in log-likelihood."""
+        """Smallest gain in log-likelihood for which the component is kept."""
         return GAIN_OF_RESPONSE if self.kind in EFFECTS else GAIN
 
 
 def channel_component(kind: Kind, channels: Sequence[int]) -> Component:
-    """Name a component of one channel or of a group of three."""
-    what = _AXES[channels[0]] if len(channels) == 1 else "force_N" if channels[0] == 0 else "torque_Nm"
-    return Component(f"{kind}_{what}", kind, tuple(float(c in channels) for c in range(6)))
+    """Return the component of a kind for one channel, or for the three channels of force or torque."""
+    name = _AXES[channels[0]] if len(channels) == 1 else "force_N" if channels[0] == 0 else "torque_Nm"
+    return Component(f"{kind}_{name}", kind, tuple(float(c in channels) for c in range(6)))
 
 
 FORCE, TORQUE = range(3), range(3, 6)
 ROTATION = Component("rotation_rad", "rotation", (0.0,) * 6)
 HYSTERESIS = Component("hysteresis", "hysteresis", (0.0,) * 6)
 RESPONSE = tuple(Component(kind, kind, (0.0,) * 6) for kind in ("gain", "cross_talk"))
-# What compensation does not know.
+# Structured errors (`ftcalib.likelihood.structure`), which the compensation does not model.
 STRUCTURE = (
     Component("kinematics_rad", "kinematics", (0.0,) * 6),
     Component("load_force", "load", channel_component("load", FORCE).share),
@@ -102,42 +102,42 @@ STRUCTURE = (
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """The estimation problem near its solution."""
+    """Estimation problem, linearised at given parameters."""
 
     J: Array
-    """(n, 6, m) derivative by the free parameters."""
+    """(n, 6, m) derivative of the wrench by the free parameters."""
     r: Array
-    """(n, 6)"""
+    """(n, 6) residuals at the point of linearisation, N and N·m."""
     prior: tuple[Array, Array]
-    """Information (m, m) and right-hand side (m,) of what was known before."""
+    """Information matrix (m, m) and right-hand side (m,) of the priors."""
     turn: Array
-    """(n, 6, 3) derivative by the orientation of each pose."""
+    """(n, 6, 3) derivative of the wrench by the orientation of each pose."""
     D: Array
-    """(n, 6, 6) measured noise of each pose, or a lower bound where the noise is unknown."""
+    """(n, 6, 6) measured noise covariance of each pose, or a lower bound if the noise is unknown."""
     time: Array
-    """(n,) ascending, in mean intervals."""
+    """(n,) ascending times of the poses, in mean intervals between poses."""
     kept: NDArray[np.bool_]
-    """(n,)"""
+    """(n,) whether a pose is used."""
     slope: bool
     """Whether a linear drift of unknown size is part of the model."""
     effects: Mapping[str, Array]
-    """(n, 6, k) each, by `EFFECTS`: derivative by the coefficients of what acts on all poses."""
+    """(n, 6, k) derivative by the coefficients of each kind of `EFFECTS`."""
     lever: float = 0.0
-    """Distance of the centre of mass, in levers of the cross-talk."""
+    """Distance of the centre of mass from the sensor origin, in units of `RANGE_LEVER_M`."""
     least: Mapping[str, float] = field(default_factory=dict)
-    """Variances by kind that the data are too few to refute."""
+    """Lower bounds of variances, by kind, where the data are too few to show smaller ones."""
     origin: int | None = None
-    """Pose whose bias is that of the parameters; None: they have the mean over all poses."""
+    """Index of the pose whose bias is a parameter; None: the parameter is the mean bias of all poses."""
 
     @cached_property
     def X(self) -> Array:
-        """(n, 6, M) by parameters, slopes and effects: all that acts on all poses; then residuals."""
+        """(n, 6, M) derivatives by parameters, slopes and effects; the last column holds the residuals."""
         time = centre(self.time, self.origin)
         slopes = np.broadcast_to(time[:, None, None] * np.eye(6), (len(time), 6, 6))
         return np.concatenate([self.J, slopes, *self.effects.values(), self.r[..., None]], axis=2)
 
     def with_only(self, components: Sequence[Component]) -> "Linearised":
-        """Leave out the effects, beside gain and cross-talk, that no component has: fewer columns take less time."""
+        """Return the problem without the effects that no component needs, to save time; gain and cross-talk stay."""
         kinds = frozenset(c.kind for c in (*RESPONSE, *components)).intersection(self.effects)
         if kinds == self.effects.keys():
             return self
@@ -153,13 +153,13 @@ class Linearised:
 
     @cached_property
     def places(self) -> Mapping[str, NDArray[np.intp]]:
-        """Columns of `X` by effect."""
+        """Column indices of `X`, by effect."""
         first = self.J.shape[2] + 6
         ends = first + np.cumsum([0, *(columns.shape[2] for columns in self.effects.values())])
         return {kind: np.arange(ends[k], ends[k + 1]) for k, kind in enumerate(self.effects)}
 
     def columns(self, c: Component) -> NDArray[np.intp] | None:
-        """Columns of `X` whose coefficients have this variance; None for what acts on each pose by itself."""
+        """Return the columns of `X` with this variance; None for a component without common coefficients."""
         m = self.J.shape[2]
         if c.kind == "slope":
             return np.asarray(m + np.flatnonzero(c.share))
@@ -169,62 +169,63 @@ class Linearised:
         return np.asarray(places.reshape(6, -1)[np.array(c.share) > 0].ravel())
 
     def size(self, c: Component) -> float:
-        """Count the independent numbers that have this variance."""
+        """Return the number of independent random numbers with this variance."""
         columns = self.columns(c)
         if columns is not None:
             return float(len(columns))
         return int(self.kept.sum()) * (2.0 if c.kind == "rotation" else float(np.count_nonzero(c.share)))
 
     def largest(self, c: Component) -> float:
-        """Upper bound of the variance for an arm and a sensor in working order.
+        """Return the upper bound of the variance for an arm and a sensor in working order.
 
-        An error of the gain acts on the torque of the weight too, as cross-talk at the lever of the centre of mass.
+        A gain error also changes the torque of the weight, like cross-talk at the lever of the centre of mass.
         """
         at_lever = (1 + self.lever) ** 2 if c.kind == "cross_talk" else 1.0
         return LARGEST.get(c.kind, np.inf) * at_lever
 
     def smallest(self, c: Component) -> float:
-        """Lower bound of the variance, where the data are too few to refute it."""
+        """Return the lower bound of the variance; 0 if there is none."""
         return self.least.get(c.kind, 0.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Point:
-    """Restricted likelihood at given variances, with the solution of the mixed model equations there."""
+    """Restricted likelihood at given variances, and the solution of the mixed model equations."""
 
     problem: Linearised
     components: tuple[Component, ...]
     theta: Array
     of_poses: list[tuple[Component, float]]
-    """Components, with their variances, that act on each pose by itself or as a walk."""
+    """Components with their variances, without those that have common coefficients."""
     own: Noise
-    """Covariance of these, with the measured noise."""
+    """Covariance of the measured noise and of the components in `of_poses`."""
     WX: Array
-    """(n, 6, M) inverse of that covariance times `Linearised.X`."""
+    """(n, 6, M) inverse of the covariance `own` times `Linearised.X`."""
     G: Array
     """(M, M) X' W X."""
     unknown: NDArray[np.intp]
-    """(k,) columns of X that are estimated."""
+    """(k,) indices of the columns of X whose coefficients are estimated."""
     C: Array
-    """(k, k) covariance of these unknowns."""
+    """(k, k) covariance of the estimated coefficients."""
     x: Array
-    """(k,) from where the problem was linearised to the best unknowns."""
+    """(k,) estimated coefficients, relative to the point of linearisation."""
     chi2: float
     loglik: float
+    """Restricted log-likelihood, up to a constant."""
 
     @property
     def worth(self) -> float:
-        """Penalised log-likelihood: less the least gain of each component."""
+        """Penalised log-likelihood: `loglik` minus the smallest gain required of each component."""
         return self.loglik - sum(c.needed for c in self.components)
 
     @property
     def too_large(self) -> bool:
-        """Whether a variance is at its upper bound."""
+        """Whether any variance is at its upper bound."""
         return any(v >= self.problem.largest(c) for c, v in zip(self.components, self.theta, strict=True))
 
     @property
     def step(self) -> Array:
-        """(m,) of the free parameters."""
+        """(m,) step of the free parameters."""
         return self.x[: self.problem.J.shape[2]]
 
     @property
@@ -239,61 +240,61 @@ class Point:
         return noise_of(self.problem, self.components, self.theta)
 
     def weigh_columns(self) -> tuple[Array, Array]:
-        """Inverse covariance times the unknowns' columns (n, 6, k), and times the residuals of the best ones (n, 6)."""
+        """Return the inverse covariance times the estimated columns (n, 6, k), and times the residuals (n, 6)."""
         WX = self.WX[..., self.unknown]
         return WX, self.WX[..., -1] - WX @ self.x
 
     def effect(self, c: Component) -> Array:
-        """(n, 6) best linear prediction of what a component that acts on all poses does to each."""
+        """Return the best linear prediction (n, 6) of the contribution of a component of `EFFECTS` to each pose."""
         columns = self.problem.columns(c)
         own = np.arange(0) if columns is None else np.flatnonzero(np.isin(self.unknown, columns))
         return np.asarray(self.problem.X[..., self.unknown[own]] @ self.x[own])
 
     def squares(self, J: Array, effects: Mapping[str, Array]) -> Array:
-        """Mean square error (6,) of predicting wrenches that are compensated for gain and cross-talk alone.
+        """Return the mean square error (6,) of a prediction with gain and cross-talk, but without structured errors.
 
         Parameters
         ----------
         J : array, shape (n, 6, m)
-            In other orientations, as that of the problem.
+            Derivative by the free parameters in the orientations of the prediction.
         effects : mapping
-            As those of the problem.
+            Derivatives by the coefficients of effects in these orientations.
         """
-        X, found = np.zeros((*J.shape[:2], self.problem.X.shape[2] - 1)), np.zeros(self.problem.X.shape[2] - 1)
+        X, modelled = np.zeros((*J.shape[:2], self.problem.X.shape[2] - 1)), np.zeros(self.problem.X.shape[2] - 1)
         X[..., : J.shape[2]] = J
         for kind, columns in effects.items():
             X[..., self.problem.places[kind]] = columns
         for c in STRUCTURE:
             if c in self.components:
-                found[self.problem.columns(c)] = 1.0
-        X, found = X[..., self.unknown], found[self.unknown]
+                modelled[self.problem.columns(c)] = 1.0
+        X, modelled = X[..., self.unknown], modelled[self.unknown]
         variance = np.einsum("nci,ij,ncj->c", X, self.C, X, optimize=True) / len(J)
-        return np.asarray(variance + np.mean((X @ (found * self.x)) ** 2, axis=0))
+        return np.asarray(variance + np.mean((X @ (modelled * self.x)) ** 2, axis=0))
 
     def left_out(self) -> tuple[Array, Array]:
-        """Residual (n, 6) of each pose when all others predict it, and its covariance (n, 6, 6)."""
+        """Return the leave-one-out residuals (n, 6) of the poses, and their covariances (n, 6, 6)."""
         return left_out(self.own, *self.weigh_columns(), self.C)
 
 
 def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]:
-    """Leave-one-out prediction of every pose, with drift and correlation, in closed form.
+    """Return the leave-one-out residuals of all poses in closed form, for noise with drift and correlation.
 
-    It is exact in the linear model: the residual is `P_kk^-1 (P y)_k` with `P = W - W J C J' W`, W the inverse noise.
-    Rejected poses are predicted from the kept ones.
+    The result is exact in the linear model: the residual of pose k is `P_kk^-1 (P y)_k` with `P = W - W J C J' W` and
+    the inverse noise W. Rejected poses are predicted from the kept ones.
 
     Parameters
     ----------
     noise : Noise
     WJ : array, shape (n, 6, m)
     u : array, shape (n, 6)
-        Inverse noise times the residuals.
+        Inverse noise covariance times the residuals.
     C : array, shape (m, m)
 
     Returns
     -------
     residuals : array, shape (n, 6)
     covariance : array, shape (n, 6, 6)
-        Noise of the pose and uncertainty of its prediction: very large where the others determine nothing.
+        Noise of the pose plus uncertainty of its prediction; very large if the other poses do not determine it.
     """
     P = noise.blocks - WJ @ C @ np.swapaxes(WJ, 1, 2)
     rejected = ~noise.kept
@@ -306,12 +307,12 @@ def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]
 
 
 def squared_length(e: Array, S: Array) -> Array:
-    """Square residuals (n, 6) in units of their covariance (n, 6, 6)."""
+    """Return the squared Mahalanobis distances (n,) of residuals (n, 6) with covariances (n, 6, 6)."""
     return np.asarray((np.linalg.solve(S, e[..., None])[..., 0] * e).sum(axis=1))
 
 
 def point(problem: Linearised, components: Sequence[Component], theta: Array, near: Point | None = None) -> Point:
-    """Evaluate the restricted likelihood; a point `near` lends its sums if the noise of the poses is the same there."""
+    """Return the restricted likelihood at given variances; sums of `near` are reused if its noise is the same."""
     m, effects, of_poses = problem.J.shape[2], [], []
     for c, value in zip(components, theta, strict=True):
         columns = problem.columns(c)
@@ -343,7 +344,7 @@ def point(problem: Linearised, components: Sequence[Component], theta: Array, ne
 
 
 def _inverse_and_logdet(H: Array) -> tuple[Array, float]:
-    """Invert an information matrix; what it leaves open gets a large variance."""
+    """Return inverse and log-determinant of an information matrix; undetermined directions get a large variance."""
     scale = column_scale(H)
     scaled = H / np.outer(scale, scale)
     L, failed = dpotrf(scaled, lower=1)
@@ -357,7 +358,7 @@ def _inverse_and_logdet(H: Array) -> tuple[Array, float]:
 
 
 def _own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float]]) -> Noise:
-    """Give the covariance with these variances, of what acts on each pose by itself and of walks."""
+    """Return the covariance of the measured noise and of the components without common coefficients."""
     D, walk, white = problem.D, np.zeros(6), np.zeros(6)
     for c, value in of_poses:
         if c.kind == "walk":
@@ -372,23 +373,23 @@ def _own_noise_of(problem: Linearised, of_poses: Sequence[tuple[Component, float
 
 
 def noise_of(problem: Linearised, components: Sequence[Component], theta: Array) -> Noise:
-    """Give the whole covariance with these variances."""
+    """Return the covariance of all components together, at these variances."""
     pairs = list(zip(components, theta, strict=True))
     own = _own_noise_of(problem, [pair for pair in pairs if problem.columns(pair[0]) is None])
-    found = [(columns, value) for c, value in pairs if (columns := problem.columns(c)) is not None]
+    effects = [(columns, value) for c, value in pairs if (columns := problem.columns(c)) is not None]
     if problem.slope:
         m = problem.J.shape[2]
-        found.append((np.arange(m, m + 6), np.inf))
-    for columns, value in found:
+        effects.append((np.arange(m, m + 6), np.inf))
+    for columns, value in effects:
         own.add_effects(problem.X[..., columns], np.full(len(columns), value))
     return own
 
 
 def score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
-    """Derivative (k,) of the restricted log-likelihood by the log variances, and average information (k, k).
+    """Return the score (k,), the derivative of the restricted log-likelihood by the log variances, and the information.
 
-    The noise at this point need not contain all of the components: for the others it is the derivative at zero, times
-    `theta`.
+    The average information is (k, k). For components that are not part of the point, the score is the derivative at
+    variance zero, times `theta`.
     """
     noise, C, G = at.own, at.C, at.G
     WX, u = at.weigh_columns()
@@ -433,14 +434,17 @@ def score(problem: Linearised, at: Point, components: Sequence[Component], theta
     known = GE[at.unknown]
     known[:, of_poses] += XV[at.unknown]
     information = np.asarray(square - known.T @ C @ known) / 2
-    # Exact data in wrong orientations leave residuals of 1e10 of their noise, whose powers overflow: nothing is learnt.
+    # Noise-free data with wrong orientations leave residuals of 1e10 sigma, whose powers overflow: return no ascent.
     if not (np.isfinite(slope).all() and np.isfinite(information).all()):
         return np.zeros_like(slope), np.zeros_like(information)
     return slope, information
 
 
 def maximise(problem: Linearised, components: Sequence[Component], theta: Array, worse_than: float = -np.inf) -> Point:
-    """Maximise from these variances (k,), all positive; stop early where `worse_than` seems out of reach."""
+    """Maximise the restricted likelihood, starting from positive variances (k,).
+
+    The ascent stops early if it cannot be expected to reach the log-likelihood `worse_than`.
+    """
     problem = problem.with_only(components)
     if not components:
         return point(problem, components, theta)
@@ -460,7 +464,7 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             # Levenberg-Marquardt: average information is the curvature only near the best variances.
             damped = information + np.diag(caution * (np.diag(information) + 1e-3))
             step = np.clip(np.linalg.solve(damped, slope), -2.5, 2.5)
-            if caution < CAREFUL:  # far below the best variance a step of expectation and maximisation is longer
+            if caution < CAREFUL:  # far below the optimum an expectation-maximisation step is longer
                 step = np.where(slope > 0, np.maximum(step, np.log1p(2 * np.maximum(slope, 0) / size)), step)
             trial = point(problem, components, np.clip(best.theta * np.exp(step), least, most))
             gained = trial.loglik - best.loglik
@@ -471,22 +475,22 @@ def maximise(problem: Linearised, components: Sequence[Component], theta: Array,
             best, caution = trial, max(caution / 10, 1e-6)
         if gained < 1e-3 or (gained < 1e-2 and np.abs(step).max() < 0.05):
             break
-        # A variance that decreases without changing the likelihood will be dropped.
+        # A variance that decreases without changing the likelihood is dropped later.
         if gained < 1e-2 and (slope < 0.05).all():
             break
     return best
 
 
 def expected_variances(problem: Linearised, at: Point) -> Array:
-    """Return the variances (k,) with the posterior mean of the white noise in place of its mode, which may be 0.
+    """Return the variances (k,), with the posterior mean of the white noise instead of its mode, which may be 0.
 
-    A drift that varies as fast as the poses leaves little for the noise, whose likelihood is then flat down to zero.
-    The prior of its standard deviation is uniform (Gelman 2006), the likelihood of its square is normal.
+    A drift that varies from pose to pose absorbs most of the noise, whose likelihood is then flat down to zero. The
+    prior of the standard deviation is uniform (Gelman 2006), and the likelihood of the variance is taken as normal.
     """
     slope, information = score(problem, at, at.components, at.theta)
     scale = column_scale(information)
     value, vector = np.linalg.eigh(information / np.outer(scale, scale))
-    # By rounding alone eigenvalues are not positive.
+    # Rounding can make eigenvalues negative.
     spread = at.theta / scale * np.sqrt((vector**2 / np.maximum(value, 1e-9)).sum(axis=1))
     mode = at.theta / spread + spread * slope / at.theta
     variance = (np.linspace(0.0, 1.0, 200)[:, None] * np.sqrt(np.maximum(mode, 0.0) + 6.0)) ** 2
@@ -497,12 +501,12 @@ def expected_variances(problem: Linearised, at: Point) -> Array:
 
 
 def parameter_estimates(at: Point) -> tuple[Array, Array]:
-    """Estimate parameters, and gain and cross-talk of the sensor, under given variances.
+    """Return the estimates of parameters, gain and cross-talk at given variances.
 
     Returns
     -------
     values : array, shape (m + 11,)
-        Step of the free parameters; best linear prediction of the coefficients, zero where none were found.
+        Step of the free parameters, then the coefficients of gain and cross-talk, zero if they are not modelled.
     covariance : array, shape (m + 11, m + 11)
     """
     problem = at.problem
@@ -514,16 +518,17 @@ def parameter_estimates(at: Point) -> tuple[Array, Array]:
 
 
 def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
-    """Give the `estimates` with a covariance for variances that were estimated too.
+    """Return `parameter_estimates` with a covariance that includes the uncertainty of the variances.
 
-    To first order in the uncertainty of the variances: estimates move with them, and the covariance at the best
-    variances is as much too small (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain: as the
-    95 % interval of Student's distribution is wider by (z² + 1) / (4 nu), so is sigma, nu by Satterthwaite (1946).
+    The correction is of first order. Estimates change with the variances, and the covariance at the best variances is
+    too small by twice that contribution (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain, so
+    sigma is widened by (z² + 1) / (4 nu), like the 95 % interval of Student's distribution, with nu by Satterthwaite
+    (1946).
     """
     x, C = parameter_estimates(at)
     if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:
         return x, C
-    # A variance that was assumed is known.
+    # A variance at its assumed lower bound is treated as known.
     free = np.flatnonzero(at.theta > 1.001 * np.array([at.problem.smallest(c) for c in at.components]))
     if not free.size:
         return x, C
@@ -540,24 +545,24 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
 
 
 def mixture_covariance(at: Point, others: Sequence[tuple[Point, float]]) -> Array:
-    """Covariance (m + 11, m + 11) that `estimates` gain because other variances are right with a share each."""
+    """Return the covariance (m + 11, m + 11) to add to `parameter_estimates` for rival models with probabilities."""
     x, C = parameter_estimates(at)
     total = np.zeros_like(C)
-    for one, share in others:
-        other, cov = parameter_estimates(one)
+    for rival, share in others:
+        other, cov = parameter_estimates(rival)
         total += share * (cov - C + np.outer(other - x, other - x))
     return total
 
 
 def unit_variances(problem: Linearised, best: Point, components: Sequence[Component]) -> Array:
-    """Variances (k,) at which each component is about as large as the white noise."""
+    """Return the variances (k,) at which each component contributes about as much as the white noise."""
     kept, n = problem.kept, int(problem.kept.sum())
     variance = np.einsum("ncc,n->c", best.own.D, kept) / n
     variances = []
     for c in components:
-        found = problem.columns(c) if c.kind != "slope" else None
-        if found is not None or c.kind == "rotation":
-            columns = problem.turn if found is None else np.sqrt(n) * problem.X[..., found]
+        places = problem.columns(c) if c.kind != "slope" else None
+        if places is not None or c.kind == "rotation":
+            columns = problem.turn if places is None else np.sqrt(n) * problem.X[..., places]
             square = np.einsum("ncd,ncd,n->c", columns, columns, kept.astype(np.float64)) / (n * columns.shape[2])
             variances.append(float(1 / np.max(square / variance)))
         else:

@@ -180,7 +180,7 @@ def test_times_that_are_no_seconds_are_refused(step_s: float, unit: str | None) 
     if unit is None:
         require_seconds(t_s, "the times")
         return
-    with pytest.raises(BadDataset, match=f"the times step by .* as if they were in {unit}"):
+    with pytest.raises(BadDataset, match=f"the times increase in steps of .* and look like {unit}"):
         require_seconds(t_s, "the times")
 
 
