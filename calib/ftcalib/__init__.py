@@ -1,11 +1,11 @@
-"""The solver core: from poses and wrenches to a calibration. Pure: numpy and scipy, no device.
+"""Solver of the calibration from poses and wrenches. It needs numpy and scipy, and accesses no device.
 
-The names are imported at their first use, so that `import ftcalib.errors` needs neither numpy nor scipy.
+Names are imported at their first use, so that `import ftcalib.errors` needs neither numpy nor scipy.
 """
 
 from importlib import import_module
 
-# Type checkers take it for that of `typing`.
+# Type checkers treat this name like `typing.TYPE_CHECKING`.
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from ftcalib.after.weighing import Weight

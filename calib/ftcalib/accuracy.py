@@ -1,4 +1,4 @@
-"""How large the errors of a calibration are: over orientations, at the tip, against a known truth."""
+"""Errors of a calibration: over orientations, at the tip of the tool, and compared with a known truth."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -10,24 +10,24 @@ from ftcalib.model import Array
 from ftcalib.result import CalibrationResult
 from ftcalib.shown import values_of
 
-# Where the tip is if no tool is described, from the flange.
+# Assumed distance of the tip from the flange if no tool is described.
 _USUAL_TIP_MM: Final = 200.0
 CONTACT_N: Final = 100.0
-"""A contact whose sigma is named."""
+"""Contact force for which a sigma is reported, N."""
 # Orientations over which the error of a calibration is averaged if the truth is known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
-# Grid of elevation and azimuth.
+# Step of the grid of elevation and azimuth.
 _STEP_DEG = 10
-# Turns of the tool about its axis at each direction, over a whole turn.
+# Number of rotations of the tool about its axis, at each direction of the axis.
 _TURNS = 12
 
 
 def error_map(result: CalibrationResult) -> dict[str, Any]:
-    """Return the error of the compensation of a free tool over the directions of the tool axis, one standard deviation.
+    """Return the standard deviation of a compensated free tool as a function of the direction of the tool axis.
 
-    `elevation_deg` (n,) and `azimuth_deg` (m,) are of flange z in base axes. `force_N` and `torque_Nm` have `map`
-    (n, m), the largest error over the turns of the tool about its axis, `largest`, `rms` over all orientations, and
-    `worst_direction` (3,) of flange z in base.
+    `elevation_deg` (n,) and `azimuth_deg` (m,) give the direction of flange z in base axes. `force_N` and `torque_Nm`
+    contain `map` (n, m), the largest error over rotations about the tool axis, `largest`, `rms` over all orientations,
+    and `worst_direction` (3,), the direction of flange z in base with the largest error.
     """
     elevation = np.radians(np.arange(-90, 91, _STEP_DEG))
     azimuth = np.radians(np.arange(-180, 181, _STEP_DEG))
@@ -50,9 +50,9 @@ def error_map(result: CalibrationResult) -> dict[str, Any]:
 
 
 def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
-    """Return R_base_flange (n, m, 12, 3, 3): flange z in these directions, turned about itself.
+    """Return R_base_flange (n, m, 12, 3, 3) with flange z in given directions, and 12 rotations about flange z.
 
-    Elevation (n,) is from the base xy-plane, azimuth (m,) about base z from base x.
+    Elevation (n,) is measured from the base xy-plane, azimuth (m,) about base z from base x.
     """
     tip, turn = np.meshgrid(np.pi / 2 - elevation_rad, azimuth_rad, indexing="ij")
     point = Rotation.from_euler("ZY", np.stack([turn, tip], axis=-1).reshape(-1, 2)).as_matrix()
@@ -61,28 +61,31 @@ def orientations(elevation_rad: Array, azimuth_rad: Array) -> Array:
 
 
 def tip_of(result: CalibrationResult) -> Array:
-    """Return the far end of the tool (3,) from the sensor origin, sensor axes: of its cylinders, else 200 mm out."""
+    """Return the tip of the tool (3,) from the sensor origin in sensor axes, m.
+
+    It is the far end of the described cylinders, by default 200 mm from the flange.
+    """
     setup = result.provenance.get("setup")
-    given: Mapping[str, Any] = setup if isinstance(setup, dict) else {}
-    rows = given.get("cylinders_mm") or [[0.0, _USUAL_TIP_MM, 0.0]]
+    described: Mapping[str, Any] = setup if isinstance(setup, dict) else {}
+    rows = described.get("cylinders_mm") or [[0.0, _USUAL_TIP_MM, 0.0]]
     far = max(rows, key=lambda row: row[1])
-    # From, to, diameter, and perhaps where the axis is.
+    # A row holds start, end, diameter, and optionally x and y of the axis.
     x, y = far[3:] if len(far) > 3 else (0.0, 0.0)
-    tip_mm = np.array([x, y, far[1] - (given.get("height_mm") or 0.0)])
+    tip_mm = np.array([x, y, far[1] - (described.get("height_mm") or 0.0)])
     return np.asarray(result.R_flange_sensor.T @ tip_mm / 1e3)
 
 
 def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTACT_N) -> Array:
-    """Return one standard deviation of a force at the tip, as the length of its error, over all directions."""
+    """Return the rms error of a contact force at the tip over all directions, N, as the norm of the error."""
     share, _ = result.contact.sigma_at(tip_of(result))
     return np.asarray(np.hypot(result.likely_error()[0], share * np.asarray(force_N)))
 
 
 def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
-    """Errors of the estimates, each divided by its standard deviation.
+    """Return the errors of the estimates, each divided by its standard deviation.
 
-    That of the rotation is the small rotation about the flange axes that leads from the truth to the estimate; that of
-    an angle is at most half a turn.
+    The error of the mounting is the rotation vector from truth to estimate, about the flange axes. The error of an
+    angle is at most 180°.
     """
     errors = {}
     for _, _, _, key, values, sigma, _ in result.estimates:
@@ -93,14 +96,14 @@ def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict
         else:
             error = values - values_of(truth[key], key)
             if key.endswith("_rad"):
-                # a ceiling is at both +180 and -180 degrees
+                # a base on the ceiling has a tilt of +180 or -180 degrees
                 error = np.remainder(error + np.pi, 2 * np.pi) - np.pi
         errors[key] = error / sigma
     return errors
 
 
 def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
-    """Return what the sensor of a free tool reads, (n, 6): computed from the truth, not with the solver's model."""
+    """Return the readings (n, 6) of a free tool from the true values, computed without the solver's model."""
     weight = np.einsum(
         "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
     )
@@ -111,13 +114,13 @@ def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
 
 
 def compensation_error(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
-    """Rms of the wrench that remains of a free tool after compensation, over `_RANDOM` orientations."""
+    """Return the rms wrench of a free tool after compensation, over random orientations."""
     left = result.compensate(_free_tool_wrench(truth, _RANDOM), _RANDOM)
     return {"force_rms_N": _rms_length(left[:, :3]), "torque_rms_Nm": _rms_length(left[:, 3:])}
 
 
 def uncompensated(truth: Mapping[str, Any]) -> tuple[float, float]:
-    """Rms of what the sensor of a free tool reads, N and N·m, over the same orientations."""
+    """Return the rms wrench of a free tool before compensation, N and N·m, over random orientations."""
     raw = _free_tool_wrench(truth, _RANDOM)
     return _rms_length(raw[:, :3]), _rms_length(raw[:, 3:])
 

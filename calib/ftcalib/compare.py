@@ -1,4 +1,4 @@
-"""Comparison of all methods on the same data, and of the cases of Yu's Table III."""
+"""Comparison of all methods on the same data, and the cases of Yu's Table III."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,32 +19,32 @@ from ftcalib.published.methods import CARLSON, PUBLISHED, published
 from ftcalib.result import CalibrationResult, Method
 from ftcalib.solver import estimator_of, solve
 
-# Largest number of folds: more poses are left out in groups.
+# Largest number of cross-validation folds; with more poses a fold leaves out several.
 _MOST_FOLDS = 50
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MethodResult(Displayed):
-    """Result of one method, or the reason why it has none."""
+    """Result of one method, or the reason why the method failed."""
 
     method: Method
     reason: str | None = None
     parameters: Parameters | None = None
     mass_kg: float = np.nan
     rotation_difference_rad: float = np.nan
-    """Angle to the mounting of the default method, or of the truth in Table III."""
+    """Angle to the mounting of the default method, or to the true mounting in Table III, rad."""
     force_rms_N: float = np.nan
     torque_rms_Nm: float = np.nan
     cv_force_rms_N: float = np.nan
-    """Cross-validated: each pose predicted from all others; NaN if the method needs every pose."""
+    """Cross-validated rms force error, N, each pose predicted from all others; NaN if the method needs every pose."""
     cv_torque_rms_Nm: float = np.nan
+    """Cross-validated rms torque error, N·m; NaN if the method needs every pose."""
     largest_errors: Array | None = None
-    """(8,) on the test set, in the axes of the sensor: Fx, Fy, Fz and norm of F in N, the same of T in N·m."""
+    """(8,) largest errors on the test set in sensor axes: Fx, Fy, Fz and |F| in N, then Tx, Ty, Tz and |T| in N·m."""
     mass_error: float = np.nan
-    """Error of the mass as a share of the reference; NaN if that is zero."""
+    """Relative error of the mass; NaN if the reference is zero."""
     centre_error: float = np.nan
-    """Distance of the centre of mass from that of the reference, as a share of its distance from the sensor; NaN
-    if that is zero."""
+    """Error of the centre of mass, relative to its distance from the sensor; NaN if that distance is zero."""
 
     def _summary(self) -> Summary:
         words = f"force {self.force_rms_N:.4f} N, torque {self.torque_rms_Nm:.5f} N·m rms of the residuals"
@@ -79,7 +79,7 @@ class MethodResult(Displayed):
         }
 
 
-def compare(  # noqa: PLR0913 - one for each thing that may be known
+def compare(  # noqa: PLR0913 - one argument for each known quantity
     dataset: CalibrationDataset,
     *,
     drift: Drift = "auto",
@@ -91,21 +91,21 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
     test: CalibrationDataset | None = None,
     truth: Parameters | None = None,
 ) -> list[MethodResult]:
-    """Run all methods; a method that cannot use these data gives a reason instead.
+    """Return the results of all methods; a method that fails on these data has a reason instead.
 
     Parameters
     ----------
     dataset : CalibrationDataset
     drift, known, g_m_s2, setup
-        As for `solve`. The published methods that need gravity take it from `known`, or assume a level base.
+        As for `solve`. Published methods that need gravity take it from `known`, or assume a level base.
     default : CalibrationResult, optional
-        What the default method has found with all of these, if that is known already.
+        Result of the default method with the same arguments, if it was computed before.
     as_published : bool
         Run Carlson's methods as printed, without biases.
     test : CalibrationDataset, optional
-        Poses of the free tool that no method has seen, for the columns of Yu's Table III.
+        Poses of the free tool that are not used for fitting, for the columns of Yu's Table III.
     truth : Parameters, optional
-        Reference of mass and centre of mass in these columns, where known; else what the default method finds.
+        Reference for mass and centre of mass in these columns; by default the result of the default method.
 
     Raises
     ------
@@ -136,14 +136,14 @@ def compare(  # noqa: PLR0913 - one for each thing that may be known
             compared.append(MethodResult(method, str(error)))
             continue
         parameters, cv_force, cv_torque = estimates
-        one = _describe(method, parameters, dataset, default.parameters, g_m_s2)
-        one = replace(one, cv_force_rms_N=cv_force, cv_torque_rms_Nm=cv_torque)
-        compared.append(one if test is None else _add_test(one, parameters, test, truth or default.parameters))
+        row = _describe(method, parameters, dataset, default.parameters, g_m_s2)
+        row = replace(row, cv_force_rms_N=cv_force, cv_torque_rms_Nm=cv_torque)
+        compared.append(row if test is None else _add_test(row, parameters, test, truth or default.parameters))
     return compared
 
 
-_ALL = "A+B+C+E+F+G"  # but D, on which they are tested; H is inside E
-# Yu, Table III: number, method, sets of the estimate, set of the test (`ftcalib.poses.selection`).
+_ALL = "A+B+C+E+F+G"  # all except the test set D; H is a part of E
+# Cases of Yu's Table III: number, method, sets for the estimate, set for the test (`ftcalib.poses.selection`).
 CASES: tuple[tuple[int, Method, str, str], ...] = (
     *((1, "srom", "A", "D"), (2, "lrom", "A", "D"), (3, "lrom", "B", "D"), (4, "lrom", "B+C", "D")),
     *((5, "lrom", "H", "D"), (6, "lrom", "E", "D"), (7, "lrom", "E+F", "D"), (8, "mixed", "A+E", "D")),
@@ -163,14 +163,14 @@ def table_iii(
     Parameters
     ----------
     dataset : CalibrationDataset
-        The sets A to G in any order, in one session.
+        Poses of the sets A to G in any order, from one session.
     numbers : sequence of int
-        Number of each pose, as `ftcalib.poses.selection.numbers_of` gives them.
+        Number of each pose, as returned by `ftcalib.poses.selection.set_numbers`.
     truth : Parameters, optional
-        Reference of mass, centre of mass and mounting; default: the maximum likelihood estimate of all poses but
-        those of D.
+        Reference for mass, centre of mass and mounting; default: the maximum likelihood estimate from all poses
+        except those of D.
     g_m_s2 : float
-        Gravity at the cell.
+        Acceleration of gravity at the cell.
 
     Returns
     -------
@@ -185,9 +185,7 @@ def table_iii(
     row_of = {int(number): row for row, number in enumerate(numbers)}
     counts = {name: sum(number not in row_of for number in set_numbers(name).tolist()) for name in EVERY_SET.split("+")}
     if missing := [f"{count} of {name}" for name, count in counts.items() if count]:
-        raise NotObservable(
-            f"Table III lacks poses of its sets ({', '.join(missing)}): take {EVERY_SET}, without leaving out a pose"
-        )
+        raise NotObservable(f"poses of Table III are missing ({', '.join(missing)}): record all poses of {EVERY_SET}")
 
     def part(sets: str) -> CalibrationDataset:
         rows = [row_of[number] for name in sets.split("+") for number in set_numbers(name).tolist()]
@@ -198,8 +196,8 @@ def table_iii(
     for number, method, data, test in CASES:
         fitted = part(data)
         parameters = published(method, fitted.R_base_flange, gravity_direction_base=-UP_IN_BASE)(fitted.wrench)
-        one = _describe(method, parameters, fitted, truth, g_m_s2)
-        rows.append((number, data, test, _add_test(one, parameters, part(test), truth)))
+        row = _describe(method, parameters, fitted, truth, g_m_s2)
+        rows.append((number, data, test, _add_test(row, parameters, part(test), truth)))
     return rows
 
 
@@ -215,7 +213,7 @@ def _describe(
 def _add_test(
     compared: MethodResult, parameters: Parameters, test: CalibrationDataset, truth: Parameters
 ) -> MethodResult:
-    """Add the columns of Table III."""
+    """Return a result with the columns of Table III added."""
     force, torque = np.split(test.wrench - predict(parameters, test.R_base_flange), 2, axis=1)
     largest = [np.abs(np.column_stack([part, np.linalg.norm(part, axis=1)])).max(axis=0) for part in (force, torque)]
     weight_N, true_N = parameters.weight_N, truth.weight_N

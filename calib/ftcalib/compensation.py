@@ -1,13 +1,13 @@
-"""Subtract weight and bias: one sample in about a microsecond, a recording at memory speed.
+"""Compensation: subtract weight and bias, one sample in about a microsecond, a recording at memory bandwidth.
 
 For given parameters the expected wrench is affine in the nine entries of R_base_flange, so the contact wrench is
 
     contact = wrench - matrix @ vec(R_base_flange) - offset        vec: row by row
 
-which is `wrench - predict(parameters, R_base_flange)` of `ftcalib.model` with everything constant computed once. Where
-the matrix of the sensor is known better than its maker's, all of it is multiplied by one more, constant too.
+which equals `wrench - predict(parameters, R_base_flange)` of `ftcalib.model`, with all constants computed once. If the
+errors of the sensor's matrix are known, the result is multiplied by a constant decoder matrix.
 
-Of a tool in motion, `inertial_wrench` gives what its acceleration adds.
+For a tool in motion `inertial_wrench` returns the wrench due to acceleration.
 """
 
 from typing import Any, NamedTuple
@@ -22,34 +22,34 @@ from ftcalib.sensor_matrix import Response, shown_gain
 Reals = NDArray[np.floating[Any]]
 
 
-# Rows per matrix product: small enough that input and output stay in the cache.
+# Number of rows per matrix product, small enough that input and output stay in the cache.
 CHUNK_ROWS = 8192
 
 
 class Compensator:
-    """The compensation of one calibration.
+    """Compensation with the parameters of one calibration.
 
     Parameters
     ----------
     parameters : Parameters
     dtype : float64 (default) or float32
-        Type of the arithmetic and of the result. float32 halves the memory traffic and costs about 1e-7 of the wrench.
+        Type of the arithmetic and of the result. float32 halves the memory traffic, with a relative error of 1e-7.
     response : Response, optional
-        Gain and cross-talk of the sensor, as the tool shows them.
+        Gain and cross-talk of the sensor for the weight of the tool.
     decoder : array, shape (6, 6), optional
-        Turns readings without the free tool into contacts: `ftcalib.sensor_matrix.ContactResponse.decoder`.
+        Converts readings minus free tool to contact wrenches: `ftcalib.sensor_matrix.ContactResponse.decoder`.
 
     Attributes
     ----------
     matrix : array, shape (6, 9)
-        N and N·m per entry of R_base_flange.
+        Derivative of the wrench by the entries of R_base_flange, N and N·m.
     offset : array, shape (6,)
-        The bias, N and N·m.
+        Bias, N and N·m.
     decoder : array, shape (6, 6), or None
 
     Notes
     -----
-    Nothing is written after construction: threads may share an instance.
+    Instances are not modified after construction, so threads may share them.
 
     Examples
     --------
@@ -80,7 +80,7 @@ class Compensator:
         self.offset: Reals = offset.astype(self.dtype)
         self.matrix.setflags(write=False)
         self.offset.setflags(write=False)
-        self._offsets: Reals = np.tile(self.offset, (CHUNK_ROWS, 1))  # subtracting one row from many is slow in numpy
+        self._offsets: Reals = np.tile(self.offset, (CHUNK_ROWS, 1))  # numpy broadcasts a single row slowly
         # One sample is a single product with (wrench, vec(R_base_flange), 1).
         product = np.concatenate([np.eye(6), -matrix, -offset[:, None]], axis=1)
         self.decoder: Reals | None = None if decoder is None else read_only(decoder).astype(self.dtype)
@@ -89,7 +89,7 @@ class Compensator:
         self._operand[15] = 1
 
     def __call__(self, wrench: ArrayLike, R_base_flange: Rotations) -> Reals:
-        """Compensate one sample or many, with all checks; `sample` and `batch` are quicker.
+        """Compensate one sample or many, with all checks; `sample` and `batch` are faster.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class Compensator:
         return self.sample(wrench, R_base_flange) if wrench.ndim == 1 else self.batch(wrench, R_base_flange)
 
     def sample(self, wrench: Reals, R_base_flange: Reals, out: Reals | None = None) -> Reals:
-        """Compensate one sample in a fast loop. numpy checks the shapes as far as the operations need them.
+        """Compensate one sample, for fast loops. Shapes are checked only as far as numpy needs them.
 
         Parameters
         ----------
@@ -170,18 +170,18 @@ def _check_shapes(wrench: Reals, R_base_flange: Reals) -> None:
 
 
 class SensorMotion(NamedTuple):
-    """Motion of the flange and the sensor against the base, n samples."""
+    """Motion of flange and sensor relative to the base, n samples."""
 
     t_s: Array
-    """(n,) increasing."""
+    """(n,) increasing times, s."""
     R_base_flange: Array
-    """(n, 3, 3)"""
+    """(n, 3, 3) orientations of the flange."""
     angular_velocity_rad_s: Array
-    """(n, 3) of the flange, in sensor axes."""
+    """(n, 3) angular velocity of the flange, in sensor axes."""
     angular_acceleration_rad_s2: Array
-    """(n, 3) of the flange, in sensor axes."""
+    """(n, 3) angular acceleration of the flange, in sensor axes."""
     linear_acceleration_m_s2: Array
-    """(n, 3) of the sensor origin, in sensor axes, gravity not included."""
+    """(n, 3) acceleration of the sensor origin, in sensor axes, without gravity."""
 
 
 def motion_of_poses(
@@ -193,29 +193,31 @@ def motion_of_poses(
     p_flange_sensor_m: Array,
     reach: int,
 ) -> SensorMotion:
-    """Differentiate n poses twice: at each, a quadratic is fitted to position and rotation vector of its neighbours.
+    """Return velocities and accelerations of poses, from a quadratic fit to the neighbours of each pose.
+
+    The fit is to position and rotation vector of the neighbours, relative to the pose.
 
     Parameters
     ----------
     t_s : array, shape (n,)
-        Increasing, at any spacing.
+        Increasing times, at any spacing.
     R_base_flange : array, shape (n, 3, 3)
     p_base_flange_m : array, shape (n, 3)
     R_flange_sensor : array, shape (3, 3)
     p_flange_sensor_m : array, shape (3,)
-        Origin of the sensor.
+        Origin of the sensor, in flange axes.
     reach : int
-        Neighbours on each side; the first and last `reach` poses have too few and are left out.
+        Number of neighbours on each side. The first and last `reach` poses have too few and are left out.
 
     Returns
     -------
     SensorMotion
-        Of n - 2 reach poses.
+        Motion at n - 2 reach poses.
     """
     size, inner = 2 * reach + 1, slice(reach, len(t_s) - reach)
 
     def around(columns: Array) -> Array:
-        """Neighbours (m, size, k) of each inner row of (n, k)."""
+        """Return the neighbours (m, size, k) of each inner row of columns (n, k)."""
         return np.swapaxes(sliding_window_view(columns, size, axis=0), 1, 2)
 
     t, R = t_s[inner], R_base_flange[inner]
@@ -236,9 +238,9 @@ def motion_of_poses(
 def inertial_wrench(
     mass_kg: float, p_sensor_com_m: Array, motion: SensorMotion, inertia_com_kg_m2: Array | None = None
 ) -> Array:
-    """Wrench (n, 6) that the motion of a load exerts on the sensor beside its weight, N and N·m, in the sensor frame.
+    """Return the inertial wrench (n, 6) of a moving load on the sensor, without weight, N and N·m, in the sensor frame.
 
-    With a the acceleration of the sensor origin, all in the sensor frame, and the inertia I about that origin, it is
+    With the acceleration a of the sensor origin and the inertia I about that origin, all in the sensor frame,
 
         force_N   = -m a - alpha x (m p) - omega x (omega x (m p))
         torque_Nm = -(m p) x a - I alpha - omega x (I omega)
@@ -252,7 +254,7 @@ def inertial_wrench(
     p_sensor_com_m : array, shape (3,)
     motion : SensorMotion
     inertia_com_kg_m2 : array, shape (3, 3), optional
-        About the centre of mass, in sensor axes. Without it the load counts as a point.
+        Inertia about the centre of mass, in sensor axes. Default: a point mass.
     """
     I_com = np.zeros((3, 3)) if inertia_com_kg_m2 is None else inertia_com_kg_m2
     P = skew(p_sensor_com_m)
@@ -266,14 +268,14 @@ def inertial_wrench(
 
 
 class MovedLoad:
-    """A load that the arm moves: its motion and inertial wrench, from poses, `reach` of them on each side."""
+    """Load moved by the arm: its motion and inertial wrench from poses, with `reach` neighbours on each side."""
 
     def __init__(self, parameters: Parameters, g_m_s2: float, p_flange_sensor_m: Array, reach: int) -> None:
         self._mass_kg = float(np.linalg.norm(parameters.gravity_force_base_N)) / g_m_s2
         self._parameters, self._p_flange_sensor_m, self._reach = parameters, p_flange_sensor_m, reach
 
     def motion(self, t_s: Array, R_base_flange: Array, p_base_flange_m: Array) -> SensorMotion:
-        """Return the motion at n poses, but for those with too few neighbours; an unknown position does not move."""
+        """Return the motion at the poses with enough neighbours; an unknown position (NaN) is taken as constant."""
         return motion_of_poses(
             t_s,
             R_base_flange,
@@ -284,5 +286,5 @@ class MovedLoad:
         )
 
     def wrench(self, motion: SensorMotion, inertia_kg_m2: Array | None = None) -> Array:
-        """Return the wrench (m, 6) of a motion; without the inertia the mass counts as a point."""
+        """Return the inertial wrench (m, 6) of a motion; without an inertia the load is a point mass."""
         return inertial_wrench(self._mass_kg, self._parameters.p_sensor_com_m, motion, inertia_kg_m2)

@@ -1,4 +1,4 @@
-"""What `print` and a notebook show of an object: a title, a short table and sentences, in at most ten lines of text."""
+"""Summaries of objects for `print` and notebooks: a title, a short table and notes, in at most ten lines of text."""
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import fields, is_dataclass
@@ -6,34 +6,34 @@ from html import escape
 from typing import Any, Final, NamedTuple
 
 MOST_LINES: Final = 10
-# Sentences for which the text always has room; a notebook shows all.
+# Number of notes that the text always shows; a notebook shows all notes.
 _LEAST_NOTES = 2
-# Longer values of a field are cut.
+# Longest text of a field, characters; longer ones are cut.
 _LONGEST = 60
-# Dark enough for a white page, light enough for a black one.
+# Colours that are readable on white and on black pages.
 _COLOURS: Final = {"good": "#2e8b57", "usable": "#b8860b", "rejected": "#d9534f"}
 
 
 class Row(NamedTuple):
-    """One line of the table."""
+    """Row of the table of a summary."""
 
     name: str
     cells: Sequence[str]
-    """A number, or the elements of a vector."""
+    """A number, or the elements of a vector, as text."""
     unit: str = ""
 
 
 class Summary(NamedTuple):
-    """What is shown of an object."""
+    """Summary of an object: title, table, notes and verdict."""
 
     title: str
     rows: Sequence[Row] = ()
-    """The most important one first: the text ends where it has ten lines."""
+    """Rows of the table, the most important ones first, because the text has at most ten lines."""
     notes: Sequence[str] = ()
     verdict: str = ""
 
     def text(self) -> str:
-        """Return at most ten lines."""
+        """Return the summary as text of at most ten lines."""
         notes = list(self.notes[: max(_LEAST_NOTES, MOST_LINES - 1 - len(self.rows))])
         if more := len(self.notes) - len(notes):
             notes[-1] += f" (and {more} more)"
@@ -44,17 +44,17 @@ class Summary(NamedTuple):
         width = max((len(name) for name, _ in rows), default=0)
         head = f"{self.title}: {self.verdict.upper()}" if self.verdict else self.title
         return "\n".join(
-            [head, *(f"  {name:{width}}  {value}" for name, value in rows), *(f"  {one}" for one in notes)]
+            [head, *(f"  {name:{width}}  {value}" for name, value in rows), *(f"  {note}" for note in notes)]
         )
 
     def html(self) -> str:
-        """Return an element that takes its colours from the page; every text is escaped."""
+        """Return the summary as an HTML element with the colours of the page; all text is escaped."""
         most = max((len(row.cells) for row in self.rows), default=0)
         pad = 'style="text-align:left;padding-right:1.5em"'
         lines = []
         for name, (*first, last), unit in self.rows:
-            filled = "".join(f"<td {pad}>{escape(one)}</td>" for one in first)
-            # the last one is as wide as the rest of the row
+            filled = "".join(f"<td {pad}>{escape(cell)}</td>" for cell in first)
+            # the last cell spans the rest of the row
             filled += f'<td colspan="{most - len(first) + (not unit)}" {pad}>{escape(last)}</td>'
             filled += f"<td {pad}>{escape(unit)}</td>" if unit else ""
             lines.append(f'<tr><th scope="row" {pad}>{escape(name)}</th>{filled}</tr>')
@@ -63,20 +63,21 @@ class Summary(NamedTuple):
             colour = _COLOURS.get(self.verdict, "inherit")
             head += f' <strong style="color:{colour}">{escape(self.verdict.upper())}</strong>'
         table = f"<table><tbody>{''.join(lines)}</tbody></table>" if lines else ""
-        notes = "".join(f"<li>{escape(one)}</li>" for one in self.notes)
+        notes = "".join(f"<li>{escape(note)}</li>" for note in self.notes)
         return f"<div><p>{head}</p>{table}{f'<ul>{notes}</ul>' if notes else ''}</div>"
 
 
 class Displayed:
-    """An object that prints short, and as a table in a notebook. A dataclass needs ``repr=False`` beside it.
+    """Base of objects that print as a short summary and show a table in a notebook.
 
-    Unless `_summary` is overridden, it shows the fields, of arrays and of other objects only shape and title.
+    A dataclass that inherits from it needs ``repr=False``. Unless `_summary` is overridden, the summary lists the
+    fields: of arrays the shape, and of other objects the title.
     """
 
     __slots__ = ()
 
     def _summary(self) -> Summary:
-        rows = [Row(one.name, [brief(getattr(self, one.name))]) for one in fields(self) if one.repr]  # type: ignore[arg-type]  # a dataclass
+        rows = [Row(each.name, [brief(getattr(self, each.name))]) for each in fields(self) if each.repr]  # type: ignore[arg-type]  # a dataclass
         return Summary(type(self).__name__, rows)
 
     def __repr__(self) -> str:
@@ -87,7 +88,7 @@ class Displayed:
 
 
 def brief(value: object) -> str:
-    """Return a value in one short line: of an array with more than nine numbers the shape, of many things how many.
+    """Return a value as one short line: the shape of an array of more than nine numbers, the length of a long list.
 
     Examples
     --------
@@ -116,5 +117,5 @@ def _format_array(value: Any) -> str:
         return f"array {value.shape}"
     if value.ndim == 0:
         return f"{value.item():.6g}"
-    elements = [_format_array(one) if getattr(one, "ndim", 0) else f"{one:.6g}" for one in value]
+    elements = [_format_array(part) if getattr(part, "ndim", 0) else f"{part:.6g}" for part in value]
     return f"[{' '.join(elements)}]"

@@ -1,4 +1,4 @@
-"""The tree of all errors: whatever a user of the library can fix is a `FtdriveError`.
+"""Exception hierarchy: every error that a user of the library can fix is a `FtdriveError`.
 
 FtdriveError
 ├── UsageError        an argument, an option or a configuration cannot be used
@@ -6,12 +6,12 @@ FtdriveError
 ├── DataError         a file, or the data in it, cannot be used
 │   ├── BadDataset        the data are invalid: the message names the row and the reason
 │   └── BadCalibration    a file is not a calibration that this version can read
-└── AcceptanceError   what was measured is not good enough, or a check failed
+└── AcceptanceError   the measured data are not good enough, or a check failed
     ├── TooFewSamples     the sensor sends too few samples for an average
     └── NotObservable     the poses do not determine the parameters: the message names what is missing
 
-`ftdrivers.errors` and `ftdrive.errors` add theirs below the same four. Python's own `ValueError` and `TypeError` mean a
-defect of the program that calls.
+`ftdrivers.errors` and `ftdrive.errors` derive further classes from these four. Python's `ValueError` and `TypeError`
+mean a defect of the calling program.
 """
 
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class FtdriveError(Exception):
     """Base of all errors of ftdrive that a user can fix; the message says what happened and what to do.
 
-    Files that are missing or cannot be written raise Python's `OSError`.
+    A file that is missing or cannot be written raises Python's `OSError` instead.
 
     Examples
     --------
@@ -51,14 +51,14 @@ class UsageError(FtdriveError):
 
 
 class DeviceError(FtdriveError):
-    """A robot, a sensor or its stream has failed. The text of the error is "found; fix".
+    """A robot, a sensor or its stream has failed. The error text is "found; fix".
 
     Parameters
     ----------
     found
-        What happened, with the value; without capital and full stop.
+        What happened, with the value; without initial capital and full stop.
     fix
-        What to do next, from a verb on; empty where that is unknown. A conversion to another class keeps it.
+        What to do next, beginning with a verb; empty if unknown.
 
     Examples
     --------
@@ -71,7 +71,7 @@ class DeviceError(FtdriveError):
     """
 
     def __init__(self, found: str, fix: str = "") -> None:
-        super().__init__(f"{found}; {fix}" if fix else found)  # one argument: two would be those of an `OSError`
+        super().__init__(f"{found}; {fix}" if fix else found)  # one argument, because `OSError` interprets two
         self.found = found
         self.fix = fix
 
@@ -91,7 +91,7 @@ class DataError(FtdriveError):
 
 
 class AcceptanceError(FtdriveError):
-    """What was measured is not good enough, or a check failed.
+    """The measured data are not good enough, or a check failed.
 
     Examples
     --------
@@ -117,7 +117,7 @@ class BadCalibration(DataError):
 
 
 class NotObservable(AcceptanceError):
-    """The poses do not determine the parameters; `finding` is the mistake in the data that explains it, if any."""
+    """The poses do not determine the parameters; `finding` is a mistake in the data that explains this, if any."""
 
     def __init__(self, message: str, finding: "Finding | None" = None) -> None:
         super().__init__(message)

@@ -1,6 +1,6 @@
-"""Files that are complete or absent, never overwritten, and name their format.
+"""Writing and reading of files: written completely or not at all, never overwritten, with a format name.
 
-A JSON file also has its `checksum`, which reveals damage and edits.
+A JSON file has a `checksum`, which reveals damage and edits.
 """
 
 import hashlib
@@ -13,16 +13,16 @@ from itertools import count, takewhile
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
-# What `json` can write: numbers, strings, None, and lists and dicts of them.
+# Values that `json` can write: numbers, strings, None, and lists and dicts of these.
 JSON: TypeAlias = Any
-# Largest text that is read whole: 200,000 poses with their covariances.
+# Largest file that is read as a whole: 200,000 poses with covariances.
 MOST_BYTES: Final = 200_000_000
-# Longest line of a file that is read by lines: a calibration is a thousandth of it.
+# Longest line of a file that is read line by line: a thousand times a calibration.
 _LONGEST_LINE: Final = 16_000_000
 
 
 def write_new(path: str | Path, content: str | bytes) -> None:
-    """Write a new file: to `<name>.<process>.partial`, fsynced, then renamed.
+    """Write a new file: first to `<name>.<process>.partial`, which is fsynced and then renamed.
 
     Parameters
     ----------
@@ -36,11 +36,11 @@ def write_new(path: str | Path, content: str | bytes) -> None:
     FileExistsError
         The file exists.
     OSError
-        The folder is missing, the disk is full, …; no partial file remains.
+        The folder is missing or the disk is full, for example; no partial file remains.
     """
     path = Path(path)
     require_new(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # of another process that writes the same name
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # differs between processes
     try:
         with partial.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -65,13 +65,13 @@ def require_new(path: Path) -> None:
 
 
 def _give_name(written: Path, path: Path) -> None:
-    """Give a file its name; of two processes at once only one succeeds, where the disk has links."""
+    """Rename a written file; if two processes do so at once, only one succeeds on file systems with hard links."""
     try:
         path.hardlink_to(written)
     except FileExistsError:
         _refuse_existing(path)
         raise
-    except (OSError, NotImplementedError):  # as on FAT
+    except (OSError, NotImplementedError):  # a file system without hard links, such as FAT
         _refuse_existing(path)
         written.rename(path)
 
@@ -82,12 +82,12 @@ def _refuse_existing(path: Path) -> None:
 
 
 def unused_path(path: Path) -> Path:
-    """Return the first of name, name-2 and so on that does not exist."""
-    return next(one for one in _numbered_paths(path) if not one.exists())
+    """Return the first path among name, name-2, name-3, … that does not exist."""
+    return next(numbered for numbered in _numbered_paths(path) if not numbered.exists())
 
 
 def newest_path(path: Path) -> Path:
-    """Return the last of name, name-2 and so on that exists; the name itself if it does not."""
+    """Return the last existing path of the sequence name, name-2, name-3, …; the name itself if it does not exist."""
     return [path, *takewhile(Path.exists, _numbered_paths(path))][-1]
 
 
@@ -97,35 +97,36 @@ def _numbered_paths(path: Path) -> Iterator[Path]:
 
 
 def open_file(path: str | Path) -> BufferedReader:
-    """Open a file for reading; raises `OSError`, also for a pipe or a device, whose reading may never end."""
+    """Open a file for reading; raise `OSError` also for a pipe or a device, whose reading may never end."""
     path = Path(path)
     mode = path.stat().st_mode
-    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # of a folder `open` has the words
-        raise OSError(f"{path} is a pipe or a device: save its content in a file, and give that")
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # for a folder, `open` raises a clear error
+        raise OSError(f"{path} is a pipe or a device: save its content in a file, and give that file")
     return path.open("rb")
 
 
 def read_file(path: str | Path) -> bytes:
-    """Read a file whole; raises `OSError` as `open_file`, and above 200 MB."""
+    """Return the content of a file; raise `OSError` like `open_file`, and for a file above 200 MB."""
     with open_file(path) as file:
         if (size := os.fstat(file.fileno()).st_size) > MOST_BYTES:
             raise OSError(
-                f"{path} has {size / 1e6:.0f} MB, more than {MOST_BYTES / 1e6:.0f} MB: check that it is the file"
+                f"{path} has {size / 1e6:.0f} MB, the limit is {MOST_BYTES / 1e6:.0f} MB: check that it is the right "
+                "file"
             )
         return file.read(MOST_BYTES)
 
 
 def read_lines(file: BufferedReader, error: type[Exception], first: int = 1) -> Iterator[bytes]:
-    """Yield the lines of the rest of a file, with their ends; raise `error`, one sentence, for a line above 16 MB.
+    """Yield the remaining lines of a file with their line ends; raise `error` for a line above 16 MB.
 
     Parameters
     ----------
     file : BufferedReader
     error : type
     first : int
-        Number of the first line, for the error.
+        Number of the first line, for the error message.
     """
-    # An iteration over the file would read a line of any length, and hide the place in the file.
+    # Iterating over the file would read a line of any length and disable `tell`.
     for number in count(first):
         line = file.readline(_LONGEST_LINE)
         if len(line) == _LONGEST_LINE:
@@ -138,7 +139,7 @@ def read_lines(file: BufferedReader, error: type[Exception], first: int = 1) -> 
 
 
 def parsed_json(text: str | bytes) -> JSON:
-    """Parse JSON; raises `ValueError`, also if it is nested too deeply."""
+    """Return parsed JSON; raise `ValueError` for invalid JSON, also if it is nested too deeply."""
     try:
         return json.loads(text)
     except RecursionError as exc:
@@ -148,30 +149,30 @@ def parsed_json(text: str | bytes) -> JSON:
 def write_object(
     path: str | Path, document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False
 ) -> None:
-    """Write a new JSON file with its checksum. Raises as `write_new`."""
+    """Write a new JSON file with a checksum. Raises like `write_new`."""
     write_new(path, object_text(document, indent=indent, allow_nan=allow_nan))
 
 
 def object_text(document: Mapping[str, JSON], *, indent: int | None = 1, allow_nan: bool = False) -> str:
-    """Return the content of a JSON file: the document and its checksum."""
+    """Return the text of a JSON file: the document with its checksum."""
     return json.dumps({**document, "checksum": _checksum(document)}, indent=indent, allow_nan=allow_nan) + "\n"
 
 
 def read_object(path: str | Path, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
-    """Read a JSON file as `object_of` takes its content. Raises `OSError` too."""
+    """Return the object in a JSON file; raise `error` like `object_of`, or `OSError`."""
     return object_of(read_file(path), error, accept_changed=accept_changed)
 
 
 def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = False) -> dict[str, Any]:
-    """Return the object in a JSON file; raise `error`, one sentence without the file name, if it has none.
+    """Return the object in the content of a JSON file; raise `error`, without the file name, if there is none.
 
     Parameters
     ----------
     content : bytes
-        Content of the file. A document without a checksum, as people write it, is accepted.
+        Content of the file. A document without a checksum, such as a hand-written one, is accepted.
     error : type
     accept_changed : bool
-        Accept a document that its checksum does not fit.
+        Whether to accept a document that differs from its checksum.
     """
     try:
         text = content.decode()
@@ -199,22 +200,22 @@ def is_changed(document: Mapping[str, JSON]) -> bool:
 
 
 def _checksum(document: Mapping[str, JSON]) -> str:
-    """Return the SHA-256 of everything but the checksum, as JSON with sorted keys."""
+    """Return the SHA-256 of a document without its checksum, as JSON with sorted keys."""
     content = {name: value for name, value in document.items() if name != "checksum"}
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 def check_format(document: Mapping[str, object], expected: str, error: type[Exception]) -> None:
-    """Check the field `format`, for example 'ftdrive.dataset/1'; raise `error` if it differs."""
-    found = document.get("format")
+    """Raise `error` if the field `format` of a document, such as 'ftdrive.dataset/1', is not the expected one."""
+    actual = document.get("format")
     kind, _, version = expected.partition("/")
-    if found is None:
+    if actual is None:
         raise error(f"the field 'format' is missing: this is not an {kind} file.")
-    if found == expected:
+    if actual == expected:
         return
-    found_kind, _, found_version = str(found).partition("/")
-    if found_kind != kind:
-        raise error(f"the format is '{found}', not '{expected}': choose a file of that format.")
+    actual_kind, _, actual_version = str(actual).partition("/")
+    if actual_kind != kind:
+        raise error(f"the format is '{actual}', not '{expected}': choose a file of that format.")
     raise error(
-        f"version '{found_version}' of {kind} is unknown, this program reads version {version}: use a newer program."
+        f"version '{actual_version}' of {kind} is unknown, this program reads version {version}: use a newer program."
     )

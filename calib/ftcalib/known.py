@@ -1,4 +1,4 @@
-"""Values known before the calibration, exactly or within a tolerance, and the described cell."""
+"""Values known before the calibration, exactly or within a tolerance, and the description of the cell."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from ftcalib.model import UP_IN_BASE, Array, Parameters, is_rotation, read_only
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """Constraints on the parameters. A tolerance is one standard deviation; 0 means exactly known.
+    """Known values of parameters. A tolerance is one standard deviation; 0 means exactly known.
 
     Raises
     ------
@@ -22,7 +22,7 @@ class Known:
 
     Examples
     --------
-    The tool was weighed on a scale:
+    A tool that was weighed on a scale:
 
     >>> import ftdrive
     >>> result = ftdrive.solve(ftdrive.read_dataset("poses.csv"), known=ftdrive.Known(mass_kg=1.235))
@@ -31,18 +31,19 @@ class Known:
     """
 
     R_flange_sensor: ArrayLike | None = None
-    """(3, 3) mounting of the sensor; with `yaw_only` except for a turn about flange z, default the identity."""
+    """(3, 3) mounting of the sensor; with `yaw_only` up to a rotation about flange z, by default the identity."""
     R_tolerance_rad: float = 0.0
-    """Tolerance of each of the three angles; with `yaw_only` of the two tilts."""
+    """Tolerance of each rotation angle of the mounting, rad; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
-    """The sensor is mounted flat: only its turn about the flange z axis is unknown."""
+    """Whether the sensor is mounted flat, so that only its rotation about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None
-    """(3,) down, of any length: (0, 0, -1) for a level robot."""
+    """(3,) direction of gravity in base axes, of any length: (0, 0, -1) for a level robot."""
     direction_tolerance_rad: float = 0.0
-    """Tolerance of each of the two tilt angles."""
+    """Tolerance of each of the two tilt angles of gravity, rad."""
     mass_kg: float | None = None
-    """Mass of the load on the sensor."""
+    """Mass of the load on the sensor, kg."""
     mass_tolerance_kg: float = 0.0
+    """Tolerance of the mass, kg."""
 
     def __post_init__(self) -> None:
         if self.R_flange_sensor is not None or self.yaw_only:
@@ -64,7 +65,7 @@ class Known:
 
 
 class Constraints:
-    """A `Known` in the form of the solver: free directions, and pseudo-measurements in units of their tolerance."""
+    """Known values in the form of the solver: free directions, and pseudo-measurements divided by their tolerance."""
 
     def __init__(self, known: Known, g_m_s2: float) -> None:
         self.R = None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor)
@@ -78,20 +79,20 @@ class Constraints:
         self._tilts = 2 if self.yaw_only else 3
 
     def rotations(self, minima: list[Array], cost: Array) -> list[Array]:
-        """Choose starting rotations (3, 3) R_flange_sensor: the given minima, or those that respect the known mounting.
+        """Return starting rotations R_flange_sensor: the unconstrained minima, or rotations near the known mounting.
 
         Parameters
         ----------
         minima : list of array, shape (3, 3)
             R_flange_sensor of the unconstrained minima.
         cost : array, shape (9, 9)
-            Force cost over vec(R_flange_sensor.T).
+            Quadratic force cost as a function of vec(R_flange_sensor.T).
         """
         if self.R is None:
             return minima
         if not self.yaw_only:
             return [self.R] if self.R_tolerance == 0 else [self.R, *minima]
-        angles = np.arange(24) * np.pi / 12  # the cost is a trigonometric polynomial of degree 2
+        angles = np.arange(24) * np.pi / 12  # sufficient, because the cost is a trigonometric polynomial of degree 2
         turned = Rotation.from_rotvec(angles[:, None] * [0.0, 0.0, 1.0]).as_matrix() @ self.R
         r = np.swapaxes(turned, 1, 2).reshape(-1, 9)
         value = np.einsum("ki,ij,kj->k", r, cost, r)
@@ -99,7 +100,7 @@ class Constraints:
         return [*turned[low][np.argsort(value[low])][:4], *(minima if self.R_tolerance > 0 else [])]
 
     def satisfy(self, p: Parameters) -> Parameters:
-        """Replace the exactly known direction and size of the gravity force."""
+        """Return the parameters with the exactly known direction and norm of the gravity force."""
         b = np.array(p.gravity_force_base_N)
         if self.direction is not None and self.direction_tolerance == 0:
             b = float(np.linalg.norm(b)) * self.direction
@@ -108,7 +109,7 @@ class Constraints:
         return Parameters(p.R_flange_sensor, b, p.force_bias_N, p.p_sensor_com_m, p.torque_bias_Nm)
 
     def free(self, p: Parameters) -> Array:
-        """Orthonormal basis (15, m) of the directions that are not exactly known."""
+        """Return an orthonormal basis (15, m) of the directions that are not exactly known."""
         keep = np.eye(15)
         fixed = []
         if self.R is not None and self.R_tolerance == 0:
@@ -125,12 +126,12 @@ class Constraints:
 
     @property
     def dof(self) -> int:
-        """Residual degrees of freedom that exact constraints and pseudo-measurements add."""
+        """Number of degrees of freedom that constraints and pseudo-measurements add to the residuals."""
         rotation = 0 if self.R is None else self._tilts
         return rotation + 2 * (self.direction is not None) + (self.weight_N is not None)
 
     def measurements(self, p: Parameters) -> tuple[Array, Array]:
-        """Derivative (k, 15) and residual (k,), known minus estimated, of the values known within a tolerance."""
+        """Return derivative (k, 15) and residual (k,), known minus estimated, of values known within a tolerance."""
         rows, residuals = [np.zeros((0, 15))], [np.zeros(0)]
 
         def add(at: int, derivative: Array, residual: Array, tolerance: float) -> None:
@@ -158,7 +159,7 @@ class Constraints:
 
 
 def turn_between(a: Array, b: Array) -> Array:
-    """Smallest rotation vector that takes unit vector a to b."""
+    """Return the smallest rotation vector that rotates unit vector a to unit vector b."""
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
     angle = np.arctan2(sine, a @ b)
@@ -168,35 +169,35 @@ def turn_between(a: Array, b: Array) -> Array:
 
 
 def unit_vector(v: Array) -> Array:
-    """Vector (3,) divided by its length; -z for a zero vector."""
+    """Return a vector (3,) divided by its norm; -z for a zero vector."""
     length = float(np.linalg.norm(v))
     return v / length if length > 0 else np.array([0.0, 0.0, -1.0])
 
 
 def _perpendicular_axes(direction: Array) -> Array:
-    """Two unit vectors (2, 3) at right angles to a unit vector and to each other."""
+    """Return two unit vectors (2, 3) perpendicular to a unit vector and to each other."""
     first = np.cross(direction, np.eye(3)[np.abs(direction).argmin()])
     first /= np.linalg.norm(first)
     return np.array([first, np.cross(direction, first)])
 
 
-# The cell as it is described: what a result is compared with.
+# Description of the cell, with which a result is compared.
 
-# One sigma of the entries of the gain of mounted sensors, measured against other sensors: 2 to 5 % at most.
+# Standard deviation of the gain of a mounted sensor; comparisons between sensors show errors of up to 2 to 5 %.
 USUAL_GAIN: Final = 0.02
-# Share of that variance that is common to all axes: 1.4 % in all of them, and 1.4 % in each.
+# Share of the variance of the gain that is common to all axes: 1.4 % common, and 1.4 % for each axis separately.
 COMMON_SHARE: Final = 0.5
-# Cross-talk over gain, as sigmas of their entries.
+# Ratio of the standard deviations of cross-talk and gain.
 CROSS_TALK_SHARE: Final = 0.5
-# One sigma, an axis, of the orientation of an arm that computes with its own factory kinematics.
+# Standard deviation per axis of the orientation of an arm with its own factory kinematics.
 USUAL_ORIENTATION_DEG: Final = 0.06
-# Range of torque over range of force, of a sensor without data sheet.
+# Ratio of torque range to force range of a sensor without data sheet.
 RANGE_LEVER_M: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
 class Setup:
-    """A described cell; None where nothing is declared. A result that contradicts it is usable at best.
+    """Description of the cell; None means not declared. A result that contradicts it is at best usable.
 
     Examples
     --------
@@ -207,33 +208,33 @@ class Setup:
     Raises
     ------
     ValueError
-        A direction of length zero, or a cylinder that is none.
+        A direction of length zero, or an invalid cylinder.
     """
 
     up_in_base: Sequence[float] | None = None
-    """(3,) declared up direction in base, of any length: (0, 0, 1) for a robot on a floor. If it is not declared, a
-    robot that would have to hang on a wall or a ceiling is not good, because wrong rotations look like that too."""
+    """(3,) up direction in base axes, of any length: (0, 0, 1) for a robot on the floor. If it is not declared, a
+    result for a robot on a wall or a ceiling is not good, because wrong rotations have the same effect."""
     tool_mass_kg: float | None = None
-    """About the mass that hangs on the sensor."""
+    """Approximate mass of the load on the sensor, kg."""
     tool_mass_sigma_kg: float | None = None
-    """One standard deviation of that, if it was weighed."""
+    """One standard deviation of the tool mass, kg, if the tool was weighed."""
     cylinders_m: Sequence[Sequence[float]] = ()
-    """Tool and sensor as cylinders along flange z: from, to, diameter, and optionally x and y of the axis."""
+    """Tool and sensor as cylinders along flange z: start, end, diameter, and optionally x and y of the axis, m."""
     sensor_height_m: float | None = None
-    """Height of the sensor's origin above the flange face."""
+    """Height of the sensor origin above the flange face, m."""
     sensor_mass_kg: float | None = None
-    """Mass of sensor and adapter, which the sensor cannot weigh."""
+    """Mass of sensor and adapter, kg, which the sensor cannot measure."""
     payload_kg: float | None = None
-    """Payload as set in the controller: all that hangs on the flange."""
+    """Payload configured in the controller, kg: everything mounted on the flange."""
     sensor_accuracy_percent: float | None = None
-    """Of the readings under load, 95 % of them, from the data sheet or a check; otherwise 4 is assumed."""
+    """Accuracy of readings under load (95 %) from the data sheet or a test; 4 % is assumed if not declared."""
     sensor_range: Sequence[float] | None = None
-    """(2,) of a force, N, and of a torque, N·m."""
+    """(2,) measuring ranges of force, N, and torque, N·m."""
     orientation_accuracy_deg: float | None = None
-    """Of the arm, one standard deviation of an axis; otherwise 0.06 is assumed, as for an arm with its own factory
-    kinematics. 0 declares an exact arm with rigid mounts."""
+    """Standard deviation per axis of the arm's orientation, deg; 0.06 is assumed if not declared, as for an arm with
+    its own factory kinematics. 0 declares an exact arm with rigid mounts."""
     sensor_has_arbitrary_zero: bool = False
-    """Whether the sensor may read anything without load, so that its bias shows no mistake."""
+    """Whether the zero of the sensor is arbitrary, so that a large bias is no sign of a mistake."""
 
     def __post_init__(self) -> None:
         if self.up_in_base is not None:
@@ -245,36 +246,36 @@ class Setup:
             raise ValueError(f"sensor_range is {list(self.sensor_range)}, expected two positive numbers: N and N·m")
         for row in self.cylinders_m:
             if len(row) not in {3, 5} or not np.isfinite(row).all():
-                raise ValueError(f"the cylinder {list(row)} is none: give from, to, diameter, and optionally x and y")
+                raise ValueError(f"the cylinder {list(row)} is invalid: give start, end, diameter, and optionally x, y")
 
     @property
     def sensor_lever_m(self) -> float:
-        """Range of torque over range of force."""
+        """Ratio of torque range to force range, m."""
         return RANGE_LEVER_M if self.sensor_range is None else self.sensor_range[1] / self.sensor_range[0]
 
     @property
     def weighed_kg(self) -> tuple[float, float] | None:
-        """Mass of the tool by a scale, and one sigma; None if it was not weighed."""
+        """Weighed mass of the tool and its sigma, kg; None if the tool was not weighed."""
         mass_kg, sigma_kg = self.tool_mass_kg, self.tool_mass_sigma_kg
         return None if mass_kg is None or sigma_kg is None else (mass_kg, sigma_kg)
 
     @property
     def gain_sigma(self) -> float:
-        """One standard deviation of the entries of the sensor's gain, before a session shows it."""
+        """Prior standard deviation of the entries of the sensor's gain."""
         return USUAL_GAIN if self.sensor_accuracy_percent is None else self.sensor_accuracy_percent / 196
 
     @property
     def orientation_rad(self) -> float:
-        """One standard deviation of the arm's orientation, an axis."""
+        """Standard deviation per axis of the arm's orientation, rad."""
         declared = self.orientation_accuracy_deg
         return float(np.deg2rad(USUAL_ORIENTATION_DEG if declared is None else declared))
 
     @property
     def up(self) -> Array:
-        """(3,) unit vector up in base, as declared; +z if it is not."""
+        """(3,) declared up direction in base axes as a unit vector; +z if not declared."""
         up = UP_IN_BASE if self.up_in_base is None else np.array(self.up_in_base)
         return np.asarray(up / np.linalg.norm(up))
 
 
-# Nothing is described.
+# A cell without any declaration.
 NOTHING: Final = Setup()

@@ -1,4 +1,4 @@
-"""The forward model: the reading of a wrist sensor that carries a rigid tool at rest.
+"""Forward model: the reading of a wrist-mounted sensor that carries a rigid tool at rest.
 
     force_N   = R_flange_sensor.T @ R_base_flange.T @ gravity_force_base_N + force_bias_N
     torque_Nm = p_sensor_com_m x (force_N - force_bias_N) + torque_bias_Nm
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast
 
 import numpy as np
-import scipy  # its parts are imported at their first use, so that commands that need none start fast
+import scipy  # submodules are imported at their first use, so that commands without them start fast
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.display import Displayed
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 Rotations: TypeAlias = "Rotation | Sequence[Rotation] | ArrayLike"
-"""Rotations as a user has them; `matrices_of` returns their matrices."""
+"""Rotations as a user may pass them; `matrices_of` converts them to matrices."""
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 ROUNDING = 2e-3  # rounding to three decimals moves an entry of R^T R by at most 1.8e-3
 _IDENTITY = np.eye(3)
 _YZX, _ZXY = np.array([1, 2, 0]), np.array([2, 0, 1])
 UP_IN_BASE = np.array([0.0, 0.0, 1.0])
-"""For a robot on a table."""
+"""(3,) up direction in base axes of a robot on a table."""
 
 _QUANTITIES = ("R_flange_sensor", "gravity_force_base_N", "force_bias_N", "p_sensor_com_m", "torque_bias_Nm")
 PARAMETER_NAMES = tuple(f"{name}.{axis}" for name in _QUANTITIES for axis in "xyz")
-"""The 15 error coordinates, in the order of the Jacobian and of every covariance."""
+"""Names of the 15 error coordinates, in the order of the Jacobian and of every covariance."""
 BIASES = np.r_[6:9, 12:15]
-"""Where force and torque bias stand in `PARAMETER_NAMES`."""
+"""Indices of force and torque bias in `PARAMETER_NAMES`."""
 
 _CUBE = (
     "+x +y +z", "+x -y -z", "+x -z +y", "+x +z -y", "-x +y -z", "-x -y +z",
@@ -51,7 +51,7 @@ SPECIAL_R_flange_base = np.array([[float(row[0] + "1") * _AXES[row[1]] for row i
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Parameters(Displayed):
-    """The estimated quantities.
+    """Estimated parameters of sensor and tool; arrays are read-only.
 
     Examples
     --------
@@ -62,15 +62,15 @@ class Parameters(Displayed):
     """
 
     R_flange_sensor: Array
-    """(3, 3) maps sensor coordinates to flange coordinates."""
+    """(3, 3) mounting of the sensor: maps sensor coordinates to flange coordinates."""
     gravity_force_base_N: Array
-    """(3,) weight of the load on the sensor, in base."""
+    """(3,) weight of the load on the sensor, in base axes."""
     force_bias_N: Array
-    """(3,) in the sensor frame."""
+    """(3,) force bias in the sensor frame."""
     p_sensor_com_m: Array
-    """(3,) centre of mass in the sensor frame."""
+    """(3,) centre of mass of the load in the sensor frame."""
     torque_bias_Nm: Array
-    """(3,) in the sensor frame, about its origin."""
+    """(3,) torque bias in the sensor frame, about the sensor origin."""
 
     def __post_init__(self) -> None:
         for name in _QUANTITIES:
@@ -82,32 +82,33 @@ class Parameters(Displayed):
 
     @property
     def weight_N(self) -> float:
-        """Size of the gravity force."""
+        """Norm of the gravity force, N."""
         return float(np.linalg.norm(self.gravity_force_base_N))
 
     def weight_sigma_N(self, covariance: Array) -> float:
-        """Return one standard deviation of the weight from the covariance (15, 15) of the parameters."""
+        """Return one standard deviation of the weight, N, from the covariance (15, 15) of the parameters."""
         variance = float(self.down @ covariance[3:6, 3:6] @ self.down)
-        return float(np.sqrt(max(variance, 0.0)))  # below 0 only by rounding, if the weight is exactly known
+        return float(np.sqrt(max(variance, 0.0)))  # rounding may make it negative if the weight is exactly known
 
     @property
     def down(self) -> Array:
-        """(3,) direction of the gravity force in base; zero without a weight."""
+        """(3,) unit vector along the gravity force in base axes; zero without a weight."""
         return np.asarray(self.gravity_force_base_N / (self.weight_N or 1.0))
 
     @property
     def bias(self) -> Array:
-        """(6,) of force and torque, N and N·m."""
+        """(6,) bias of force and torque, N and N·m."""
         return np.concatenate([self.force_bias_N, self.torque_bias_Nm])
 
     def moved(self, step: Array) -> Self:
-        """Apply an error vector.
+        """Return the parameters after an error vector.
 
         Parameters
         ----------
         step : array, shape (15,)
-            In the order of `PARAMETER_NAMES`. The first three are a small rotation vector delta in rad, about the
-            flange axes: s_eR <- s_eR exp([delta]x), which is R_flange_sensor <- exp([delta]x).T R_flange_sensor.
+            Error vector in the order of `PARAMETER_NAMES`. The first three entries are a small rotation vector delta in
+            rad, about the flange axes: s_eR <- s_eR exp([delta]x), that is R_flange_sensor <- exp([delta]x).T
+            R_flange_sensor.
         """
         return type(self)(
             rotation_of(-step[:3]) @ self.R_flange_sensor,
@@ -118,7 +119,7 @@ class Parameters(Displayed):
         )
 
     def difference(self, other: Self) -> Array:
-        """Return the error vector (15,) with which `moved` gives `other`."""
+        """Return the error vector (15,) for which `moved` returns `other`."""
         turn = scipy.spatial.transform.Rotation.from_matrix(self.R_flange_sensor @ other.R_flange_sensor.T)
         return np.concatenate(
             [
@@ -132,12 +133,12 @@ class Parameters(Displayed):
 
 
 def cross(a: Array, b: Array) -> Array:
-    """Cross product of vectors (..., 3): `numpy.cross`, whose checks take ten times as long as a few products."""
+    """Return the cross product of vectors (..., 3), faster than `numpy.cross` for few vectors."""
     return a.take(_YZX, -1) * b.take(_ZXY, -1) - a.take(_ZXY, -1) * b.take(_YZX, -1)
 
 
 def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Wrench of the weight alone, without bias.
+    """Return the wrench of the weight alone, without bias.
 
     Parameters
     ----------
@@ -147,7 +148,7 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
     Returns
     -------
     array, shape (..., 6)
-        N and N·m, exerted on the sensor, in the sensor frame, about its origin.
+        Wrench on the sensor, N and N·m, in the sensor frame, about the sensor origin.
     """
     R_base_sensor = R_base_flange @ parameters.R_flange_sensor
     force_N = parameters.gravity_force_base_N @ R_base_sensor  # row vector times R is R.T times the vector
@@ -156,7 +157,7 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
 
 
 def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
-    """Wrench that the sensor reads without contact: weight and bias, Yu eqs 12-13.
+    """Return the wrench that the sensor reads without contact: weight and bias, Yu eqs 12-13.
 
     Parameters
     ----------
@@ -167,7 +168,7 @@ def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
     Returns
     -------
     array, shape (..., 6)
-        N and N·m, in the sensor frame, about its origin.
+        N and N·m, in the sensor frame, about the sensor origin.
 
     Examples
     --------
@@ -190,7 +191,7 @@ def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
 
 
 def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Derivative of `predict` by the error vector of `Parameters.moved`.
+    """Return the derivative of `predict` by the error vector of `Parameters.moved`.
 
     With R = s_eR, A = e_bR, g = A F_b and u = R g:  dF = -R [g]x delta + R A dF_b + dF0,
     dT = [P]x (dF - dF0) - [u]x dP + dT0.
@@ -203,7 +204,7 @@ def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
     Returns
     -------
     array, shape (..., 6, 15)
-        Columns as in `PARAMETER_NAMES`.
+        Columns in the order of `PARAMETER_NAMES`.
     """
     R_sensor_flange = parameters.R_flange_sensor.T
     gravity_flange_N = parameters.gravity_force_base_N @ R_base_flange
@@ -223,13 +224,13 @@ def matrices_of(rotations: Rotations) -> NDArray[Any]:
     if hasattr(rotations, "as_matrix"):
         return np.asarray(rotations.as_matrix())
     if isinstance(rotations, Sequence) and rotations and hasattr(rotations[0], "as_matrix"):
-        return np.stack([one.as_matrix() for one in cast("Sequence[Rotation]", rotations)])
+        return np.stack([rotation.as_matrix() for rotation in cast("Sequence[Rotation]", rotations)])
     return np.asarray(rotations)
 
 
 def skew(v: Array) -> Array:
-    """Cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
-    if v.ndim == 1:  # most calls, and four times faster
+    """Return the cross-product matrices (..., 3, 3) of vectors (..., 3): skew(a) @ b = a x b."""
+    if v.ndim == 1:  # the most frequent case, four times faster
         x, y, z = v.tolist()
         return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix = np.zeros((*v.shape[:-1], 3, 3))
@@ -238,20 +239,20 @@ def skew(v: Array) -> Array:
 
 
 def rotation_of(vector: Array) -> Array:
-    """Rotation matrix of a rotation vector (3,), ten times faster than scipy's."""
+    """Return the rotation matrix of a rotation vector (3,), ten times faster than scipy."""
     angle = math.sqrt(float(vector @ vector))
     K = skew(vector)
-    if angle < 1e-4:  # series: both coefficients lose their digits
+    if angle < 1e-4:  # the closed form loses digits at small angles, the series does not
         return np.asarray(_IDENTITY + (1 - angle**2 / 6) * K + (0.5 - angle**2 / 24) * (K @ K))
     return np.asarray(_IDENTITY + math.sin(angle) / angle * K + (1 - math.cos(angle)) / angle**2 * (K @ K))
 
 
 def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
-    """Weight (N) and the tilt angles alpha, beta (rad) of the base for a gravity force (3,): Yu eqs 46-48.
+    """Return weight (N) and tilt angles alpha, beta (rad) of the base for a gravity force (3,): Yu eqs 46-48.
 
-    Two misprints of eq 48 are corrected: the weight is the norm of F_b, not its square, and the angles are those that
-    reproduce F_b = -weight [cos(alpha) sin(beta), -sin(alpha), cos(alpha) cos(beta)], with alpha in [-pi/2, pi/2]. An
-    upright base has (0, 0), one under the ceiling (0, pi). Where gravity runs along base y, beta is free and set to 0.
+    Two misprints of eq 48 are corrected: the weight is the norm of F_b, not its square, and the angles satisfy
+    F_b = -weight [cos(alpha) sin(beta), -sin(alpha), cos(alpha) cos(beta)], with alpha in [-pi/2, pi/2]. An upright
+    base has (0, 0), a base on the ceiling (0, pi). If gravity is along base y, beta is undetermined and set to 0.
     """
     x, y, z = F_b.tolist()
     beta = np.arctan2(0.0 - x, 0.0 - z) if x or z else 0.0  # not -x: a negative zero would turn pi to -pi
@@ -259,14 +260,14 @@ def weight_and_tilt(F_b: Array) -> tuple[float, float, float]:
 
 
 def angle_between(R1: Array, R2: Array) -> Array:
-    """Angle in rad, shape (...), between rotations of shape (..., 3, 3) each; accurate for small angles too."""
-    # The chord keeps the digits of small angles, of which the trace loses half.
+    """Return the angles (...) in rad between rotations (..., 3, 3); accurate also for small angles."""
+    # Computed from the chord, because the trace loses half of the digits of small angles.
     chord = np.linalg.norm(np.asarray(R1) - R2, axis=(-2, -1)) / math.sqrt(8)
     return np.asarray(2 * np.arcsin(np.minimum(chord, 1.0)))
 
 
 def angle_between_vectors(a: Array, b: Array) -> float:
-    """Angle in rad between two vectors (3,) of any length; accurate for small angles too."""
+    """Return the angle in rad between two vectors (3,) of any length; accurate also for small angles."""
     return float(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))
 
 
@@ -278,19 +279,19 @@ def nearest_rotation(M: Array) -> Array:
 
 
 def is_rotation(R: Array) -> bool:
-    """Check whether a matrix is a rotation (3, 3); its entries may be rounded to three decimals."""
+    """Return whether a matrix is a rotation (3, 3); its entries may be rounded to three decimals."""
     return R.shape == (3, 3) and bool(np.abs(R.T @ R - np.eye(3)).max() < ROUNDING and np.linalg.det(R) > 0)
 
 
 def read_only(value: ArrayLike) -> Array:
-    """Copy to a read-only float64 array."""
+    """Return a read-only float64 copy of an array."""
     array = np.array(value, dtype=np.float64)
     array.setflags(write=False)
     return array
 
 
 def keep_finite(record: object, whose: str, **shapes: tuple[int, ...]) -> None:
-    """Make arrays of a frozen record read-only copies; raise `ValueError` unless they are finite, in these shapes."""
+    """Replace arrays of a frozen record by read-only copies; raise `ValueError` if not finite or of another shape."""
     for name, shape in shapes.items():
         value = read_only(getattr(record, name))
         if value.shape != shape or not np.isfinite(value).all():
@@ -301,15 +302,15 @@ def keep_finite(record: object, whose: str, **shapes: tuple[int, ...]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftResult:
-    """Change of the bias during the tour; arrays are read-only."""
+    """Drift of the bias during the session; arrays are read-only."""
 
     change: Array
     """(6,) bias at the last pose minus bias at the first, N and N·m."""
     sigma: Array
-    """(6,) one standard deviation of that."""
+    """(6,) one standard deviation of `change`."""
     course: Array | None = None
-    """(n, 6) bias of each pose minus the mean bias, in the order of the poses given; None in a result, which keeps the
-    change alone."""
+    """(n, 6) bias of each pose minus the mean bias, in the order of the poses; None in a calibration result, which
+    stores only the change."""
 
     def __post_init__(self) -> None:
         keep_finite(self, "the drift's ", change=(6,), sigma=(6,))

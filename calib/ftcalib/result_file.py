@@ -1,4 +1,4 @@
-"""The file of a calibration: what it holds, how it becomes a result again, and whether it was edited since."""
+"""Calibration files: their content, its conversion to a result, and detection of edits."""
 
 from collections.abc import Mapping
 from dataclasses import fields
@@ -13,10 +13,10 @@ from ftcalib.model import PARAMETER_NAMES, Array, DriftResult, Parameters, read_
 from ftcalib.sensor_matrix import Response, SensorMatrix
 
 _FORMAT = "ftdrive.calibration/2"
-# The bias of a session with drift is its mean there.
+# Earlier format, in which the bias of a session with drift is its mean.
 _EARLIER = "ftdrive.calibration/1"
 
-# What a file has of a result, in its order.
+# Fields of a calibration file, in their order.
 _NAMES = (
     *("id", "method", "verdict", "findings", "n_poses", "mass_kg", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "force_bias_N", "torque_bias_Nm", "p_sensor_com_m", "tilt_alpha_rad", "tilt_beta_rad"),
@@ -25,7 +25,7 @@ _NAMES = (
     *("cable_shift", "weights", "rejected_poses", "second_basin_chi2", "p_wrong", "quality", "g_m_s2"),
     *("parameter_names", "covariance", "hidden_covariance", "residuals", "provenance"),
 )
-# Fields that are read as they are, and arrays. Files of version 0.1.0 and earlier have none of the later arrays.
+# Fields that are read unchanged, and array fields. Files of version 0.1.0 and earlier lack the later arrays.
 _PLAIN = (
     *("chi2", "dof", "noise_source", "g_m_s2", "method", "provenance", "p_value", "components", "gain_sigma"),
     *("second_basin_chi2", "quality"),
@@ -34,10 +34,10 @@ _ARRAYS, _LATER_ARRAYS = ("covariance", "residuals", "measured_sigma", "weights"
 
 
 def document_of(result: object, **computed: JSON) -> dict[str, JSON]:
-    """Return the content of the file of a calibration at rest: attributes of a result, and what is computed for it."""
+    """Return the document of a static calibration file, from attributes of a result and computed values."""
     computed |= {"parameter_names": list(PARAMETER_NAMES)}
-    held = {name: computed[name] if name in computed else _json(getattr(result, name)) for name in _NAMES}
-    return {"format": _FORMAT, "schema_version": 1, **held}
+    values = {name: computed[name] if name in computed else _json(getattr(result, name)) for name in _NAMES}
+    return {"format": _FORMAT, "schema_version": 1, **values}
 
 
 def _json(value: Any) -> JSON:
@@ -46,14 +46,14 @@ def _json(value: Any) -> JSON:
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, Mapping):
-        return {name: _json(one) for name, one in value.items()}
+        return {name: _json(each) for name, each in value.items()}
     if isinstance(value, tuple):
-        return [_json(one) for one in value]
+        return [_json(each) for each in value]
     return value.to_dict() if hasattr(value, "to_dict") else value
 
 
 def fields_of(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Build the fields of a `CalibrationResult` at rest from the content of a file; unknown fields are ignored."""
+    """Return the fields of a static `CalibrationResult` from the document of a file; unknown fields are ignored."""
     if document.get("format") != _EARLIER:
         check_format(document, _FORMAT, BadCalibration)
     drift, response, sensor = document["drift"], document["response"], document.get("sensor")
@@ -64,7 +64,7 @@ def fields_of(document: Mapping[str, Any]) -> dict[str, Any]:
         **{name: _array(document[name]) for name in _ARRAYS},
         **{name: _array(document.get(name)) for name in _LATER_ARRAYS},
         "hidden_covariance": _array(document.get("hidden_covariance", np.zeros((15, 15)))),
-        "findings": tuple(Finding.from_dict(one) for one in document["findings"]),
+        "findings": tuple(Finding.from_dict(finding) for finding in document["findings"]),
         "drift": None if drift is None else DriftResult(drift["change"], drift["sigma"]),
         "response": None if response is None else Response(response["coefficients"], response["covariance"]),
         "sensor": None if sensor is None else SensorMatrix.from_dict(sensor),
@@ -77,7 +77,7 @@ def _array(value: Any) -> Array | None:
 
 
 def is_edited(document: Mapping[str, Any], derived: Mapping[str, JSON], *, accept: bool) -> bool:
-    """Whether a content differs from its checksum or from what follows from it; `BadCalibration` unless accepted."""
+    """Whether a document differs from its checksum or from derived values; raise `BadCalibration` unless accepted."""
     edited = is_changed(document) or any(document.get(name, value) != value for name, value in derived.items())
     if edited and not accept:
         raise BadCalibration(

@@ -1,15 +1,15 @@
-"""Numbers in words: a sigma has two significant digits, and its value ends at the same place."""
+"""Formatting of numbers with a sigma: the sigma has two significant digits, the value the same number of decimals."""
 
 import math
 from typing import Final, SupportsFloat
 
 MOST_DECIMALS: Final = 9
-# Decimals of a value whose sigma is zero or not known.
+# Number of decimals of a value whose sigma is zero or unknown.
 _UNKNOWN: Final = 4
 
 
 def decimals(sigma: float) -> int:
-    """Return how many decimals show two significant digits of a sigma.
+    """Return the number of decimals that shows two significant digits of a sigma.
 
     Examples
     --------
@@ -23,7 +23,7 @@ def decimals(sigma: float) -> int:
 
 
 def to_place_of(value: SupportsFloat, sigma: float, sign: str = "") -> str:
-    """Write a value to the last place of its sigma; of the sigma itself, two significant digits.
+    """Return a value as text, rounded to the last decimal of its sigma.
 
     Examples
     --------
@@ -34,7 +34,7 @@ def to_place_of(value: SupportsFloat, sigma: float, sign: str = "") -> str:
 
 
 def with_sigma(value: SupportsFloat, sigma: float, sign: str = "") -> str:
-    """Write a value with its sigma.
+    """Return a value with its sigma as text.
 
     Examples
     --------
@@ -45,7 +45,7 @@ def with_sigma(value: SupportsFloat, sigma: float, sign: str = "") -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """Write a number with its noun.
+    """Return a number with its noun, in the plural if needed.
 
     Examples
     --------

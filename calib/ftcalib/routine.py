@@ -1,7 +1,7 @@
-"""The calibration routine at one pose (wait until still, average, repeat if necessary) and the dataset of a tour.
+"""The calibration routine at one pose (wait for rest, average, repeat if necessary) and the dataset of a tour.
 
-Every path goes through it: a tour, poses by hand, a verification, a replay. It reaches devices only through
-the protocols below and prints nothing. Its decisions depend only on the readings of arm and sensor.
+Tours, hand-guided poses, verifications and replays all use this routine. It accesses devices only through the
+protocols below and prints nothing. Its decisions depend only on the readings of arm and sensor.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +17,7 @@ from ftcalib.errors import NotObservable, TooFewSamples
 from ftcalib.model import Array
 from ftcalib.sampling import Sampling
 
-# Interfaces of sensor and arm for the calibration routine: drivers, recordings and fakes implement them.
+# Interfaces of sensor and arm for the calibration routine, implemented by drivers, recordings and test doubles.
 
 
 class WrenchSamples(Protocol):
@@ -25,15 +25,15 @@ class WrenchSamples(Protocol):
 
     @property
     def t_host_ns(self) -> NDArray[np.int64]:
-        """(n,) host clock at receipt."""
+        """(n,) times of receipt on the host clock, ns."""
 
     @property
     def t_device_s(self) -> Array:
-        """(n,) device clock, NaN where there is none."""
+        """(n,) times on the device clock, s; NaN without a device clock."""
 
     @property
     def seq(self) -> NDArray[np.int64]:
-        """(n,) sequence number; gaps are lost samples."""
+        """(n,) sequence numbers; a gap means lost samples."""
 
     @property
     def counts(self) -> NDArray[np.int32]:
@@ -41,55 +41,55 @@ class WrenchSamples(Protocol):
 
     @property
     def wrench(self) -> Array:
-        """(n, 6) N and N·m, in the sensor frame."""
+        """(n, 6) wrenches in the sensor frame, N and N·m."""
 
     @property
     def status(self) -> NDArray[np.uint32]:
-        """(n,) vendor status word."""
+        """(n,) status words of the vendor."""
 
 
 class Sensor(Protocol):
     """A source of wrenches."""
 
     def collect(self, duration_s: float, /) -> WrenchSamples:
-        """Return every sample of the next `duration_s` seconds, or raise."""
+        """Return all samples of the next `duration_s` seconds; raise if the stream fails."""
 
     def check(self) -> None:
         """Raise if the stream has failed."""
 
 
 class ArmReading(Protocol):
-    """State of the arm at one moment."""
+    """State of the arm at one time."""
 
     @property
     def t_host_ns(self) -> int:
-        """Host clock at receipt."""
+        """Time of receipt on the host clock, ns."""
 
     @property
     def q_rad(self) -> Array:
-        """(6,) joint angles."""
+        """(6,) joint angles, rad."""
 
     @property
     def R_base_flange(self) -> Array:
-        """(3, 3) flange coordinates to base coordinates."""
+        """(3, 3) orientation of the flange: maps flange coordinates to base coordinates."""
 
 
 class Arm(Protocol):
-    """An arm at a pose, or about to come to rest there."""
+    """An arm at a pose, at rest or about to come to rest."""
 
     def state(self) -> ArmReading:
-        """Read a fresh state, or raise."""
+        """Return a fresh state; raise if the arm sends none."""
 
     def wait_until_still(self, *, timeout_s: float, guard: Callable[[], None]) -> None:
-        """Return when the arm has come to rest, or raise."""
+        """Return when the arm is at rest; raise after the time-out or if the guard raises."""
 
 
 Stage = Literal["settle", "sample"]
 
-# Largest turn of the flange during a dwell: a tenth of the noise of a good sensor at 1 kg.
+# Largest rotation of the flange during a dwell: it changes the force of 1 kg by a tenth of the noise of a good sensor.
 MOVED_RAD = float(np.radians(0.05))
 
-# Factors on the averaging time, tried in turn until there are enough samples: polled sensors may be slow.
+# Factors of the averaging time, tried in turn until there are enough samples, because polled sensors may be slow.
 LONGER = (1, 2, 4)
 
 
@@ -100,7 +100,7 @@ class TourPose:
     number: int
     """Number of the orientation: 1 to 24 as in Yu et al., Fig. 3; above 100 for all others."""
     q_rad: Array
-    """(6,) joint angles."""
+    """(6,) joint angles, rad."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,19 +108,19 @@ class PoseRecord:
     """Raw readings of arm and sensor at one pose."""
 
     stop: int
-    """Position in the tour, from 1; the return to the first pose is last."""
+    """Position in the tour, counted from 1; the return to the first pose is the last position."""
     pose: TourPose
     before: ArmReading
     after: ArmReading
     samples: WrenchSamples
     steady: bool
-    """Neither flange nor mean wrench changed during the dwell."""
+    """Whether neither flange nor mean wrench changed during the dwell."""
     attempts: int = 1
-    """Dwells until this one, which was steady or the last."""
+    """Number of dwells at this pose, including this one."""
     clock_offset_ns: int = 0
-    """From the host clock to the clock of the run, which may span a restart of the computer."""
+    """Offset from the host clock to the clock of the run, ns; a run may span a restart of the computer."""
     swings: bool = False
-    """A weight hangs on a string: its swing is no part of the mean."""
+    """Whether a weight hangs on a string, so that its swing is removed from the mean."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 
@@ -136,21 +136,21 @@ class PoseRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftCheck:
-    """Change from the first pose to its repetition at the end of the tour."""
+    """Change of the reading from the first pose to its repetition at the end of the tour."""
 
     change: Array
-    """(6,) N and N·m."""
+    """(6,) change of the mean wrench, N and N·m."""
     sigma: Array
-    """(6,) standard deviation of the change expected from the noise alone."""
+    """(6,) standard deviation of the change due to noise alone, N and N·m."""
     elapsed_s: float
-    """Negative if the first pose was retaken after the return."""
+    """Time from the first pose to its repetition, s; negative if the first pose was retaken after the return."""
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the fields as JSON takes them."""
+        """Return the fields as a JSON object."""
         return {"change": self.change.tolist(), "sigma": self.sigma.tolist(), "elapsed_s": self.elapsed_s}
 
 
-def take_pose(  # noqa: PLR0913 - what a pose is judged by
+def take_pose(  # noqa: PLR0913 - the limits for a steady pose
     arm: Arm,
     sensor: Sensor,
     stop: int,
@@ -162,27 +162,27 @@ def take_pose(  # noqa: PLR0913 - what a pose is judged by
     quiet_std: Array | None = None,
     most_swing_N: float | None = None,
 ) -> PoseRecord:
-    """Wait until the arm is still, and average; repeat if arm or wrench changed during the dwell.
+    """Wait until the arm is at rest, then average; repeat if arm or wrench changed during the dwell.
 
     Parameters
     ----------
     stop : int
-        Place in the tour.
+        Position in the tour.
     pose : TourPose
         Pose of the arm.
     guard : callable
-        Called between readings of the arm; raises to abort. Default: the check of the sensor.
+        Called between readings of the arm, and raises to abort. Default: the check of the sensor.
     on_stage : callable
         Called at the start of each stage.
     quiet_std : array, shape (6,), optional
-        Standard deviation of the samples of an arm at rest. A dwell with more than twice that is not steady.
+        Standard deviation of the samples with the arm at rest. A dwell with more than twice this noise is not steady.
     most_swing_N : float, optional
-        A weight hangs on a string: amplitude of its force above which a dwell is not steady.
+        Largest amplitude of the force of a weight on a string in a steady dwell. Default: no weight on a string.
 
     Raises
     ------
     TooFewSamples
-        The sensor is too slow even for the longest of `LONGER`.
+        The sensor is too slow even for the longest averaging time (`LONGER`).
     Exception
         Whatever the arm, the sensor or the guard raises.
     """
@@ -202,7 +202,7 @@ def take_pose(  # noqa: PLR0913 - what a pose is judged by
             steady = steady and bool(np.linalg.norm(amplitude[:3]) <= most_swing_N)
         if steady:
             steady = is_stationary(wrench) if quiet_std is None else is_quiet(wrench, quiet_std)
-        # The last attempt is kept even if it is noisy: its covariance says so, and a tour needs its pose.
+        # The last attempt is kept even if it is not steady, because a tour needs every pose. Its covariance is large.
         record = PoseRecord(stop, pose, before, after, samples, steady, attempt, swings=most_swing_N is not None)
         if steady:
             break
@@ -220,44 +220,44 @@ def _collect_enough(sensor: Sensor, average_s: float) -> WrenchSamples:
         if len(samples.wrench) >= LEAST_SAMPLES:
             return samples
     raise TooFewSamples(
-        f"the sensor sent {len(samples.wrench)} samples in {times * average_s} s, at least {LEAST_SAMPLES} are needed: "
-        "check its rate, or average longer"
+        f"the sensor sent only {len(samples.wrench)} samples in {times * average_s} s, at least {LEAST_SAMPLES} are "
+        "needed: check the sampling rate, or average longer"
     )
 
 
 def turned_rad(before: ArmReading, after: ArmReading) -> float:
-    """Angle between the flange orientations of two readings."""
+    """Return the angle between the flange orientations of two readings, rad."""
     change = before.R_base_flange.T @ after.R_base_flange
     sine = np.linalg.norm([change[2, 1] - change[1, 2], change[0, 2] - change[2, 0], change[1, 0] - change[0, 1]]) / 2
     return float(np.arctan2(sine, (np.trace(change) - 1) / 2))
 
 
 def is_return(record: PoseRecord, records: Sequence[PoseRecord]) -> bool:
-    """Check whether a record is the return to the first pose of its tour."""
+    """Return whether a record is the return to the first pose of its tour."""
     return record.stop != records[0].stop and record.pose.number == records[0].pose.number
 
 
 def dataset_from(records: Sequence[PoseRecord], meta: Mapping[str, Any]) -> CalibrationDataset:
-    """Turn the records of a complete or aborted tour into a dataset.
+    """Return the dataset of a complete or aborted tour.
 
-    The return to the first pose is left out, because `drift_check` uses it.
+    The return to the first pose is left out; it is used by `drift_check`.
     """
     if not records:
         raise NotObservable("the run contains no pose: record poses first")
-    kept = [record for record in records if not is_return(record, records)]
-    t_ns = np.array([record.t_mid_ns for record in kept])
+    poses = [record for record in records if not is_return(record, records)]
+    t_ns = np.array([record.t_mid_ns for record in poses])
     return CalibrationDataset(
-        R_base_flange=np.stack([record.before.R_base_flange for record in kept]),
-        wrench=np.stack([record.mean.mean for record in kept]),
-        wrench_cov=np.stack([record.mean.covariance for record in kept]),
-        n_samples=np.array([len(record.samples.t_host_ns) for record in kept]),
+        R_base_flange=np.stack([record.before.R_base_flange for record in poses]),
+        wrench=np.stack([record.mean.mean for record in poses]),
+        wrench_cov=np.stack([record.mean.covariance for record in poses]),
+        n_samples=np.array([len(record.samples.t_host_ns) for record in poses]),
         t_s=(t_ns - t_ns[0]) * 1e-9,
         meta=meta,
     )
 
 
 def drift_check(records: Sequence[PoseRecord]) -> DriftCheck | None:
-    """Compare the first pose with its repetition at the end; None if the tour was aborted before."""
+    """Return the change from the first pose to its repetition; None if the tour was aborted before the repetition."""
     if len(records) < 2 or not is_return(records[-1], records):
         return None
     first, last = records[0], records[-1]

@@ -1,15 +1,17 @@
-"""How long a pose is sampled: settings, which a configuration reads without numpy."""
+"""Settings for sampling a pose. The module does not import numpy, so that reading a configuration is fast."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True, slots=True)
 class Sampling:
-    """Time limits and repetitions at each pose."""
+    """Averaging time, time-out and number of attempts at each pose."""
 
     average_s: float = 2.0
+    """Averaging time at a pose, s."""
     still_timeout_s: float = 10.0
+    """Time-out for the arm to come to rest, s."""
     attempts: int = 2
-    """Dwells at a pose, at most: a dwell with motion or drift is repeated, and the last one is kept as noisy."""
+    """Largest number of dwells at a pose. A dwell with motion or drift is repeated; the last one is kept anyway."""
     noise_record_s: float = 12.0
-    """Length of the record before a tour from which the averaging time is chosen; 0 uses `average_s`."""
+    """Duration of the noise record before a tour that determines the averaging time, s; 0: `average_s` is used."""

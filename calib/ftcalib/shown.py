@@ -1,4 +1,4 @@
-"""What a screen, a table and a figure show of a calibration: its estimates as numbers, rows, a DataFrame and plots."""
+"""Presentation of a calibration: its estimates as numbers, table rows, a DataFrame and plots."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from importlib import import_module
@@ -6,7 +6,7 @@ from io import BytesIO
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import scipy  # its parts are imported at their first use
+import scipy  # submodules are imported at their first use
 from numpy.typing import ArrayLike, NDArray
 
 from ftcalib.display import Row
@@ -14,7 +14,7 @@ from ftcalib.errors import UsageError
 from ftcalib.model import Array
 from ftcalib.rounding import to_place_of, with_sigma
 
-# The first fields of `Estimate`.
+# The first four fields of each `ShownEstimate`.
 _QUANTITIES: Final[Sequence[tuple[str, float, str, str]]] = (
     ("mass", 1.0, "kg", "mass_kg"),
     ("centre of mass", 1e3, "mm", "p_sensor_com_m"),
@@ -30,45 +30,45 @@ _IN_MOTION: Final[Sequence[tuple[str, float, str, str]]] = (
     ("wrench after pose", 1e3, "ms", "delay_s"),
     ("sensor above flange", 1e3, "mm", "height_m"),
 )
-# A standard deviation below this share of the largest one is one of rounding: its value was taken as known.
+# A standard deviation below this share of the largest one is a rounding error: the value was exactly known.
 _KNOWN_BELOW: Final = 1e-9
 
 
 class ShownEstimate(NamedTuple):
-    """A quantity of a calibration: a number, a vector, a symmetric tensor, or a mounting as its rotation vector."""
+    """Estimated quantity for display: a number, a vector, a symmetric tensor, or the rotation vector of a mounting."""
 
     label: str
     factor: float
-    """From the unit of the file to that of the screen."""
+    """Conversion factor from SI to the displayed unit."""
     unit: str
-    """On the screen."""
+    """Displayed unit."""
     key: str
-    """In the file."""
+    """Name of the quantity in a calibration file."""
     values: Array
-    """(k,) SI."""
+    """(k,) values in SI units."""
     sigma: Array
-    """(k,) one standard deviation, SI."""
+    """(k,) standard deviations in SI units."""
     is_known: NDArray[np.bool_]
-    """(k,) whether a number was taken as known: its sigma is one of rounding."""
+    """(k,) whether a value was exactly known, so that its sigma is only a rounding error."""
 
     @property
     def axes(self) -> Sequence[str]:
-        """(k,) names of the numbers."""
+        """(k,) axis names of the values."""
         return {1: ("",), 3: tuple("xyz"), 6: ("xx", "yy", "zz", "xy", "xz", "yz")}[len(self.values)]
 
 
 def shown_estimates(document: Mapping[str, Any]) -> list[ShownEstimate]:
-    """Return the estimates in the content of a calibration file: values, `sigma` and `covariance`."""
+    """Return the estimates contained in the document of a calibration file."""
     known_below = _KNOWN_BELOW * float(np.sqrt(np.diag(document["covariance"]).max()))
-    found = []
+    estimates = []
     for label, factor, unit, key in (*_QUANTITIES, *(_IN_MOTION if "inertia_kg_m2" in document else ())):
         values, sigma = (values_of(source[key], key) for source in (document, document["sigma"]))
-        found.append(ShownEstimate(label, factor, unit, key, values, sigma, sigma <= known_below))
-    return found
+        estimates.append(ShownEstimate(label, factor, unit, key, values, sigma, sigma <= known_below))
+    return estimates
 
 
 def values_of(value: Any, key: str) -> Array:
-    """Return a quantity or its sigma as numbers; a mounting as its rotation vector, rad."""
+    """Return a quantity, or its sigma, as an array (k,); a mounting as its rotation vector, rad."""
     values = np.asarray(value, dtype=np.float64)
     if key == "R_flange_sensor" and values.ndim == 2:
         values = scipy.spatial.transform.Rotation.from_matrix(values).as_rotvec()
@@ -78,7 +78,7 @@ def values_of(value: Any, key: str) -> Array:
 
 
 def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
-    """Return the lines of a summary; the gravity force has none, because it follows from mass and tilt."""
+    """Return the rows of a summary. The gravity force is left out, because it follows from mass and tilt."""
     rows = list[Row]()
     for label, factor, unit, key, values, sigmas, known in estimates:
         if key == "gravity_force_base_N":
@@ -87,7 +87,7 @@ def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
             f"{to_place_of(factor * value, 0.0)} fixed" if is_known else with_sigma(factor * value, factor * sigma)
             for value, sigma, is_known in zip(values, sigmas, known, strict=True)
         ]
-        if key == "tilt_beta_rad":  # beside alpha
+        if key == "tilt_beta_rad":  # in the same row as alpha
             rows[-1] = Row("base tilt alpha, beta", [*rows[-1].cells, *cells], unit)
         elif key == "inertia_kg_m2":
             rows += [
@@ -100,20 +100,20 @@ def summary_rows(estimates: Iterable[ShownEstimate]) -> list[Row]:
 
 
 def data_frame(columns: Mapping[str, ArrayLike]) -> Any:
-    """Return columns by name as a DataFrame of pandas, else of Polars.
+    """Return named columns as a DataFrame of pandas, or of Polars if pandas is not installed.
 
     Raises
     ------
     UsageError
-        Neither of the two is installed.
+        Neither pandas nor Polars is installed.
     """
     for name in ("pandas", "polars"):
         try:
             return import_module(name).DataFrame(dict(columns))
         except ModuleNotFoundError as error:
-            if error.name != name:  # it is there, but what it needs is not
+            if error.name != name:  # the package is installed, but one of its dependencies is not
                 raise
-    raise UsageError("a DataFrame needs pandas or Polars, and neither is installed: pip install pandas")
+    raise UsageError("a DataFrame needs pandas or Polars, but neither is installed: run pip install pandas")
 
 
 def wrench_figure(
@@ -126,7 +126,7 @@ def wrench_figure(
     marked: Array | None = None,
     points: bool = False,
 ) -> Any:
-    """Draw forces above torques, and return the Figure, which a notebook shows and `savefig` writes.
+    """Return a matplotlib Figure of forces above torques, which a notebook shows and `savefig` writes.
 
     Parameters
     ----------
@@ -134,13 +134,13 @@ def wrench_figure(
     wrench : array, shape (n, 6)
         N and N·m.
     label, title : str
-        Of `x`, and of the figure.
+        Label of the x axis, and title of the figure.
     sigma : array, shape (6,) or (n, 6), optional
-        One standard deviation: of a line a band around it, of points a band around zero.
+        One standard deviation, drawn as a band: around the lines, or around zero if points are drawn.
     marked : array of bool, shape (n,), optional
         Points to mark as rejected.
     points : bool
-        Draw points instead of lines.
+        Whether to draw points instead of lines.
 
     Raises
     ------
@@ -150,10 +150,10 @@ def wrench_figure(
     try:
         base = import_module("matplotlib.figure").Figure
     except ImportError:
-        raise UsageError("a figure needs matplotlib, which is not installed: pip install matplotlib") from None
+        raise UsageError("a figure needs matplotlib, which is not installed: run pip install matplotlib") from None
 
-    class Shown(base):  # type: ignore[misc, valid-type]  # known only here
-        """A figure that a notebook shows without pyplot, which would show it twice."""
+    class Shown(base):  # type: ignore[misc, valid-type]  # the base class is imported above
+        """Figure that a notebook displays without pyplot, which would display it twice."""
 
         def _repr_png_(self) -> bytes:
             self.savefig(written := BytesIO(), format="png")

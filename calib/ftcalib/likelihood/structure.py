@@ -146,8 +146,8 @@ def _of_each_channel(basis: Array) -> Array:
 # Hysteresis: each axis lags behind by a share of its last change. Reading i is wrench i minus a share of its step,
 # wrench i minus wrench i - 1.
 #
-# The six shares, one for each axis, have one variance. The step to the first pose is unknown, so a usual step is assumed
-# for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
+# The six shares, one for each axis, have one variance. The step to the first pose is unknown, so a usual step is
+# assumed for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
 
 # With more poses the unknown step to the first pose is negligible.
 FEW = 1000

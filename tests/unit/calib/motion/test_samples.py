@@ -144,7 +144,7 @@ def test_the_ends_that_both_streams_have_count() -> None:
     assert 0 <= 9.99 + 0.02 - reach_s(WIDE_S) - rows.t_s[-1] < WIDE_S + 3 * MEAN_S
     few = motion_rows((t[:195], values[:195]), (t_pose, poses))
     assert len(few) == 8
-    with pytest.raises(BadDataset, match=r"have 1\.9 s in common"):
+    with pytest.raises(BadDataset, match=r"overlap by 1\.9 s"):
         motion_rows((t[:191], values[:191]), (t_pose, poses))
 
 
@@ -187,7 +187,7 @@ def test_samples_that_cannot_be_used_are_refused(wrong: str) -> None:
             means.result()
         return
     (values[1] if wrong == "value" else t)[0 if wrong == "value" else 2] = 0.5 if wrong == "order" else np.nan
-    with pytest.raises(BadDataset, match="time goes back" if wrong == "order" else "not a finite number"):
+    with pytest.raises(BadDataset, match="times decrease" if wrong == "order" else "not a finite number"):
         means.add(t, values)
 
 
