@@ -42,13 +42,13 @@ from ftcalib.sensor_matrix import (
 )
 from ftcalib.shown import ShownEstimate, data_frame, shown_estimates, summary_rows, wrench_figure
 
-# A mass by a scale and that of the fit contradict each other by so many sigmas of the sensor's gain.
+# Number of sigmas of the sensor's gain from which weighed and estimated mass contradict each other.
 _CONTRADICTS = 4.0
 
-# Eigenvalues of a correlation matrix below this are no rounding.
+# Smallest eigenvalue of a correlation matrix that can be a rounding error.
 INDEFINITE = -1e-6
 
-# Unit by the end of a name; the rotation vector of the mounting is in rad.
+# Unit for the last part of a name; the rotation vector of the mounting is in rad.
 _SI: Mapping[str, str] = {
     "kg": "kg", "m": "m", "N": "N", "Nm": "N·m", "rad": "rad", "sensor": "rad", "m2": "kg·m²", "s": "s",
 }  # fmt: skip
@@ -75,24 +75,25 @@ NoiseSource = Literal["measured", "residuals"]
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MotionResult(Displayed):
-    """What a recording in motion gives beside the static model; arrays are read-only."""
+    """Additional results of a recording in motion; arrays are read-only."""
 
     inertia_kg_m2: Array
-    """(3, 3) of the load about its centre of mass, in sensor axes."""
+    """(3, 3) inertia of the load about its centre of mass, in sensor axes."""
     delay_s: float
-    """Delay of the wrench after the poses."""
+    """Delay of the wrench relative to the poses, s."""
     height_m: float
-    """Height of the sensor origin above the flange face."""
+    """Height of the sensor origin above the flange face, m."""
     covariance: Array
-    """(23, 23) of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
+    """(23, 23) covariance of the 15 error coordinates, ixx, iyy, izz, ixy, ixz, iyz, height and delay."""
     used_share: float
-    """Share of the recording that counts: the rest was contact, gaps, or too fast where the position is unknown."""
+    """Share of the recording that was used. The rest was contact, gaps, or too fast to use without positions."""
     contacts: tuple[Mapping[str, float], ...] = ()
-    """Each with `t_s` after the first sample, `duration_s`, and the peaks `force_N` and `torque_Nm`, all filtered."""
+    """Contacts: time `t_s` after the first sample, `duration_s`, and filtered peaks `force_N` and `torque_Nm`."""
 
     def __post_init__(self) -> None:
         keep_finite(self, "the motion's ", inertia_kg_m2=(3, 3), covariance=(23, 23))
-        object.__setattr__(self, "contacts", tuple(MappingProxyType(dict(one)) for one in self.contacts))
+        contacts = tuple(MappingProxyType(dict(contact)) for contact in self.contacts)
+        object.__setattr__(self, "contacts", contacts)
 
     @property
     def sigma(self) -> dict[str, Array | float]:
@@ -102,19 +103,19 @@ class MotionResult(Displayed):
         return {"inertia_kg_m2": inertia, "height_m": float(std[6]), "delay_s": float(std[7])}
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return what a calibration file and `--json` have of it."""
+        """Return the fields of a calibration file and of `--json`."""
         return {
             "inertia_kg_m2": self.inertia_kg_m2.tolist(),
             "delay_s": self.delay_s,
             "height_m": self.height_m,
             "used_share": self.used_share,
-            "contacts": [dict(one) for one in self.contacts],
+            "contacts": [dict(contact) for contact in self.contacts],
             "motion_covariance": self.covariance.tolist(),
         }
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self | None:
-        """Build from `to_dict`; None for a calibration at rest."""
+        """Return the motion result in the document of a calibration file; None for a static calibration."""
         if "inertia_kg_m2" not in document:
             return None
         names = ("inertia_kg_m2", "delay_s", "height_m", "motion_covariance", "used_share", "contacts")
@@ -123,7 +124,9 @@ class MotionResult(Displayed):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationResult(Displayed, Calibrated):
-    """Estimates with their covariance; arrays are read-only. Frames and signs: docs/explanation/model.md.
+    """Calibration: estimates with their covariance, provenance and verdict; arrays are read-only.
+
+    Frames and signs are defined in docs/explanation/model.md.
 
     Examples
     --------
@@ -134,65 +137,66 @@ class CalibrationResult(Displayed, Calibrated):
     """
 
     parameters: Parameters
-    """With `drift` its biases are those at the end of the session."""
+    """Estimates; with `drift` the biases are those at the end of the session."""
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
+    """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame: `response` included, drift not, but its
-    mean."""
+    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame. The prediction has `response` and the
+    mean bias, but not its drift."""
     chi2: float
-    """Weighted sum of squared residuals of the used poses, with the measured noise alone, without drift or
-    `components`. If the noise was not measured, with the noise estimated from the residuals."""
+    """Weighted sum of squared residuals of the used poses with the measured noise alone, without drift and
+    `components`; with the noise from the residuals if it was not measured."""
     dof: int
+    """Degrees of freedom of `chi2`."""
     noise_source: NoiseSource
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
     method: Method | Literal["motion"]
     findings: tuple[Finding, ...]
-    """What gives the verdict, the first one to be fixed first; then notes."""
+    """Findings that determine the verdict, in the order in which to fix them, followed by notes."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
     p_value: float | None = None
-    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
+    """Probability of a larger chi2 under the measured noise alone; None if the noise was not measured."""
     measured_sigma: Array | None = None
-    """(6,) measured standard deviation of a pose's mean, root mean square over the poses, N and N·m; None = unknown."""
+    """(6,) measured standard deviation of the mean of a pose, rms over the poses, N and N·m; None = unknown."""
     weights: Array | None = None
     """(n,) 1 = used, 0 = rejected because it does not fit the others. None = all are used."""
     components: Mapping[str, float] = field(default_factory=dict)
     """Standard deviations of the variance components, by name and unit: beyond the measured noise, or all of the noise
     if it was not measured. `walk_…` is the random walk of the bias per mean interval between poses, `slope_…` its
-    linear change over the session, `rotation_rad` the error of each pose's orientation per axis, `gain` and
-    `cross_talk` the size of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
-    share of its last swing by which each axis lags. `load_…`, `cable_…` and `kinematics_rad` are errors that have a
-    structure (`ftcalib.likelihood.structure`). In motion `rotation_rad` and `yielding_rad` are smooth turns of arm and
-    mount, and `slow_…` is noise of seconds."""
+    linear change over the session, `rotation_rad` the orientation error of a pose per axis, `gain` and `cross_talk`
+    the standard deviation of the entries of `response`, relative and relative to a lever of 50 mm, `hysteresis` the
+    share of its last change by which an axis lags. `load_…`, `cable_…` and `kinematics_rad` are structured errors
+    (`ftcalib.likelihood.structure`). In motion `rotation_rad` and `yielding_rad` are smooth rotations of arm and mount,
+    and `slow_…` is slow noise."""
     drift: DriftResult | None = None
-    """None: no drift was found, or `drift="none"`."""
+    """Drift of the bias; None if no drift was found, or if `drift="none"`."""
     mean_bias: Array | None = None
-    """(6,) mean of the bias over the session, N and N·m; None: no drift, or the mean is in `parameters`, as in files of
-    an earlier format."""
+    """(6,) mean of the bias over the session, N and N·m; None without drift, or if `parameters` has the mean bias, as
+    in files of an earlier format."""
     response: Response | None = None
-    """Gain and cross-talk of the sensor; None: none were found, or the method does not estimate them."""
+    """Gain and cross-talk of the sensor; None if not found, or if the method does not estimate them."""
     gain_sigma: float = 0.0
-    """Standard deviation of the entries of the gain, if one was found."""
+    """Standard deviation of the entries of the gain, if a gain was found."""
     hidden_covariance: Array = field(default_factory=lambda: np.zeros((15, 15)))
-    """(15, 15) of the estimates, from errors of arm and mounts that the poses do not show."""
+    """(15, 15) covariance of the estimates due to errors of arm and mounts that the poses do not show."""
     cable_shift: Array | None = None
-    """(15,) by which a cable that acts as a spring may have moved the estimates, in the coordinates of `covariance`;
-    None: the readings show none."""
+    """(15,) possible shift of the estimates by a cable that acts like a spring, in the coordinates of `covariance`;
+    None if the readings show no cable."""
     second_basin_chi2: float | None = None
-    """Increase of chi2 at the second best solution, under the noise model; None: there is no other."""
+    """Increase of chi2 at the second best solution, under the noise model; None if there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
-    """Statistics behind the verdict: `loo_force_rms_N` and `loo_torque_rms_Nm` (each pose predicted from all others),
-    `next_use_force_rms_N` and `next_use_torque_rms_Nm`, the same for `workspace` and, where the tour shows a drift,
-    `hour` (`likely_error`), `bias_growth_per_min` (6; change of the bias in the minute after the last pose),
+    """Statistics behind the verdict: leave-one-out errors `loo_force_rms_N` and `loo_torque_rms_Nm`, errors
+    `next_use_force_rms_N` and `next_use_torque_rms_Nm`, the same for `workspace` and, if the tour shows a drift, for
+    `hour` (see `likely_error`), `bias_growth_per_min` (6; change of the bias in the minute after the last pose),
     `worst_pose` (row from 1), `residual_sigma` (n; 1 expected), `lag1` (correlation of successive residuals),
     `correlations` (pairs of parameters above 0.9)."""
     sensor: SensorMatrix | None = None
-    """What is known of the sensor's own matrix, from loads or a data sheet; None: its usual errors are assumed."""
+    """Errors of the sensor's matrix, from known loads or a data sheet; None: usual errors are assumed."""
     weighed_kg: tuple[float, float] | None = None
-    """Mass of the tool by a scale, and one sigma, which show the gain common to all axes; None: it was not weighed."""
+    """Weighed mass of the tool and its sigma, kg, which determine the gain common to all axes; None: not weighed."""
     motion: MotionResult | None = None
-    """What a recording in motion gives, whose rows count as poses; None = from poses at rest."""
+    """Additional results of a recording in motion; None for a calibration from static poses."""
 
     def __post_init__(self) -> None:
         for each in fields(Parameters):
@@ -224,15 +228,15 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def id(self) -> str:
-        """Name of the result: 12 hex digits of the SHA-256 of all that the reading of a free tool depends on.
+        """Identifier of the result: 12 hex digits of the SHA-256 of the values that determine the compensation.
 
-        Two files with the same id subtract alike, whatever their provenance. The matrix of the sensor, which turns what
-        is left into a contact, is not part of it: all tools share it.
+        Two files with the same id compensate equally, whatever their provenance. The matrix of the sensor, which
+        decodes contacts, is not part of the id, because all tools share it.
         """
         return self._id(self.response and self.response.to_dict())
 
     def _id(self, response: JSON) -> str:
-        """Return the id with these numbers of `response`, whose sigmas another computer may round otherwise."""
+        """Return the id for given numbers of `response`, whose sigmas may be rounded differently on other computers."""
         numbers = [getattr(self.parameters, each.name).tolist() for each in fields(Parameters)]
         numbers += [self.covariance.tolist(), self.gain_sigma, self.g_m_s2]
         if response is not None:
@@ -243,7 +247,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def is_edited(self) -> bool:
-        """Whether its file was edited after it was solved, and accepted nevertheless."""
+        """Whether the file of the result was edited after solving and was accepted nevertheless."""
         return bool(self.provenance.get("edited"))
 
     @property
@@ -253,8 +257,8 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def reasons(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.words for one in self.findings)
+        """Sentences of the findings."""
+        return tuple(finding.words for finding in self.findings)
 
     @property
     def n_poses(self) -> int:
@@ -278,22 +282,22 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def R_flange_sensor(self) -> Array:
-        """(3, 3) maps sensor coordinates to flange coordinates."""
+        """(3, 3) mounting of the sensor: maps sensor coordinates to flange coordinates."""
         return self.parameters.R_flange_sensor
 
     @property
     def gravity_force_base_N(self) -> Array:
-        """(3,) weight of the load on the sensor, in base."""
+        """(3,) weight of the load on the sensor, in base axes."""
         return self.parameters.gravity_force_base_N
 
     @property
     def force_bias_N(self) -> Array:
-        """(3,) in the sensor frame."""
+        """(3,) force bias in the sensor frame."""
         return self.parameters.force_bias_N
 
     @property
     def torque_bias_Nm(self) -> Array:
-        """(3,) in the sensor frame, about its origin."""
+        """(3,) torque bias in the sensor frame, about the sensor origin."""
         return self.parameters.torque_bias_Nm
 
     @property
@@ -303,37 +307,37 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def weight_N(self) -> float:
-        """Weight of the load on the sensor."""
+        """Weight of the load on the sensor, N."""
         return self.parameters.weight_N
 
     @property
     def mass_kg(self) -> float:
-        """Weight divided by `g_m_s2`."""
+        """Mass of the load on the sensor, kg: weight divided by `g_m_s2`."""
         return self.weight_N / self.g_m_s2
 
     @property
     def tilt_alpha_rad(self) -> float:
-        """First tilt angle of the base, see `ftcalib.model.weight_and_tilt`."""
+        """First tilt angle of the base, rad, see `ftcalib.model.weight_and_tilt`."""
         return weight_and_tilt(self.gravity_force_base_N)[1]
 
     @property
     def tilt_beta_rad(self) -> float:
-        """Second tilt angle of the base."""
+        """Second tilt angle of the base, rad, see `ftcalib.model.weight_and_tilt`."""
         return weight_and_tilt(self.gravity_force_base_N)[2]
 
     @property
     def tool_covariance(self) -> Array:
-        """(15, 15) of mounting, weight and centre of mass of the tool itself, in the coordinates of `covariance`.
+        """(15, 15) covariance of the true mounting, weight and centre of mass, in the coordinates of `covariance`.
 
-        It includes what errors of arm, mounts and sensor, and a cable, can hide in them. `covariance` does not, because
-        compensation needs only the sum.
+        It includes errors of arm, mounts, sensor and a cable that the session cannot separate from these parameters.
+        `covariance` does not include them, because they cancel in the compensation.
         """
         hidden = self.contact.hidden_covariance + self.hidden_covariance
         lag, weight = self.components.get("hysteresis", 0.0), self.gravity_force_base_N
         hidden[3:6, 3:6] += lag**2 * np.outer(weight, weight)
         if self.cable_shift is not None:
             hidden += np.outer(self.cable_shift, self.cable_shift)
-        # Nothing hides in a value that was given exactly, such as the mass: the covariance has none along it.
+        # Exactly known values, such as a mass, have no hidden errors; `covariance` is zero along them.
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         scale[scale < 1e-12] = 1.0
         value, vector = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -344,9 +348,9 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def sigma(self) -> Mapping[str, Array | float]:
-        """One standard deviation of every quantity, by its name; `R_flange_sensor`: (3,) rad about the flange axes.
+        """Standard deviation of every quantity by its name, from `tool_covariance`.
 
-        They are those of `tool_covariance`.
+        That of `R_flange_sensor` is (3,) in rad about the flange axes.
         """
         covariance = self.tool_covariance
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -362,7 +366,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the scale of the sensor, at the tool, which no orientation shows."""
+        """Relative standard deviation of the sensor's scale for the tool, which no orientation shows."""
         return float(np.hypot(self.contact.scale_sigma, self.components.get("hysteresis", 0.0)))
 
     def compensate(self, wrench: ArrayLike, R_base_flange: Rotations, *, response: bool = True) -> Array:
@@ -374,8 +378,8 @@ class CalibrationResult(Displayed, Calibrated):
             As measured, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
         response : bool
-            Whether to apply gain and cross-talk of the sensor to the weight. False gives the result of a program that
-            knows only mounting, weight, centre of mass and bias.
+            Whether to apply gain and cross-talk of the sensor to the weight. False: the result of a program that uses
+            only mounting, weight, centre of mass and bias.
 
         Returns
         -------
@@ -387,34 +391,34 @@ class CalibrationResult(Displayed, Calibrated):
 
     @cached_property
     def contact(self) -> ContactResponse:
-        """How the sensor reads a contact: its decoder, and the errors that remain of it."""
+        """Response of the sensor to a contact: the decoder and its remaining errors."""
         sensor = self.sensor or SensorMatrix.usual()
-        # The fit of the loads has the rotation of a run of its own, with its correlation.
+        # If this dataset is one of the runs with loads, their fit already contains the error of the rotation.
         is_of_loads = self.provenance.get("dataset_sha256") in (sensor.provenance.get("datasets") or ())
         rotation = None if is_of_loads else self.covariance[:3, :3]
         return sensor.contact_response(self.parameters, self.shown_response, rotation, self._excess(sensor))
 
     @property
     def known_contact(self) -> ContactResponse | None:
-        """How the sensor reads a contact if known loads have shown it; None else."""
+        """Response of the sensor to a contact, if it was determined with known loads; otherwise None."""
         return self.contact if self.sensor is not None and self.sensor.source == "loads" else None
 
     def _excess(self, sensor: SensorMatrix) -> tuple[float, float] | None:
-        """Return by how much more the tool weighs as read than by a scale, relative, and one sigma."""
+        """Return the relative excess of the measured over the weighed mass of the tool, and its sigma."""
         if self.weighed_kg is None:
             return None
         mass_kg, sigma_kg = self.weighed_kg
         noise_kg = self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
         excess, sigma = self.mass_kg / mass_kg - 1, float(np.hypot(sigma_kg, noise_kg)) / mass_kg
-        # Beyond that it is another tool, or a unit, and no gain: the verdict names it.
+        # A larger excess is no gain error, but another tool or a wrong unit, which the verdict reports.
         return (excess, sigma) if abs(excess) <= _CONTRADICTS * np.hypot(sensor.sigma[0, 0], sigma) else None
 
     @property
     def shown_response(self) -> Response:
-        """Gain and cross-talk as found, or zero with the covariance that the fit leaves of the usual ones.
+        """Gain and cross-talk as estimated; if not found, zero with the posterior covariance of usual errors.
 
-        A fit of n poses shows a gain as well as n readings of the weight do, with the error of predicting one from the
-        others. Half of that counts: a small one is not found.
+        A fit of n poses determines a gain as well as n readings of the weight with the leave-one-out error. Half of
+        this information is used, because a small gain is not selected.
         """
         if self.response is not None:
             return self.response
@@ -429,18 +433,18 @@ class CalibrationResult(Displayed, Calibrated):
         return Response(np.zeros(SIZE), covariance)
 
     def contact_sigma(self, wrench: ArrayLike, R_base_flange: Rotations) -> Array:
-        """Return one standard deviation of each axis of a contact: what the free tool leaves, and its own errors.
+        """Return one standard deviation of each axis of a contact wrench: errors of the free tool and of the contact.
 
         Parameters
         ----------
         wrench : array, shape (6,) or (n, 6)
-            The contact as `compensate` gives it, N and N·m, in the sensor frame.
+            Contact wrench from `compensate`, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
 
         Returns
         -------
         array, same shape as `wrench`
-            Without the noise of a sample.
+            Standard deviations, without the noise of a sample.
         """
         contact, R = np.asarray(wrench, dtype=np.float64), matrices_of(R_base_flange)
         excess = np.square(self.likely_error()) - np.square(self.predicted_error())
@@ -450,28 +454,28 @@ class CalibrationResult(Displayed, Calibrated):
 
     @cached_property
     def compensator(self) -> Compensator:
-        """The fast form of `compensate`: one sample, into a buffer, or a recording."""
+        """Compensator for fast loops: single samples, samples into a buffer, or recordings."""
         return Compensator(self.parameters, response=self.response, decoder=self.contact.decoder)
 
     @property
     def noise_explains(self) -> bool:
         """Whether the residuals agree with the noise model.
 
-        True for an update, whose poses are too few for a test. In motion each state has the noise of its residuals, and
-        smooth errors have their part of the next use: they explain the rows if they add no more to it than sigma has.
+        True for an update, which has too few poses for a test. In motion, it is true if smooth errors do not make the
+        error at the next use larger than the error predicted from the covariance.
         """
         if self.motion is not None:
             return bool((self.likely_error() <= np.array(self.predicted_error())).all())
         return not self.quality or (self.p_value is not None and self.p_value >= SURE)
 
     def likely_error(self, where: Literal["next_use", "workspace", "hour"] = "next_use") -> Array:
-        """Root mean square error (2,) of compensating a free tool at the next use, N and N·m.
+        """Return the rms error (2,) of compensating a free tool at the next use, N and N·m.
 
-        It is `predicted_error` where the measured noise explains the residuals. Elsewhere it is the error in predicting
-        each pose from all others, so it holds for orientations like those of the tour. In both it has the drift of the
-        bias in the minute after the last pose. In motion it is that of load and smooth errors, at rest in the
-        orientations of the recording. In the "workspace" it is that in any orientation, and after an "hour" that with
-        the drift until then: NaN where the tour shows none.
+        If the measured noise explains the residuals, it is `predicted_error`. Otherwise it is the leave-one-out error,
+        which applies to orientations like those of the tour. In both cases the drift of the bias in the minute after
+        the last pose is added. For a recording in motion it is the error of load and smooth errors at rest in the
+        recorded orientations. "workspace" is the error over all orientations, and "hour" the error with the drift of
+        one hour, NaN if the tour shows no drift.
         """
         if not self.quality:
             return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)
@@ -483,7 +487,7 @@ class CalibrationResult(Displayed, Calibrated):
         return np.array([self.quality[f"{names[0]}_{unit}"] for unit in units], dtype=np.float64)
 
     def residual_summary(self) -> dict[str, float]:
-        """Root mean square and largest norm of the force and torque residuals over the poses."""
+        """Return rms and largest norm of the force and torque residuals over the poses."""
         force, torque = np.linalg.norm(self.residuals[:, :3], axis=1), np.linalg.norm(self.residuals[:, 3:], axis=1)
         return {
             "force_rms_N": float(np.sqrt(np.mean(force**2))),
@@ -502,19 +506,19 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def estimates(self) -> list[ShownEstimate]:
-        """Each quantity with its sigma, in the order in which it is shown."""
+        """Estimated quantities with their sigmas, in the order of display."""
         sigma = self.sigma
         values = {key: getattr(self if hasattr(self, key) else self.motion, key) for key in sigma}
         return shown_estimates({**values, "sigma": sigma, "covariance": self.covariance})
 
     def to_frame(self) -> Any:
-        """Return the estimates as a DataFrame of pandas, else of Polars.
+        """Return the estimates as a DataFrame of pandas, or of Polars if pandas is not installed.
 
         Returns
         -------
         DataFrame
-            A row for each number: `name`, such as ``p_sensor_com_m.x``, `value`, `sigma` and `unit`, SI. The mounting
-            `R_flange_sensor` is its rotation vector. Sigma is 0 for what was known.
+            One row per number: `name`, such as ``p_sensor_com_m.x``, `value`, `sigma` and `unit` in SI. The mounting
+            `R_flange_sensor` is given as its rotation vector. Sigma is 0 for exactly known values.
 
         Raises
         ------
@@ -523,19 +527,19 @@ class CalibrationResult(Displayed, Calibrated):
         """
         rows = [
             (f"{key}.{axis}" if axis else key, float(value), float(sigma), _SI[key.rpartition("_")[2]])
-            for one in self.estimates
-            for key, sigmas in [(one.key, np.where(one.is_known, 0.0, one.sigma))]
-            for axis, value, sigma in zip(one.axes, one.values, sigmas, strict=True)
+            for estimate in self.estimates
+            for key, sigmas in [(estimate.key, np.where(estimate.is_known, 0.0, estimate.sigma))]
+            for axis, value, sigma in zip(estimate.axes, estimate.values, sigmas, strict=True)
         ]
         return data_frame(dict(zip(("name", "value", "sigma", "unit"), zip(*rows, strict=True), strict=True)))
 
     def plot(self) -> Any:
-        """Draw what the fit leaves of each pose, or row of a recording in motion: measured minus predicted.
+        """Return a plot of the residuals, measured minus predicted, of each pose or row of a recording in motion.
 
         Returns
         -------
         matplotlib.figure.Figure
-            Forces above torques, in sensor axes. The band is one sigma of the measured noise, where it is known.
+            Forces above torques, in sensor axes. The band is one sigma of the measured noise, if known.
 
         Raises
         ------
@@ -561,13 +565,13 @@ class CalibrationResult(Displayed, Calibrated):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any], *, accept_edited: bool = False) -> Self:
-        """Build from the content of a calibration file; unknown fields are ignored.
+        """Return the result from the document of a calibration file; unknown fields are ignored.
 
         Parameters
         ----------
         document : mapping
         accept_edited : bool
-            Accept content that its checksum, its id or its verdict does not fit; the result is then `is_edited`.
+            Whether to accept a document that does not match its checksum, id or verdict; `is_edited` is then true.
 
         Raises
         ------
@@ -589,7 +593,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @classmethod
     def load(cls, path: str | Path, *, accept_edited: bool = False) -> Self:
-        """Read a calibration file, as `from_dict`. Raises `BadCalibration` or `OSError`."""
+        """Return the result in a calibration file, see `from_dict`. Raises `BadCalibration` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadCalibration, accept_changed=True), accept_edited=accept_edited)
         except BadCalibration as exc:
@@ -597,7 +601,7 @@ class CalibrationResult(Displayed, Calibrated):
 
 
 def require_positive_definite(covariance: Array) -> None:
-    """Raise `ValueError` for a covariance with a negative eigenvalue; exactly known values have none."""
+    """Raise `ValueError` for a covariance with a negative eigenvalue; zero rows of exactly known values are ignored."""
     sigma = np.sqrt(np.abs(np.diag(covariance)))
     free = sigma > 0
     correlations = covariance[np.ix_(free, free)] / np.outer(sigma[free], sigma[free])
@@ -607,9 +611,9 @@ def require_positive_definite(covariance: Array) -> None:
 
 
 def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]:
-    """Propagate the covariance of the gravity force to weight (N), alpha and beta (rad).
+    """Return the standard deviations of weight (N), alpha and beta (rad) from the covariance of the gravity force.
 
-    Sigma of an angle is limited to pi, where the linear formula loses its meaning.
+    The sigma of an angle is limited to pi, where the linear propagation is no longer valid.
     """
     weight, _, _ = weight_and_tilt(F_b)
     if weight == 0.0:
@@ -619,7 +623,7 @@ def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]
     out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
     gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
     variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
-    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # below 0 only by rounding, if exactly known
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # rounding may make it negative
     along_beta = np.array([z, 0.0, -x])
     beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
     return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

@@ -1,25 +1,25 @@
-"""The matrix of a sensor: what of its errors a tool shows, and what they do to a contact.
+"""Errors of a sensor's matrix: which of them a tool shows, and how they affect the reading of a contact.
 
     reading = (I + E) wrench + bias        in the sensor frame, about its origin
 
-A tool shows in all orientations what E does to forces at its centre of mass: a gain of the force, and cross-talk from
-force to torque,
+In all orientations, a tool shows the effect of E on forces at its centre of mass: a gain of the force, and cross-talk
+from force to torque,
 
     force_N = (1 + force_gain) u + force_bias_N        torque_Nm = p x u + cross_talk_m u + torque_bias_Nm
 
-with u the weight in the sensor frame. Both matrices are symmetric, and the gain has no trace: together with mounting,
+with u the weight in the sensor frame. Both matrices are symmetric, and the gain has trace zero: together with mounting,
 weight and centre of mass they describe every linear response to one payload. A gain common to all axes cannot be
-separated from the weight. These are eleven of the 36 numbers (`Response`). Of the others three are a rotation d of the
-sensor and three a shift of the centre of mass, which the calibration of the tool has in its estimates. A contact in the
-axes of that calibration is read as M times the contact, with
+separated from the weight. Gain and cross-talk are eleven of the 36 numbers (`Response`). Three others are a rotation d
+of the sensor, and three a shift of the centre of mass; both are part of the tool's estimates. In the axes of the
+calibration, the reading of a contact is M times the contact, with
 
     M = I + E - blk([d]x, [d]x)        d: half the antisymmetric part of E_FF + E_FT [p]x, p the centre of mass
 
-so its decoded error is linear in the error of E. What no load has shown of E keeps its prior. A tool that was weighed
-shows one number more: the gain common to all axes at its centre of mass.
+so the error of the decoded contact is linear in the error of E. Entries of E that no load has shown keep their prior. A
+weighed tool shows one more number: the gain common to all axes at its centre of mass.
 
-The errors of E and of the mounting belong together. A calibration on its own has a noise of its own, beside the d of
-the present E. If its poses are among those of the loads, the fit of all has both with their correlation.
+The errors of E and of the mounting are correlated. The mounting of a separate calibration has its own noise and the d
+of the present E. If its poses are among those of the runs with loads, the joint fit contains the correlation.
 """
 
 from collections.abc import Mapping
@@ -48,12 +48,12 @@ from ftcalib.model import (
 
 FORMAT = "ftdrive.sensor/1"
 
-# Errors that are not linear, relative to the load: the certificates of six sensors have .08 to .28 % of range.
+# Nonlinear errors, relative to the load: the certificates of six sensors state 0.08 to 0.28 % of range.
 FLOOR: Final = 0.0025
 # Degrees of freedom of the prior on the size of the errors.
 _USUAL_COUNTS = 2.0
 
-# Plausible in a file: errors of the entries and their sigma relative to the ranges, the lever in m, the floor.
+# Limits of plausible values in a file: errors of the entries and their sigma relative to the ranges, lever, floor.
 _LARGEST_ERROR, _LARGEST_SIGMA, _LEVERS_M, _LARGEST_FLOOR = 0.5, 0.5, (1e-3, 10.0), 0.5
 
 _DIAGONAL = np.arange(0, 36, 7)
@@ -68,25 +68,25 @@ def _symmetric(i: int, j: int) -> Array:
 
 
 _MIXED = [_symmetric(i, j) for i, j in ((0, 1), (0, 2), (1, 2))]
-# (5, 3, 3) basis of the gain: equal and independent coefficients make the entries so.
+# (5, 3, 3) basis of the gain: independent coefficients of equal variance give independent entries of equal variance.
 GAIN = np.array([np.diag([1.0, -1, 0]) / np.sqrt(2), np.diag([1.0, 1, -2]) / np.sqrt(6), *_MIXED])
-# (6, 3, 3) basis of the cross-talk, m: it counts relative to a force at this lever.
+# (6, 3, 3) basis of the cross-talk, m; its coefficients are relative to a force at the lever `RANGE_LEVER_M`.
 CROSS_TALK_M = RANGE_LEVER_M * np.array([*(_symmetric(i, i) for i in range(3)), *_MIXED])
 SIZE = len(GAIN) + len(CROSS_TALK_M)
-# One sigma of each coefficient of a mounted or aged sensor before its fit.
+# Prior standard deviation of each coefficient, for a mounted or aged sensor.
 USUAL = USUAL_GAIN * np.array([1.0, 1.0, *[CROSS_TALK_SHARE] * 9])
-# Sum of the squares of the entries of each basis; of the cross-talk relative to the lever.
+# Sum of the squared entries of each basis matrix, those of the cross-talk relative to the lever.
 SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 
-# Weights of the squared coefficients whose sum is the variance of one entry, if all nine are independent: the symmetric
-# part of two entries has half their variance.
+# Weights with which the squared coefficients add up to the variance of one entry, if all nine entries are independent.
+# The symmetric part of two entries has half their variance.
 _WEIGHTS = np.array([1, 1, 2, 2, 2]) / 5
-# Least sigma of the gain common to all axes: no orientation shows it, and no sensor is better.
+# Smallest sigma of the gain common to all axes, which no orientation shows.
 LEAST_COMMON_GAIN = 0.002
 
 
 def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Give the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
+    """Return the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
     u = gravity_wrench(parameters, R_base_flange)[..., :3]
     T = np.zeros((*u.shape[:-1], 6, SIZE))
     T[..., :3, :5] = np.einsum("kij,...j->...ik", GAIN, u)
@@ -95,36 +95,36 @@ def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
 
 
 def sensor_columns(parameters: Parameters, R_base_flange: Array) -> dict[str, Array]:
-    """Give these derivatives by what they are of."""
+    """Return the derivatives of the wrench by the coefficients of "gain" (..., 6, 5) and "cross_talk" (..., 6, 6)."""
     columns = response_columns(parameters, R_base_flange)
     return {"gain": columns[..., : len(GAIN)], "cross_talk": columns[..., len(GAIN) :]}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Gain and cross-talk as estimated; what was not looked for, or not found, is zero. Arrays are read-only."""
+    """Estimated gain and cross-talk of a sensor; components that were not found are zero. Arrays are read-only."""
 
     coefficients: Array
-    """(11,) of the bases `GAIN` and `CROSS_TALK_M`."""
+    """(11,) coefficients of the bases `GAIN` and `CROSS_TALK_M`."""
     covariance: Array
-    """(26, 26) of the 15 error coordinates of the parameters and of the coefficients."""
+    """(26, 26) covariance of the 15 error coordinates of the parameters and of the coefficients."""
 
     def __post_init__(self) -> None:
         keep_finite(self, "the response's ", coefficients=(SIZE,), covariance=(15 + SIZE, 15 + SIZE))
 
     @property
     def force_gain(self) -> Array:
-        """(3, 3) symmetric, without trace: read minus true force, over the true force."""
+        """(3, 3) symmetric gain error with trace zero: (measured - true force) / true force."""
         return np.asarray(np.tensordot(self.coefficients[:5], GAIN, 1))
 
     @property
     def cross_talk_m(self) -> Array:
-        """(3, 3) symmetric: torque read for a force, N·m/N."""
+        """(3, 3) symmetric cross-talk: measured torque per force, N·m/N."""
         return np.asarray(np.tensordot(self.coefficients[5:], CROSS_TALK_M, 1))
 
     @property
     def sigma(self) -> dict[str, Array]:
-        """One standard deviation (3, 3) of each entry of both matrices, by their names."""
+        """(3, 3) standard deviations of the entries of `force_gain` and `cross_talk_m`, by name."""
         C = self.covariance[15:, 15:]
         return {
             name: np.sqrt(np.maximum(np.einsum("kij,kl,lij->ij", basis, C[own, own], basis), 0.0))
@@ -133,15 +133,15 @@ class Response:
 
     @property
     def gain_sigma(self) -> float:
-        """Standard deviation of the entries of the whole gain, of which the symmetric part without trace shows."""
+        """Standard deviation of the entries of the full gain matrix, inferred from its symmetric traceless part."""
         return float(np.sqrt(_WEIGHTS @ (self.coefficients**2 + np.diag(self.covariance)[15:])[:5]))
 
     def wrench(self, parameters: Parameters, R_base_flange: Array) -> Array:
-        """Give what gain and cross-talk add (..., 6) to the wrench of the weight."""
+        """Return the contribution (..., 6) of gain and cross-talk to the wrench of the weight."""
         return np.asarray(response_columns(parameters, R_base_flange) @ self.coefficients)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Give what a calibration file holds of it; reading takes `coefficients` and `covariance`."""
+        """Return the object in a calibration file; only `coefficients` and `covariance` are read back."""
         return {
             "force_gain": self.force_gain.tolist(),
             "cross_talk_m": self.cross_talk_m.tolist(),
@@ -152,47 +152,47 @@ class Response:
 
 
 def shown_gain(response: Response | None) -> Array:
-    """(6, 3) force and torque read beyond the true ones for a force at the centre of mass; 0 where none were found."""
+    """Return the errors (6, 3) of force and torque per force at the centre of mass; zero without a response."""
     return np.zeros((6, 3)) if response is None else np.concatenate([response.force_gain, response.cross_talk_m])
 
 
 class Calibrated:
-    """A fit, a calibration, or an update of it: estimates of tool and sensor, and the covariance of their errors.
+    """Estimates of tool and sensor with covariance: a fit, a calibration, or an update of a calibration.
 
-    The errors are the 15 coordinates `PARAMETER_NAMES` and, where a response was found, its 11 coefficients.
+    The error coordinates are the 15 of `PARAMETER_NAMES` and, if a response was found, its 11 coefficients.
     """
 
     parameters: Parameters
     covariance: Array
-    """(15, 15) of the parameters alone."""
+    """(15, 15) covariance of the parameters alone."""
     response: Response | None
-    """Gain and cross-talk of the sensor; None where none were found."""
+    """Gain and cross-talk of the sensor; None if not found."""
 
     def __init__(self, parameters: Parameters, covariance: Array, response: Response | None = None) -> None:
         self.parameters, self.covariance, self.response = parameters, covariance, response
 
     @property
     def joint_covariance(self) -> Array:
-        """(15, 15) of the parameters, or (26, 26) with gain and cross-talk where they were found."""
+        """(15, 15) covariance of the parameters, or (26, 26) with gain and cross-talk if they were found."""
         return self.covariance if self.response is None else self.response.covariance
 
     @property
     def shown_response(self) -> Response | None:
-        """Gain and cross-talk as found; of a calibration without them zero, with what the fit leaves of the prior."""
+        """Gain and cross-talk as found; in a calibration without them zero, with their posterior covariance."""
         return self.response
 
     def with_joint(self, covariance: Array) -> Response | None:
-        """Keep gain and cross-talk, if there are any, with another joint covariance."""
+        """Return gain and cross-talk, if there are any, with another joint covariance."""
         return None if self.response is None else Response(self.response.coefficients, covariance)
 
     def jacobian(self, R_base_flange: Array, parameters: Parameters | None = None) -> Array:
-        """Derivative (..., 6, 15 or 26) of the wrench by what `joint_covariance` has, at these or other parameters."""
+        """Return the derivative (..., 6, 15 or 26) of the wrench by the coordinates of `joint_covariance`."""
         p = self.parameters if parameters is None else parameters
         J = jacobian(p, R_base_flange)
         return J if self.response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=-1)
 
     def wrench_covariance(self, R_base_flange: Array) -> Array:
-        """Covariance of the predicted wrench due to the uncertainty of the estimates.
+        """Return the covariance of the predicted wrench due to the uncertainty of the estimates.
 
         Parameters
         ----------
@@ -206,39 +206,40 @@ class Calibrated:
         return np.asarray(J @ self.joint_covariance @ np.swapaxes(J, -1, -2))
 
     def predicted_error(self) -> tuple[float, float]:
-        """Root mean square error of the predicted wrench over all orientations, N and N·m, from noise alone.
+        """Return the rms error of the predicted wrench over all orientations, N and N·m, from noise alone.
 
-        It is of second degree in the orientation, so its mean over the rotations of the cube is the mean over all.
+        The mean square error is quadratic in the orientation matrix, so its mean over the rotations of the cube equals
+        the mean over all rotations.
         """
         over = self.wrench_covariance(np.swapaxes(SPECIAL_R_flange_base, 1, 2))
         variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
         return float(np.sqrt(variance[:3].sum())), float(np.sqrt(variance[3:].sum()))
 
 
-# What of the gain depends on the load.
+# Part of the gain that depends on the load, one standard deviation.
 LOAD: Final = 0.005
 
 
 def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_base_flange: Array) -> Array:
-    """Give what errors of the sensor do to the reading of a load, for one sigma of each, beyond those of the tool.
+    """Return the effects of sensor errors on the reading of a load that the calibration of the tool does not show.
 
-    The response to the tool is that to any load at its centre of mass. A load at another has a torque beside, to which
-    the sensor responds by errors of its own, as large as those that the tool shows.
+    The response to the tool applies to any load at its centre of mass. A load at another point has an additional
+    torque, with unknown errors as large as those that the tool shows.
 
     Parameters
     ----------
     tool : Parameters
-        Of the calibration.
+        Parameters of the calibrated tool.
     known : Response
-        Gain and cross-talk of the tool, as found or with the covariance that the fit leaves of the prior.
+        Gain and cross-talk of the tool, as found, or zero with their posterior covariance.
     p : Parameters
-        Of the load.
+        Parameters of the load.
     R_base_flange : array, shape (n, 3, 3)
 
     Returns
     -------
     array, shape (n, 6, 38)
-        Independent columns, the errors of `known` not among them.
+        One column per independent error, for one standard deviation, without the errors of `known`.
     """
     square = known.coefficients**2 + np.diag(known.covariance)[15:]
     in_force, in_torque = (float(np.sqrt(np.mean(part))) for part in np.split(square / USUAL**2, [5]))
@@ -248,31 +249,31 @@ def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_bas
     columns[:, :3, :9] = _products(np.eye(3), u @ lever.T, np.full((3, 3), in_force * entries[0, 1] / RANGE_LEVER_M))
     columns[:, 3:, 9:18] = _products(np.eye(3), u @ lever.T, in_torque * entries)
     columns[:, 3:, 18:] = _products(lever, u, in_force * entries)
-    # A gain of one load is that of another but for what depends on the load.
+    # The gain for another load differs only by its part that depends on the load.
     other = min(abs(p.weight_N / tool.weight_N - 1), 1.0) if tool.weight_N else 1.0
     loads = response_columns(p, R_base_flange) * np.minimum(np.sqrt(square), LOAD) * other
     return np.concatenate([columns, loads], axis=2)
 
 
 def _products(A: Array, v: Array, sigma: Array) -> Array:
-    """Derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
+    """Return the derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
     return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
 
 
 _ENTRIES = np.eye(36).reshape(36, 6, 6)
-"""Derivative of an error (6, 6) of the matrix by its entries, row by row."""
+"""(36, 6, 6) derivative of the error matrix E by its entries, row by row."""
 
 
 def ranges(lever_m: float) -> Array:
-    """Return the ranges (6,) of the axes relative to that of a force, for a range of torque of `lever_m` times it."""
+    """Return the measuring ranges (6,) relative to the force range; `lever_m` is torque range over force range."""
     return np.repeat([1.0, lever_m], 3)
 
 
 def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
-    """Return the variances (36,) of the entries of a usual sensor's error, without what all axes have in common.
+    """Return the variances (36,) of the entries of E of a usual sensor, without the gain common to all axes.
 
-    `gain_sigma` is one standard deviation of the entries of the diagonal, the common part included, and `lever_m` the
-    range of torque over that of force.
+    `gain_sigma` is the standard deviation of the diagonal entries, including the common part, and `lever_m` the ratio
+    of torque range to force range.
     """
     F = ranges(lever_m)
     share = np.where(np.eye(6) > 0, np.sqrt(1 - COMMON_SHARE), CROSS_TALK_SHARE)
@@ -280,7 +281,7 @@ def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
 
 
 def _gain_at(E: Array, p: Array) -> tuple[Array, Array]:
-    """Return force and torque (..., 3, 3) that E reads for a force at p, beyond the true ones."""
+    """Return the errors of force and torque (..., 3, 3) that E causes per force at p."""
     P = skew(p)
     return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
 
@@ -292,12 +293,12 @@ def vector_of(M: Array) -> Array:
 
 
 def _mounting_turn(E: Array, p: Array) -> Array:
-    """Return the rotation vector (..., 3) that the calibration of a tool at p has for E, sensor axes."""
+    """Return the rotation vector (..., 3), sensor axes, by which E changes the estimated mounting of a tool at p."""
     return vector_of(_gain_at(E, p)[0])
 
 
 def shown_by(p: Array) -> Array:
-    """Return the derivative (11, 36) of gain and cross-talk of a tool at p by the entries of E."""
+    """Return the derivative (11, 36) of the gain and cross-talk seen with a tool at p, by the entries of E."""
     force, torque = _gain_at(_ENTRIES, p)
     torque = torque - skew(p) @ skew(_mounting_turn(_ENTRIES, p))
     parts = [
@@ -309,7 +310,7 @@ def shown_by(p: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SensorMatrix(Displayed):
-    """Errors of a sensor's matrix before a tool shows some of them; arrays are read-only.
+    """Prior knowledge of the errors of a sensor's matrix; arrays are read-only.
 
     Examples
     --------
@@ -320,16 +321,16 @@ class SensorMatrix(Displayed):
     """
 
     error: Array
-    """(6, 6) E in the sensor frame, N and N·m."""
+    """(6, 6) error matrix E in the sensor frame, N and N·m."""
     covariance: Array
-    """(39, 39) of a rotation of the sensor (3, rad, flange axes) and of the entries of E, row by row."""
+    """(39, 39) covariance of a rotation of the sensor (3, rad, flange axes) and of the entries of E, row by row."""
     source: Source = "assumed"
     lever_m: float = RANGE_LEVER_M
-    """Range of torque over range of force."""
+    """Ratio of torque range to force range, m."""
     floor: float = FLOOR
-    """Errors that are not linear, relative to the load in units of the ranges, one sigma."""
+    """Nonlinear errors relative to the load in units of the ranges, one standard deviation."""
     provenance: Mapping[str, JSON] = field(default_factory=dict)
-    """Serial number, sets of loads, date."""
+    """Origin of the matrix, such as serial number, sets of loads and date."""
 
     def __post_init__(self) -> None:
         keep_finite(self, "the sensor's ", error=(6, 6), covariance=(39, 39))
@@ -342,13 +343,13 @@ class SensorMatrix(Displayed):
     def usual(
         cls, gain_sigma: float = USUAL_GAIN, *, lever_m: float = RANGE_LEVER_M, source: Source = "assumed"
     ) -> Self:
-        """Return what is known of a sensor without loads: the size of its errors.
+        """Return the prior of a sensor that was not calibrated with known loads.
 
         Parameters
         ----------
         gain_sigma : float
-            One standard deviation of the entries of the diagonal. Half of that variance is common to all axes, because
-            calibration masses, ageing and temperature act on all of them. The other entries have half of the deviation,
+            Standard deviation of the diagonal entries. Half of the variance is common to all axes, because calibration
+            masses, ageing and temperature affect all of them. The other entries have half of this standard deviation,
             relative to the ranges.
         lever_m : float
         source : {"assumed", "data sheet"}
@@ -359,34 +360,34 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def declared(cls, setup: Setup) -> Self:
-        """Return what a described cell has of its sensor."""
+        """Return the prior of the sensor declared in the description of a cell."""
         source: Source = "assumed" if setup.sensor_accuracy_percent is None else "data sheet"
         return cls.usual(setup.gain_sigma, lever_m=setup.sensor_lever_m, source=source)
 
     @property
     def sigma(self) -> Array:
-        """(6, 6) one standard deviation of the entries of E."""
+        """(6, 6) standard deviations of the entries of E."""
         return np.asarray(np.sqrt(np.diag(self.covariance)[3:]).reshape(6, 6))
 
     @cached_property
     def common(self) -> Array:
-        """(36, 36) part of the covariance of the entries of E that is common to all axes."""
+        """(36, 36) covariance of the entries of E due to the gain common to all axes."""
         shared = np.zeros((36, 36))
         shared[np.ix_(_DIAGONAL, _DIAGONAL)] = self.covariance[3 + _DIAGONAL[0], 3 + _DIAGONAL[1]]
         return shared
 
     def shown_variance(self, p_sensor_com_m: Array) -> Array:
-        """Return the variance (11,) of gain and cross-talk that a tool of this centre of mass shows, beforehand."""
+        """Return the prior variance (11,) of the gain and cross-talk seen with a tool of this centre of mass."""
         H = shown_by(p_sensor_com_m)
         return np.asarray(np.einsum("ai,ij,aj->a", H, self.covariance[3:, 3:] - self.common, H))
 
     def hidden_covariance(self, parameters: Parameters) -> Array:
-        """Covariance (15, 15) of what these errors hide in mounting, weight and centre of mass, before any reading.
+        """Return the prior covariance (15, 15) of mounting, weight and centre of mass due to errors of the sensor.
 
         Parameters
         ----------
         parameters : Parameters
-            Of the expected tool.
+            Parameters of the expected tool.
         """
         return _hidden_covariance(parameters, np.zeros(36), self.covariance[3:, 3:])
 
@@ -397,30 +398,30 @@ class SensorMatrix(Displayed):
         rotation_covariance: Array | None = None,
         excess: tuple[float, float] | None = None,
     ) -> "ContactResponse":
-        """Return how the sensor reads a contact, given what the calibration of a tool shows of its errors.
+        """Return the response of the sensor to a contact, given the errors that the calibration of a tool shows.
 
         Parameters
         ----------
         parameters : Parameters
-            Of the tool.
+            Parameters of the tool.
         shown : Response, optional
-            Gain and cross-talk of the tool, with their covariance. None: the prior remains.
+            Gain and cross-talk of the tool, with their covariance. None: only the prior is used.
         rotation_covariance : array, shape (3, 3), optional
-            Of `R_flange_sensor`, flange axes, rad²: a contact is turned with it. None: exactly known, or after loads
-            that of their fit, because it has the poses of this calibration.
+            Covariance of `R_flange_sensor` about the flange axes, rad², which affects the direction of a contact. None:
+            exactly known or, for a matrix from loads whose fit contains this calibration, the covariance of that fit.
         excess : float and float, optional
-            Relative to its mass by a scale, by how much more the tool weighs as read, and one sigma.
+            Relative excess of the measured over the weighed mass of the tool, and its sigma.
         """
         E, C = np.asarray(self.error), np.asarray(self.covariance[3:, 3:])
         p, R = parameters.p_sensor_com_m, parameters.R_flange_sensor
         if self.source == "loads" and rotation_covariance is None:
             T = block_diag(R.T, np.eye(36))
             return ContactResponse(self, parameters, E, T @ self.covariance @ T.T)
-        # A sensor that is declared perfect has nothing to learn.
+        # For a sensor that is declared perfect nothing is updated.
         if self.source != "loads" and shown is not None and C.any():
             H, coefficients, remaining = shown_by(p), shown.coefficients, shown.covariance[15:, 15:]
-            # Scaled inverse chi-square: the mean of the variance of the differences between the axes. The variance that
-            # is common to all axes keeps its prior.
+            # Posterior mean of the variance of differences between the axes (scaled inverse chi-square). The variance
+            # common to all axes keeps its prior.
             squares = (coefficients**2 + np.diag(remaining)) / self.shown_variance(p)
             size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
             C = size * (C - self.common) + self.common
@@ -436,7 +437,7 @@ class SensorMatrix(Displayed):
         return ContactResponse(self, parameters, E, T @ C @ T.T + block_diag(turned, np.zeros((36, 36))))
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the content of a sensor's file."""
+        """Return the document of a sensor file."""
         return {
             "format": FORMAT,
             "error": self.error.tolist(),
@@ -449,7 +450,7 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`. Raises `BadCalibration`, also for numbers that no sensor has."""
+        """Return the matrix in the document of a sensor file. Raises `BadCalibration`, also for implausible values."""
         check_format(document, FORMAT, BadCalibration)
         names = ("error", "covariance", "source", "lever_m", "floor", "provenance")
         try:
@@ -463,21 +464,21 @@ class SensorMatrix(Displayed):
         return sensor
 
     def _require_plausible(self) -> None:
-        """Raise `ValueError` for errors that no sensor has, and for a covariance that is none."""
+        """Raise `ValueError` for implausible errors or an invalid covariance."""
         if not (_LEVERS_M[0] <= self.lever_m <= _LEVERS_M[1] and self.floor <= _LARGEST_FLOOR):
-            raise ValueError(f"lever_m {self.lever_m:g} and floor {self.floor:g} are those of no sensor")
+            raise ValueError(f"lever_m {self.lever_m:g} and floor {self.floor:g} are implausible")
         relative = ranges(self.lever_m) / ranges(self.lever_m)[:, None]
         C = self.covariance
         variance = np.diag(C)
         least = float(np.linalg.eigvalsh((C + C.T) / 2)[0]) if variance.max() < np.pi**2 * 1e4 else -np.inf
         if (variance < 0).any() or not np.allclose(C, C.T, rtol=1e-6, atol=1e-12) or least < -1e-9 * variance.max():
-            raise ValueError("the covariance is none: it is not symmetric, or a variance is negative or too large")
+            raise ValueError("the covariance is invalid: it is not symmetric, or a variance is negative or too large")
         for name, values, most in (
             ("error", np.abs(self.error) * relative, _LARGEST_ERROR),
             ("sigma", self.sigma * relative, _LARGEST_SIGMA),
         ):
             if (largest := float(values.max())) > most:
-                raise ValueError(f"a {name} of {100 * largest:.3g} % is that of no sensor")
+                raise ValueError(f"{name} has an entry of {100 * largest:.3g} %, which is implausible")
 
     def save(self, path: str | Path) -> None:
         """Write a new file; raises `FileExistsError` if it exists."""
@@ -485,7 +486,7 @@ class SensorMatrix(Displayed):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a sensor's file. Raises `BadCalibration` or `OSError`."""
+        """Return the matrix in a sensor file. Raises `BadCalibration` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadCalibration))
         except BadCalibration as exc:
@@ -493,40 +494,40 @@ class SensorMatrix(Displayed):
 
 
 def _require_types(document: Mapping[str, Any]) -> None:
-    """Raise `TypeError` for values that JSON or numpy would take for numbers, such as strings and booleans."""
+    """Raise `TypeError` for values that numpy would convert to numbers, such as strings and booleans."""
     for name in ("error", "covariance", "lever_m", "floor"):
         if any(type(value) not in (int, float) for value in np.array(document[name], object).flat):
-            raise TypeError(f"{name} has something else than numbers")
+            raise TypeError(f"{name} contains values that are not numbers")
     if not isinstance(document["provenance"], Mapping):
-        raise TypeError("provenance is no object")
+        raise TypeError("provenance is not an object")
 
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """How a sensor reads a contact, in the axes of a tool's calibration."""
+    """Response of a sensor to a contact, in the axes of a tool's calibration."""
 
     sensor: SensorMatrix
     parameters: Parameters
-    """Of the tool."""
+    """Parameters of the tool."""
     error: Array
-    """(6, 6) E as estimated."""
+    """(6, 6) estimated error matrix E."""
     error_covariance: Array
-    """(39, 39) of the rotation of `R_flange_sensor` (3, rad, sensor axes) and of the entries of E, row by row."""
+    """(39, 39) covariance of the mounting (3, rad, sensor axes) and of the entries of E, row by row."""
 
     @cached_property
     def decoder(self) -> Array | None:
-        """(6, 6) that turns reading minus free tool into the contact; None where it is the identity."""
+        """(6, 6) matrix that converts reading minus free tool to the contact wrench; None if it is the identity."""
         if not self.error.any():
             return None
         turn = skew(_mounting_turn(self.error, self.parameters.p_sensor_com_m))
         return read_only(np.linalg.inv(np.eye(6) + self.error - np.kron(np.eye(2), turn)))
 
     def decode(self, contact: Array) -> Array:
-        """Apply the decoder to wrenches (..., 6) that have the free tool subtracted."""
+        """Return decoded contact wrenches (..., 6) from readings minus free tool (..., 6)."""
         return contact if self.decoder is None else np.asarray(contact @ self.decoder.T)
 
     def error_columns(self, wrench: Array) -> Array:
-        """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by what `error_covariance` is of."""
+        """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by the coordinates of `error_covariance`."""
         turns = -np.kron(np.eye(2), skew(np.eye(3)))
         effects = np.concatenate([turns, _ENTRIES])
         if self.decoder is not None:
@@ -535,18 +536,18 @@ class ContactResponse:
 
     @cached_property
     def hidden_covariance(self) -> Array:
-        """(15, 15) mean square of what the sensor hides in mounting, weight and centre of mass of the tool itself."""
+        """(15, 15) mean square of the errors of mounting, weight and centre of mass that the sensor hides."""
         return _hidden_covariance(self.parameters, self.error.ravel(), self.error_covariance[3:, 3:])
 
     @property
     def scale_sigma(self) -> float:
-        """Standard deviation of the weight of the tool itself, relative to its reading."""
+        """Relative standard deviation of the true weight of the tool."""
         weight = self.parameters.gravity_force_base_N
         return float(np.sqrt(weight @ self.hidden_covariance[3:6, 3:6] @ weight) / max(weight @ weight, 1e-12))
 
     @cached_property
     def _by_products(self) -> Array:
-        """(36, 36) that gives the covariance of a contact w, row by row, from its products w w'."""
+        """(36, 36) matrix that maps the products w w' of a contact w to its covariance, both row by row."""
         columns = self.error_columns(np.eye(6))  # (wrench, axis, error)
         C = np.einsum("kia,ab,ljb->ijkl", columns, self.error_covariance, columns)
         F = ranges(self.sensor.lever_m)
@@ -554,30 +555,28 @@ class ContactResponse:
         return np.asarray(C.reshape(36, 36))
 
     def covariance(self, wrench: Array) -> Array:
-        """Covariance (..., 6, 6) of decoded contacts (..., 6) that errors of the sensor cause, with the floor.
-
-        It is quadratic in the contact, so that one product with a constant gives it.
+        """Return the covariance (..., 6, 6) of decoded contacts due to errors of the sensor, including the floor.
 
         Parameters
         ----------
         wrench : array, shape (..., 6)
-            The contact, N and N·m.
+            Contact wrenches, N and N·m.
         """
         wrench = np.asarray(wrench)
         products = (wrench[..., :, None] * wrench[..., None, :]).reshape(*wrench.shape[:-1], 36)
         return np.asarray((products @ self._by_products.T).reshape(*wrench.shape, 6))
 
     def sigma_at(self, p_sensor_m: Array) -> tuple[float, float]:
-        """Return one sigma of a force of 1 N at a place (3,), and of its torque, N·m: of the lengths of their errors.
+        """Return the rms errors of force (N) and torque (N·m) of a contact of 1 N at a point (3,), over all directions.
 
-        It is the root mean square over all directions of the force.
+        The errors are norms of the error vectors.
         """
-        # The covariance is quadratic in the force, so that its mean over all directions is that over three axes.
+        # The covariance is quadratic in the force, so its mean over all directions equals that over three axes.
         C = self.covariance(np.concatenate([np.eye(3), np.cross(p_sensor_m, np.eye(3))], axis=1)).mean(axis=0)
         return float(np.sqrt(np.trace(C[:3, :3]))), float(np.sqrt(np.trace(C[3:, 3:])))
 
     def true_load(self, shown: Response) -> tuple[float, Array]:
-        """Return weight (N) and centre of mass (3,) of the tool itself: its reading, gain included, is decoded."""
+        """Return the true weight (N) and centre of mass (3,) of the tool, by decoding its reading."""
         p = self.parameters
         reading = np.concatenate([np.eye(3), skew(p.p_sensor_com_m)]) * p.weight_N
         reading += p.weight_N * shown_gain(shown)
@@ -587,10 +586,10 @@ class ContactResponse:
 
 
 def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
-    """Mean square (15, 15) of what entries of E, with a mean (36,) and covariance C, hide in the estimates of a tool.
+    """Return the mean square (15, 15) of hidden errors of a tool, for entries of E with mean (36,) and covariance C.
 
-    An antisymmetric gain is a rotation of the mounting, an antisymmetric cross-talk a shift of the centre of mass, and
-    a gain common to all axes a weight, with a centre of mass that is as much nearer. No orientation shows them.
+    An antisymmetric gain looks like a rotation of the mounting, an antisymmetric cross-talk like a shift of the centre
+    of mass, and a gain common to all axes like a larger weight with a closer centre of mass. No orientation shows them.
     """
     p = parameters.p_sensor_com_m
     turn, (_, torque) = _mounting_turn(_ENTRIES, p), _gain_at(_ENTRIES, p)
@@ -607,6 +606,6 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
 
 
 def _common_gain(p: Array) -> Array:
-    """Return the derivative (1, 36) of the gain common to all axes, of a tool at p, by the entries of E."""
+    """Return the derivative (1, 36) of the gain common to all axes, for a tool at p, by the entries of E."""
     force, _ = _gain_at(_ENTRIES, p)
     return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

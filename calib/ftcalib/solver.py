@@ -34,26 +34,27 @@ from ftcalib.published.yu import ROUNDING_RAD, special_deviation_rad, special_nu
 from ftcalib.result import CalibrationResult, Method, require_positive_definite
 from ftcalib.sensor_matrix import SensorMatrix
 
+# Number of simulations for the covariance of a published method.
 SIMULATIONS = 400
-# No sensor resolves smaller differences of force.
+# Smaller differences of the force, N, are below the resolution of any sensor.
 UNRESOLVED_N = 1e-12
-# Largest force over the standard error of its mean that a sensor can have.
+# Largest plausible ratio of a force to the standard error of its mean.
 _RESOLVED = 3e6
 
-# Published methods that need the direction of gravity, or the weight.
+# Published methods that need the direction of gravity or the weight.
 _NEED_GRAVITY = ("carlson-relaxation", "carlson-cayley")
 
 
 @contextmanager
 def _finite() -> Iterator[None]:
-    """Ignore numbers that overflow; raise `BadDataset` for a fit that comes to no end by them."""
+    """Ignore overflow warnings; raise `BadDataset` if an overflow makes the fit fail."""
     try:
         with np.errstate(all="ignore"):
             yield
     except np.linalg.LinAlgError as error:
         raise BadDataset(
-            f"the fit is not finite ({error}): check the units of the wrench and of its standard errors, and that each "
-            "row has one orientation and its own reading"
+            f"the fit failed because of numbers that are not finite ({error}): check the units of the wrench and of "
+            "its standard errors, and that each row has one orientation and its own reading"
         ) from error
 
 
@@ -69,32 +70,33 @@ def solve(
     provenance: Mapping[str, Any] | None = None,
     as_published: bool = False,
 ) -> CalibrationResult:
-    """Calibrate from a dataset.
+    """Return the calibration from a dataset of static poses.
 
     Parameters
     ----------
     dataset : CalibrationDataset
     method : Method
-        "ml": maximum likelihood, from 4 poses on; "known-rotation", "yaw-only": the same for a sensor whose mounting is
-        known (`known`, default: axes of sensor and flange agree), or known except for its turn about flange z.
-        Or, for comparison, one of `ftcalib.published.methods.PUBLISHED`.
+        "ml": maximum likelihood from 4 or more poses; "known-rotation", "yaw-only": the same for a known mounting
+        (`known`, default: axes of sensor and flange agree), or a mounting known up to a rotation about flange z.
+        For comparison, one of `ftcalib.published.methods.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
-        Model of the bias during the tour: chosen from the data, constant, or as given. Poses without time count as
-        equally spaced in their order.
+        Model of the bias during the session; "auto": chosen from the data. Poses without times are taken as equally
+        spaced in their order.
     known : Known, optional
-        Known mounting, direction of gravity and mass. Published methods use what they need, as exactly known: Carlson's
-        gravity, "vougioukas" the mounting (default: axes of sensor and flange agree) and the direction of gravity
-        (default: the up direction of `setup`), "wang" the mounting, "yang" the mounting up to a turn about flange z.
+        Known mounting, direction of gravity and mass. Published methods use the values that they need as exactly known:
+        Carlson's methods gravity, "vougioukas" the mounting (default: axes of sensor and flange agree) and the
+        direction of gravity (default: the up direction of `setup`), "wang" the mounting, "yang" the mounting up to a
+        rotation about flange z.
     g_m_s2 : float
-        Gravity; mass is weight divided by it.
+        Acceleration of gravity; the mass is the weight divided by it.
     setup : Setup
-        The described cell, for the verdict. Its up direction serves the published methods that need gravity. A known
-        direction of gravity declares one too.
+        Description of the cell, for the verdict. Published methods that need gravity use its up direction. A known
+        direction of gravity also declares the up direction.
     provenance : mapping, optional
-        Stored with the result, beside the hash of the dataset. Must be valid JSON.
+        Stored with the result, together with the hash of the dataset. Must be valid JSON.
     as_published : bool
-        Run one of Carlson's methods as printed: without biases (`ftcalib.published.methods.published`). `provenance`
-        then has `as_published`.
+        Whether to run one of Carlson's methods as printed, without biases (`ftcalib.published.methods.published`). The
+        `provenance` then contains `as_published`.
 
     Raises
     ------
@@ -121,7 +123,7 @@ def solve(
     wrench_cov = dataset.wrench_cov
     if wrench_cov is not None:
         wrench_cov = pooled_covariance(wrench_cov, dataset.n_samples)
-    # Yu's and Carlson's methods assume nothing of the mounting, so the fit beside them does not either.
+    # Yu's and Carlson's methods assume no mounting, so neither does the maximum likelihood fit for comparison.
     assumed = known if estimator is None or method in BASELINES else None
     poses = dataset.R_base_flange, dataset.wrench, wrench_cov
     fit_poses = partial(fit, *poses, t_s=dataset.t_s, drift=drift, gain_sigma=setup.gain_sigma)
@@ -174,7 +176,7 @@ def _choose(
     *,
     as_published: bool,
 ) -> tuple[Known | None, Setup]:
-    """Check the arguments; return what the method takes as known, and the cell that its result is compared with."""
+    """Check the arguments; return the known values for the method, and the description of the cell."""
     for name, value, choices in (("method", method, get_args(Method)), ("drift", drift, get_args(Drift))):
         if value not in choices:
             raise ValueError(f"{name} is '{value}', expected one of {', '.join(choices)}")
@@ -184,7 +186,7 @@ def _choose(
     if setup.up_in_base is None and known is not None and known.gravity_direction_base is not None:
         setup = replace(setup, up_in_base=(-np.asarray(known.gravity_direction_base)).tolist())
     known = _constrain(method, known, setup)
-    # Three orientations have 4 or 8 exact solutions: only known values, or a fourth, leave one.
+    # Three orientations have 4 or 8 exact solutions; known values or a fourth orientation make the solution unique.
     require_orientations(dataset.R_base_flange, 5 if method == "lrom" else 4 if known is None else 3)
     if np.ptp(dataset.wrench[:, :3], axis=0).max() < UNRESOLVED_N:
         raise NotObservable("the force is the same in all poses: check that the sensor works and carries a load.")
@@ -193,19 +195,19 @@ def _choose(
 
 
 def _require_sense(dataset: CalibrationDataset) -> None:
-    """Raise `BadDataset` for torques that are all zero, and for raw counts with standard errors in other units."""
+    """Raise `BadDataset` if all torques are zero, or if raw counts are combined with standard errors in other units."""
     if not dataset.wrench[:, 3:].any():
         raise BadDataset(
-            "all torques are zero, as of a three-axis sensor, which shows no centre of mass and is not supported: take "
-            "a six-axis sensor, or give its torques"
+            "all torques are zero, as from a three-axis sensor, which cannot measure a centre of mass and is not "
+            "supported: use a six-axis sensor, or give its torques"
         )
     if dataset.wrench_cov is None or (dataset.wrench != np.round(dataset.wrench)).any():
         return
     sigma_N = float(np.sqrt(np.einsum("nii->ni", dataset.wrench_cov)[:, :3].mean()))
     if (largest := float(np.abs(dataset.wrench[:, :3]).max())) > _RESOLVED * sigma_N:
         raise BadDataset(
-            f"the wrench looks like raw counts, up to {largest:.3g}, beside standard errors of {sigma_N:.2g}, which no "
-            "sensor resolves: give both in N and N·m, or leave the standard errors out"
+            f"the wrench looks like raw counts, up to {largest:.3g}, with standard errors of {sigma_N:.2g}, which no "
+            "sensor resolves: give wrench and standard errors in N and N·m, or leave the standard errors out"
         )
 
 
@@ -217,15 +219,15 @@ def _fit_ml(
     g_m_s2: float,
     setup: Setup,
 ) -> Fit:
-    """Fit by maximum likelihood, with what is `assumed` of the known values.
+    """Return the maximum likelihood fit with the known values `assumed`.
 
-    Published methods use this fit too: for observability, and for the noise if it was not measured.
+    Published methods use this fit too: to check observability, and for the noise if it was not measured.
     """
     try:
         best = fit_poses(known=assumed, g_m_s2=g_m_s2)
         _require_determined(best, known)
     except NotObservable as exc:
-        # A mistake in the data often leaves the poses undetermined: name it, rather than ask for more poses.
+        # A mistake in the data often makes the parameters undetermined; report it instead of asking for more poses.
         if named := _mistakes(fit_poses, dataset, known, g_m_s2, setup):
             raise NotObservable(f"{named[0].words}.", named[0]) from exc
         raise
@@ -233,7 +235,10 @@ def _fit_ml(
 
 
 def _judge(case: Case, measured_sigma: Array | None) -> Quality:
-    """Judge estimates, with what explains the data better, the simplest first; `measured_sigma` (6,) is of a pose."""
+    """Return the judgement of estimates, with a mistake or a change that explains the data better, the simplest first.
+
+    `measured_sigma` (6,) is the measured standard deviation of a pose.
+    """
     try:
         require_positive_definite(case.found.covariance)
         require_positive_definite(case.found.joint_covariance)
@@ -245,30 +250,33 @@ def _judge(case: Case, measured_sigma: Array | None) -> Quality:
 
 
 def _find_change(case: Case, quality: Quality, measured_sigma: Array | None) -> list[Finding]:
-    """Find a lasting change, where the fit needs what could hide one: components of the noise, or poses left out."""
-    found, t_s = case.freest, case.t_s
+    """Return the finding of a change during the session, if one explains the data better than the fit.
+
+    It is searched only if the fit has components or rejected poses that could hide a change.
+    """
+    fitted, t_s = case.freest, case.t_s
     kinds = ("walk", "slope") if quality.chi2_p is None else ("walk", "slope", "white")
-    drifts = any(name.startswith(kinds) for name in found.components)
+    drifts = any(name.startswith(kinds) for name in fitted.components)
     drifts |= bool(quality.errors) or not quality.used.all()
-    # Noise from the residuals hides a turn too.
-    if not isinstance(found, Fit) or not (drifts or (found.components and not quality.is_exact)):
+    # Noise estimated from the residuals can hide a rotation of the sensor too.
+    if not isinstance(fitted, Fit) or not (drifts or (fitted.components and not quality.is_exact)):
         return []
     if t_s is None or not np.isfinite(t_s).all():
-        t_s = np.arange(len(found.wrench), dtype=np.float64)
-    rows, changes = possible_changes(found, t_s, steps=drifts)
-    R, cov, times = found.R_base_flange[rows], None if measured_sigma is None else np.diag(measured_sigma**2), t_s[rows]
-    costs = [_cost(one, R, cov, times) for one in changes]
+        t_s = np.arange(len(fitted.wrench), dtype=np.float64)
+    rows, changes = possible_changes(fitted, t_s, steps=drifts)
+    R, cov = fitted.R_base_flange[rows], None if measured_sigma is None else np.diag(measured_sigma**2)
+    costs = [_cost(change, R, cov, t_s[rows]) for change in changes]
     if not np.isfinite(least := min(costs, default=np.inf)):
         return []
-    # The same poses with the same noise have been fitted already.
-    again = cov is not None or len(rows) < len(found.wrench)
-    known = fit(R, found.wrench[rows], cov, t_s=times) if again else found
+    # Refit only if poses or noise differ from those of the fit.
+    again = cov is not None or len(rows) < len(fitted.wrench)
+    unchanged = fit(R, fitted.wrench[rows], cov, t_s=t_s[rows]) if again else fitted
     change = changes[costs.index(least)]
-    return [change.finding(rows, found.weights)] if least < known.minus_two_log_likelihood else []
+    return [change.finding(rows, fitted.weights)] if least < unchanged.minus_two_log_likelihood else []
 
 
 def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array) -> float:
-    """Minus twice the log-likelihood without a change, and what its numbers cost; infinite if much remains."""
+    """Return -2 log likelihood of the data corrected for a change, plus its penalty; infinite if they fit badly."""
     try:
         without = fit(R, change.corrected, cov, t_s=t_s)
     except NotObservable:
@@ -280,7 +288,7 @@ def _cost(change: SessionChange, R: Array, cov: Array | None, t_s: Array) -> flo
 
 
 def _zero_is_arbitrary(dataset: CalibrationDataset) -> bool:
-    """Whether the sensor reported so when the dataset was recorded."""
+    """Whether the sensor reported an arbitrary zero when the dataset was recorded."""
     place: Any = dataset.meta
     for key in ("devices", "sensor", "facts"):
         place = place.get(key) if isinstance(place, Mapping) else None
@@ -288,13 +296,13 @@ def _zero_is_arbitrary(dataset: CalibrationDataset) -> bool:
 
 
 def _written(dataset: CalibrationDataset) -> str:
-    """Return as what the orientations were written: a form, the order of Euler angles, or nothing if it is unknown."""
+    """Return the form in which orientations were given: a name, the order of Euler angles, or "" if unknown."""
     form = str(dataset.meta.get("form", ""))
     return str(dataset.meta.get("euler", "")) if form == "euler" else form
 
 
 def _require_usable(method: Method, known: Known | None, as_published: bool) -> None:
-    """Raise `ValueError` for known values that a published method cannot use, and for a form that it does not have."""
+    """Raise `ValueError` for known values that a published method cannot use, or for a missing printed form."""
     if as_published:
         require_printed_form(method)
     if known is None or method not in PUBLISHED or method in _NEED_GRAVITY:
@@ -310,14 +318,14 @@ def _require_usable(method: Method, known: Known | None, as_published: bool) -> 
 def _fit_published(
     method: Method, estimator: Estimator, dataset: CalibrationDataset, wrench_cov: Array | None, best: Fit
 ) -> Estimate:
-    """Apply a published method; `best` gives the degrees of freedom and the second solution."""
+    """Return the estimate of a published method; `best` provides degrees of freedom and second solution."""
     parameters = estimator(dataset.wrench)
     noise = wrench_cov
-    if noise is None:  # take the residuals of the method as its noise
+    if noise is None:  # estimate the noise from the residuals of the method
         residuals = dataset.wrench - predict(parameters, dataset.R_base_flange)
         square = (residuals**2).reshape(-1, 2, 3).mean(axis=(0, 2)) * 6 * len(dataset) / best.dof
         noise = np.broadcast_to(np.diag(np.repeat(np.maximum(square, 1e-24), 3)), (len(dataset), 6, 6))
-    # Cube roots err most where a component of the gravity force is zero, which their own estimate hides.
+    # The cube roots of SROM are worst near a zero component of the gravity force, which their own estimate hides.
     truth = best.parameters if method in SPECIAL else parameters
     return Estimate.independent(
         parameters,
@@ -333,7 +341,7 @@ def _fit_published(
 
 
 def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | None:
-    """Known values with those that the method assumes."""
+    """Return the known values, including those that the method assumes."""
     if method in ("known-rotation", "vougioukas", "wang") and (known is None or known.R_flange_sensor is None):
         known = replace(known or Known(), R_flange_sensor=np.eye(3))
     if method in ("yaw-only", "yang"):
@@ -351,7 +359,7 @@ def _constrain(method: Method, known: Known | None, setup: Setup) -> Known | Non
 
 
 def _fit_freely(fit_poses: Callable[..., Fit], dataset: CalibrationDataset) -> Fit | None:
-    """Fit without known values; None if the poses do not determine all parameters."""
+    """Return the fit without known values; None if the poses do not determine all parameters."""
     try:
         require_orientations(dataset.R_base_flange, 4)
         best = fit_poses()
@@ -364,7 +372,7 @@ def _fit_freely(fit_poses: Callable[..., Fit], dataset: CalibrationDataset) -> F
 def _mistakes(
     fit_poses: Callable[..., Fit], dataset: CalibrationDataset, known: Known | None, g_m_s2: float, setup: Setup
 ) -> list[Finding]:
-    """Find what explains that poses do not determine the parameters: wrong known values can leave no weight."""
+    """Return mistakes that explain why the parameters are not determined: faulty data, or wrong known values."""
     poses = dataset.R_base_flange, dataset.wrench
     findings = faults(*poses, setup.up, _written(dataset)) or other_poses(*poses) or no_weight(*poses)
     if not findings and known is not None and (free := _fit_freely(fit_poses, dataset)) is not None:
@@ -381,7 +389,7 @@ def estimator_of(
     *,
     as_published: bool = False,
 ) -> Estimator:
-    """Prepare a published method, with mounting and gravity from `known` if it needs them. Raises `NotObservable`."""
+    """Return the estimator of a published method, with mounting and gravity from `known`. Raises `NotObservable`."""
     known = known or Known()
     direction = -setup.up if known.gravity_direction_base is None else known.gravity_direction_base
     return published(
@@ -395,7 +403,7 @@ def estimator_of(
 
 
 def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_flange: Array) -> list[Finding]:
-    """Name poses that deviate from the special orientations of the method, and the error that this causes."""
+    """Return a finding if poses deviate from the special orientations of the method, with the resulting force error."""
     if method not in SPECIAL:
         return []
     deviation_rad = special_deviation_rad(R_base_flange, *special_numbers(R_base_flange, others=True))
@@ -407,7 +415,7 @@ def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_f
 
 
 def _require_determined(best: Fit, known: Known | None) -> None:
-    """Raise `NotObservable` for undetermined parameters, with advice if the poses alone are the reason."""
+    """Raise `NotObservable` for undetermined parameters, with advice if only the poses are the reason."""
     Z = best.free
     information = Z.T @ best.information @ Z
     scale = column_scale(information)
@@ -422,15 +430,15 @@ def _require_determined(best: Fit, known: Known | None) -> None:
         names = [PARAMETER_NAMES[3 * k].partition(".")[0] for k in np.flatnonzero(share > 0.05)]
         raise NotObservable(
             f"the poses do not determine {free.sum()} of {len(free)} combinations of {', '.join(names)}: add poses "
-            "that tilt the tool about two different horizontal axes, and turn it about its own."
+            "that tilt the tool about two different horizontal axes and turn it about its own axis."
         )
 
 
 def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange: Array, wrench_cov: Array) -> Array:
-    """Mean square error of a closed form around `truth`, from repetitions with simulated noise.
+    """Return the mean square error (15, 15) of a closed-form method around `truth`, from simulated noise.
 
-    Linear propagation fails, because SROM's cube roots have no derivative if a component of the gravity force is zero.
-    The seed is fixed, so that the same data give the same numbers.
+    Linear propagation fails, because the cube roots of SROM have no derivative at a zero component of the gravity
+    force. The seed is fixed, so that the same data give the same result.
     """
     rng = np.random.default_rng(20210)
     L = np.linalg.cholesky(wrench_cov)

@@ -1,4 +1,4 @@
-"""The dataset of a calibration: one orientation and one mean wrench per pose, and pooling of their covariances."""
+"""Dataset of a calibration: one orientation and one mean wrench per pose; pooling of the covariances."""
 
 import hashlib
 import json
@@ -21,20 +21,20 @@ from ftcalib.shown import data_frame
 
 FORMAT = "ftdrive.dataset/1"
 
-# Whether rotations map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
+# Rotations that map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
 # papers.
 Orientation = Literal["R_base_flange", "R_flange_base"]
 
-# N, N·m or their squares: no sensor measures more, and powers of it must not overflow.
+# Largest accepted value in N, N·m or their squares, so that powers of it do not overflow.
 LARGEST = 1e9
-# N² or (N·m)²: sigma 1 nN; with much less, products of inverses lose all digits.
+# Smallest accepted variance, N² or (N·m)², for a sigma of 1 nN. Smaller ones would cost all digits in products.
 _LEAST_VARIANCE = 1e-18
 _MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationDataset(Displayed):
-    """n poses, one row each. Arrays are read-only copies.
+    """Dataset of n static poses, one row each. Arrays are read-only copies.
 
     Orientations rounded to three or more decimals are projected onto SO(3).
 
@@ -54,17 +54,17 @@ class CalibrationDataset(Displayed):
     """
 
     R_base_flange: Array
-    """(n, 3, 3) maps flange coordinates to base coordinates."""
+    """(n, 3, 3) orientations of the flange: map flange coordinates to base coordinates."""
     wrench: Array
     """(n, 6) mean wrench in N and N·m as measured, in the sensor frame: no bias, tare or compensation applied."""
     wrench_cov: Array | None
-    """(n, 6, 6) covariance of the mean; None = unknown."""
+    """(n, 6, 6) covariances of the means; None = unknown."""
     n_samples: NDArray[np.int64]
-    """(n,) samples behind each mean; 0 = unknown."""
+    """(n,) number of samples of each mean; 0 = unknown."""
     t_s: Array
-    """(n,) seconds since the first pose; NaN = unknown."""
+    """(n,) times since the first pose, s; NaN = unknown."""
     meta: Mapping[str, JSON] = field(default_factory=dict)
-    """Further data, such as serial numbers, versions and events."""
+    """Metadata, such as serial numbers, versions and events."""
 
     def __post_init__(self) -> None:
         n = len(np.atleast_1d(np.asarray(self.R_base_flange)))
@@ -102,7 +102,7 @@ class CalibrationDataset(Displayed):
         t_s: ArrayLike = np.nan,
         meta: Mapping[str, JSON] | None = None,
     ) -> Self:
-        """Build from rotations, such as a list of scipy's, and mean wrenches; what is unknown may be left out.
+        """Return a dataset from rotations, such as a list of scipy rotations, and mean wrenches.
 
         Parameters
         ----------
@@ -155,13 +155,13 @@ class CalibrationDataset(Displayed):
         return Summary(f"Dataset of {counted(len(self), 'pose')}, wrenches as measured, in the sensor frame", rows)
 
     def to_frame(self) -> Any:
-        """Return a DataFrame of pandas, else of Polars, which `ftdrive.read_dataset` reads again.
+        """Return a DataFrame of pandas, or of Polars if pandas is not installed; `ftdrive.read_dataset` can read it.
 
         Returns
         -------
         DataFrame
-            A row for each pose: `t` in s, the rotation matrix R_base_flange `r11` to `r33`, `fx` to `tz` in N and N·m,
-            and where they are known the standard errors `sigma_fx` to `sigma_tz`.
+            One row per pose: `t` in s, the rotation matrix R_base_flange `r11` to `r33`, `fx` to `tz` in N and N·m,
+            and, if known, the standard errors `sigma_fx` to `sigma_tz`.
 
         Raises
         ------
@@ -177,7 +177,7 @@ class CalibrationDataset(Displayed):
         return data_frame(columns)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the content of a dataset file."""
+        """Return the document of a dataset file."""
         return {
             "format": FORMAT,
             "R_base_flange": self.R_base_flange.tolist(),
@@ -190,7 +190,7 @@ class CalibrationDataset(Displayed):
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from the content of a dataset file; unknown fields are ignored. Raises `BadDataset`."""
+        """Return the dataset from the document of a file; unknown fields are ignored. Raises `BadDataset`."""
         check_format(document, FORMAT, BadDataset)
         names = ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s", "meta")
         missing = [name for name in names if name not in document]
@@ -211,17 +211,17 @@ class CalibrationDataset(Displayed):
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a dataset file. Raises `BadDataset` or `OSError`."""
+        """Return the dataset in a file. Raises `BadDataset` or `OSError`."""
         try:
             return cls.from_dict(read_object(path, BadDataset))
         except BadDataset as exc:
             raise BadDataset(f"{Path(path).name}: {exc}") from exc
 
     def sha256(self) -> str:
-        """Hash the content, independent of spacing and order of fields in the file.
+        """Return the SHA-256 of the content, independent of spacing and order of fields in the file.
 
-        It covers the meta data as JSON with sorted keys, then each array: name, shape, and numbers as little-endian
-        float64 row by row (an unknown covariance has no shape and no numbers).
+        It covers the metadata as JSON with sorted keys, then each array: name, shape, and numbers as little-endian
+        float64 row by row. An unknown covariance has no shape and no numbers.
         """
         digest = hashlib.sha256(json.dumps(dict(self.meta), allow_nan=False, sort_keys=True).encode())
         for name in ("R_base_flange", "wrench", "wrench_cov", "n_samples", "t_s"):
@@ -232,13 +232,13 @@ class CalibrationDataset(Displayed):
 
 
 def shorten_list(names: Sequence[str], most: int = 20) -> str:
-    """Return names for a message, and how many more there are."""
+    """Return names for a message, at most `most` of them, with the number of the others."""
     shown = ", ".join(name if len(name) <= 40 else f"{name[:40]}…" for name in names[:most])
     return shown if len(names) <= most else f"{shown} and {len(names) - most} more"
 
 
 def require_finite(name: str, value: object, shape: tuple[int, ...]) -> Array:
-    """Convert to an array of this shape, one row per pose; raises `BadDataset` naming the row that is not finite."""
+    """Return an array of given shape, one row per pose; raise `BadDataset`, naming the row, if it is not finite."""
     array = _require_shape(name, value, shape)
     _reject(name, array, ~np.isfinite(array), "not a finite number.")
     return array
@@ -268,7 +268,7 @@ def _reject(name: str, array: Array, wrong: NDArray[np.bool_], why: str) -> None
 
 
 def proper_rotations(R: Array) -> Array:
-    """Return rotations (n, 3, 3) without their rounding. Raises `BadDataset` naming the row that is none."""
+    """Return rotation matrices (n, 3, 3) without rounding errors; raise `BadDataset`, naming the row, if invalid."""
     error = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2))
     for i in np.flatnonzero(error > ROUNDING):
         raise BadDataset(
@@ -280,7 +280,7 @@ def proper_rotations(R: Array) -> Array:
             f"row {i + 1}: the orientation is a reflection (determinant {np.linalg.det(R[i]):.3f}), not a rotation: "
             "check the sign of one axis."
         )
-    rounded = error > 1e-12  # exact ones stay unchanged, so that a loaded file has the hash of the saved one
+    rounded = error > 1e-12  # exact rotations stay unchanged, so that a loaded dataset has the hash of the saved one
     R[rounded] = nearest_rotation(R[rounded])
     return R
 
@@ -306,34 +306,34 @@ def _covariance_problem(C: Array) -> str | None:
     return None
 
 
-# Covariances of pose means that come from few samples each.
+# Pooling of the covariances of pose means, each from few samples.
 
-# With this many independent samples, the covariance of a pose counts as much as the common shape.
+# Number of independent samples at which the covariance of a pose has the same weight as the common shape.
 _TRUSTED_SAMPLES = 100.0
-# Median of the variance of six Gaussian values, relative to its mean: that of chi-square with 5 degrees, over 5.
+# Ratio of median to mean of the variance of six Gaussian values: the median of chi-square(5), divided by 5.
 _MEDIAN_SCATTER = 0.8702920382191053
-# A pose whose variances scatter more than this, relative to their freedom, has a shape of its own: 1 % by chance.
+# A pose whose variances scatter more, relative to their degrees of freedom, keeps its own shape; 1 % do by chance.
 _UNLIKE = 3.0
 
 
 def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
-    """Shrink each covariance towards the shape common to all poses, times a size of its own.
+    """Return each covariance shrunk towards a shape common to all poses, scaled for each pose.
 
     A 6 x 6 covariance from N samples is so uncertain that weighting with it increases the mean square error of the
-    calibration: 3 times with N = 10, 1.15 times with N = 50. The common shape has no such error. The size keeps the
-    differences between poses that exceed the scatter of N samples.
+    calibration: 3 times with N = 10, 1.15 times with N = 50. The common shape has no such error. The scale of a pose
+    keeps differences between poses that exceed the scatter of N samples.
 
-    Samples of filtered noise repeat each other, and their correlation in time is itself uncertain: 1000 samples behind
-    a low-pass of 2 Hz may determine a variance no better than 4 independent ones. So the covariances themselves show
-    their degrees of freedom, a share of N - 1: within a pose, the logarithms of six variances of equal size scatter by
-    2 / freedom.
+    Samples of filtered noise are correlated, and their correlation is itself uncertain: 1000 samples after a 2 Hz
+    low-pass filter may determine a variance no better than 4 independent samples. The degrees of freedom, a share of
+    N - 1, are therefore estimated from the covariances: within a pose, the logarithms of six equal variances scatter
+    with variance 2 / freedom.
 
     Parameters
     ----------
     wrench_cov : array, shape (n, 6, 6)
-        Covariance of the mean of each pose.
+        Covariances of the means of the poses.
     n_samples : int array, shape (n,)
-        Samples of each, independent or not; 0 = unknown: that covariance is not changed.
+        Number of samples of each pose, independent or not; 0 = unknown, and the covariance is not changed.
 
     Returns
     -------
@@ -353,25 +353,25 @@ def pooled_covariance(wrench_cov: Array, n_samples: NDArray[np.int64]) -> Array:
     spread = _spread_within(S, shape)
     typical = float(np.median(spread * freedom)) / _MEDIAN_SCATTER / (1 - 1 / len(S))
     freedom *= min(1.0, 2 / max(typical, 1e-12))
-    # Equal sizes scatter by 2 / (6 freedom) in the logarithm, whose mean is half of that low: remove both.
+    # The logarithms of equal scales have the variance 2 / (6 freedom), and a bias of half of it: correct both.
     log_size, scatter = np.log(size), 2 / (6 * freedom)
     mean = float(np.average(log_size, weights=freedom))
-    found = float(np.average((log_size - mean) ** 2, weights=freedom))
-    real = max(found - float(np.average(scatter, weights=freedom)), 0.0)
-    size = np.exp(mean + (log_size - mean) * real / (real + scatter) + np.minimum(scatter, found) / 2)
+    observed = float(np.average((log_size - mean) ** 2, weights=freedom))
+    real = max(observed - float(np.average(scatter, weights=freedom)), 0.0)
+    size = np.exp(mean + (log_size - mean) * real / (real + scatter) + np.minimum(scatter, observed) / 2)
     own, common = np.ones(len(known)), np.zeros(len(known))
     unlike = 1 - _UNLIKE * 2 / freedom / np.maximum(spread, 1e-12)
     own[known] = np.maximum(freedom / (freedom + _TRUSTED_SAMPLES), unlike)
     common[known] = (1 - own[known]) * size
     pooled = own[:, None, None] * wrench_cov
-    for i, j in np.ndindex(6, 6):  # without a second array of that size
+    for i, j in np.ndindex(6, 6):  # avoids a second array of the same size
         pooled[:, i, j] += common * shape[i, j]
     return pooled
 
 
 def _spread_within(S: Array, shape: Array) -> Array:
-    """Return how the logarithms of the six variances of each covariance (n, 36) scatter, independent ones in shape."""
+    """Return the variance (n,) of the logarithms of the six variances of each covariance, relative to the shape."""
     white = np.linalg.inv(np.linalg.cholesky(shape))
     log_variances = np.log(S @ np.einsum("ca,cb->abc", white, white).reshape(36, 6))
-    log_variances -= np.median(log_variances, axis=0)  # a pose of another shape is a part of the common one
+    log_variances -= np.median(log_variances, axis=0)  # robust against poses with another shape
     return np.asarray(log_variances.var(axis=1, ddof=1))

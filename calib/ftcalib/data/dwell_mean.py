@@ -1,4 +1,4 @@
-"""Mean of a dwell, its covariance, tests whether the dwell was quiet, and the averaging time that it needs."""
+"""Mean and covariance of a dwell, tests for a quiet dwell, and the choice of the averaging time."""
 
 from dataclasses import dataclass
 
@@ -13,25 +13,25 @@ LEAST_SAMPLES = 20
 
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
 
-# Assumed sigma of a sensor without visible noise: 1 mN, and the torque of that at 25 mm, the usual ratio.
+# Assumed sigma of a sensor without visible noise: 1 mN, and the torque of this force at the usual lever of 25 mm.
 RESOLUTION = np.repeat([1e-3, 2.5e-5], 3)
 
 # In less than 1 % of quiet dwells the halves differ by more than this many standard errors in any of six channels.
-# Student's t with 18 degrees of freedom gives 3.7; the rest is for noise that is correlated in time. With 3 standard
-# errors, 4 % of quiet dwells of 2 s fail, and 13 % behind a 5 Hz filter: one pose or more in nearly every tour.
+# Student's t with 18 degrees of freedom gives 3.7; the margin allows for correlated noise. With 3 standard errors, 4 %
+# of quiet dwells of 2 s would fail, and 13 % after a 5 Hz filter: at least one pose in nearly every tour.
 QUIET = 4.5
 
-# A dwell that scatters more than this factor times the noise of the sensor is not quiet, even if its halves agree.
+# A dwell with more than this factor times the noise of the sensor is not quiet, even if its halves agree.
 RESTLESS = 2.0
 
 # Frequencies at which a weight swings on a string of 100 to 500 mm.
 SWING_HZ = (0.7, 1.6)
-# A swing explains at least this share of the scatter of all channels, which white noise does not reach.
+# Smallest share of the variance of all channels that a swing explains; fits to white noise do not reach it.
 SWING_SHARE = 0.25
-# Means of about so many parts of a dwell show its frequency.
+# Number of block means of a dwell in which the frequency of a swing is searched.
 SWING_BLOCKS = 200
 
-# Differences of this size, relative to the largest value, are rounding errors.
+# Largest rounding error, relative to the largest value.
 ROUNDING = 1e-9
 
 
@@ -40,18 +40,18 @@ class PoseMean:
     """Mean wrench of one dwell."""
 
     mean: Array
-    """(6,) N and N·m."""
+    """(6,) mean wrench, N and N·m."""
     covariance: Array
-    """(6, 6) of the mean, positive definite."""
+    """(6, 6) covariance of the mean, positive definite."""
 
 
 def mean_and_covariance(wrench: Array) -> PoseMean:
-    """Average a dwell, with a covariance that allows for correlation in time and coarse quantisation.
+    """Return the mean of a dwell with its covariance, which accounts for autocorrelation and quantisation.
 
     The variance of a mean is tau s² / N with tau the integrated autocorrelation time, here from Geyer's initial
     monotone sequence (Practical Markov Chain Monte Carlo, Stat. Sci. 7, 1992) with Wolff's correction for the
-    subtracted mean (Comput. Phys. Commun. 156, 2004). The mean has the correlation of the samples between channels. If
-    the noise of a channel is smaller than its quantisation step, averaging does not help, and the step counts instead.
+    subtracted mean (Comput. Phys. Commun. 156, 2004). The correlation between channels is that of the samples. If the
+    noise of a channel is smaller than its quantisation step, averaging does not help, and the step is used instead.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
     std = np.sqrt(np.diag(S))
     tau = _autocorrelation_time(noise)
     variance = tau * std**2 / N + _quantisation_variance(wrench, std)
-    for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise gets the variance of its noisiest neighbour
+    for kind in (slice(0, 3), slice(3, 6)):  # a channel without noise gets the largest variance of its group
         silent = variance[kind] == 0
         variance[kind][silent] = variance[kind].max() or RESOLUTION[kind][silent] ** 2
     safe = np.where(std > 0, std, 1.0)
@@ -84,14 +84,12 @@ def mean_and_covariance(wrench: Array) -> PoseMean:
 
 
 def without_swing(wrench: Array, duration_s: float) -> tuple[Array, Array]:
-    """Take the swing of a weight on a string out of a dwell: two harmonics of one frequency, if significant.
+    """Return a dwell without the swing of a weight on a string, and the amplitude (6,) of the first harmonic.
 
-    The mean of what is left is the constant of the fit. A plain mean would keep a part of the swing, because a dwell
-    hardly ever holds whole periods. `wrench` (N, 6) has 20 evenly spaced samples or more, in N and N·m, over
-    `duration_s`; three periods of the longest string, of 1.4 s, are best.
-
-    Returns the samples without the swing, and the amplitude (6,) of the first harmonic, zero if none is significant.
-    Raises `BadDataset` for too few samples, or a value that is not finite.
+    The swing is fitted by two harmonics of one frequency and subtracted if it is significant; otherwise the amplitude
+    is zero. A plain mean would keep part of the swing, because a dwell rarely contains whole periods. `wrench` (N, 6)
+    has 20 or more evenly spaced samples, in N and N·m, over `duration_s`; three periods of the longest string, of
+    1.4 s each, are best. Raises `BadDataset` for too few samples, or a value that is not finite.
     """
     wrench = _require_samples(wrench)
     N = len(wrench)
@@ -111,8 +109,8 @@ def without_swing(wrench: Array, duration_s: float) -> tuple[Array, Array]:
     if left_of(best_Hz) > (1 - SWING_SHARE) * np.square(blocks).sum():
         return wrench, np.zeros(6)
     X = _harmonics(t_s, best_Hz)
-    found = np.linalg.lstsq(X, wrench)[0]
-    return wrench - X[:, 1:] @ found[1:], np.hypot(found[1], found[2])
+    fitted = np.linalg.lstsq(X, wrench)[0]
+    return wrench - X[:, 1:] @ fitted[1:], np.hypot(fitted[1], fitted[2])
 
 
 def _harmonics(t_s: Array, frequency_Hz: float) -> Array:
@@ -121,9 +119,9 @@ def _harmonics(t_s: Array, frequency_Hz: float) -> Array:
 
 
 def is_stationary(wrench: Array) -> bool:
-    """Check whether the two halves of a dwell have the same mean in every channel, within the noise.
+    """Return whether the two halves of a dwell have the same mean in every channel, within the noise.
 
-    The standard error of their difference comes from 20 batch means, ten in each half, so that it holds for filtered
+    The standard error of the difference is estimated from 20 batch means, ten in each half, so it is valid for filtered
     noise. Pure noise fails in less than 1 % of dwells. A jolt much shorter than half the dwell increases the standard
     error as much as the difference, and passes.
 
@@ -147,10 +145,10 @@ def is_stationary(wrench: Array) -> bool:
 
 
 def noise_level(wrench: Array, window: int) -> Array:
-    """Standard deviation (6,) of an untouched sensor: the median over windows, little affected by contact or drift.
+    """Return the standard deviation (6,) of an untouched sensor: the median over windows, robust to contact and drift.
 
-    `wrench` (N, 6) are samples of the arm at rest, N and N·m. A window has 20 to N samples, as many as the dwells to
-    compare with it. Raises `BadDataset` for too few samples, or a value that is not finite.
+    `wrench` (N, 6) are samples with the arm at rest, N and N·m. A window has 20 to N samples, the same number as the
+    dwells that are compared with it. Raises `BadDataset` for too few samples, or a value that is not finite.
     """
     wrench = _require_samples(wrench)
     if not LEAST_SAMPLES <= window <= len(wrench):
@@ -160,27 +158,27 @@ def noise_level(wrench: Array, window: int) -> Array:
 
 
 def is_quiet(wrench: Array, level: Array) -> bool:
-    """Check whether a dwell is stationary and scatters at most twice as much as the untouched sensor.
+    """Return whether a dwell is stationary and has at most twice the noise of the untouched sensor.
 
-    The scatter shows vibration, a hand on the tool and short jolts, which equal halves hide. Pure noise never doubles,
-    so quiet dwells fail as rarely as in `is_stationary`: of 2 s at 500 Hz 0.15 % of white noise, 0.4 % behind a
-    low-pass of 10 Hz, 0.9 % of 5 Hz, 6 % of 2 Hz, because 2 s contain few independent samples.
+    The noise reveals vibration, a hand on the tool and short jolts, even if the halves are equal. Pure noise never
+    doubles, so quiet dwells fail as rarely as in `is_stationary`. With 2 s at 500 Hz, 0.15 % fail for white noise, and
+    0.4, 0.9 and 6 % after a low-pass filter of 10, 5 and 2 Hz, because 2 s contain few independent samples.
 
-    `level` (6,) is that of `noise_level`. Raises `BadDataset` for fewer than 20 samples, or a value that is not
+    `level` (6,) is the result of `noise_level`. Raises `BadDataset` for fewer than 20 samples, or a value that is not
     finite.
     """
     return is_stationary(wrench) and not restless_channels(wrench, level).any()
 
 
 def restless_channels(wrench: Array, level: Array) -> NDArray[np.bool_]:
-    """Find the channels (6,) of a dwell that scatter more than twice as much as the untouched sensor."""
+    """Return which channels (6,) of a dwell have more than twice the noise of the untouched sensor."""
     wrench = _require_samples(wrench)
-    flicker = _resolution(wrench) / 2  # between two neighbouring values, normal for a sensor with coarse steps
+    flicker = _resolution(wrench) / 2  # between two adjacent values, normal for coarse quantisation
     return np.asarray(wrench.std(axis=0, ddof=1) > RESTLESS * level + flicker + ROUNDING * np.abs(wrench).max(axis=0))
 
 
 def _require_samples(wrench: Array) -> Array:
-    """Check (N, 6) samples: N >= 20 and all finite. Raises `BadDataset`."""
+    """Return samples (N, 6) as an array; raise `BadDataset` unless N >= 20 and all are finite."""
     wrench = np.asarray(wrench, dtype=np.float64)
     if wrench.ndim != 2 or wrench.shape[1] != 6 or len(wrench) < LEAST_SAMPLES:
         raise BadDataset(f"a dwell has shape {wrench.shape}, expected (N, 6) with N >= {LEAST_SAMPLES}: record longer.")
@@ -190,7 +188,7 @@ def _require_samples(wrench: Array) -> Array:
 
 
 def _autocorrelation_time(noise: Array) -> Array:
-    """Integrated autocorrelation time (6,) in samples: 1 for white noise, and for a channel without noise."""
+    """Return the integrated autocorrelation time (6,) in samples: 1 for white noise, or for a channel without noise."""
     N = len(noise)
     fft = scipy.fft
     spectrum = np.abs(fft.rfft(noise, fft.next_fast_len(2 * N, real=True), axis=0)) ** 2
@@ -202,15 +200,15 @@ def _autocorrelation_time(noise: Array) -> Array:
         m = int(negative[0]) if negative.size else len(pairs)
         monotone = np.minimum.accumulate(pairs[:m, c])
         tau[c] = (2 * monotone.sum() / gamma[0, c] - 1) * (1 + (4 * m - 1) / N)
-    # Anticorrelated noise shortens the autocorrelation time, but a mean is never that certain.
+    # Anticorrelated noise shortens the autocorrelation time; the lower bound avoids overconfident means.
     return np.maximum(tau, 0.1)
 
 
 def _quantisation_variance(wrench: Array, std: Array) -> Array:
-    """Variance (6,) of the rounding error in a mean: q²/12 without noise, zero with enough noise.
+    """Return the variance (6,) of the rounding error of a mean: q²/12 without noise, zero with enough noise.
 
-    Gaussian noise of sigma dithers the error away by exp(-4 pi² sigma² / q²) (Widrow, Kollar, Quantization Noise,
-    2008); the rounded samples may add q²/4 to the observed variance.
+    Gaussian noise of standard deviation sigma reduces it by the factor exp(-4 pi² sigma² / q²) (Widrow, Kollar,
+    Quantization Noise, 2008). Rounding may add up to q²/4 to the observed variance.
     """
     step = _resolution(wrench)
     dither = np.maximum(std**2 - step**2 / 4, 0) / np.where(step > 0, step, 1.0) ** 2
@@ -218,7 +216,7 @@ def _quantisation_variance(wrench: Array, std: Array) -> Array:
 
 
 def _resolution(wrench: Array) -> Array:
-    """Smallest difference (6,) between two values of a channel, 0 for a constant channel."""
+    """Return the smallest difference (6,) between two values of each channel; 0 for a constant channel."""
     gaps = np.diff(np.sort(wrench, axis=0), axis=0)
     step = np.where(gaps > ROUNDING * np.abs(wrench).max(axis=0), gaps, np.inf).min(axis=0)
     return np.where(np.isfinite(step), step, 0.0)
@@ -228,51 +226,50 @@ def _resolution(wrench: Array) -> Array:
 
 SHORTEST_S, LONGEST_S = 1.0, 10.0
 
-# Averages are compared in steps that hold whole periods of 50 Hz and of 60 Hz mains.
+# Step of the averaging times, which contains whole periods of 50 Hz and of 60 Hz mains.
 STEP_S = 0.1
 
-# Block means of this length lose nothing for averages of a second or more.
+# Length of block means, short enough for averages of a second or more.
 BLOCK_S = 0.02
 
-# The scatter of an average needs a record that is several averages long.
+# Smallest length of a record, in averaging times, for estimating the scatter of averages.
 AVERAGES_IN_RECORD = 3
 
-# The curve is flat and noisy near its minimum: a shorter average may be worse by this factor.
+# A shorter average is accepted if its sigma is larger by at most this factor, because the minimum is flat and noisy.
 FLAT = 1.05
 
-# If sigma of the longest average exceeds the prediction for white noise by this factor, the cause is drift.
+# If the sigma of the longest average exceeds the prediction for white noise by this factor, the cause is drift.
 DRIFTS = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AveragingTime:
-    """An averaging time and the sigma that it gives."""
+    """Averaging time at a pose and the resulting standard deviation."""
 
     seconds: float
-    """1 to 10, a multiple of 0.1."""
+    """Averaging time, s: 1 to 10, a multiple of 0.1."""
     sigma: Array
-    """(6,) standard deviation of a mean over that time, N and N·m."""
+    """(6,) standard deviation of a mean over the averaging time, N and N·m."""
     floor: Array
-    """(6,) smallest sigma of all examined times, per channel, N and N·m."""
+    """(6,) smallest sigma over all examined averaging times, per channel, N and N·m."""
     reached: bool
     """Whether every channel meets its target."""
     words: str
-    """Time and sigma in a sentence, with the reason if a target is not reached."""
+    """Sentence with averaging time and sigma, and the reason if a target is not reached."""
 
 
 def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
-    """Overlapping Allan deviation: scatter of the means of successive intervals of a record.
+    """Return the overlapping Allan deviation: the scatter of the means of successive intervals of a record.
 
     ``sigma²(m) = sum_j (S_j+2m - 2 S_j+m + S_j)² / (2 m² (N - 2m + 1))`` with S the cumulative sum. For white noise it
-    is the standard deviation of a mean over m samples. With drift it stays finite, and grows again
-    where drift dominates.
+    is the standard deviation of a mean over m samples. With drift it remains finite, and increases for long intervals.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
         Consecutive samples, evenly spaced.
     lengths : array of int, shape (k,)
-        Samples in an interval, each 1 to N / 2.
+        Numbers of samples per interval, each from 1 to N / 2.
 
     Returns
     -------
@@ -287,7 +284,7 @@ def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
     N = len(wrench)
     for m in lengths:
         if not 1 <= m <= N // 2:
-            raise BadDataset(f"a record of {N} samples has no Allan deviation over {m}: choose 1 to {N // 2}.")
+            raise BadDataset(f"a record of {N} samples is too short for intervals of {m}: choose 1 to {N // 2}.")
     S = np.concatenate([np.zeros((1, wrench.shape[1])), np.cumsum(wrench - wrench.mean(axis=0), axis=0)])
     return np.array(
         [
@@ -298,17 +295,17 @@ def allan_deviation(wrench: Array, lengths: Array | list[int]) -> Array:
 
 
 def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, target_torque_Nm: float) -> AveragingTime:
-    """Choose the shortest averaging time that meets the targets, from a record of the sensor at rest.
+    """Return the shortest averaging time that meets the targets, from a record of the sensor at rest.
 
     Parameters
     ----------
     wrench : array, shape (N, 6)
-        Consecutive samples, N and N·m; at least 3 s. 30 s cover all times up to 10 s; 60 s cover them well.
+        Consecutive samples, N and N·m, of at least 3 s. 30 s cover all times up to 10 s; 60 s are better.
     rate_Hz : float
         Sampling rate.
     target_force_N, target_torque_Nm : float
-        Wanted standard deviation of the mean of one pose. Sigma of the biases from n poses is about ``sqrt(3 / n)``
-        times that, so 0.02 N from 24 poses need 0.057 N here.
+        Required standard deviation of the mean of one pose. The sigma of the biases from n poses is about
+        ``sqrt(3 / n)`` times smaller, so 0.02 N from 24 poses requires 0.057 N here.
 
     Raises
     ------
@@ -317,10 +314,10 @@ def averaging_time(wrench: Array, rate_Hz: float, *, target_force_N: float, targ
 
     Notes
     -----
-    Sigma of a mean is its Allan deviation, plus the rounding error that averaging does not remove if the noise is
-    smaller than the resolution. All six channels must meet their targets. If one cannot, the time is chosen that brings
-    the worst channel closest. Chance lengthens the time more often than it shortens it: for white noise that needs 3 s,
-    a record of 60 s gives 2.8 to 6.1 s (5 to 95 %), a record of 120 s gives 3.0 to 4.6 s.
+    The sigma of a mean is its Allan deviation, plus the rounding error that averaging does not remove if the noise is
+    smaller than the resolution. All six channels must meet their targets. If one cannot, the time that brings the worst
+    channel closest to its target is chosen. The estimated time is more often too long than too short: for white noise
+    that requires 3 s, a record of 60 s gives 2.8 to 6.1 s (5 to 95 %), a record of 120 s gives 3.0 to 4.6 s.
     """
     if not (target_force_N > 0 and target_torque_Nm > 0):
         raise ValueError(f"targets are {target_force_N} N and {target_torque_Nm} N·m: choose positive values.")

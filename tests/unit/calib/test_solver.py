@@ -659,7 +659,7 @@ def test_a_three_axis_sensor_is_named(measured: bool) -> None:
 def test_raw_counts_beside_standard_errors_in_newtons_are_named(recwarn: pytest.WarningsRecorder) -> None:
     R = Rotation.random(12, rng=3).as_matrix()
     counts = np.round(predict(TRUTH, R) * 1e6)
-    with pytest.raises(BadDataset, match=r"looks like raw counts, up to .* beside standard errors of"):
+    with pytest.raises(BadDataset, match=r"looks like raw counts, up to .* with standard errors of"):
         solve(dataset(R, counts, white(12)))
     solve(dataset(R, np.round(predict(TRUTH, R) * 1e3), None))  # counts without standard errors are solved
     assert not recwarn.list

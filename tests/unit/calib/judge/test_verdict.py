@@ -17,17 +17,17 @@ from ftcalib.judge.verdict import (
     Case,
     DriftAhead,
     Quality,
-    _drift,
-    _errors,
-    _noise,
-    _poses,
+    _drift_findings,
+    _error_findings,
+    _noise_findings,
+    _pose_findings,
     _response_findings,
     _second_solution,
     _some_runs,
-    _structure,
+    _structure_findings,
     _structure_in_motion,
     _successive_correlation,
-    _weight,
+    _weight_findings,
     out_of_line,
     strong_correlations,
 )
@@ -489,7 +489,7 @@ def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -
     across = np.cross(along, [1.0, 0, 0])
     covariance = 1e-9 * np.eye(15)
     covariance[3:6, 3:6] += (WEIGHT_N / sigmas) ** 2 * np.outer(along, along) + 1e3 * np.outer(across, across)
-    found = _weight(replace(FITTED, covariance=covariance), Setup())
+    found = _weight_findings(replace(FITTED, covariance=covariance), Setup())
     assert [one.code for one in found] == ["weight_insignificant"] * (not significant)
 
 
@@ -501,10 +501,10 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
     factor: float, share: float, severity: str
 ) -> None:
     loud = replace(FITTED, components={"walk_force_N": 0.1, "white_force_N": 0.0})
-    (finding,) = _noise(loud, statistics(chi2_p=0.9e-3, noise_factor=factor, largest_share=share))
+    (finding,) = _noise_findings(loud, statistics(chi2_p=0.9e-3, noise_factor=factor, largest_share=share))
     assert (finding.severity, finding.values["components"]) == (severity, {"walk_force_N": 0.1})
-    assert _noise(loud, statistics(chi2_p=1.1e-3, noise_factor=factor)) == []
-    assert [one.code for one in _noise(loud, statistics(chi2_p=None))] == ["noise_unknown"]
+    assert _noise_findings(loud, statistics(chi2_p=1.1e-3, noise_factor=factor)) == []
+    assert [one.code for one in _noise_findings(loud, statistics(chi2_p=None))] == ["noise_unknown"]
 
 
 @pytest.mark.parametrize(
@@ -521,7 +521,7 @@ def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
 def test_a_smooth_error_limits_from_a_fifth_of_a_percent_of_the_weight_on(
     components: dict[str, float], found: list[tuple[str, str]]
 ) -> None:
-    named = _structure(replace(FITTED, components=components))
+    named = _structure_findings(replace(FITTED, components=components))
     assert [(one.code, one.severity) for one in named] == found
 
 
@@ -542,7 +542,7 @@ def test_in_motion_a_smooth_error_is_named_only_where_it_limits(components: dict
 
 def test_poses_are_pointed_at_beyond_their_limits() -> None:
     def found(fitted: Estimate = FITTED, **values: Any) -> list[str]:
-        return [one.code for one in _poses(fitted, statistics(**values), Setup())]
+        return [one.code for one in _pose_findings(fitted, statistics(**values), Setup())]
 
     assert found() == []
     assert found(lag1_p=0.9e-3) == ["residuals_alike"]
@@ -575,7 +575,7 @@ def test_errors_count_relative_to_the_weight_at_a_lever() -> None:
         sigma = np.repeat([0.05, 0.04 * lever_m * WEIGHT_N / np.sqrt(3)], 3)
         wrench = noisy(np.random.default_rng(31), R24, truth, sigma)
         loud = fit(R24, wrench, white(24, sigma), start=truth, weights=used.astype(float))
-        largest, (finding,), left_out = _errors(loud, used, few=False)
+        largest, (finding,), left_out = _error_findings(loud, used, few=False)
         length = [np.sqrt(np.mean(np.sum(part[used] ** 2, axis=1))) for part in np.hsplit(loud.left_out_residuals, 2)]
         assert left_out == pytest.approx(tuple(length))
         residual_Nm = np.sqrt(np.mean(np.sum(loud.residuals[used, 3:] ** 2, axis=1)))
@@ -623,12 +623,12 @@ def test_a_drift_is_named_from_three_sigmas_on_and_limits_from_two_percent_of_th
     drift = DriftResult(np.array(change), np.repeat([0.01, 0.001], 3), np.zeros((2, 6)))
     ahead = DriftAhead(*np.zeros((3, 6)))
     drifting = replace(OF_20_N, drift=drift)
-    findings = _drift(drifting, ahead, is_cause=is_cause)
+    findings = _drift_findings(drifting, ahead, is_cause=is_cause)
     named = [(one.severity, one.values["force_N"], one.values["torque_Nm"]) for one in findings]
     assert named == ([] if found is None else [found])
     if change[4]:
         still = DriftAhead(np.zeros(6), *[np.array([0, 0, 0, 0, 0.041**2, 0])] * 2)
-        assert _drift(drifting, still, is_cause=True)[0].severity == "limit"
+        assert _drift_findings(drifting, still, is_cause=True)[0].severity == "limit"
 
 
 @pytest.mark.parametrize(("sigmas", "certain"), [(2.9, False), (3.1, True)])
@@ -661,7 +661,7 @@ def test_a_drift_of_rounding_size_is_no_drift() -> None:
     drift, zero = DriftResult(change, sigma, np.zeros((2, 6))), np.zeros(6)
     for at_next_use_N, severity in ((0.3, "note"), (0.5, "limit")):  # of 20 N, 2 % are 0.4
         ahead = DriftAhead(zero, *[np.array([0.0, at_next_use_N**2, 0, 0, 0, 0])] * 2)
-        (finding,) = _drift(replace(OF_20_N, drift=drift), ahead, is_cause=True)
+        (finding,) = _drift_findings(replace(OF_20_N, drift=drift), ahead, is_cause=True)
         assert (finding.severity, finding.values) == (severity, {"force_N": 0.1, "torque_Nm": 0.0})
 
 

@@ -15,7 +15,7 @@ from ftcalib.motion.estimate import (
     TOUCH_N,
     TOUCH_NM,
     _first_kept,
-    _local,
+    _local_noise,
     _untouched,
     _without_contact,
     fit_motion,
@@ -304,7 +304,7 @@ def test_noise_of_a_row_is_that_around_it() -> None:
     unit[4] = 5.0
     kept[7] = False
     unit[7] = 100.0
-    local = _local(unit, kept)
+    local = _local_noise(unit, kept)
     burst = np.sqrt((1 + 1 + 25 + 1) / 4)
     np.testing.assert_allclose(local, [1, 1, 1, burst, burst, burst, 1, 1, 1])
 

@@ -17,12 +17,12 @@ from ftcalib.motion.solve import (
     SLOW_RAD_S,
     _coarse_delay,
     _contacts,
-    _findings,
-    _means,
-    _narrow,
+    _motion_findings,
+    _narrow_findings,
     _other_wrench,
     _range_deg,
     _require_enough_motion,
+    _residual_means,
     _select_rows,
 )
 from ftcalib.result import MotionResult
@@ -107,7 +107,7 @@ def test_a_fit_with_large_errors_is_not_determined(place: int, sigma: float, eno
 def test_residuals_are_averaged_over_the_kept_rows_around() -> None:
     residuals = np.arange(42.0).reshape(7, 6)
     kept = np.array([True, True, False, True, False, False, False])
-    means = _means(best_of(residuals=residuals, kept=kept), 3)
+    means = _residual_means(best_of(residuals=residuals, kept=kept), 3)
     np.testing.assert_allclose(means[0], (residuals[0] + residuals[1]) / 2)
     np.testing.assert_allclose(means[2], (residuals[1] + residuals[3]) / 2)
     np.testing.assert_allclose(means[3], residuals[3])
@@ -133,7 +133,7 @@ def motion_result(delay_s: float = 0.0, contacts: tuple[Any, ...] = ()) -> Motio
 
 def found(best: Any, motion: MotionResult, *, positions: bool = True, height_m: float | None = None) -> dict[str, Any]:
     rows = rows_of(100, TRUTH)
-    return {one.code: one for one in _findings(rows, rows[:80], best, motion, height_m, positions=positions)}
+    return {one.code: one for one in _motion_findings(rows, rows[:80], best, motion, height_m, positions=positions)}
 
 
 def test_what_a_recording_lacks_is_a_finding() -> None:
@@ -188,16 +188,18 @@ def of_range(degrees: float) -> MotionRows:
 
 def test_a_narrow_motion_is_named_by_its_range_or_its_error() -> None:
     covariance = np.zeros((SIZE, SIZE))
-    assert [one.severity for one in _narrow(of_range(44), best_of(covariance=covariance), explained=False)] == ["limit"]
-    assert _narrow(of_range(46), best_of(covariance=covariance), explained=False) == []
+    assert [
+        one.severity for one in _narrow_findings(of_range(44), best_of(covariance=covariance), explained=False)
+    ] == ["limit"]
+    assert _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False) == []
     covariance[2, 2] = 1.0
-    (one,) = _narrow(of_range(46), best_of(covariance=covariance), explained=False)
+    (one,) = _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False)
     assert one.severity == "reject"
     assert one.values["range_deg"] == pytest.approx(46)
     assert one.values["mounting_deg"] == pytest.approx(np.degrees(1))
-    assert _narrow(of_range(46), best_of(covariance=covariance), explained=True) == []
+    assert _narrow_findings(of_range(46), best_of(covariance=covariance), explained=True) == []
     covariance[2, 2], covariance[4, 4] = 1e4, 0.25
-    (one,) = _narrow(of_range(44), best_of(covariance=covariance), explained=True)
+    (one,) = _narrow_findings(of_range(44), best_of(covariance=covariance), explained=True)
     assert (one.values["mounting_deg"], one.values["weight_N"]) == (180.0, 0.5)
 
 

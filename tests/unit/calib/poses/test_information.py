@@ -290,7 +290,7 @@ def test_a_rim_gets_centre_poses() -> None:
 
 def test_impossible_choices_are_rejected() -> None:
     for n in (3, 25):
-        with pytest.raises(ValueError, match=f"cannot choose {n} poses of 24"):
+        with pytest.raises(ValueError, match=f"cannot choose {n} of 24"):
             choose(ALL, n, GUESS)
     with pytest.raises(ValueError, match="no candidates"):
         next_pose(ALL, ALL[:0], GUESS)

@@ -132,5 +132,5 @@ def test_gravity_of_a_wall_counts() -> None:
 def test_few_candidates_are_all_taken_and_too_few_are_refused() -> None:
     assert sorted(choose_verification_poses(candidates(3), FITTED, 3)) == [0, 1, 2]
     for n in (1, 4):
-        with pytest.raises(ValueError, match=f"cannot choose {n} poses of 3"):
+        with pytest.raises(ValueError, match=f"cannot choose {n} of 3"):
             choose_verification_poses(candidates(3), FITTED, n)
