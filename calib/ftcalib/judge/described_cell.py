@@ -1,4 +1,4 @@
-"""What contradicts known values or the described cell: signs, mounting, payload, mass and centre of mass."""
+"""Contradictions to known values or to the described cell: signs, mounting, payload, mass and centre of mass."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,37 +18,37 @@ from ftcalib.likelihood.fit import Estimate
 from ftcalib.model import UP_IN_BASE, Array, Parameters
 from ftcalib.rounding import to_place_of
 
-# A centre of mass may lie this far on the robot's side of the sensor origin, because adapter plates do.
+# Tolerated distance of a centre of mass on the robot's side of the sensor origin, where adapter plates may be.
 INSIDE_M = 0.01
 REVERSED_TILT_DEG = 135.0
-# A robot that leans more hangs on a wall.
+# Tilt from which the robot must be mounted on a wall.
 HANGING_DEG = 60.0
-# A larger angle is another mounting, not a lean.
+# Largest angle of a lean; a larger one is another mounting.
 OTHER_MOUNTING_DEG: Final = 10.0
-# About the accuracy of an arm's own orientation.
+# Smallest lean that is reported: about the accuracy of an arm's orientation.
 LEAN_DEG: Final = 0.2
-# Cables and screws may reach this far out of the described cylinders.
+# Tolerance of the described cylinders, for cables and screws.
 COM_MARGIN_M = 0.01
-# A centre of mass farther outside than this is wrong; nearer, the description may be.
+# A centre of mass farther outside the tool is wrong; closer, the description may be wrong.
 SURELY_OUTSIDE_M = 0.1
-# Units are suspected where the centre of mass is outside and farther from the sensor than this.
+# Wrong units are suspected if the centre of mass is outside the tool and farther from the sensor than this.
 FAR_COM_M = 0.1
-# Less than this share of the described mass is a remainder, not a tool.
+# A smaller share of the described mass is the rest of a compensated weight, not a tool.
 NO_TOOL_SHARE = 0.1
-# The mass of a tool is known to about the larger of this mass and this share.
+# Tolerance of a described tool mass: the larger of this mass and this share.
 TOOL_KG, TOOL_SHARE = 0.1, 0.3
 _SIGMAS_OF_MARGIN: Final = 3.0
-# A payload may differ by the larger of this mass and this share of the expected one.
+# Tolerance of the payload: the larger of this mass and this share of the expected payload.
 PAYLOAD_KG, PAYLOAD_SHARE = 0.5, 0.3
-# A payload may be larger by this where the mass of sensor and adapter is unknown.
+# Additional tolerance of a larger payload if the mass of sensor and adapter is unknown.
 SENSOR_KG: Final = 0.3
-# Units are suspected where the payload differs by more than this, and agrees within this share in another unit.
+# Wrong units are suspected if the payload differs by more than this, and agrees within this share in another unit.
 UNIT_KG, UNIT_SHARE = 0.8, 0.3
 _SIGNIFICANT: Final = 4.0
 
 
 def directions(parameters: Parameters, covariance: Array, setup: Setup, written: str = "") -> list[Finding]:
-    """Find signs that look reversed, and gravity that does not agree with the mounting, declared or not.
+    """Return findings for reversed signs, and for a direction of gravity that contradicts the mounting of the robot.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
     covariance : array, shape (15, 15)
     setup : Setup
     written : str
-        As what the orientations were written, as of `faults`.
+        Form in which the orientations were given, see `faults`.
     """
     lean = lean_from(-setup.up, parameters.gravity_force_base_N, covariance[3:6, 3:6])
     inside_m = _inside_m(parameters, covariance)
@@ -64,8 +64,8 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
         return [Finding.of("forces_reversed" if inside_m else "weight_upwards", off_deg=lean.deg)]
     findings = []
     if 0 < inside_m <= FARTHEST_COM_M:
-        # Gravity shows the centre of mass relative to the point of the torques alone. Only a described tool that cannot
-        # have it where reversed torques put it leaves one cause.
+        # Gravity shows the centre of mass only relative to the reference point of the torques. Reversed torques are
+        # excluded only if the described tool cannot have the mirrored centre of mass.
         mirrored = replace(parameters, p_sensor_com_m=-parameters.p_sensor_com_m)
         possible = not setup.cylinders_m or _outside_m(mirrored, covariance, setup) <= COM_MARGIN_M
         code = "torques_reversed" if possible else "torques_about_point"
@@ -83,9 +83,10 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
 
 
 def _quaternion_orders(gravity_direction_base: Array, up: Array, written: str) -> list[str]:
-    """Return the orders of quaternions with which gravity points down, had they been read inverted and in another.
+    """Return the true orders of quaternions with which gravity would point down, if they were read wrongly.
 
-    Such orientations are `U R V` of the true ones with fixed rotations U and V, so they fit as well.
+    Quaternions read inverted and in the wrong order give `U R V` of the true orientations with fixed rotations U and V,
+    so they fit as well.
     """
     if written not in ("", "quaternion"):
         return []
@@ -93,7 +94,7 @@ def _quaternion_orders(gravity_direction_base: Array, up: Array, written: str) -
     return [order for order, cosine in along.items() if cosine > np.cos(np.radians(OTHER_MOUNTING_DEG))]
 
 
-# From base axes as read to those in which the arm stands, for quaternions that are truly in this order.
+# Rotations from the base axes as read to the true base axes, for quaternions whose true order is the key.
 _OTHER_ORDERS: Final = {
     "w, x, y, z": np.array([[0.0, 0, 1], [0, -1, 0], [1, 0, 0]]),
     "x, y, z, w": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -101,10 +102,10 @@ _OTHER_ORDERS: Final = {
 
 
 def _inside_m(parameters: Parameters, covariance: Array) -> float:
-    """Distance of the centre of mass behind the sensor, towards the robot; 0 if it is not significant.
+    """Return the distance of the centre of mass behind the sensor, towards the robot; 0 if not significant.
 
-    Reversed torques put the centre of mass of a tool along the flange axis inside the arm, where no tool is. That of a
-    tool to the side lies beside the arm either way, so farther aside than behind shows nothing.
+    For a tool along the flange axis, reversed torques put the centre of mass inside the arm, where no tool can be. A
+    centre of mass that is farther to the side than behind shows nothing.
     """
     outwards = parameters.R_flange_sensor[2]  # flange z in the sensor frame
     inside_m = -float(outwards @ parameters.p_sensor_com_m)
@@ -115,32 +116,32 @@ def _inside_m(parameters: Parameters, covariance: Array) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Lean:
-    """How far the measured direction of gravity in the base is from an expected one."""
+    """Angle between the measured and the expected direction of gravity in the base."""
 
     deg: float
     sigma_deg: float
     side: str
-    """The low side of the base, such as "+y"."""
+    """Low side of the base, such as "+y"."""
 
     @property
     def is_other_mounting(self) -> bool:
-        """Whether it is too large for a lean."""
+        """Whether the angle is too large for a lean."""
         return self.deg > OTHER_MOUNTING_DEG
 
     @property
     def is_significant(self) -> bool:
-        """Whether it is larger than its uncertainty and than the accuracy of an arm's own orientation."""
+        """Whether the angle exceeds its uncertainty and the accuracy of an arm's orientation."""
         return self.deg >= max(LEAN_DEG, _SIGNIFICANT * self.sigma_deg)
 
     def __str__(self) -> str:
-        deg, sigma_deg = (to_place_of(one, self.sigma_deg) for one in (self.deg, self.sigma_deg))
+        deg, sigma_deg = (to_place_of(angle, self.sigma_deg) for angle in (self.deg, self.sigma_deg))
         return f"leans {deg}° (sigma {sigma_deg}°) towards its {self.side}"
 
 
 def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Lean:
-    """Compare measured gravity (3,), with its covariance (3, 3), with the expected direction `down` (3,), unit length.
+    """Return the lean of measured gravity (3,) with covariance (3, 3) from the expected unit vector `down` (3,).
 
-    All in base axes. The side is the axis of the base, or the pair of axes, along which gravity differs.
+    All vectors are in base axes. The side is the axis, or the pair of axes, along which gravity differs.
     """
     along_N = float(gravity_force_base_N @ down)
     aside_N = gravity_force_base_N - along_N * down
@@ -155,18 +156,18 @@ def lean_from(down: Array, gravity_force_base_N: Array, covariance: Array) -> Le
 def payload(
     payload_kg: float | None, load_kg: float, sensor_kg: float | None, parameters: Parameters | None = None
 ) -> list[Finding]:
-    """Compare the controller's payload with the load of the flange.
+    """Return findings if the payload in the controller does not match the load on the flange.
 
     Parameters
     ----------
     payload_kg : float, optional
-        As set in the controller.
+        Payload configured in the controller.
     load_kg : float
-        Load on the sensor, which cannot weigh itself.
+        Load on the sensor, without the sensor itself.
     sensor_kg : float, optional
-        Mass of sensor and adapter. Where it is unknown the payload may be larger by `SENSOR_KG`.
+        Mass of sensor and adapter. If it is unknown, the payload may be larger by `SENSOR_KG`.
     parameters : Parameters, optional
-        Estimated; they show units of torque that belong to those of force.
+        Estimated parameters, which show the unit of torque that belongs to a unit of force.
     """
     if payload_kg is None:
         return []
@@ -184,7 +185,7 @@ def payload(
 
 
 def tool(parameters: Parameters, covariance: Array, setup: Setup, g_m_s2: float) -> list[Finding]:
-    """Compare mass and centre of mass with the described tool."""
+    """Return findings if mass or centre of mass contradict the described tool."""
     return [*_mass_findings(parameters, covariance, setup, g_m_s2), *_centre_of_mass(parameters, covariance, setup)]
 
 
@@ -209,7 +210,7 @@ def _mass_findings(parameters: Parameters, covariance: Array, setup: Setup, g_m_
 def force_unit_of_cell(
     estimate: Estimate, known: Known | None, setup: Setup, g_m_s2: float
 ) -> tuple[float, float] | None:
-    """Return what a unit of force is by the known or the described mass, in N, and its standard deviation."""
+    """Return the size of the unit of force in N according to the known or described mass, and its sigma."""
     if known is not None and known.mass_kg is not None:
         true_kg, tolerance_kg = known.mass_kg, known.mass_tolerance_kg
     elif setup.tool_mass_kg:
@@ -244,11 +245,11 @@ def _centre_of_mass(parameters: Parameters, covariance: Array, setup: Setup) -> 
 
 
 def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float:
-    """Return how far the centre of mass surely lies outside the described cylinders; negative inside.
+    """Return the significant distance of the centre of mass outside the described cylinders; negative inside.
 
-    A body's centre of mass lies in its convex hull. The distance from that of the cylinders is the largest over all
-    directions of the point's reach beyond the hull's, less margin and sigma in that direction. Without the sensor's
-    height its origin may be anywhere between flange face and tip.
+    A body's centre of mass lies in its convex hull. The distance from the hull is the maximum over all directions of
+    the extent of the point minus that of the hull, less a multiple of sigma. If the height of the sensor is unknown,
+    its origin may be anywhere between flange face and tip.
     """
     height_m = setup.sensor_height_m
     lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2
@@ -260,12 +261,12 @@ def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float
     return float((reach_m - _reach_m(setup.cylinders_m) - _SIGNIFICANT * sigma_m).max())
 
 
-# Neighbours are about 4° apart, so the distance is exact to 0.1 %.
+# Neighbouring directions are about 4° apart, so the distance is accurate to 0.1 %.
 _DIRECTIONS = np.vstack([evenly_spread(2000), np.eye(3), -np.eye(3)])
 
 
 def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
-    """Return how far the convex hull of cylinders along flange z reaches in each direction."""
+    """Return the extent of the convex hull of cylinders along flange z in each of `_DIRECTIONS`, m."""
     aside, along_z = np.linalg.norm(_DIRECTIONS[:, :2], axis=1), _DIRECTIONS[:, 2]
     reaches = []
     for low, high, diameter, *axis in cylinders_m:
@@ -276,9 +277,9 @@ def _reach_m(cylinders_m: Sequence[Sequence[float]]) -> Array:
 
 # Known values that the data contradict.
 
-# A ratio this close to that of two units is one.
+# Largest relative difference between a ratio of masses and a ratio of units.
 SAME_UNIT = 0.04
-# Entries of a rotation this close to -1, 0 and 1 permute the axes.
+# Largest difference of the entries of a rotation from -1, 0 and 1 for a permutation of the axes.
 SAME_AXES = 0.1
 
 
@@ -290,20 +291,20 @@ def contradictions(
     sigmas: float,
     up_in_base: ArrayLike = UP_IN_BASE,
 ) -> list[Finding]:
-    """Name the known values that the data contradict, each with the value from the data.
+    """Return a finding for each known value that the data contradict, with the value from the data.
 
     Parameters
     ----------
     known : Known
     estimate : Parameters
-        From a fit without known values.
+        Estimate without known values.
     covariance : array, shape (15, 15)
-        Covariance of that fit.
+        Covariance of `estimate`.
     g_m_s2 : float
     sigmas : float
-        Smallest difference to name, in standard deviations.
+        Smallest difference that is reported, in standard deviations.
     up_in_base : array_like, shape (3,)
-        Where up should be.
+        Expected up direction.
     """
     contradicted = []
     weight_N, sigma_N = estimate.weight_N, estimate.weight_sigma_N(covariance)
@@ -330,7 +331,7 @@ def contradictions(
         axis = unit_vector(turn)
         sigma = float(np.sqrt(axis @ covariance[:3, :3] @ axis))
         if np.linalg.norm(turn) > sigmas * np.hypot(sigma, known.R_tolerance_rad):
-            upwards = float(estimate.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # as mirrored axes read
+            upwards = float(estimate.gravity_force_base_N @ np.asarray(up_in_base)) > 0  # mirrored axes
             Q = np.asarray(known.R_flange_sensor).T @ estimate.R_flange_sensor * (-1 if upwards else 1)
             order = np.round(Q)
             permuted = np.abs(Q - order).max() <= SAME_AXES and not (order == np.eye(3)).all()

@@ -1,4 +1,4 @@
-"""Mistakes in the data of a bad fit: orientations, pairs, axes, units. Named only if undoing one helps."""
+"""Mistakes in the data of a bad fit: orientations, pairing, axes. They are reported only if a correction helps."""
 
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,55 +17,55 @@ from ftcalib.judge.observability import RECOMMENDED_POSES
 from ftcalib.likelihood.rotation_minima import com_and_torque_bias, force_cost, given_rotation, minima
 from ftcalib.model import UP_IN_BASE, Array, Parameters, SPECIAL_R_flange_base, gravity_wrench, predict
 
-# Rounding of readings, relative to the largest: no fit leaves less.
+# Rounding error of readings, relative to the largest.
 ROUNDING = 1e-9
 READINGS = {
     "orientations_inverted": "inverted orientations",
     "quaternion_order": "quaternions in the order ({order})",
     "euler_angles": "Euler angles in the order {order}",
 }
-# Orders of turning by three angles about axes of the base. About axes of the tool, each is the reverse of one.
+# Orders of rotations by three angles about base axes; rotations about tool axes have the reverse order.
 EULER_ORDERS = tuple("".join(axes) for axes in permutations("xyz"))
-# Scores that differ by less do not decide between two readings of the orientations.
+# Largest difference of scores of equally good interpretations of the orientations.
 EQUAL = 0.1
-# Accept a hypothesis if it reduces the residual to this share.
+# A mistake is accepted if its correction reduces the residual to this share.
 COLLAPSE = 0.4
-# The other residual may grow by this factor.
+# Largest accepted increase of the other residual, as a factor.
 NO_WORSE = 1.2
-# Forces that a mistake explains leave no more than this share of the weight.
+# Largest force residual after a correction, as a share of the weight.
 CORRECTED = 0.1
-# Penalty of a weight that pulls sideways, and of a tool inside the flange, in the logarithm of the residuals.
+# Penalty, in the logarithm of the residuals, of a weight that pulls sideways, and of a tool inside the flange.
 IMPLAUSIBLE = 1.0
-# Residuals that differ by less than this factor are equal: the simpler explanation is taken.
+# Residuals that differ by a smaller factor are considered equal, and the simpler explanation is preferred.
 TIED = 1.3
-# Forces of a weight in other poses than given: residuals in shares of the weight, and little of them radial. Poses that
-# are off by less than the second share are right ones that move.
+# Wrenches of a weight in other poses: force residual from which poses are suspected, and from which they are taken for
+# other poses rather than inaccurate ones, as shares of the weight; largest radial share of the residual.
 OFF_POSES, OTHER_POSES, OF_A_WEIGHT = 0.015, 0.15, 0.1
-# A constant force that points down this exactly is a weight in base axes.
+# Largest angle between a constant force and down for a weight in base axes.
 IN_BASE_RAD = np.deg2rad(10.0)
-# A force that varies by less than this share of it is constant.
+# Largest relative variation of a constant force.
 STEADY = 0.05
-# Poses with the same extreme reading of a channel.
+# Smallest number of poses with the same extreme reading of a saturated channel.
 FEWEST_SATURATED = 3
-# Degrees of freedom of a regression that predicts readings with a noise of its own.
+# Smallest number of degrees of freedom of a regression that predicts readings.
 FEWEST_TO_PREDICT = 4
-# With fewer poses, readings whose fit differs by more than this share of the spread should not be equal.
+# With fewer poses, equal readings are unexpected if their predictions differ by more than this share of the spread.
 UNEQUAL = 0.05
-# Probability, per reading, of one that is farther from its prediction.
+# Probability, per reading, of a larger deviation from the prediction by chance.
 BY_CHANCE = 1e-6
 CHANNELS = ("fx", "fy", "fz", "tx", "ty", "tz")
-# Poses that show steps of the readings.
+# Number of poses in which steps of the readings are searched.
 FOR_STEPS = 1000
-# Different readings of a channel that show steps: a weight along each axis reads as -weight, 0 and +weight.
+# Smallest number of different readings that shows steps: a weight along the axes alone reads -weight, 0 and +weight.
 FEWEST_STEPS = 4
-# Decimal places that a table may have.
+# Largest number of decimal places of a table.
 DECIMALS = 9
-# Rounding matters if its standard deviation exceeds this share of the spread.
+# Rounding matters if its standard deviation exceeds this share of the spread of the readings.
 COARSE = 0.005
 
 
 def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
-    """Fit forces alone, then torques to them by linear least squares."""
+    """Return parameters fitted to the forces alone, with centre of mass and torque bias by linear least squares."""
     n, force_N, torque_Nm = len(wrench), wrench[:, :3], wrench[:, 3:]
     best = minima(force_cost(R_base_flange, force_N, np.ones(n)))[0]
     F_b, F0 = given_rotation(best.R, R_base_flange, force_N, np.ones(n))
@@ -74,7 +74,7 @@ def rough_fit(R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def _least_rms(R_base_flange: Array, force_N: Array) -> float:
-    """Root mean square force residual (N) that no rotation falls below: that of any (3, 3) matrix of its size."""
+    """Return a lower bound of the rms force residual (N) over all mountings: that of any matrix of the same norm."""
     Q = force_cost(R_base_flange, force_N, np.ones(len(force_N)))
     return float(np.sqrt(3 * max(np.linalg.eigvalsh(Q)[0], 0.0) / len(force_N)))
 
@@ -83,7 +83,7 @@ def _least_rms(R_base_flange: Array, force_N: Array) -> float:
 class _Rough:
     parameters: Parameters
     weight_sensor_N: Array
-    """(n, 3)"""
+    """(n, 3) predicted weight in the sensor frame."""
     force_rms_N: float
     torque_rms_Nm: float
     shares: tuple[float, float]
@@ -108,9 +108,10 @@ class _Rough:
         return bool(self.parameters.p_sensor_com_m @ self.parameters.R_flange_sensor[2] >= 0)
 
     def score(self, up_in_base: Array) -> float:
-        """Logarithm of the residuals plus the penalty; lower is better.
+        """Return the logarithm of the residuals plus a penalty of implausible results; lower is better.
 
-        Quaternions in another order often fit as well as inverted ones, with another mounting of robot and sensor.
+        The penalty decides between interpretations that fit equally well with different mountings of robot and sensor,
+        such as quaternions in another order and inverted orientations.
         """
         p = self.parameters
         cosine = -float(p.gravity_force_base_N @ up_in_base) / (p.weight_N * _vector_norm(up_in_base) or 1.0)
@@ -119,20 +120,21 @@ class _Rough:
 
 
 def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE, written: str = "") -> list[Finding]:
-    """Find the mistake that explains a bad fit: form of orientations, zeroing, pairing of wrenches and poses, or axes.
+    """Return the mistake that explains a bad fit: form of orientations, zeroing, pairing of wrench and pose, or axes.
 
-    Reversing all three axes of torque or of force only moves the centre of mass to the other side of the sensor.
+    Reversing all three axes of force or torque is not detected here, because it only moves the centre of mass to the
+    other side of the sensor.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-        In the order of the poses.
+        Orientations in the order of the poses.
     wrench : array, shape (n, 6)
     up_in_base : array_like, shape (3,)
-        Where up should be.
+        Expected up direction.
     written : str
-        As what the orientations were written: quaternion, matrix, vector, joints, or three angles in an order such as
-        "xyz" or "ZYX", as scipy names it. Empty if that is unknown. Only its mistakes are tried.
+        Form in which the orientations were given: quaternion, matrix, vector, joints, or the order of three angles in
+        the notation of scipy, such as "xyz" or "ZYX". Empty if unknown. Only mistakes of this form are tried.
     """
     if len(wrench) < RECOMMENDED_POSES + 1:
         return []
@@ -142,7 +144,7 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
     as_read = _Rough.of(R_base_flange, wrench)
     explanations = []
     for code, values, R, y in _readings(R_base_flange, wrench, written):
-        # No rotation does better than any matrix of its size: this bound spares the search over rotations.
+        # A lower bound of the residual avoids the search over rotations.
         if code != "columns_swapped" and _least_rms(R, y[:, :3]) > COLLAPSE * as_read.force_rms_N:
             continue
         trial = _Rough.of(R, y)
@@ -152,8 +154,8 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
             explanations.append((trial.score(up), code, values, trial.force_rms_N))
     if explanations:
         least = min(score for score, *_ in explanations)
-        equal = [one for one in explanations if one[0] < least + EQUAL]
-        # The simplest of those that fit alike.
+        equal = [explanation for explanation in explanations if explanation[0] < least + EQUAL]
+        # Of equally good explanations the simplest is reported.
         _, code, values, corrected_N = equal[0]
         also = dict.fromkeys(READINGS[name].format(**own) for _, name, own, _ in equal[1:] if name in READINGS)
         if code in READINGS:
@@ -163,9 +165,9 @@ def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BA
 
 
 def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
-    """Recognise the wrenches of a weight in other poses than given: forces on a sphere, torques that belong to them.
+    """Return a finding for wrenches of a weight in other poses: forces on a sphere, with matching torques.
 
-    A sphere does not depend on the orientations, so it also shows an order or a form of them that `faults` cannot undo.
+    The sphere does not depend on the orientations, so this detects wrong orders or forms that `faults` cannot correct.
     """
     if len(wrench) < RECOMMENDED_POSES + 1:
         return []
@@ -188,14 +190,14 @@ def other_poses(R_base_flange: Array, wrench: Array) -> list[Finding]:
 
 
 def no_weight(R_base_flange: Array, wrench: Array) -> list[Finding]:
-    """Recognise a wrench without weight: compensated already, or zeroed at each pose."""
+    """Return a finding for wrenches without weight: already compensated, or zeroed at each pose."""
     rough = _Rough.of(R_base_flange, wrench)
     p = rough.parameters
     return units.too_light(p.weight_N, _vector_norm(p.p_sensor_com_m), rough.force_rms_N)
 
 
 def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[Finding]:
-    """Recognise a weight in base axes that was recorded without bias: the force is the same in all poses."""
+    """Return a finding for a weight given in base axes without bias: the force is the same in all poses."""
     mean, up = wrench[:, :3].mean(axis=0), np.asarray(up_in_base, dtype=np.float64)
     size_N = float(np.linalg.norm(mean))
     downwards = float(-mean @ up) > np.cos(IN_BASE_RAD) * size_N * float(np.linalg.norm(up))
@@ -204,12 +206,12 @@ def constant_weight(wrench: Array, up_in_base: ArrayLike = UP_IN_BASE) -> list[F
     return [Finding.of("constant_force", force_N=mean)]
 
 
-# Code and values of a mistake, and orientations and wrench without it.
+# Code and values of a mistake, and the corrected orientations and wrenches.
 _Reading = tuple[str, Mapping[str, Any], Array, Array]
 
 
 def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
-    """Yield each mistake as code and values, with the data as they are without it, the simplest first."""
+    """Yield possible mistakes, the simplest first: code and values, and the corrected data."""
     if written.lower() in EULER_ORDERS:
         yield from _euler_orders(R, wrench, written)
     if written != "joints":
@@ -220,21 +222,21 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
         for shift, order, read_as in ((-1, "w, x, y, z", "x, y, z, w"), (1, "x, y, z, w", "w, x, y, z")):
             exchanged = Rotation.from_quat(np.roll(quaternions, shift, axis=1)).as_matrix()
             yield "quaternion_order", {"order": order, "read_as": read_as}, exchanged, wrench
-    # Matrices are often computed from angles.
+    # Rotation matrices are often computed from angles.
     for read_as in EULER_ORDERS if written in ("", "matrix") else []:
         yield from _euler_orders(R, wrench, read_as)
     in_flange = np.concatenate([np.einsum("nji,nj->ni", R, part) for part in (wrench[:, :3], wrench[:, 3:])], axis=1)
     yield "wrench_in_base", {}, R, in_flange
     for side, own, other in (("before", slice(None, -1), slice(1, None)), ("after", slice(1, None), slice(None, -1))):
         yield "pairing_shifted", {"neighbour": side}, R[own], wrench[other]
-    # The model is linear in the orientation, so a difference of two serves as one.
+    # The model is linear in the orientation, so it also applies to differences between two poses.
     yield "zeroed_each_pose", {}, np.diff(R, axis=0), wrench[1:]
 
 
 def _euler_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
-    """Turn by the same angles about x, y and z in the other orders.
+    """Yield orientations from the same angles about x, y and z in the other orders.
 
-    The middle angle of the true order lies within 90°, as programs write it. Beyond, the other solution is meant.
+    Programs write the middle angle within 90°. If it is beyond in another order, the equivalent angles are used.
     """
     extrinsic: Any = read_as if read_as.islower() else read_as[::-1].lower()
     with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary
@@ -270,7 +272,7 @@ def _axis_faults(as_read: _Rough, torque_Nm: Array, up: Array) -> list[Finding]:
 
 
 def channels(Q: Array) -> Sequence[str]:
-    """Name the channels from which the axes of a wrench should be taken, given the signed permutation (3, 3)."""
+    """Return the names of the channels from which x, y and z should be taken, for a signed permutation (3, 3)."""
     return [("-" if row[k] < 0 else "") + "xyz"[k] for row in Q for k in [int(np.abs(row).argmax())]]
 
 
@@ -284,9 +286,9 @@ def _torque_rms(weight_sensor_N: Array, torque_Nm: Array, P: Array, T0: Array) -
 
 
 def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
-    """Find channels that do not move, that are coarse or that stop at a limit, and rows that were copied.
+    """Return findings for stuck, coarsely quantised or saturated channels, and for copied rows.
 
-    Equal readings count only where the orientations predict different ones.
+    Equal readings are reported only if the orientations predict different ones.
     """
     spread = np.ptp(wrench, axis=0)
     group = np.repeat([spread[:3].max(), spread[3:].max()], 3)
@@ -294,11 +296,11 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
     findings = [Finding.of("stuck_channels", channels=stuck)] if stuck else []
     coarse = [_coarse_step(part[:FOR_STEPS]) for part in np.hsplit(wrench, 2)]
     if any(coarse):
-        # Coarse steps make equal readings by themselves: no copy or saturation is looked for.
+        # Coarse steps cause equal readings, so copies and saturation are not searched.
         return [*findings, Finding.of("quantised", step_N=coarse[0], step_Nm=coarse[1])]
     distinct = len(np.unique(wrench[:, np.argmax(spread)])) == len(wrench)
     copied = [] if distinct else _copies(wrench)
-    # A channel that spans a few of the last decimal places has equal readings by right.
+    # A channel that varies only in the last decimal places has equal readings anyway.
     fine = spread > FEWEST_STEPS * np.repeat([_last_place(part) for part in np.hsplit(wrench, 2)], 3)
     ties = [(k, tied) for k in np.flatnonzero(fine & (spread > 0)) for tied in _tied(wrench[:, k])]
     repeated: list[NDArray[np.intp]] = []
@@ -316,16 +318,16 @@ def broken_channels(wrench: Array, R_base_flange: Array) -> list[Finding]:
 
 
 def _tied(readings: Array) -> list[NDArray[np.intp]]:
-    """Return the rows that share the smallest reading, and those that share the largest, where they are enough."""
+    """Return the rows with the smallest reading and those with the largest, if there are enough to show saturation."""
     limits = [np.flatnonzero(readings == limit) for limit in (readings.min(), readings.max())]
     return [rows for rows in limits if len(rows) >= FEWEST_SATURATED]
 
 
 def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], channels: NDArray[np.intp]) -> bool:
-    """Whether the orientations predict other readings of the channels in `rows` than the equal ones that were read.
+    """Whether the equal readings of the channels in `rows` contradict their prediction from the other poses.
 
-    The other poses predict them: each channel is linear in the direction of gravity in flange axes. Rounded readings of
-    poses that share this direction are equal by right: four of the 24 orientations do so on a level base.
+    Each channel is linear in the direction of gravity in flange axes. Rounded readings of poses with the same direction
+    are rightly equal, for example of four of the 24 special orientations on a level base.
     """
     others = np.setdiff1d(np.arange(len(wrench)), rows)
     dof = len(others) - 4
@@ -344,16 +346,16 @@ def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], cha
 
 
 def _resolution(wrench: Array) -> Array:
-    """Return the smallest difference of two readings of each channel (6,), as far as it may be that of rounding."""
+    """Return the resolution (6,) of the readings: the smallest difference in each channel, within plausible limits."""
     gaps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in wrench.T]
     finest, coarsest = ROUNDING * np.abs(wrench).max(axis=0), np.sqrt(12) * COARSE * np.ptp(wrench, axis=0)
     return np.asarray(np.maximum(np.minimum(gaps, coarsest), finest))
 
 
 def written_step(wrench: Array) -> Array:
-    """Return the last decimal place of forces and torques (6,) that were written rounded, which no noise hides.
+    """Return the last decimal place (6,) of forces and torques that were written rounded.
 
-    It is 0 without one, and where rounding matters, because `broken_channels` then names it.
+    It is 0 if they were not rounded, or if the rounding is so coarse that `broken_channels` reports it.
     """
     steps = []
     for part in np.hsplit(wrench, 2):
@@ -364,13 +366,13 @@ def written_step(wrench: Array) -> Array:
 
 
 def _last_place(part: Array) -> float:
-    """Return the last decimal place of forces or torques (n, 3); 0 if they have more than a table."""
+    """Return the last decimal place of forces or torques (n, 3); 0 if they have more than `DECIMALS` decimals."""
     places = (10.0**-k for k in range(DECIMALS) if np.abs(part - np.round(part, k)).max() < 1e-3 * 10.0**-k)
     return next(places, 0.0)
 
 
 def _coarse_step(readings: Array) -> float:
-    """Return the step of which all differences of readings (n, 3) are multiples; 0 without one that matters."""
+    """Return the quantisation step of readings (n, 3); 0 if there is none, or if it is too small to matter."""
     distinct = [np.unique(channel) for channel in readings.T]
     if max(map(len, distinct)) < FEWEST_STEPS:
         return 0.0
@@ -381,6 +383,6 @@ def _coarse_step(readings: Array) -> float:
 
 
 def _copies(wrench: Array) -> list[NDArray[np.intp]]:
-    """Return the rows of each wrench that occurs more than once."""
+    """Return, for each wrench that occurs more than once, the rows with this wrench."""
     _, first, count = np.unique(wrench, axis=0, return_index=True, return_counts=True)
     return [np.flatnonzero((wrench == wrench[row]).all(axis=1)) for row in np.sort(first[count > 1])]

@@ -1,7 +1,7 @@
-"""Observability of a set of poses: rank, parameters that cannot be separated, second solution, gaps, poses to add.
+"""Observability of a set of poses: rank, inseparable parameters, second solution, and poses to add.
 
-The Fisher information covers the neighbourhood of one solution only. So two further checks follow: whether a second
-solution elsewhere explains the data as well, and which motion removes the ambiguity.
+The Fisher information describes only the neighbourhood of one solution. Two further checks are therefore made: whether
+a second, distant solution explains the data as well, and which motion removes the ambiguity.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ LEAST_POSES = 4
 RECOMMENDED_POSES = 6
 RANK_TOLERANCE = 1e-9
 POOR_CONDITION = 1e4
-# Eight poses distinguish the two solutions even if the tool weighs only ten times the noise.
+# With this gap, eight poses distinguish the two solutions even if the tool weighs only ten times the noise.
 WEAK_GAP = 0.02
 AMBIGUOUS_GAP = 1e-6
 # In 7361 simulated calibrations, a second solution with chi2 larger by this was never the right one.
@@ -28,20 +28,20 @@ SAME_ORIENTATION_RAD = np.deg2rad(0.5)
 LEVER_M = 0.025
 MOST_ADVISED = 5
 
-# Tool before any data: 1 kg, 80 mm from a sensor on an upright robot. Rank and gap hardly depend on it.
+# Assumed tool without data: 1 kg at 80 mm from a sensor on an upright robot. Rank and gap hardly depend on the tool.
 NOMINAL = Parameters(np.eye(3), -STANDARD_GRAVITY_M_S2 * UP_IN_BASE, np.zeros(3), np.array([0, 0, 0.08]), np.zeros(3))
 
 _SAME_MINIMUM_RAD = np.deg2rad(1.0)
 _ALIGNED = np.cos(np.deg2rad(5.0))
 _NARROW_DEG = 30.0
-# Smaller spreads of unit vectors count as zero: about one degree.
+# Spreads of unit vectors below about one degree are taken as zero.
 _THIN = 0.02
 _GROUPS = ("the mounting of the sensor", "gravity", "force bias", "centre of mass", "torque bias")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observability:
-    """Which parameters the poses determine."""
+    """Assessment of which parameters a set of poses determines."""
 
     orientations: int
     """Number of different orientations, counted up to 24."""
@@ -50,22 +50,23 @@ class Observability:
     condition: float
     """Ratio of the extreme eigenvalues of the scaled Fisher information; infinite below rank 15."""
     ambiguities: tuple[str, ...]
-    """Sentences: the reason, then the parameters that cannot be separated. Empty for a sound set."""
+    """Clauses: first the reason, then the parameters that cannot be separated. Empty for a sound set."""
     advice: tuple[str, ...]
-    """Poses to add, one phrase each, starting from the last pose of the set."""
+    """Phrases that describe the poses to add, relative to the last pose of the set."""
     advised_R_base_flange: Array
-    """(k, 3, 3) orientations of these poses; they make the set sound, if five poses suffice."""
+    """(k, 3, 3) orientations of the poses to add; the set is then sound, if five poses suffice."""
     second_gap: float
-    """Mean squared force residual of the best other solution, over weight squared: at best 8/9, 0 if ambiguous."""
+    """Mean squared force residual of the best other solution, relative to the weight squared: at most 8/9, 0 if
+    ambiguous."""
 
     @property
     def sound(self) -> bool:
-        """True for four orientations, full rank, a fair condition, and a clearly worse second solution."""
+        """Whether there are four orientations, full rank, a fair condition, and a clearly worse second solution."""
         enough = self.orientations >= LEAST_POSES and self.rank == 15
         return enough and self.condition <= POOR_CONDITION and self.second_gap >= WEAK_GAP
 
     def sentence(self) -> str:
-        """One sentence with the reason and the poses to add."""
+        """Return one sentence with the reason and the poses to add."""
         if not self.ambiguities:
             return f"the poses determine all parameters (condition {self.condition:.2g}, gap {self.second_gap:.2g})."
         text = self.ambiguities[0] + (": " + ", and ".join(self.ambiguities[1:]) if self.ambiguities[1:] else "")
@@ -79,17 +80,17 @@ class Observability:
 def assess(
     R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None, *, advise: bool = True
 ) -> Observability:
-    """Assess which parameters a set of poses determines.
+    """Return the observability of a set of poses.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
     parameters : Parameters
-        Estimated or, before any data, guessed.
+        Estimated parameters or, without data, a guess.
     wrench_cov : array, shape (n, 6, 6), optional
         Noise of each pose; equal for all poses by default.
     advise : bool
-        Whether to look for poses to add.
+        Whether to search for poses to add.
     """
     observability, information, weak = _nearby(R_base_flange, parameters, wrench_cov)
     observability = _with_second_gap(observability, R_base_flange, parameters)
@@ -106,7 +107,7 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
     Raises
     ------
     NotObservable
-        The message gives their number and the poses to add.
+        The message states the number of different orientations and the poses to add.
     """
     n, different = len(R_base_flange), different_orientations(R_base_flange)
     if n < least:
@@ -124,9 +125,9 @@ def require_orientations(R_base_flange: Array, least: int = LEAST_POSES) -> None
 
 
 def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None) -> None:
-    """Raise `NotObservable`, with the reason and the poses to add, for poses that do not determine the parameters.
+    """Raise `NotObservable`, with the reason and the poses to add, if the poses do not determine the parameters.
 
-    The parameters are the estimated ones, because observability depends on the direction of gravity.
+    `parameters` are the estimates, because observability depends on the direction of gravity.
     """
     require_orientations(R_base_flange)
     observability = assess(R_base_flange, parameters, wrench_cov, advise=False)
@@ -137,10 +138,10 @@ def require_observable(R_base_flange: Array, parameters: Parameters, wrench_cov:
 def _scaled_information(
     R_base_flange: Array, parameters: Parameters = NOMINAL, wrench_cov: Array | None = None
 ) -> Array:
-    """Fisher information (15, 15) in units of 1 rad, weight, weight, lever and weight times lever.
+    """Return the Fisher information (15, 15) in units of 1 rad, weight, weight, lever and weight times lever.
 
-    The lever is the distance of the centre of mass, 25 mm at least. By default the noise of the forces
-    is the weight and that of the torques 25 mm times it, so that the entries count poses.
+    The lever is the distance of the centre of mass, at least 25 mm. By default the noise of the forces equals the
+    weight, and that of the torques 25 mm times the weight, so the entries are numbers of poses.
     """
     weight_N = parameters.weight_N or 1.0
     lever_m = max(float(np.linalg.norm(parameters.p_sensor_com_m)), LEVER_M)
@@ -154,10 +155,10 @@ def _scaled_information(
 
 
 def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tuple[float, RotationMinimum | None]:
-    """Mean squared force residual, over the squared weight, of the best solution with another mounting; also that one.
+    """Return the gap to the best solution with another mounting, and that solution; infinity and None without one.
 
-    Without noise and from forces alone, because torques rarely decide. With white force noise sigma the wrong solution
-    of n poses is worse by n (weight / sigma)² times the gap. Infinite and None if there is no other minimum.
+    The gap is the mean squared force residual over the squared weight, from forces without noise, because torques
+    rarely decide. With force noise sigma, chi2 of the wrong solution of n poses is larger by n (weight / sigma)² gap.
     """
     force_N = gravity_wrench(parameters, R_base_flange)[:, :3]
     mountings = minima(force_cost(R_base_flange, force_N, np.ones(len(force_N))))
@@ -169,8 +170,8 @@ def second_minimum(R_base_flange: Array, parameters: Parameters = NOMINAL) -> tu
 
 
 def different_orientations(R_base_flange: Array) -> int:
-    """Count orientations that differ by more than half a degree; stops counting at 24."""
-    # The first 24 of a usual tour all differ: one comparison of all pairs answers for it.
+    """Return the number of orientations that differ by more than half a degree, counted up to 24."""
+    # The first 24 poses of a usual tour all differ, which one comparison of all pairs shows.
     kept, rest = R_base_flange[:24], R_base_flange[24:]
     pairs = np.triu_indices(len(kept), 1)
     if np.any(angle_between(kept[pairs[0]], kept[pairs[1]]) <= SAME_ORIENTATION_RAD):
@@ -188,9 +189,9 @@ def different_orientations(R_base_flange: Array) -> int:
 def _nearby(
     R_base_flange: Array, parameters: Parameters, wrench_cov: Array | None = None
 ) -> tuple[Observability, Array, Array]:
-    """Assess the neighbourhood of one solution, as if there were no second one.
+    """Return the observability in the neighbourhood of one solution, without a second solution.
 
-    Also the information (15, 15) in units of its largest eigenvalue, and its weak directions (15, k).
+    Also returned are the information (15, 15) in units of its largest eigenvalue, and its weak directions (15, k).
     """
     information = _scaled_information(R_base_flange, parameters, wrench_cov)
     eigenvalues, V = np.linalg.eigh(information)
@@ -203,7 +204,7 @@ def _nearby(
 
 
 def _is_sound(R_base_flange: Array, parameters: Parameters) -> bool:
-    """Give the `sound` of `assess`, and look for the second solution, which takes the longest, only if need be."""
+    """Whether a set of poses is sound; the second solution, which takes longest, is searched only if necessary."""
     observability = _nearby(R_base_flange, parameters)[0]
     return observability.sound and _with_second_gap(observability, R_base_flange, parameters).sound
 
@@ -247,7 +248,7 @@ def _ambiguities(
             "reversed gravity with the sensor turned by 180° about that axis explains them as well",
         )
     mean = gravity_flange.mean(axis=0)
-    length = float(np.linalg.norm(mean))  # zero for balanced sets, which point everywhere
+    length = float(np.linalg.norm(mean))  # zero for balanced sets
     widest = np.rad2deg(np.arccos(np.clip((gravity_flange @ mean).min() / max(length, _THIN), -1, 1)))
     if widest < _NARROW_DEG:
         return (
@@ -269,7 +270,7 @@ def _ambiguities(
 def _one_axis(
     axis_flange: Array, R_base_flange: Array, parameters: Parameters, information: Array, *, steady: bool
 ) -> tuple[str, ...]:
-    """Turns about one axis only: name each change of the parameters that hardly changes a reading."""
+    """Return the clauses for rotations about a single axis: the reason, and the parameters that cannot be separated."""
     R, P, b = parameters.R_flange_sensor.T, parameters.p_sensor_com_m, parameters.gravity_force_base_N
     axis_base, axis_sensor = R_base_flange @ axis_flange, R @ axis_flange
     weight_N, zero = parameters.weight_N, np.zeros(3)
@@ -314,7 +315,7 @@ def _axis_name(axis_flange: Array) -> str:
 
 
 def _suggested_motions() -> list[tuple[str, Array]]:
-    """Motions of the tool from the last pose, as phrases and rotations, simple ones first."""
+    """Return motions of the tool from the last pose as phrases and rotations, the simplest first."""
 
     def turn(axis: str, angle_deg: int) -> tuple[str, Array]:
         words = "turn the last joint by" if axis == "z" else "tilt the tool about the flange's"
@@ -328,9 +329,9 @@ def _suggested_motions() -> list[tuple[str, Array]]:
 
 
 def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ...], Array]:
-    """Search for few and simple motions from the last pose that make the set sound.
+    """Return phrases and orientations of a few simple motions from the last pose that make the set sound.
 
-    Each step takes the first motion that does so, or else the most informative one.
+    Each step takes the first motion that makes the set sound, or else the most informative one.
     """
     poses, words, motions = R_base_flange, list[str](), _suggested_motions()
     while len(words) < MOST_ADVISED:
@@ -345,7 +346,10 @@ def _advice(R_base_flange: Array, parameters: Parameters) -> tuple[tuple[str, ..
 
 
 def _worth(R_base_flange: Array, parameters: Parameters) -> float:
-    """Volume of the information, and distance of gravity directions from a plane, which has a second solution."""
+    """Return a score of the information volume and of the spread of gravity directions out of a plane.
+
+    Gravity directions in one plane have a second solution.
+    """
     information = _scaled_information(R_base_flange, parameters)
     gravity_flange = parameters.gravity_force_base_N @ R_base_flange
     spread = np.linalg.svd(gravity_flange - gravity_flange.mean(axis=0), compute_uv=False)
@@ -353,15 +357,15 @@ def _worth(R_base_flange: Array, parameters: Parameters) -> float:
     return float(np.log(np.maximum(np.linalg.eigvalsh(information), 0) + 1e-3).sum() + 4 * np.log(spread + 1e-3).sum())
 
 
-# Neighbours are about 3° apart.
+# Number of points on the sphere; neighbours are about 3° apart.
 _POINTS = 4000
-# Directions that are compared with all points at once, to save memory.
+# Number of directions compared with all points at once, limited to save memory.
 _PART = 500
 _ALONG = np.sin(np.radians(22.5))
 
 
 def evenly_spread(n: int) -> Array:
-    """Return n unit vectors (n, 3), evenly spread over the sphere: Fibonacci's spiral."""
+    """Return n unit vectors (n, 3) spread evenly over the sphere on a Fibonacci spiral."""
     i = np.arange(n) + 0.5
     z, azimuth = 1 - 2 * i / n, i * np.pi * (3 - np.sqrt(5))
     rho = np.sqrt(1 - z**2)
@@ -369,12 +373,12 @@ def evenly_spread(n: int) -> Array:
 
 
 def largest_gap(directions: Array) -> tuple[float, Array]:
-    """Find the direction that is farthest from the nearest of these unit vectors (n, 3).
+    """Return the direction with the largest angle to the nearest of given unit vectors (n, 3).
 
     Returns
     -------
     angle_rad : float
-        From that direction to the nearest, to about a degree.
+        Angle between that direction and the nearest unit vector, accurate to about a degree.
     direction : array, shape (3,)
         Unit vector.
     """

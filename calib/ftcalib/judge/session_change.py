@@ -1,11 +1,11 @@
-"""What changed during a session: bias, load or mounting from a pose on, or between two sensors that take turns.
+"""Changes during a session: of bias, load or mounting from a pose onwards, or alternating between two sensors.
 
-The bias may also step several times, as by a program that zeroes the sensor at its start.
+The bias may also step several times, for example if a program zeroes the sensor at its start.
 
-Each change competes with drift, inexact orientations, gain and bumped poses: the solver fits the data without it, and
-it is named if their restricted likelihood is larger by more than its `cost`.
+Each change competes with drift, orientation errors, gain and outliers. The solver fits the data corrected for the
+change, and the change is reported if their restricted likelihood is larger by more than its `cost`.
 
-`cable_of` estimates what a cable may have moved.
+`cable_of` estimates how far a cable may have shifted the estimates.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -37,32 +37,32 @@ from ftcalib.model import (
 )
 from ftcalib.sensor_matrix import response_columns
 
-# Fewer do not show a change beside 15 parameters.
+# With fewer poses a change cannot be separated from the 15 parameters.
 FEWEST_POSES = 10
-# Poses before and after.
+# Smallest number of poses before and after a change.
 FEWEST_ON_A_SIDE = 3
-# Of longer sessions only every second, third, ... pose is looked at; of those beyond 1000 poses, fewer.
+# Largest number of poses that are examined, and that number for sessions of more than 1000 poses.
 MOST_POSES, OF_MANY = 300, 150
-# A change must bring the mean square misfit below this share before the likelihood is asked.
+# A change is fitted only if it reduces the mean square misfit below this share.
 CLEARLY = 0.9
-# Residuals below this share of the weight are those of a change that is linear in its numbers.
+# With smaller residuals, as a share of the weight, a change is treated as linear.
 SMALL = 0.01
-# By which twice the log-likelihood must rise, beside log(6 n) for each number of the change.
+# Required gain in twice the log-likelihood, in addition to log(6 n) for each parameter of the change.
 MARGIN = 10.0
-# Drift that varies looks like steps of the bias, and hysteresis like two sensors that take turns: these bring more.
+# The required gain for steps of the bias and for alternating sensors, which resemble drift and hysteresis.
 LARGER_MARGIN = 20.0
-# Numbers of mounting and gravity that a step of the bias leaves, as matrix and vector, without their common scale.
+# Number of parameters of mounting and gravity, as matrix and vector without their common scale.
 _SHAPE = 11
-# Steps of the bias that are looked for, and poses between two.
+# Largest number of steps of the bias, and smallest number of poses between two steps.
 MOST_STEPS, FEWEST_BETWEEN = 6, 2
-# Sets of steps that get one more.
+# Number of sets of steps that are extended by another step (beam search).
 BEAM = 4
 Steps = tuple[int, ...]
 Rows = NDArray[np.integer | np.bool_]
 
-# Columns of `_columns`.
+# Column indices of `_change_columns`.
 TURN, BIAS, COM, LOAD, MOUNTING = range(3), range(3, 9), range(10, 13), range(9, 13), range(13, 16)
-# What changes, by code; a sensor mostly turns with its tool, and more seldom in itself.
+# Columns of the parameters that change, by code. A sensor usually turns together with its tool.
 KINDS = {
     "bias_stepped": [*BIAS],
     "com_shifted": [*COM],
@@ -72,44 +72,45 @@ KINDS = {
     "sensor_and_tool_turned": [*MOUNTING],
 }
 CHANGES = frozenset(("sensors_alternate", *KINDS))
-"""Codes of the findings that are changes, not mistakes."""
+"""Codes of findings about changes; all other codes of causes are mistakes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SessionChange:
-    """A change of some rows, relative to the others."""
+    """Change of some rows relative to the others."""
 
     code: str
     rows: Rows
-    """(n,) in the order of time: which changed, or how often the bias had stepped."""
+    """(n,) in the order of time: whether a row has changed, or the number of bias steps before it."""
     values: Mapping[str, float]
-    """Values of its finding."""
+    """Values of the finding."""
     corrected: Array
-    """(n, 6) wrench without it."""
+    """(n, 6) wrench with the change removed."""
     misfit: float
-    """Mean square of what it leaves, in noise."""
+    """Mean square residual after the correction, relative to the noise."""
     criterion: float
+    """BIC of the change among other kinds of change."""
 
     @property
     def takes_turns(self) -> bool:
-        """Whether every other pose differs, not all from one on."""
+        """Whether every other pose has changed, instead of all poses after a certain one."""
         step = np.diff(self.rows.astype(np.int64))
         return bool((step > 0).any() and (step < 0).any())
 
     @property
     def starts(self) -> NDArray[np.intp]:
-        """The first pose after each change."""
+        """Indices of the first pose after each change."""
         return np.flatnonzero(np.diff(self.rows)) + 1
 
     @property
     def cost(self) -> float:
-        """By how much minus twice the log-likelihood must fall without the change."""
+        """Required reduction of -2 log likelihood by the correction."""
         n, times = len(self.rows), 1 if self.takes_turns else len(self.starts)
         margin = LARGER_MARGIN if self.takes_turns or self.code == "bias_stepped" else MARGIN
         return float(times * (len(KINDS[self.code]) * np.log(6 * n) + 2 * np.log(n) + margin))
 
     def finding(self, rows: NDArray[np.intp], weights: Array) -> Finding:
-        """Name it, by the rows (n,) of the session that were looked at, and the weights of all its rows."""
+        """Return the finding, given the examined rows (n,) of the session and the weights of all rows."""
         poses, code = (rows[self.starts] + 1).tolist(), self.code
         values = {"pose": poses if len(poses) > 1 else poses[0]} | dict(self.values)
         severity: Severity = "reject"
@@ -117,27 +118,27 @@ class SessionChange:
             code = "sensor_turned"
         if self.takes_turns:
             code = "sensors_alternate"
-        elif code == "bias_stepped" or not (weights[rows[: self.starts[0]]] > 0.5).any():  # the load as it is now
+        elif code == "bias_stepped" or not (weights[rows[: self.starts[0]]] > 0.5).any():  # the present load was fitted
             severity = "limit"
         needed = CODES[code].values
         return Finding.of(code, severity, **{name: value for name, value in values.items() if name in needed})
 
 
 def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np.intp], list[SessionChange]]:
-    """Find the likeliest lasting change, or sensors that take turns, and the steps of the bias that leave the least.
+    """Return the likeliest lasting change or alternation of sensors, and the best steps of the bias.
 
     Parameters
     ----------
     found : Fit
-        Without known values.
+        Fit without known values.
     t_s : array, shape (n,)
     steps : bool
-        Whether steps of the bias count: not where the fit found no drift that they would look like.
+        Whether to search steps of the bias, which look like a drift.
 
     Returns
     -------
     rows : int array, shape (k,)
-        Those that were looked at, by time; of long sessions some.
+        Examined rows in the order of time; a subset for long sessions.
     changes : list of SessionChange
     """
     rows = np.argsort(t_s, kind="stable")
@@ -149,20 +150,19 @@ def possible_changes(found: Fit, t_s: Array, *, steps: bool) -> tuple[NDArray[np
     used = found.residuals[rows][found.weights[rows] > 0.5]
     likeliest = _likeliest_change(found.on_average, R, wrench, np.repeat(_axis_rms(used), 3))
     stepped = bias_steps(R, wrench) if steps else None
-    return rows, [one for one in (likeliest, stepped) if one is not None]
+    return rows, [change for change in (likeliest, stepped) if change is not None]
 
 
 def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Array) -> SessionChange | None:
-    """Find the change that leaves the least; None if it does not leave much less than none, or a steady drift.
+    """Return the change with the smallest misfit; None if no change or a linear drift fits almost as well.
 
-    The poses are in the order of time. `scale` (6,) is how much each channel is off without a change, in any common
-    unit.
+    The poses are in the order of time. `scale` (6,) is proportional to the residual of each channel without a change.
     """
     n = len(wrench)
     ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
     J = np.concatenate([jacobian(parameters, R), response_columns(parameters, R)], axis=2)
     residuals = wrench - predict(parameters, R)
-    # A steady drift is no change: what remains beside it is the measure.
+    # The misfit without a change is that with a linear drift, because a steady drift is no change.
     without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
     small = bool((_axis_rms(residuals) < SMALL * _axis_rms(gravity_wrench(parameters, R))).all())
     changes = []
@@ -175,19 +175,19 @@ def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Ar
         else:
             continue
         changes += [_refine(code, start, R, wrench, scale, groups[int(np.argmin(m))]) for code, m in misfits.items()]
-    change = min(changes, key=lambda one: one.criterion)
+    change = min(changes, key=lambda candidate: candidate.criterion)
     return change if change.misfit < CLEARLY * without else None
 
 
 def _axis_rms(wrench: Array) -> Array:
-    """Root mean square (2,) of the axes of force and of torque."""
+    """Return the rms (2,) over all axes of force, and over all axes of torque."""
     return np.asarray(np.sqrt(np.mean(wrench.reshape(-1, 2, 3) ** 2, axis=(0, 2))))
 
 
 def _linear_misfits(
     p: Parameters, R: Array, J: Array, residuals: Array, scale: Array, groups: NDArray[np.bool_]
 ) -> dict[str, Array]:
-    """Squared misfit (k,) of each kind of change of each group (k, n), together with the columns J (n, 6, m)."""
+    """Return the squared misfit (k,) of each kind of change in each group (k, n), fitted together with columns J."""
     C, J, r = _change_columns(p, R) / scale[:, None], J / scale[:, None], residuals / scale
     J = J / column_scale(summed_products(J, J))
     inverse = np.linalg.pinv(summed_products(J, J), rcond=1e-12, hermitian=True)
@@ -207,37 +207,37 @@ def _linear_misfits(
 
 
 def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
-    """Find the steps of the bias that leave the least force; None in few poses, or if they leave no less than none.
+    """Return the steps of the bias with the smallest force misfit; None for few poses, or if steps do not help.
 
-    Poses between two steps have a bias of their own, so only differences within them count. No rotation leaves less
-    than any matrix of its size, whose cost needs no start. The best sets of steps each get one more.
+    Each interval between steps has its own bias, so only differences within intervals are used. The misfit is that of
+    an unconstrained matrix instead of a rotation, which needs no starting value. Steps are added by beam search.
 
     Parameters
     ----------
     R : array, shape (n, 3, 3)
-        In the order of time, as the wrench.
+        Orientations in the order of time.
     wrench : array, shape (n, 6)
     """
     n = len(wrench)
     force_N = wrench[:, :3] - wrench[:, :3].mean(axis=0)
     finest = (ROUNDING * float(np.abs(wrench[:, :3]).max())) ** 2
-    # In flange axes, M f - R.T b for a matrix M, the mounting, and gravity b: linear in both.
+    # Residual in flange axes: M f - R.T b, linear in the mounting M (an arbitrary matrix) and in gravity b.
     rows = np.concatenate([np.einsum("nj,ik->nijk", force_N, np.eye(3)).reshape(n, 3, 9), -R.swapaxes(1, 2)], axis=2)
     total, sums = summed_products(rows, rows), np.concatenate([np.zeros((1, 3, 12)), np.cumsum(rows, axis=0)])
 
     def means(first: NDArray[np.intp], last: NDArray[np.intp]) -> Array:
-        """What a bias of its own takes from the sums of squares (k, 12, 12) of these poses."""
+        """Return the reduction (k, 12, 12) of the sums of squares by separate biases of intervals of poses."""
         own = sums[last] - sums[first]
         return np.asarray(np.einsum("kai,kaj->kij", own, own) / np.maximum(last - first, 1)[:, None, None])
 
     def square_left(gram: Array, steps: int) -> Array:
-        """Mean square of force (k,) that mounting and gravity leave of sums of squares (k, 12, 12)."""
+        """Return the mean square force residuals (k,) after fitting mounting and gravity, from sums (k, 12, 12)."""
         cross = gram[:, :9, 9:]
         left = gram[:, :9, :9] - cross @ np.linalg.pinv(gram[:, 9:, 9:], hermitian=True) @ cross.swapaxes(1, 2)
         return np.asarray(3 * np.maximum(np.linalg.eigvalsh(left)[:, 0], 0.0) / (3 * (n - steps - 1) - _SHAPE) + finest)
 
     def with_another(beam: Sequence[Steps]) -> dict[Steps, float]:
-        """Add each possible step to each set of others: all steps, and the mean square of force that they leave."""
+        """Return the mean square force residual of each set of steps, extended by each possible further step."""
         bounds, added = np.array([[0, *others, n] for others in beam]), dict[Steps, tuple[int, int]]()
         for i, own in enumerate(bounds.tolist()):
             for first, last in pairwise(own):
@@ -254,7 +254,7 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
         return dict(zip(added, square.tolist(), strict=True))
 
     everything = total - means(np.array([0]), np.array([n]))
-    # The first set must be better than none, and a larger one clearly better.
+    # One step must be better than none, and each further step clearly better.
     least = 3 * n * float(np.log(square_left(everything, 0)[0])) + LARGER_MARGIN
     best, beam = Steps(), [Steps()]
     for count in range(1, min(MOST_STEPS, n - 2 - _SHAPE // 3) + 1):
@@ -279,12 +279,12 @@ def bias_steps(R: Array, wrench: Array) -> SessionChange | None:
 
 
 def _less_means(values: Array, steps: Sequence[int]) -> Array:
-    """Values (n, ...) minus their mean between the steps."""
+    """Return values (n, ...) minus their mean in each interval between steps."""
     return np.concatenate([part - part.mean(axis=0) for part in np.split(values, steps)])
 
 
 def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
-    """Yield rows that may be of one kind, all if None, and the groups of others that may differ from them."""
+    """Yield rows that may be unchanged (None: all), and the groups of other rows that may have changed."""
     after = np.arange(n) >= np.arange(FEWEST_ON_A_SIDE, n - FEWEST_ON_A_SIDE + 1)[:, None]
     half, every_other = n // 2, np.arange(n)[None] % 2 == 1
     yield None, np.concatenate([after, every_other])
@@ -294,7 +294,7 @@ def _groups(n: int) -> Iterator[tuple[slice | None, NDArray[np.bool_]]]:
 
 
 def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArray[np.bool_]) -> dict[str, Array]:
-    """Squared misfit (k,) of each kind of change of each group (k, n), in closed form; the parameters stay."""
+    """Return the squared misfit (k,) of each kind of change in each group (k, n), at fixed parameters."""
     y, g, C = (wrench - p.bias) / scale, gravity_wrench(p, R) / scale, _change_columns(p, R) / scale[:, None]
     d, count = y - g, groups.sum(axis=1)[:, None, None]
 
@@ -306,7 +306,7 @@ def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArr
         return np.asarray(np.einsum("kj,kji,ki->k", moment, np.linalg.pinv(gram, hermitian=True), moment))
 
     def turned(cross: Array, square: Array) -> Array:
-        """Leave what the best rotation does (Kabsch 1976)."""
+        """Return the squared misfit after the best rotation (Kabsch 1976)."""
         s = np.linalg.svd(cross, compute_uv=False)
         return np.asarray(square - 2 * (s[:, 0] + s[:, 1] + np.sign(np.linalg.det(cross)) * s[:, 2]))
 
@@ -325,7 +325,7 @@ def _misfits(p: Parameters, R: Array, wrench: Array, scale: Array, groups: NDArr
 
 
 def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, rows: Rows) -> SessionChange:
-    """Undo the change of some rows, and improve it together with all parameters by linear least squares."""
+    """Return the change of some rows, refined together with all parameters by linear least squares."""
     y, g, own = wrench - p.bias, gravity_wrench(p, R), KINDS[code]
     undone, turn, step = y.copy(), np.eye(3), np.zeros(6)
     if code in ("sensor_turned", "sensor_changed"):
@@ -352,13 +352,13 @@ def _refine(code: str, p: Parameters, R: Array, wrench: Array, scale: Array, row
         "change_N": float(moved[9] if rows[-1] else -moved[9]),
         "shift_mm": 1e3 * _norm(moved[COM]),
     }
-    # BIC: kinds of change with more numbers must explain more.
+    # BIC: kinds of change with more parameters must explain more.
     criterion = wrench.size * np.log(max(misfit, 1e-300)) + len(own) * np.log(wrench.size)
     return SessionChange(code, rows, values, undone - C @ x[: len(own)] + p.bias, misfit, float(criterion))
 
 
 def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
-    """Mean square of what the columns J (n, 6, m) leave, for each degree of freedom, and their coefficients."""
+    """Return the mean square residual per degree of freedom after fitting columns J (n, 6, m), and the coefficients."""
     J, r = J / scale[:, None], residuals / scale
     gram = summed_products(J, J)
     unit = column_scale(gram)
@@ -369,7 +369,10 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
 
 
 def _change_columns(p: Parameters, R: Array) -> Array:
-    """(n, 6, 16) derivative by a turn of the sensor, both biases, weight, centre of mass, and a turn with the tool."""
+    """Return the derivative (n, 6, 16) of the wrench by the parameters that may change.
+
+    They are a rotation of the sensor, both biases, weight, centre of mass, and a rotation of sensor and tool together.
+    """
     J, g = jacobian(p, R), gravity_wrench(p, R)
     turn = -np.concatenate([skew(g[:, :3]), skew(g[:, 3:])], axis=1)
     bias = np.broadcast_to(np.eye(6), (len(R), 6, 6))
@@ -384,23 +387,22 @@ def _norm(vector: Array) -> float:
     return float(np.linalg.norm(vector))
 
 
-# A cable that acts as a spring: how far its torque may have moved mounting, weight and centre of mass.
+# A cable that acts like a spring, and the shift of mounting, weight and centre of mass that its torque may cause.
 #
 #     torque_Nm = K v,    v = rotation vector of an orientation relative to the one in which the cable is slack
 #
-# Over orientations within a cone such a torque looks like a shift of the centre of mass, and its rest like white noise.
-# Where there is such noise, the stiffness K (3, 3) is estimated beside the parameters. These move (the bias of an
-# omitted variable), and their reported sigma allows for this. Compensation does not need it: the cable pulls in the
-# next use too.
+# Over orientations within a cone such a torque looks like a shift of the centre of mass, and the rest like white noise.
+# If there is such noise, the stiffness K (3, 3) is estimated together with the parameters. The resulting shift of the
+# parameters (omitted-variable bias) is added to their reported sigma. The compensation is not corrected, because the
+# cable pulls at the next use too.
 
-# Probability of a chance finding: slack at the mean orientation, and at the best of about 70.
+# False-alarm probability: with the slack orientation at the mean, and at the best of about 70 orientations.
 FALSE = 1e-3, 1e-4
-# Probability of a chance finding where the torques have more noise than was measured: its cause is unknown, and a
-# cable is a usual one.
+# False-alarm probability if the torques have more noise than measured, for which a cable is a common cause.
 FALSE_IN_NOISE = 0.05
-# Poses: fewer leave nothing for a test. More are seldom of a tour.
+# Number of poses: with fewer no test is possible, and a tour rarely has more.
 FEWEST, MOST = 8, 1000
-# Numbers that are estimated.
+# Number of parameters of the stiffness and of the slack orientation.
 STIFFNESS, SLACK = 9, 3
 STARTS = 24
 STEPS_RAD = np.deg2rad([40.0, 20.0, 10.0])
@@ -409,10 +411,10 @@ _AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
 
 
 def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
-    """Look for the torque of a spring in what a fit leaves; None if chance explains it.
+    """Return the finding of a cable that acts like a spring, and the shift of the estimates; None if not significant.
 
-    The finding holds the torque, root mean square over the poses, and what it may have done to the centre of mass. The
-    second value (15,) is by what it may have moved the estimates; zero for the biases, which belong to the cell.
+    The finding contains the rms torque over the poses, and the possible shift of the centre of mass. The shift (15,) is
+    zero for the biases.
     """
     n = len(fit.order)
     dof = fit.dof - STIFFNESS - SLACK
@@ -426,7 +428,7 @@ def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     chi2 = float(np.vdot(r, u))
 
     def best_of(slack: Array) -> tuple[float, Array, Array, Array]:
-        """Find the best slack orientation of (k, 3, 3): fall of chi2, orientation, torques, moved parameters."""
+        """Return the best slack orientation of (k, 3, 3): reduction of chi2, orientation, torques, parameter shift."""
         k = len(slack)
         v = Rotation.from_matrix((np.swapaxes(slack, 1, 2)[:, None] @ R).reshape(-1, 3, 3)).as_rotvec()
         each = np.zeros((n, 6, k, 3, 3))
@@ -438,7 +440,7 @@ def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
         between = summed_products(WJ, X).reshape(15, k, 9).swapaxes(0, 1)
         H -= np.swapaxes(between, 1, 2) @ C @ between
         scale = np.sqrt(np.maximum(np.einsum("kaa->ka", H), 1e-300))
-        # Turns about one axis alone leave a part of the stiffness open.
+        # Rotations about a single axis do not determine all of the stiffness.
         H = np.asarray(H / scale[:, :, None] / scale[:, None] + 1e-6 * np.eye(9))
         stiffness = np.linalg.solve(H, (g / scale)[..., None])[..., 0] / scale
         gain = np.sum(g * stiffness, axis=1)
@@ -454,10 +456,10 @@ def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     measured = bool(np.isfinite(fit.measured_chi2))
     noisy = measured and any(name.startswith("white_t") for name in fit.components)
     if not sure and (noisy or not measured):
-        best = max(best, best_of(R[:: max(1, n // STARTS)]), key=lambda found: found[0])
+        best = max(best, best_of(R[:: max(1, n // STARTS)]), key=lambda candidate: candidate[0])
         for angle_rad in STEPS_RAD:
             near = best[1] @ Rotation.from_rotvec(angle_rad * _AROUND).as_matrix()
-            best = max(best, best_of(near), key=lambda found: found[0])
+            best = max(best, best_of(near), key=lambda candidate: candidate[0])
         sure = probability(best[0], STIFFNESS + SLACK) < (FALSE_IN_NOISE if noisy else FALSE[1])
     if not sure:
         return None

@@ -1,4 +1,4 @@
-"""Units that were taken for N and N·m, by the weight and the centre of mass that they make."""
+"""Detection of wrong units of force and torque, by implausible weights and centres of mass."""
 
 from collections.abc import Collection
 
@@ -8,17 +8,18 @@ from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
-# A centre of mass farther than the first must be described; farther than the second is wrong otherwise.
+# Distances of the centre of mass: beyond the first, without a described tool, a result is limited; beyond the second it
+# is rejected.
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
 NEAREST_COM_M = 5e-4
-# Weights beyond these look like forces in another unit: 30 g, and more than any UR arm carries.
+# Weights outside the first two limits look like forces in another unit: below 30 g, or above the payload of UR arms.
 LIGHTEST_N, HEAVIEST_N, IMPOSSIBLE_N = 0.3, 500.0, 2000.0
-# A force and a torque of bias beyond the range of most sensors, in N and N·m, and of any that an arm carries.
+# Bias of force and torque, N and N·m, beyond the range of most sensors, and beyond that of any sensor on an arm.
 LARGE_BIAS, IMPOSSIBLE_BIAS = (500.0, 100.0), (2000.0, 400.0)
-# A sensor whose bias is so many times the weight was not chosen for the tool.
+# A bias must also exceed the weight by this factor to be implausible.
 LARGE_SHARE = 20.0
 CONFIRMED_SIGMAS = 3.0
-# Forces in another unit leave less than this share of the weight.
+# Largest residual, as a share of the weight, of data that are only in another unit.
 NOISY = 0.03
 FORCE_UNITS_N = {"N": 1.0, "lbf": 4.4482216152605, "kgf": 9.80665, "gf": 9.80665e-3, "mN": 1e-3, "kN": 1e3}
 TORQUE_UNITS_NM = {
@@ -36,12 +37,12 @@ UNITS = (
     *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),
 )
 
-# Pairs of a unit of force and one of torque.
+# Pairs of suspected units of force and torque.
 Suspects = list[tuple[str, str]]
 
 
 def by_com(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> Suspects:
-    """Return the wrong units, with one of these units of force, that make a usual distance of the centre of mass."""
+    """Return pairs of wrong units, with the given units of force, that explain the distance of the centre of mass."""
     low, high = USUAL_COM_M
     return [
         (force, torque)
@@ -51,7 +52,7 @@ def by_com(com_m: float, forces: Collection[str] = tuple(FORCE_UNITS_N)) -> Susp
 
 
 def by_mass(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
-    """Return the wrong units of force that make a mass of the data agree with another one, within a share of it."""
+    """Return the units of force with which the measured mass would equal the true mass, within a relative tolerance."""
     if true_kg <= 0:
         return []
     off = {unit: abs(mass_kg * size / true_kg - 1) for unit, size in FORCE_UNITS_N.items() if size != 1}
@@ -59,19 +60,19 @@ def by_mass(mass_kg: float, true_kg: float, tolerance: float) -> list[str]:
 
 
 def suspects(estimate: Parameters, forces: Collection[str]) -> Suspects:
-    """Return these units of force, with those of torque that give a usual centre of mass."""
+    """Return the units of force, each with the units of torque that give a usual centre of mass."""
     return by_com(float(np.linalg.norm(estimate.p_sensor_com_m)), forces) or [(force, "N·m") for force in forces]
 
 
 def unit_of_force(mass: float, sigma: float, true_kg: float, tolerance_kg: float) -> tuple[float, float]:
-    """Return what a unit of force is by a known mass, in N, and its standard deviation.
+    """Return the size of the unit of force in N according to a known mass, and its standard deviation.
 
     Parameters
     ----------
     mass, sigma : float
-        As the data give it, with its standard deviation, if a unit were 1 N.
+        Mass from the data and its standard deviation, for a unit of 1 N.
     true_kg, tolerance_kg : float
-        The known mass, and its standard deviation.
+        Known mass and its standard deviation.
     """
     unit_N = true_kg / mass
     return unit_N, unit_N * float(np.hypot(sigma / mass, tolerance_kg / true_kg))
@@ -85,19 +86,19 @@ def implausible(
     any_bias: bool = False,
     unit_N: tuple[float, float] | None = None,
 ) -> list[Finding]:
-    """Find a bias that no sensor, and a weight or a centre of mass that no tool has, with units that make it usual.
+    """Return findings for an implausible bias, weight or centre of mass, with the units that would explain them.
 
     Parameters
     ----------
     estimate : Parameters
     residual_N : float
-        Root mean square of the forces.
+        Rms residual of the forces.
     described : bool
-        Whether the shape of the tool is, which alone limits how far its centre of mass may be.
+        Whether the shape of the tool is described; then the description limits the centre of mass.
     any_bias : bool
         Whether the zero of the sensor is arbitrary.
     unit_N : (float, float), optional
-        By a known mass, as of `unit_of_force`.
+        Size of the unit of force by a known mass, from `unit_of_force`.
     """
     weight_N, com_m = estimate.weight_N, float(np.linalg.norm(estimate.p_sensor_com_m))
     findings = [*([] if any_bias else _bias(estimate, unit_N)), *too_light(weight_N, com_m, residual_N)]
@@ -119,7 +120,7 @@ def _bias(estimate: Parameters, unit_N: tuple[float, float] | None) -> list[Find
     size = np.array([np.linalg.norm(estimate.force_bias_N), np.linalg.norm(estimate.torque_bias_Nm)])
     lever_m = max(USUAL_COM_M[1], float(np.linalg.norm(estimate.p_sensor_com_m)))
     large = (size > LARGE_BIAS) & (size > LARGE_SHARE * estimate.weight_N * np.array([1.0, lever_m]))
-    # Of a sensor with an arbitrary zero, a known mass confirms the unit of force.
+    # A large force bias is plausible if a known mass confirms the unit of force.
     large[0] &= unit_N is None or abs(unit_N[0] - 1) > CONFIRMED_SIGMAS * unit_N[1]
     if not large.any():
         return []
@@ -129,7 +130,7 @@ def _bias(estimate: Parameters, unit_N: tuple[float, float] | None) -> list[Find
 
 
 def too_light(weight_N: float, com_m: float, residual_N: float) -> list[Finding]:
-    """Find a weight that is none: in kilonewtons, or already compensated, which leaves little but noise."""
+    """Return a finding for a weight near zero: in kilonewtons, or already compensated."""
     if weight_N >= LIGHTEST_N:
         return []
     if residual_N < NOISY * weight_N and (pairs := by_com(com_m, ["kN"])):

@@ -1,6 +1,6 @@
-"""All findings about estimates, which give their verdict: how well they predict, and whether they are plausible.
+"""Findings about estimates and their verdict: how well they predict, and whether they are plausible.
 
-Cross-validation interpolates a drift, but a calibration is used after its tour: `drift_ahead` extrapolates it.
+Cross-validation interpolates a drift, but a calibration is used after its tour, so `drift_ahead` extrapolates it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,33 +32,34 @@ from ftcalib.sensor_matrix import Response
 SIGNIFICANT_SIGMAS = 5.0
 NOISE_FACTOR = 3.0
 USABLE_SHARE, REJECTED_SHARE = 0.02, 0.10
-# Mean square of the cross-validated residuals, in sigma, up to which a few poses are as their covariance predicts.
+# Largest mean square of leave-one-out residuals, in sigma, at which few poses agree with their covariance.
 _AS_PREDICTED = 4.0
-# If residuals reach half the weight, neither gravity nor centre of mass mean anything.
+# If residuals reach half the weight, estimates of gravity and centre of mass are meaningless.
 SENSELESS_SHARE = 0.5
-# Largest error of a good result whose residuals exceed the measured noise.
+# Largest error, as a share of the weight, of a good result whose residuals exceed the measured noise.
 NOISY_SHARE = 0.01
-# Largest error of a good result that has a structure, of the weight: its sigmas rest on a few numbers.
+# Largest structured error of a good result, as a share of the weight.
 STRUCTURED_SHARE = 0.002
-# The same in motion, and what is named at rest; and what calibrated arms keep.
+# Largest structured error of a good result in motion, which is noted in a static result; and the orientation error of
+# a calibrated arm, which is accepted in motion.
 SMOOTH_SHARE, CALIBRATED_ARM_RAD = 0.0005, 0.001
 # Torque errors are compared with the weight at this lever, or at the centre of mass if that is farther.
 USUAL_LEVER_M = 0.1
 CORRELATED = 0.9
 FEW_LEFT_OUT = 0.1
-# Torques of another sensor leave more than this share of their change.
+# Torque residual, as a share of the change of the torques, from which torques do not follow the weight.
 UNRELATED = 0.8
-# Poses that show a fault as clearly as all of them, in runs long enough to show a wrong pairing.
+# Number of poses in which mistakes are searched, and length of the runs of successive poses among them.
 ENOUGH_FOR_FAULTS, SUCCESSIVE = 2000, 100
-# Probability of a false reason.
+# False-alarm probability of a finding.
 SURE = 1e-3
 
-# From pose to pose, if their times are not known.
+# Assumed interval between poses if their times are unknown.
 USUAL_INTERVAL_S = 10.0
-# From the last pose to the next use.
+# Time from the last pose to the next use.
 NEXT_USE_S = 60.0
 HOUR = 3600.0 / NEXT_USE_S
-# A linear drift is mostly the beginning of a warm-up, of 10 to 30 min.
+# Time constant of a warm-up of 10 to 30 min, of which a linear drift is usually the beginning.
 WARM_UP = 1200.0 / NEXT_USE_S
 
 _RMS = "force_rms_N", "torque_rms_Nm"
@@ -66,18 +67,18 @@ _RMS = "force_rms_N", "torque_rms_Nm"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftAhead:
-    """The bias at the next use, a minute after the last pose, less that of the result; zero without drift."""
+    """Expected change of the bias from the last pose to the next use, a minute later; zero without drift."""
 
     growth_per_min: Array
-    """(6,) change in the next minute: its size if the bias is linear in time, its standard deviation if it walks."""
+    """(6,) change of the bias in the next minute for a linear drift, or its standard deviation for a random walk."""
     square: Array
-    """(6,) expected square at the next use."""
+    """(6,) expected squared change of the bias at the next use."""
     hour_square: Array
-    """(6,) the same an hour after the last pose."""
+    """(6,) expected squared change of the bias an hour after the last pose."""
 
 
 def drift_ahead(found: Estimate, t_s: Array | None = None) -> DriftAhead:
-    """Extrapolate the drift that was found; without finite times `t_s` (n,) one pose every 10 s in their order."""
+    """Return the extrapolated drift; without finite times `t_s` (n,) an interval of 10 s between poses is assumed."""
     if found.drift is None or found.drift.course is None:
         return DriftAhead(*np.zeros((3, 6)))
     n = len(found.weights)
@@ -88,10 +89,10 @@ def drift_ahead(found: Estimate, t_s: Array | None = None) -> DriftAhead:
     intervals = NEXT_USE_S * (n - 1) / np.ptp(time)
     walk = np.zeros(6)
     for channels in (FORCE, TORQUE, *([c] for c in range(6))):
-        # A random walk has no direction: only its variance grows until the next use.
+        # A random walk has mean zero; only its variance grows until the next use.
         walk[channels] += intervals * found.components.get(channel_component("walk", channels).name, 0.0) ** 2
     linear = np.where(walk > 0, 0.0, found.drift.change * NEXT_USE_S / (time[last] - time[first]))
-    # The change from the first pose to the last has the errors of both ends.
+    # The variance of the change from first to last pose contains the errors of both ends.
     known = found.drift.sigma**2 / 2
     square = linear**2 + walk + known
     hour = (WARM_UP * (1 - np.exp(-HOUR / WARM_UP)) * linear) ** 2 + HOUR * walk + known
@@ -100,70 +101,71 @@ def drift_ahead(found: Estimate, t_s: Array | None = None) -> DriftAhead:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """What is judged: estimates, and what is known about their data and the cell."""
+    """Estimates to be judged, with information about their data and the cell."""
 
     found: Estimate
     t_s: Array | None = None
-    """(n,) when each pose was measured; the order of rows counts if it is missing or not finite."""
+    """(n,) times of the poses; the order of rows is used if times are missing or not finite."""
     setup: Setup = NOTHING
-    """The described cell."""
+    """Description of the cell."""
     known: Known | None = None
-    """That the estimates used."""
+    """Known values used by the estimates."""
     free: Estimate | None = None
-    """The best fit to the same poses without known values, if the estimates used some or are no fit."""
+    """Maximum likelihood fit without known values, if the estimates used known values or another method."""
     g_m_s2: float = STANDARD_GRAVITY_M_S2
     written: str = ""
-    """As what the orientations were written, as of `faults`."""
+    """Form in which the orientations were given, see `faults`."""
 
     @property
     def freest(self) -> Estimate:
-        """Without known values, where there is such a fit: known values that are wrong would look like a change."""
+        """Estimates without known values if available, because wrong known values would look like a change."""
         return self.free or self.found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quality:
-    """The judgement on estimates, and the numbers that it rests on."""
+    """Judgement of estimates: statistics, findings and verdict."""
 
     used: NDArray[np.bool_]
-    """(n,)"""
+    """(n,) whether a pose was used."""
     finest: Array
-    """(6,) residual that no sensor resolves, or none of readings that were written rounded."""
+    """(6,) smallest residual that a sensor, or readings that were written rounded, can resolve."""
     is_exact: bool
-    """Whether no sensor resolves the residuals, as in simulated data. Equal readings are no copies then."""
+    """Whether all residuals are below `finest`, as in simulated data. Equal readings are then no copies."""
     accidents: bool
-    """Whether something happened to the rejected poses alone. Uneven rounding alone also rejects poses."""
+    """Whether the rejected poses are isolated outliers; rounding alone may also reject poses."""
     suspect: bool
-    """Whether a mistake in the data may be the reason of errors, rejected poses or cross-talk."""
+    """Whether a mistake in the data may be the cause of errors, rejected poses or cross-talk."""
     residual_sigma: Array
-    """(n,) cross-validated residual of each pose in sigma, root mean square over the channels: 1 expected."""
+    """(n,) leave-one-out residual of each pose in sigma, rms over the channels: 1 expected."""
     worst_pose: int
-    """Row of the used pose with the largest cross-validated residual."""
+    """Row of the used pose with the largest leave-one-out residual."""
     lag1: float
     """Correlation of the residuals of successive used poses; near 0 without drift."""
     lag1_p: float
     """Probability of a larger correlation by chance."""
     largest_share: float
-    """Largest error relative to the weight."""
+    """Largest error of force or torque relative to the weight."""
     errors: list[Finding]
-    """Errors of force and torque that are too large."""
+    """Findings for errors of force and torque that are too large."""
     loo_force_rms_N: float
-    """Cross-validated: root mean square error of predicting each used pose from all others."""
+    """Leave-one-out rms error of force over the used poses, N."""
     loo_torque_rms_Nm: float
+    """Leave-one-out rms error of torque over the used poses, N·m."""
     ahead: DriftAhead
-    """The drift from the last pose to the next use."""
+    """Drift from the last pose to the next use."""
     noise_factor: float | None
-    """Residuals over measured noise; None if the noise was not measured."""
+    """Ratio of residuals to measured noise; None if the noise was not measured."""
     chi2_p: float | None
-    """Probability of a larger chi2 if there is only the measured noise; None if the noise was not measured."""
+    """Probability of a larger chi2 under the measured noise alone; None if the noise was not measured."""
     correlations: tuple[tuple[str, str, float], ...]
-    """Pairs of parameters that are correlated by more than 0.9, strongest first."""
+    """Pairs of parameters with a correlation above 0.9, strongest first."""
     findings: tuple[Finding, ...] = ()
-    """The first one to be fixed first; notes come last."""
+    """Findings in the order in which to fix them; notes come last."""
     uses: Mapping[str, JSON] = field(default_factory=dict)
     """Errors of compensating a free tool after a tour, by name and unit: see `_errors_of_uses`."""
     cable_shift: Array | None = None
-    """(15,) by which a cable may have moved the estimates; None: the readings show none."""
+    """(15,) possible shift of the estimates by a cable; None if the readings show no cable."""
 
     @property
     def verdict(self) -> Verdict:
@@ -176,7 +178,7 @@ class Quality:
         return self.chi2_p is not None and self.chi2_p >= SURE
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the statistics that a result keeps as its `quality`."""
+        """Return the statistics that a result stores as `quality`."""
         return {
             "loo_force_rms_N": self.loo_force_rms_N,
             "loo_torque_rms_Nm": self.loo_torque_rms_Nm,
@@ -189,16 +191,16 @@ class Quality:
 
 
 def statistics(case: Case) -> Quality:
-    """Return the numbers that a judgement rests on, without findings.
+    """Return the statistics of a judgement, without findings.
 
-    Errors count relative to the weight, torques at a lever: the residual, the cross-validated error, which few poses
-    cannot make look small, and the error expected over all orientations.
+    Residuals, leave-one-out errors and expected errors over all orientations are compared with the weight, those of
+    torque with the weight at a lever.
     """
     found, t_s = case.found, case.t_s
     used, finest = found.weights > 0.5, _finest(found.wrench)
     residuals = standardize(found.left_out_residuals, found.left_out_cov)
     residual_sigma = np.sqrt(np.mean(residuals**2, axis=1))
-    # The others predict one of a few poses badly, as the covariance of the prediction says.
+    # With few poses, leave-one-out errors are large, which is accepted if they agree with their covariance.
     few = used.sum() < RECOMMENDED_POSES and np.mean(residual_sigma[used] ** 2) < _AS_PREDICTED
     largest_share, errors, left_out_rms = _error_findings(found, used, few=bool(few))
     unresolved = np.abs(found.residuals) <= finest
@@ -209,7 +211,7 @@ def statistics(case: Case) -> Quality:
         finest,
         bool(unresolved[used].all()),
         accidents,
-        bool(errors) or not accidents or "cross_talk" in found.components,  # which hides axes that almost agree
+        bool(errors) or not accidents or "cross_talk" in found.components,  # cross-talk may hide slightly wrong axes
         residual_sigma,
         int(np.argmax(np.where(used, residual_sigma, -1.0))),
         *_successive_correlation(residuals[used], None if t_s is None else t_s[used]),
@@ -224,13 +226,13 @@ def statistics(case: Case) -> Quality:
 
 
 def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
-    """Judge the estimates of a tour by their statistics and by what explains the data better: mistakes, or a change.
+    """Return the judgement of a tour with findings, given mistakes or a change that explain the data better.
 
-    Residuals up to three times the measured noise are good if the errors stay below 1 %, because orientations and
-    cables always add to the noise of a good sensor.
+    Residuals up to three times the measured noise are good if the errors are below 1 %, because orientations and cables
+    always add to the noise of a good sensor.
     """
     found, free = case.found, case.free
-    mistaken, broken = any(one.code not in CHANGES for one in causes), _broken(found, quality, causes)
+    mistaken, broken = any(cause.code not in CHANGES for cause in causes), _broken(found, quality, causes)
     contradicted = list[Finding]()
     if case.known is not None and free is not None:
         at_its_best = free.parameters, free.covariance
@@ -242,7 +244,7 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
     findings = [
         *broken,
         *causes,
-        *(replace(one, severity="limit") if gain and one.severity == "reject" else one for one in quality.errors),
+        *(replace(each, severity="limit") if gain and each.severity == "reject" else each for each in quality.errors),
         *_weight_findings(found, case.setup),
         *_second_solution(found, free),
         *_unit_findings(case, quality, contradicted),
@@ -256,10 +258,10 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
         *([] if cable is None else cable[:1]),
     ]
     findings += _cell_findings(case, quality, findings, mistaken=mistaken, broken=bool(broken))
-    # Data with a mistake, or that fit as they are, say nothing against a known value.
+    # Contradictions to known values are reported only if the data have no mistake and do not fit the measured noise.
     if not (broken or mistaken or quality.fits_measured_noise):
         harmless = verdict_of(findings) == "good"
-        findings += [replace(one, severity="note") if harmless else one for one in contradicted]
+        findings += [replace(each, severity="note") if harmless else each for each in contradicted]
     return replace(
         quality,
         findings=tuple(folded(ordered(findings))),
@@ -269,10 +271,10 @@ def judge(case: Case, quality: Quality, causes: Sequence[Finding]) -> Quality:
 
 
 def judge_motion(case: Case) -> Quality:
-    """Judge the estimates of a recording in motion by rows of it, which are means and no poses of their own."""
+    """Return the judgement of a recording in motion, whose rows are treated like static poses."""
     found, quality = case.found, statistics(case)
-    # Neighbouring rows of a motion differ too little to show a bias that changes with each.
-    mistakes = [one for one in find_mistakes(case, quality) if one.code != "zeroed_each_pose"]
+    # Neighbouring rows differ too little to show whether the sensor was zeroed at each.
+    mistakes = [mistake for mistake in find_mistakes(case, quality) if mistake.code != "zeroed_each_pose"]
     mistakes = mistakes or find_other_poses(case, quality)
     broken = _broken(found, quality, mistakes)
     findings = [
@@ -289,10 +291,10 @@ def judge_motion(case: Case) -> Quality:
 
 
 def find_mistakes(case: Case, quality: Quality) -> list[Finding]:
-    """Look for mistakes in all poses, or of many in evenly spread runs, and if there are none, in the used poses.
+    """Return mistakes in all poses (a subset of many) or, if there are none, in the used poses.
 
-    A wrong pose or two were rejected; only the used poses show whether most of them are wrong. Good data are not looked
-    at, except for torques that belong to no weight.
+    Isolated wrong poses were rejected, so the used poses are examined too. Good data are examined only for torques that
+    do not follow the weight.
     """
     found, order, mistakes = case.found, _some_runs(case.t_s, len(quality.used)), list[Finding]()
     kept = order[quality.used[order]]
@@ -303,24 +305,24 @@ def find_mistakes(case: Case, quality: Quality) -> list[Finding]:
 
 
 def find_other_poses(case: Case, quality: Quality) -> list[Finding]:
-    """Look for a weight in other poses than given, which other mistakes or a change may explain better."""
+    """Return a finding for a weight in other poses; other mistakes or a change may explain the data better."""
     if not quality.suspect:
         return []
     found, order = case.found, _some_runs(case.t_s, len(quality.used))
     kept = order[quality.used[order]]
     named = other_poses(found.R_base_flange[kept], found.wrench[kept])
-    # Those that fit by chance do not show how far off the poses are.
+    # Poses that fit by chance do not show the error of the others.
     if named and not _few_rejected(quality.used):
         named = other_poses(found.R_base_flange[order], found.wrench[order]) or named
     return named
 
 
 def _errors_of_uses(case: Case, quality: Quality) -> dict[str, JSON]:
-    """Errors of compensating a free tool after a tour, N and N·m, with the drift that was found.
+    """Return the errors of compensating a free tool after a tour, N and N·m, including drift.
 
-    At the next use, a minute after the last pose, it is that of noise alone if this explains the residuals, else the
-    cross-validated one, of all poses if many were rejected: what they had may come again. "workspace" is the same in
-    any orientation with any base joints, and "hour" an hour after the last pose, as a drift goes on.
+    "next_use", a minute after the last pose, is the error due to noise if this explains the residuals, otherwise the
+    leave-one-out error, of all poses if many were rejected. "workspace" is the same over all orientations and base
+    joint angles, and "hour" an hour after the last pose.
     """
     found, few_rejected, more = case.found, _few_rejected(quality.used), np.zeros(2)
     if quality.fits_measured_noise and few_rejected:
@@ -333,24 +335,24 @@ def _errors_of_uses(case: Case, quality: Quality) -> dict[str, JSON]:
     next_use = np.sqrt(np.array(error) ** 2 + now)
     of_arm = error_with_other_joints(found.parameters, case.setup.orientation_rad) ** 2
     rms = {"next_use": next_use, "workspace": np.sqrt(next_use**2 + more + of_arm)}
-    if ahead.square.any():  # a tour without drift does not show what an hour brings
+    if ahead.square.any():  # without a drift in the tour the error after an hour is unknown
         rms["hour"] = np.sqrt(next_use**2 + then - now)
     uses = {f"{when}_{unit}": float(each[k]) for when, each in rms.items() for k, unit in enumerate(_RMS)}
     return {**uses, "bias_growth_per_min": ahead.growth_per_min.tolist()}
 
 
 def _broken(found: Estimate, quality: Quality, causes: Sequence[Finding]) -> list[Finding]:
-    """Look for broken channels; simulated readings without noise repeat themselves by right, also in wrong poses."""
-    if quality.is_exact or any(_leaves_nothing(one, quality.finest) for one in causes):
+    """Return findings for broken channels; not for simulated data without noise, whose readings may repeat."""
+    if quality.is_exact or any(_leaves_nothing(cause, quality.finest) for cause in causes):
         return []
     return broken_channels(found.wrench, found.R_base_flange)
 
 
 def _unit_findings(case: Case, quality: Quality, contradicted: Sequence[Finding] = ()) -> list[Finding]:
-    """Name a bias, a weight or a centre of mass that only another unit would make usual."""
+    """Return findings for a bias, weight or centre of mass that wrong units would explain."""
     found, setup = case.found, case.setup
-    # A contradicted mass has it already.
-    by_mass = any(one.code == "known_mass" for one in contradicted)
+    # The finding of a contradicted mass already states the unit of force.
+    by_mass = any(each.code == "known_mass" for each in contradicted)
     return units.implausible(
         found.parameters,
         _rms_norm(found.residuals[quality.used, :3]),
@@ -363,41 +365,41 @@ def _unit_findings(case: Case, quality: Quality, contradicted: Sequence[Finding]
 def _cell_findings(
     case: Case, quality: Quality, findings: Sequence[Finding], *, mistaken: bool, broken: bool
 ) -> list[Finding]:
-    """Compare with the described cell, as far as the findings leave estimates that mean something."""
+    """Return contradictions to the described cell, unless other findings make the estimates meaningless."""
     parameters, covariance, setup = case.found.parameters, case.found.covariance, case.setup
     load_kg, named = parameters.weight_N / case.g_m_s2, list[Finding]()
     payload = described_cell.payload(setup.payload_kg, load_kg, setup.sensor_mass_kg, parameters)
-    # Signs and mounting follow from the estimates, which mean nothing beside a mistake or such errors.
+    # With a mistake or very large errors the estimates of signs and mounting are meaningless.
     if not mistaken and quality.largest_share < SENSELESS_SHARE:
         hidden = hidden_in_any_poses(parameters, setup.orientation_rad)
         named += described_cell.directions(parameters, covariance + hidden, setup, case.written)
-        named += [one for one in payload if one.code == "payload_units" and not broken]
-    if verdict_of([*findings, *named]) != "rejected":  # its contradictions would be consequences
-        named += [one for one in payload if one not in named]
+        named += [each for each in payload if each.code == "payload_units" and not broken]
+    if verdict_of([*findings, *named]) != "rejected":  # contradictions of a rejected result are consequences
+        named += [each for each in payload if each not in named]
         named += described_cell.tool(parameters, covariance, setup, case.g_m_s2)
     return named
 
 
 def _few_rejected(used: NDArray[np.bool_]) -> bool:
-    """Whether so few poses were rejected that something happened to them alone."""
+    """Whether so few poses were rejected that they are isolated outliers."""
     return bool(used.sum() >= (1 - FEW_LEFT_OUT) * len(used))
 
 
 def _finest(wrench: Array) -> Array:
-    """(6,) residual that no sensor resolves, or none of readings (n, 6) that were written rounded."""
+    """Return the smallest residual (6,) that a sensor, or readings (n, 6) that were written rounded, can resolve."""
     largest = np.abs(wrench).max(axis=0).reshape(2, 3).max(axis=1)
     return np.asarray(np.maximum(np.maximum(RESOLUTION, ROUNDING * np.repeat(largest, 3)), written_step(wrench)))
 
 
 def _leaves_nothing(mistake: Finding, finest: Array) -> bool:
-    """Whether the data without a mistake fit without noise, as only simulated ones do."""
+    """Whether the data corrected for a mistake have no noise, which happens only in simulations."""
     left_N, left_Nm = (mistake.values.get(name, np.inf) for name in ("corrected_N", "corrected_Nm"))
     return bool(left_N <= finest[0] or left_Nm <= finest[3])
 
 
 def _unrelated_torques(found: Estimate, quality: Quality) -> list[Finding]:
-    """Recognise torques that do not follow the weight while the forces do: another sensor's, or of one without load."""
-    torque_Nm, codes = found.wrench[quality.used, 3:], {one.code: one.severity for one in quality.errors}
+    """Return a finding for torques that do not follow the weight although the forces do."""
+    torque_Nm, codes = found.wrench[quality.used, 3:], {error.code: error.severity for error in quality.errors}
     is_near = float(np.linalg.norm(found.parameters.p_sensor_com_m)) < units.NEAREST_COM_M
     left = _rms_norm(found.residuals[quality.used, 3:]) / (_rms_norm(torque_Nm - torque_Nm.mean(axis=0)) or 1.0)
     if left < UNRELATED or "force_error" in codes or not (is_near or codes.get("torque_error") == "reject"):
@@ -406,15 +408,15 @@ def _unrelated_torques(found: Estimate, quality: Quality) -> list[Finding]:
 
 
 def _some_runs(t_s: Array | None, n: int) -> NDArray[np.intp]:
-    """Rows by time: all, or of many poses evenly spread runs."""
+    """Return the rows in the order of time: all, or evenly spread runs of many poses."""
     order = np.arange(n) if t_s is None or not np.isfinite(t_s).all() else np.argsort(t_s, kind="stable")
     return np.asarray(order[np.arange(n) // SUCCESSIVE % max(n // ENOUGH_FOR_FAULTS, 1) == 0])
 
 
 def _successive_correlation(standardized: Array, t_s: Array | None = None) -> tuple[float, float]:
-    """Correlation of standardized residuals (n, 6) of successive poses, and the probability of a larger one by chance.
+    """Return the correlation of standardized residuals (n, 6) of successive poses, and its p-value.
 
-    The times `t_s` order the poses; rows are in order if they are missing or not finite.
+    The poses are sorted by the times `t_s`, or by row if times are missing or not finite.
     """
     if t_s is not None and np.isfinite(t_s).all():
         standardized = standardized[np.argsort(t_s, kind="stable")]
@@ -424,7 +426,7 @@ def _successive_correlation(standardized: Array, t_s: Array | None = None) -> tu
 
 
 def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[tuple[str, str, float], ...]:
-    """Name the pairs of parameters whose estimates are correlated by more than `least`, strongest first."""
+    """Return the pairs of parameters with a correlation above `least`, strongest first."""
     sigma = np.sqrt(np.diag(covariance))
     sigma[sigma == 0] = 1.0  # exactly known
     correlation = covariance / np.outer(sigma, sigma)
@@ -436,10 +438,10 @@ def strong_correlations(covariance: Array, least: float = CORRELATED) -> tuple[t
 def _error_findings(
     found: Estimate, used: NDArray[np.bool_], *, few: bool
 ) -> tuple[float, list[Finding], tuple[float, float]]:
-    """Return the largest error relative to the weight, errors that are too large, and the cross-validated rms.
+    """Return the largest error relative to the weight, findings for large errors, and the leave-one-out rms errors.
 
-    Of residual, cross-validated and expected error the first is named that exceeds the highest limit. With a `few`
-    poses the cross-validated error limits the use of a result, and does not reject it.
+    Of residual, leave-one-out error and expected error, the first that exceeds the highest limit is reported. With
+    `few` poses the leave-one-out error limits a result, but does not reject it.
     """
     weight_N, lever_m = found.parameters.weight_N, _lever_m(found)
     expected = found.predicted_error()
@@ -451,7 +453,7 @@ def _error_findings(
             ("cross-validation", left_out[k]),
             ("uncertainty over all orientations", expected[k]),
         )
-        # The largest number of limits; of equal ones the first: residual, cross-validated, then expected error.
+        # The error that exceeds most limits is reported; of equal ones the first.
         limits = [sum(error > limit * scale for limit in (USABLE_SHARE, REJECTED_SHARE)) for _, error in errors]
         source, error = errors[int(np.argmax(limits))] if max(limits) else max(errors, key=lambda pair: pair[1])
         share = error / scale if scale else float("inf")
@@ -478,7 +480,7 @@ def _weight_findings(found: Estimate, setup: Setup) -> list[Finding]:
 def _second_solution(found: Estimate, free: Estimate | None = None) -> list[Finding]:
     if found.second_basin_chi2 is None:
         return []
-    # What a published method does not model, such as a gain, makes both of its solutions worse.
+    # Effects that a published method does not model, such as a gain, increase chi2 of both solutions.
     fitted = free if free is not None and not isinstance(found, Fit) else found
     delta = found.second_basin_chi2 / max(1.0, fitted.chi2 / fitted.dof)
     if delta >= ACCEPTED_DELTA_CHI2:
@@ -489,11 +491,11 @@ def _second_solution(found: Estimate, free: Estimate | None = None) -> list[Find
 
 
 def _gain_not_modelled(found: Estimate, free: Estimate | None) -> list[Finding]:
-    """Name the gain of the sensor if it explains most of the residuals of a method that does not model it."""
+    """Return a finding if the gain of the sensor explains most of the residuals of a method that ignores it."""
     if isinstance(found, Fit) or free is None or free.response is None:
         return []
     used = free.weights > 0.5
-    ours, best = (_rms_norm(one.residuals[used, :3]) for one in (found, free))
+    ours, best = (_rms_norm(estimate.residuals[used, :3]) for estimate in (found, free))
     reads = free.response.wrench(free.parameters, found.R_base_flange[used])[:, :3]
     if best > COLLAPSE * ours or _rms_norm(reads - reads.mean(axis=0)) < ours / 2:
         return []
@@ -525,7 +527,7 @@ def _noise_findings(found: Estimate, quality: Quality) -> list[Finding]:
 
 
 def _left_out_rms(found: Estimate, poses: NDArray[np.bool_]) -> tuple[float, float]:
-    """Root mean square error of predicting these poses from the others; over all orientations if they cannot."""
+    """Return the leave-one-out rms errors of poses; the predicted error if no pose can be predicted from the others."""
     checked = poses & ~_is_unchecked(found)
     if not checked.any():
         return found.predicted_error()
@@ -533,7 +535,7 @@ def _left_out_rms(found: Estimate, poses: NDArray[np.bool_]) -> tuple[float, flo
 
 
 def _is_unchecked(found: Estimate) -> NDArray[np.bool_]:
-    """(n,) whether the other poses determine too little to predict this one."""
+    """Return whether each pose (n,) cannot be predicted from the others."""
     return np.asarray(np.trace(found.left_out_cov[:, :3, :3], axis1=1, axis2=2) > found.parameters.weight_N**2)
 
 
@@ -542,7 +544,7 @@ def _lever_m(found: Estimate) -> float:
 
 
 def _structure_findings(found: Estimate) -> list[Finding]:
-    """Name errors that are smooth over the poses; large ones limit the result."""
+    """Return findings for structured errors; large ones limit the result."""
     load, pull = (
         _component_sizes(found, "load_force", "load_torque"),
         _component_sizes(found, "cable_force_N", "cable_torque_Nm"),
@@ -554,9 +556,9 @@ def _structure_findings(found: Estimate) -> list[Finding]:
 
 
 def _structure_in_motion(found: Estimate) -> list[Finding]:
-    """Name smooth errors that limit the result: at lower limits, because averaging leaves little noise."""
+    """Return findings for smooth errors in motion, with lower limits because averaging leaves little noise."""
     load, pull = (_component_sizes(found, f"{name}_N", f"{name}_Nm") for name in ("load", "cable"))
-    # An orientation of the arm may be off by as much as calibrated arms are.
+    # Orientation errors up to those of calibrated arms are accepted.
     limits = SMOOTH_SHARE, SMOOTH_SHARE, np.array([SMOOTH_SHARE, CALIBRATED_ARM_RAD])
     return _smooth_error_findings(
         found, load / _per_N(found), pull, _component_sizes(found, "yielding_rad", "rotation_rad"), limits
@@ -568,14 +570,14 @@ def _component_sizes(found: Estimate, *names: str) -> Array:
 
 
 def _per_N(found: Estimate) -> Array:
-    """Force and torque (2,) with which errors are compared."""
+    """Return the reference force and torque (2,) for relative errors."""
     return np.array([1.0, _lever_m(found)]) * found.parameters.weight_N
 
 
 def _smooth_error_findings(
     found: Estimate, load: Array, pull: Array, turn_rad: Array, limits: Sequence[Array | float], least: float = np.inf
 ) -> list[Finding]:
-    """Name a load that is not linear (2,), a cable (2,) and turns (k,) beyond limits; note others from `least`."""
+    """Return findings for nonlinear response (2,), cable (2,) and orientation errors (k,); notes from `least` on."""
     findings = []
     for code, share, limit, values in (
         ("response_not_linear", load, limits[0], {"share_percent": 100 * float(load.max())}),
@@ -589,7 +591,7 @@ def _smooth_error_findings(
 
 
 def _pose_findings(found: Estimate, quality: Quality, setup: Setup) -> list[Finding]:
-    """Name poses that were rejected, that nothing checks, or that deviate most, and drift from pose to pose."""
+    """Return findings for rejected, unchecked and deviating poses, few poses, and correlated residuals."""
     findings, n = list[Finding](), int(quality.used.sum())
     if not quality.used.all():
         rows = np.flatnonzero(~quality.used) + 1
@@ -615,10 +617,7 @@ def _pose_findings(found: Estimate, quality: Quality, setup: Setup) -> list[Find
 
 
 def _drift_findings(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> list[Finding]:
-    """Name a significant drift, 0 where it is not.
-
-    It limits the result if it is no consequence, and large from the first pose to the last or up to the next use.
-    """
+    """Return a finding for a significant drift; it limits the result if it is large and not a consequence."""
     if (drift := found.drift) is None:
         return []
     force_N, torque_Nm = (float(np.linalg.norm(drift.change[part])) for part in (slice(0, 3), slice(3, 6)))
@@ -634,7 +633,7 @@ def _drift_findings(found: Estimate, ahead: DriftAhead, *, is_cause: bool) -> li
 
 
 def _response_findings(response: Response | None, weight_N: float, *, assumed: bool = False) -> list[Finding]:
-    """Name the axes along which the sensor reads high or low, and how much force leaks into torque."""
+    """Return notes on gain errors along and between axes, and on cross-talk from force to torque."""
     if response is None:
         return []
     gain, cross_talk, sigma = response.force_gain, response.cross_talk_m, response.sigma
@@ -654,12 +653,12 @@ def _response_findings(response: Response | None, weight_N: float, *, assumed: b
 
 
 def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
-    """Rows of poses that were rejected, or that the others predict badly."""
+    """Return the rows of poses that were rejected, or that have large leave-one-out residuals."""
     typical = max(float(np.median(residual_sigma[used] ** 2)), 1.0)
     limit = chi2_isf(6, SURE / len(residual_sigma)) / 6 * typical
     return np.flatnonzero(~used | (residual_sigma**2 > limit)).tolist()
 
 
 def _rms_norm(vectors: Array) -> float:
-    """Root mean square of the lengths of (n, 3) vectors."""
+    """Return the rms norm of vectors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
