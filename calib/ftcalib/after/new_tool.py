@@ -1,10 +1,10 @@
-"""A new tool from few poses, and several runs as one fit: mounting, base and gain belong to the cell, not to the tool.
+"""Calibration of a new tool from few poses, and combination of several runs: both reuse parameters of the cell.
 
-`new_tool` takes mounting, direction of gravity, gain and cross-talk of an earlier result with their covariance as a
-prior. Weight, centre of mass and bias have none. The misfit of poses and prior tests whether they still hold.
+`new_tool` uses mounting, direction of gravity, gain and cross-talk of an earlier result, with their covariance, as a
+prior. Weight, centre of mass and bias have no prior. The misfit of poses and prior tests whether the prior still holds.
 
-`together` joins runs of one tool whose bias has moved between them: each is solved by itself, and what they share is
-the mean weighted by information.
+`together` combines runs of one tool with a different bias in each run. Each run is solved separately, and the shared
+parameters are averaged with information weights.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,58 +30,60 @@ from ftcalib.sensor_matrix import (
     sensor_error_columns,
 )
 
-# Share of good runs that the test of what was kept rejects.
+# False-alarm probability of the test of the prior.
 FALSE_ALARMS = 1e-4
-# Rows of a prior: three of the mounting, two of the base.
+# Indices of the rows of a prior: three for the mounting, two for the base.
 WHOLE = (0, 1, 2, 3, 4)
 _MOUNTING, _BASE = WHOLE[:3], WHOLE[3:]
 
-# From the rows of the prior that count to the misfit, its degrees of freedom, and the parameters.
+# Function from the used rows of the prior to the misfit, its degrees of freedom, and the parameters.
 _Refit = Callable[[Sequence[int]], tuple[float, int, Parameters]]
 
 
 class CellPrior:
-    """A Gaussian prior of mounting and direction of gravity, and of gain and cross-talk where the result has them.
+    """Gaussian prior of mounting, direction of gravity and, if the result has them, gain and cross-talk.
 
     Parameters
     ----------
     earlier : CalibrationResult
-        A result of the same sensor, mounting and base, with any tool.
+        Result of the same sensor, mounting and base, with any tool.
     """
 
     def __init__(self, earlier: CalibrationResult) -> None:
         self.earlier, gain = earlier, earlier.response
         self.coefficients = np.zeros(0) if gain is None else np.array(gain.coefficients)
-        """(11,) of gain and cross-talk, or none."""
+        """(11,) coefficients of gain and cross-talk; empty if the earlier result has none."""
         self._covariance = np.array(earlier.joint_covariance)
-        self._across = np.linalg.svd(skew(earlier.parameters.gravity_force_base_N))[0][:, :2]  # gravity
+        # (3, 2) two directions perpendicular to gravity.
+        self._across = np.linalg.svd(skew(earlier.parameters.gravity_force_base_N))[0][:, :2]
 
     @property
     def has_response(self) -> bool:
-        """Whether gain and cross-talk are known."""
+        """Whether the prior contains gain and cross-talk."""
         return len(self.coefficients) > 0
 
     def count(self, kept: Sequence[int]) -> int:
-        """Return the number of rows; `kept` as of `rows`."""
+        """Return the number of rows; `kept` as in `rows`."""
         return len(kept) + len(self.coefficients) * bool(kept)
 
     def rows(self, p: Parameters, coefficients: Array, kept: Sequence[int] = WHOLE) -> tuple[Array, Array]:
-        """Return the derivative (k, 15 or 26) and the residual (k,), earlier minus present, in standard deviations.
+        """Return the derivative (k, 15 or 26) and residual (k,), earlier minus present, in standard deviations.
 
         Parameters
         ----------
         p : Parameters
-            The present ones.
+            Present parameters.
         coefficients : array, shape (11,) or (0,)
-            Coefficients of gain and cross-talk.
+            Present coefficients of gain and cross-talk.
         kept : sequence of int
-            Which count: 0 to 2 mounting, 3 and 4 base. Gain and cross-talk do unless it is empty.
+            Rows of the prior that are used: 0 to 2 for the mounting, 3 and 4 for the base. Gain and cross-talk are
+            always used, unless `kept` is empty.
         """
         rows = [*kept, *range(len(WHOLE), len(WHOLE) + len(self.coefficients))] if kept else []
         old = self.earlier.parameters
         before = self._derivative(old)[rows]
         V = before @ self._covariance @ before.T
-        # Exactly known values have no variance: the ridge keeps the root finite.
+        # Exactly known values have zero variance; the ridge term keeps the root finite.
         root = np.linalg.inv(np.linalg.cholesky(V + 1e-12 * np.diag(np.diag(V)) + 1e-24 * np.eye(len(V))))
         apart = [p.difference(old)[:3], self._across.T @ (old.down - p.down), self.coefficients - coefficients]
         return root @ self._derivative(p)[rows], root @ np.concatenate(apart)[rows]
@@ -95,27 +97,27 @@ class CellPrior:
         rows[5:, 15:] = np.eye(size - 15)
         return rows
 
-    def contradiction(self, chi2: float, dof: int, refit: _Refit, what: str, alone: str) -> str:
-        """Name what does not hold any more; empty where the prior fits.
+    def contradiction(self, chi2: float, dof: int, refit: _Refit, data: str, alone: str) -> str:
+        """Return a sentence about the part of the prior that contradicts the data; empty if the prior fits.
 
         Parameters
         ----------
         chi2, dof : float, int
             Misfit with the whole prior.
         refit : callable
-            Fits without a part of it. May raise `NotObservable`.
-        what, alone : str
-            Name of the data, and how to calibrate without the earlier result.
+            Function that fits with a part of the prior. May raise `NotObservable`.
+        data, alone : str
+            Name of the data, and advice for calibrating without the earlier result.
         """
-        if not dof or chi2_sf(len(_BASE), chi2) >= FALSE_ALARMS:  # no part of the prior can lower it by enough
+        if not dof or chi2_sf(len(_BASE), chi2) >= FALSE_ALARMS:  # leaving out a part cannot reduce chi2 significantly
             return ""
         explained, old = list[tuple[float, str]](), self.earlier.parameters
-        for cause, kept in (("the sensor is mounted otherwise", _BASE), ("the base leans otherwise", _MOUNTING)):
+        for cause, kept in (("the mounting of the sensor has changed", _BASE), ("the base has tilted", _MOUNTING)):
             try:
                 left, freedom, new = refit(kept)
             except NotObservable:
                 continue
-            # The sum over all readings hides a turn that lowers it clearly.
+            # The difference is tested, because chi2 over all readings can hide a significant rotation.
             fits = not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS
             if fits and chi2_sf(dof - freedom, chi2 - left) < FALSE_ALARMS:
                 turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))
@@ -127,80 +129,80 @@ class CellPrior:
         misfit = f"chi2 {chi2:.0f} for {dof} degrees of freedom"
         if not explained:
             return (
-                f"{what} do not fit mounting and base of {self.earlier.id} ({misfit}): check for contact, or solve "
-                "alone."
+                f"{data} do not fit mounting and base of {self.earlier.id} ({misfit}): check for contact, or solve "
+                "without the earlier result."
             )
         explained.sort()
-        found = " or ".join(text for left, text in explained if left < explained[0][0] + 10)
-        return f"{found} since {self.earlier.id} ({misfit}): {alone}."
+        causes = " or ".join(text for left, text in explained if left < explained[0][0] + 10)
+        return f"{causes} since {self.earlier.id} ({misfit}): {alone}."
 
 
-# Share of a load by which a sensor responds to it otherwise than to a smaller one, at most: usually, and rarely.
+# Largest part of the response that depends on the load, as a share of the load: usually, and in rare cases.
 _LOADS = (LOAD, 0.02)
 _MOST_STEPS = 30
-# Squared step in standard deviations.
+# Convergence: squared step in standard deviations.
 _SETTLED = 1e-12
 _SINGULAR = 1e12
 _SIGNIFICANT = 5.0
-# Rows of the error coordinates that runs of one tool share.
+# Indices of the error coordinates that runs of one tool share.
 _SHARED = np.array([0, 1, 2, 3, 4, 5, 9, 10, 11])
 
 
 def new_tool(
     earlier: CalibrationResult, dataset: CalibrationDataset, provenance: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
-    """Estimate weight, centre of mass and bias of a tool; take the rest from an earlier result with its covariance.
+    """Return the calibration of a tool from few poses, with mounting, base and gain from an earlier result.
 
     Parameters
     ----------
     earlier : CalibrationResult
-        Accepted, of the same sensor, mounting and base.
+        Accepted result of the same sensor, mounting and base.
     dataset : CalibrationDataset
-        3 poses or more whose noise was measured; 4 for a test worth its name.
+        3 or more poses whose noise was measured; 4 for a meaningful test of the earlier result.
     provenance : mapping, optional
-        Where the dataset comes from.
+        Origin of the dataset.
 
     Returns
     -------
     CalibrationResult
-        Its `provenance` names the earlier result as `parent`.
+        Calibration whose `provenance` names the earlier result as `parent`.
 
     Raises
     ------
     NotObservable
-        The poses do not determine the tool, or what was kept holds no more: the message names mounting or base.
+        The poses do not determine the tool, or contradict the earlier result. The message names mounting or base.
     """
     if dataset.wrench_cov is None:
         raise NotObservable(
-            "the noise of the poses was not measured, so nothing tests the earlier result: leave --from out."
+            "the noise of the poses was not measured, so the earlier result cannot be tested: leave --from out."
         )
     start = _start(earlier.parameters, dataset.R_base_flange, dataset.wrench)
     noise = pooled_covariance(dataset.wrench_cov, dataset.n_samples)
-    prior, poses_in_words = CellPrior(earlier), "the poses"
+    prior, data = CellPrior(earlier), "the poses"
     alone = "calibrate this tool alone, from 12 poses or more"
-    # A response that depends on the load shows at a larger one: in full where no change of the cell explains the poses.
+    # A larger dependence on the load is assumed only if no change of the cell explains the poses.
     for load in _LOADS:
         weights: Array = np.linalg.inv(noise + np.diag(_beyond(earlier, start, load))).astype(np.float64)
         poses = dataset.R_base_flange, dataset.wrench, weights
-        found = _fit_tool(prior, *poses, WHOLE)
+        fitted = _fit_tool(prior, *poses, WHOLE)
 
         def refit(kept: Sequence[int], poses: tuple[Array, Array, Array] = poses) -> tuple[float, int, Parameters]:
             again = _fit_tool(prior, *poses, kept)
             return again.chi2, again.dof, again.parameters
 
-        changed = prior.contradiction(found.chi2, found.dof, refit, poses_in_words, alone)
-        if not changed.startswith(poses_in_words):
+        changed = prior.contradiction(fitted.chi2, fitted.dof, refit, data, alone)
+        if not changed.startswith(data):
             break
     if changed:
         raise NotObservable(changed)
-    # Only the components that belong to the cell are kept: errors of the arm and of the sensor, not of one session.
+    # Components that belong to arm and sensor are kept, but not those of one session.
     kept = {name: value for name, value in earlier.components.items() if name in ("rotation_rad", "hysteresis")}
-    result = apply_update(earlier, found, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
+    result = apply_update(earlier, fitted, {**(provenance or {}), "dataset_sha256": dataset.sha256()})
     return replace(result, quality={}, weights=None, components=kept)
 
 
 def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Array, kept: Sequence[int]) -> Update:
-    """Fit all parameters; `kept` as of `CellPrior.rows`."""
+    """Return the fit of all parameters with a part of the prior; `kept` as in `CellPrior.rows`."""
     n, k = len(wrench), len(prior.coefficients)
     new, coefficients = _start(prior.earlier.parameters, R_base_flange, wrench), prior.coefficients
     seen = prior.earlier.shown_response
@@ -224,11 +226,15 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
         if float(step @ H @ step) < _SETTLED:
             break
     else:
-        raise NotObservable(f"the fit has not settled in {_MOST_STEPS} steps: check the poses, or solve alone.")
+        raise NotObservable(
+            f"the fit has not converged in {_MOST_STEPS} steps: check the poses, or solve without the earlier result."
+        )
     covariance = np.linalg.inv(H)[: 15 + k, : 15 + k]
     weight_N, sigma_N = new.weight_N, new.weight_sigma_N(covariance)
     if weight_N < _SIGNIFICANT * sigma_N:
-        raise NotObservable(f"the weight of the tool is {weight_N:.2g} N, sigma {sigma_N:.2g} N: check the sensor.")
+        raise NotObservable(
+            f"the weight of the tool, {weight_N:.2g} N (sigma {sigma_N:.2g} N), is not significant: check the sensor."
+        )
     chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)
     dof = 6 * n + len(r) - len(H)
     response = Response(coefficients, covariance) if prior.has_response else None
@@ -236,7 +242,7 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
 
 
 def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
-    """Take weight, centre of mass and bias by linear least squares with the earlier mounting and base."""
+    """Return parameters with weight, centre of mass and bias by linear least squares, for earlier mounting and base."""
     u = old.down @ (R_base_flange @ old.R_flange_sensor)
     A = np.zeros((len(u), 6, 10))
     A[:, :3, 0], A[:, :3, 1:4] = u, np.eye(3)
@@ -247,12 +253,12 @@ def _start(old: Parameters, R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> Array:
-    """Variance (6,) of a pose beyond its noise: what noise did not explain, or may have hidden, in the earlier fit.
+    """Return the variance (6,) of a pose beyond its noise, from the residuals of the earlier fit and their uncertainty.
 
-    What depends on the load grows with its third power, at `most` to this share of the load.
+    It is scaled with the third power of the load, up to the share `most` of the load.
     """
     measured = np.square(np.zeros(6) if earlier.measured_sigma is None else earlier.measured_sigma)
-    # One sigma of chi2.
+    # One sigma of chi2 / dof.
     hidden = np.sqrt(2 / max(earlier.dof, 1))
     if earlier.noise_explains:
         variance = (max(earlier.chi2 / max(earlier.dof, 1) - 1, 0.0) + hidden) * measured
@@ -272,43 +278,43 @@ def _beyond(earlier: CalibrationResult, new: Parameters, most: float = LOAD) -> 
 
 
 def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any] | None = None) -> CalibrationResult:
-    """Join results of one tool on one cell; the bias is that of the last run.
+    """Return the combined result of several runs of one tool on one cell, with the bias of the last run.
 
     Parameters
     ----------
     results : sequence of CalibrationResult
-        Results of runs that were solved by themselves, the oldest first.
+        Results of runs that were solved separately, the oldest first.
     provenance : mapping, optional
 
     Returns
     -------
     CalibrationResult
-        Verdict, findings and residuals are those of the last run.
+        Combined estimates, with verdict, findings and residuals of the last run.
 
     Raises
     ------
     NotObservable
         The runs contradict each other in more than the bias.
     """
-    if any((np.diag(one.covariance)[_SHARED] <= 0).any() for one in results):
-        raise NotObservable("a run takes a value as exactly known: solve its runs without known values.")
+    if any((np.diag(result.covariance)[_SHARED] <= 0).any() for result in results):
+        raise NotObservable("a run has exactly known values: solve the runs without known values.")
     last = results[-1]
-    covariances = [one.covariance for one in results]
-    differences = [last.parameters.difference(one.parameters) for one in results]
+    covariances = [result.covariance for result in results]
+    differences = [last.parameters.difference(result.parameters) for result in results]
     responses = []
-    if any(one.response is not None for one in results):
-        responses = [one.shown_response for one in results]
-        covariances = [one.covariance for one in responses]
+    if any(result.response is not None for result in results):
+        responses = [result.shown_response for result in results]
+        covariances = [response.covariance for response in responses]
         differences = [
-            np.append(off, one.coefficients - responses[-1].coefficients)
-            for off, one in zip(differences, responses, strict=True)
+            np.append(off, response.coefficients - responses[-1].coefficients)
+            for off, response in zip(differences, responses, strict=True)
         ]
     n = len(differences[-1])
     alike = np.append(_SHARED, np.arange(15, n))
-    # What was not looked for has no variance.
-    alike = alike[np.all([np.diag(one)[alike] > 0 for one in covariances], axis=0)]
+    # Coefficients that were not estimated have no variance.
+    alike = alike[np.all([np.diag(C)[alike] > 0 for C in covariances], axis=0)]
     difference = np.array(differences)[:, alike]
-    information = np.array([np.linalg.inv(one[np.ix_(alike, alike)]) for one in covariances])
+    information = np.array([np.linalg.inv(C[np.ix_(alike, alike)]) for C in covariances])
     C = np.linalg.inv(information.sum(axis=0))
     x = C @ np.einsum("kij,kj->i", information, difference)
     rest = difference - x
@@ -319,7 +325,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
             "`ftdrive diff` shows in what; tool, sensor or base has changed."
         )
     shared, own = np.ix_(alike, alike), np.arange(n)[BIASES]
-    # The bias belongs to the last run: it moves as far as the shared values correlate with it.
+    # The bias is that of the last run, corrected by its correlation with the shared parameters.
     before = covariances[-1]
     G = before[np.ix_(own, alike)] @ np.linalg.inv(before[shared])
     step = np.zeros(n)
@@ -342,7 +348,7 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
         provenance={
             **last.provenance,
             **(provenance or {}),
-            "together": [one.id for one in results],
+            "together": [result.id for result in results],
             "between_chi2": chi2,
             "between_dof": dof,
         },

@@ -1,35 +1,35 @@
-"""Differences between calibrations and their course: step, trend, temperature."""
+"""Differences between calibrations, drift onsets, trends, and the dependence of the bias on temperature."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import scipy  # its parts are imported at their first use: lists of calibrations start without them
+import scipy  # submodules are imported at their first use, so that listing calibrations starts fast
 from numpy.typing import NDArray
 
 from ftcalib.model import Array, Parameters, read_only
 
-# The difference of two calibrations, in standard deviations and tested jointly.
+# Difference of two calibrations in standard deviations, and its joint test.
 
-# A standard deviation below this share of the largest is one of rounding: the value was taken as known.
+# A standard deviation below this share of the largest is a rounding error: the value was exactly known.
 _KNOWN = 1e-9
-# An eigenvalue of a correlation matrix below this is one of rounding too.
+# A smaller eigenvalue of a correlation matrix is a rounding error.
 _SINGULAR = 1e-10
-# A difference in a direction that both calibrations take as known counts from here on.
+# Smallest significant difference along a direction that both calibrations take as exactly known.
 _ROUNDING_SIGMAS = 1e-3
 
 
 class EstimatedParameters(Protocol):
-    """A calibration, an update of it, or a row of a store."""
+    """Parameters with covariance: a calibration, an update of a calibration, or a row of a store."""
 
     @property
     def parameters(self) -> Parameters:
-        """Estimates."""
+        """Estimated parameters."""
 
     @property
     def covariance(self) -> Array:
-        """(15, 15) of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
+        """(15, 15) covariance of the error coordinates `ftcalib.model.PARAMETER_NAMES`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,36 +37,36 @@ class ChiSquare:
     """Chi-square test of no difference."""
 
     chi2: float
-    """Squared Mahalanobis distance; infinite if values that both take as known differ."""
+    """Squared Mahalanobis distance; infinite if exactly known values differ."""
     dof: int
     p_value: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Difference:
-    """Second calibration minus the first."""
+    """Difference of two calibrations: the second minus the first."""
 
     change: Array
-    """(15,) in the error coordinates `ftcalib.model.PARAMETER_NAMES`; the rotation about the flange axes, rad."""
+    """(15,) difference in the error coordinates `ftcalib.model.PARAMETER_NAMES`; rotation about flange axes, rad."""
     sigma: Array
-    """(15,) one standard deviation of that; 0 where both calibrations share the value or take it as known."""
+    """(15,) standard deviation of the difference; 0 if both calibrations share a value or take it as exactly known."""
     joint: ChiSquare
-    """Test of all parameters that the calibrations do not share."""
+    """Joint test of all parameters that the calibrations do not share."""
     groups: Mapping[str, ChiSquare]
-    """Test of each field of `Parameters`."""
+    """Test of each field of `Parameters`, by its name."""
 
     @property
     def in_sigmas(self) -> Array:
-        """(15,) change divided by sigma; 0 where shared, infinite where two known values differ."""
+        """(15,) change divided by sigma; 0 for shared values, infinite if exactly known values differ."""
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray(np.where(self.change == 0, 0.0, self.change / self.sigma))
 
 
 def calibration_difference(first: EstimatedParameters, second: EstimatedParameters) -> Difference:
-    """Compare two calibrations whose errors are independent.
+    """Return the difference of two calibrations whose errors are independent.
 
-    A field that is identical in both was copied, as by an update of the bias. It is left out of the joint test, because
-    its error is common to both. Gain and cross-talk of the sensor are not compared.
+    A field that is identical in both calibrations was copied, for example by an update of the bias. It is left out of
+    the joint test, because its error is common. Gain and cross-talk of the sensor are not compared.
 
     Parameters
     ----------
@@ -75,12 +75,12 @@ def calibration_difference(first: EstimatedParameters, second: EstimatedParamete
     Returns
     -------
     Difference
-        With the covariances of both. The mountings are R1 = exp(-d1) R and R2 = exp(-d2) R, with small errors d about
-        the flange axes, so the error d1 is turned into the axes of the second mounting before it is added.
+        Its covariance is the sum of both. The mountings are R1 = exp(-d1) R and R2 = exp(-d2) R, with small errors d
+        about the flange axes, so the error d1 is rotated into the axes of the second mounting before adding.
     """
     old, new = first.parameters, second.parameters
     change = old.difference(new)
-    # The left Jacobian of the rotation drops out of the Mahalanobis distance, because it leaves its own axis in place.
+    # The left Jacobian of the rotation cancels in the Mahalanobis distance, because it does not change the axis.
     turn = scipy.linalg.block_diag(new.R_flange_sensor @ old.R_flange_sensor.T, np.eye(12))
     covariance = second.covariance + turn @ first.covariance @ turn.T
     for i, field in enumerate(fields(Parameters)):
@@ -95,7 +95,7 @@ def calibration_difference(first: EstimatedParameters, second: EstimatedParamete
 
 
 def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare:
-    """Test some rows; directions without variance count only if they differ."""
+    """Return the test of some rows; directions without variance are ignored unless they differ."""
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     known = sigma[rows] <= _KNOWN * sigma.max()
     if np.any(change[rows[known]] != 0):
@@ -113,48 +113,48 @@ def _test(change: Array, covariance: Array, rows: NDArray[np.intp]) -> ChiSquare
     return ChiSquare(chi2, dof, float(scipy.special.chdtrc(dof, chi2)))
 
 
-# Whether a bias has begun to drift: the onset of a linear change in a series of verifications of one calibration.
+# Drift onset: the beginning of a linear change of the bias in a series of verifications of one calibration.
 #
-# A component of the bias, as changes d_i since the calibration at times t_i, is modelled by
+# The changes d_i of a component of the bias since the calibration, at times t_i, are modelled by
 #
 #     d_i = c + s max(0, t_i - t0) + e_i,    e_i ~ N(0, sigma_i^2),    c ~ N(0, sigma_c^2),
 #
 # with the common error c of the calibration. For each onset t0, c and s are estimated by generalised least squares. The
-# t0 with the largest chi2 of s counts (Hinkley, J. Am. Stat. Assoc. 66, 1971). As in `trend`, s must be significant
-# against the stated sigmas and against the scatter about the line (F test).
+# t0 with the largest chi2 of s is selected (Hinkley, J. Am. Stat. Assoc. 66, 1971). As in `trend`, s must be
+# significant compared with the stated sigmas and with the scatter about the line (F test).
 #
-# A sudden change, such as a tare, a knock or one bad verification, raises the same statistic. So a step at any t1
-# competes:
+# A sudden change, such as a tare, a knock or one bad verification, also increases this chi2. The onset therefore
+# competes with a step at any t1:
 #
 #     d_i = c + b [t_i >= t1] + e_i.
 #
-# Where a step is significant and fits better than any onset, the series begins again at t1 with a free c.
+# If a step is significant and fits better than any onset, the series is restarted at t1 with a free c.
 
-# Verifications: fewer do not show their scatter.
+# Smallest number of verifications; fewer do not show their scatter.
 FEWEST = 6
-# Largest p-value of an onset that counts, in one component at one look. It allows for the search over onsets, six
-# components and 365 looks a year: false alarms and delays in simulation are in docs/contributing/figures/fleet.md.
+# Largest p-value of a significant onset, for one component in one analysis. It allows for the search over onsets, six
+# components and 365 analyses a year. Simulated false alarms and delays: docs/contributing/figures/fleet.md.
 SIGNIFICANT = 1e-5
-# A drift has gone on for so long: a sudden change of the last days is no drift yet.
+# Shortest duration of a drift; a more recent change may be a step.
 LEAST_DAYS = 7.0
-# If the series begins later, the error of the calibration limits its level no more, because more may have changed.
+# If the series begins later after the calibration, the error of the calibration no longer constrains c.
 _NEAR_DAYS = 14.0
-# A step fits better than an onset if its chi2 is larger by this: odds of 20 to 1.
+# Smallest difference of chi2 by which a step fits better than an onset: odds of 20 to 1.
 CLEARLY = 6.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftOnset:
-    """Likeliest onset of each of k components; arrays (k,)."""
+    """Likeliest drift onset of each of k components of the bias; arrays (k,)."""
 
     found: NDArray[np.bool_]
-    """Whether the component drifts."""
+    """Whether the component drifts significantly."""
     t0_days: Array
-    """When it began."""
+    """Time of the onset since the calibration, days."""
     slope: Array
-    """Change a day since then."""
+    """Change of the bias per day since the onset."""
     sigma: Array
-    """One standard deviation of that, by the stated sigmas or by the scatter if that is larger."""
+    """Standard deviation of the slope, from the stated sigmas or from the scatter, whichever is larger."""
     p_value: Array
     """p-value of the slope, for one onset and one component."""
 
@@ -164,18 +164,18 @@ class DriftOnset:
 
 
 def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: Array) -> DriftOnset | None:
-    """Search the onset of a drift in a series of verifications; None if there are too few since the last step.
+    """Return the drift onset in a series of verifications; None if there are too few since the last step.
 
     Parameters
     ----------
     t_days : array, shape (n,)
-        Since the calibration, in ascending order; any spacing.
+        Times since the calibration in ascending order, at any spacing.
     change : array, shape (n, k)
-        Change of the bias since the calibration, as `ftcalib.after.verification` estimates it.
+        Changes of the bias since the calibration, from `ftcalib.after.verification`.
     sigma : array, shape (n, k)
-        One standard deviation from the readings of each verification, positive.
+        Standard deviations due to the readings of each verification, positive.
     calibration_sigma : array, shape (k,)
-        One standard deviation from the calibration, common to all.
+        Standard deviations due to the calibration, common to all verifications.
     """
     if len(t_days) < FEWEST:
         return None
@@ -189,7 +189,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
         chi2 = np.sum(w * d * d, axis=0) - np.sum(w * d, axis=0) ** 2 / (np.sum(w, axis=0) + known)
         ramp, slope, slope_sigma, t0 = _onsets(t, d, w, known, from_calibration=near and first == 0)
         step, after = _best_steps(d, w, known)
-        p_ramp, p_step = (_p_value(one, chi2, len(t) - 3) for one in (ramp, step))
+        p_ramp, p_step = (_p_value(part, chi2, len(t) - 3) for part in (ramp, step))
         ahead = np.where(p_step < SIGNIFICANT, step - ramp, -np.inf)
         if ahead.max() <= CLEARLY:
             scatter = np.maximum((chi2 - ramp) / (len(t) - 3), 1.0)
@@ -200,7 +200,7 @@ def drift_onset(t_days: Array, change: Array, sigma: Array, calibration_sigma: A
 
 
 def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: bool) -> tuple[Array, Array, Array, Array]:
-    """Return chi2, slope, its sigma and onset (k,) of the best onset, at a verification or at the calibration."""
+    """Return chi2, slope, sigma of the slope and time (k,) of the best onset, at a verification or the calibration."""
     t0 = t[t <= t[-1] - LEAST_DAYS]
     if from_calibration:
         t0 = np.append(0.0, t0)
@@ -222,7 +222,7 @@ def _onsets(t: Array, d: Array, w: Array, known: Array, *, from_calibration: boo
 
 
 def _best_steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
-    """Return chi2 and row (k,) of the best step, which is the first verification after it."""
+    """Return chi2 of the best step and the row (k,) of the first verification after it."""
     A, B = np.sum(w, axis=0) + known, _reversed_sums(w)[:-1]
     y = A * _reversed_sums(w * d)[:-1] - B * np.sum(w * d, axis=0)
     determinant = B * (A - B)
@@ -233,19 +233,19 @@ def _best_steps(d: Array, w: Array, known: Array) -> tuple[Array, Array]:
 
 
 def _reversed_sums(rows: Array) -> Array:
-    """Return the sums (n + 1, k) of each row and all later ones, the last of which is none."""
+    """Return the sums (n + 1, k) of each row and all later rows; the last row is 0."""
     return np.concatenate([np.cumsum(rows[::-1], axis=0)[::-1], np.zeros((1, rows.shape[1]))])
 
 
 def _p_value(chi2: Array, total: Array, dof: int) -> Array:
-    """Return the larger p-value of one coefficient: against the stated sigmas, and against the scatter."""
+    """Return the larger of two p-values of a coefficient: with the stated sigmas, and with the observed scatter."""
     rest = np.maximum(total - chi2, 1e-12) / dof
     return np.maximum(scipy.special.chdtrc(1, chi2), scipy.special.fdtrc(1, dof, chi2 / rest))
 
 
-# Linear change of an estimate from calibration to calibration, and whether it is significant.
+# Linear trend of an estimate over successive calibrations, and its significance.
 
-# Two points have a line without any scatter about it.
+# Smallest number of estimates; two points show no scatter about a line.
 FEWEST_ESTIMATES = 3
 
 
@@ -256,23 +256,23 @@ class Trend:
     slope: Array
     """(k,) change per unit of time."""
     sigma: Array
-    """(k,) one standard deviation of that, from the covariances or from the scatter if that is larger."""
+    """(k,) standard deviation of the slope, from the covariances or from the scatter, whichever is larger."""
     p_value: float
-    """Probability of a larger slope, in any direction, if nothing changes linearly."""
+    """Probability of a larger slope, in any direction, without a linear change."""
     n: int
 
 
 def trend(t: Array, values: Array, covariance: Array) -> Trend:
-    """Fit a line by generalised least squares, and test its slope against zero.
+    """Return a line fitted by generalised least squares, with a test of its slope against zero.
 
-    The slope must be significant against the stated covariances (chi-square, k degrees of freedom), and against the
-    scatter about the line (F test, k and k (n - 2)). The p-value is the larger of the two, so neither covariances that
-    are too small nor a scatter that happens to be small makes a trend.
+    The slope is tested with the stated covariances (chi-square, k degrees of freedom) and with the scatter about the
+    line (F test, k and k (n - 2)). The p-value is the larger of the two, so neither covariances that are too small nor
+    an accidentally small scatter produces a trend.
 
     Parameters
     ----------
     t : array, shape (n,)
-        n >= 3, not all equal.
+        Times; n >= 3, not all equal.
     values : array, shape (n, k)
     covariance : array, shape (n, k, k)
         Covariance of each row, positive definite; the rows are independent.
@@ -304,52 +304,52 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     return Trend(slope / scale, sigma / scale, float(max(scipy.special.chdtrc(k, chi2), against_scatter)), n)
 
 
-# Bias of a sensor against its temperature, over calibrations and verifications, and whether that predicts anything.
+# Dependence of the bias on the temperature of the sensor, over calibrations and verifications.
 #
-# A component of the bias is y = a + c (T - T0) + s + w(t): s scatters from run to run, w walks with the time. Both are
-# chosen by restricted likelihood, alike for the components of force and for those of torque, so that a walk which looks
-# like a temperature by chance widens the sigma of c. What a fit predicts of a run that it lacks has a closed form. A
-# temperature that does not predict such runs better than the other runs alone is of no use, however steep its slope.
+# A component of the bias is y = a + c (T - T0) + s + w(t), with a scatter s from run to run and a random walk w. Their
+# variances are averaged over the restricted likelihood, with common values for the components of force and for those of
+# torque, so a walk that resembles the temperature increases the sigma of c. Leave-one-out predictions have a closed
+# form. The temperature is used only if it predicts left-out runs better than the other runs alone.
 
-# Between the coldest and the warmest run.
+# Smallest difference between the coldest and the warmest run, K.
 _LEAST_K = 3.0
 # Largest p-value of a slope that is used.
 SURE = 1e-3
-# Older runs do not count: their walk says little about today.
+# Largest number of runs; older runs are ignored, because the random walk makes them irrelevant.
 _MOST = 100
-# Tried for scatter and walk, in standard deviations of the runs about their line.
+# Trial values of scatter and walk, relative to the standard deviation of the runs about their line.
 _SHARES = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BiasTemperature:
-    """Linear change of the bias with the temperature of a sensor, force first, sensor axes."""
+    """Linear dependence of the bias on the temperature of a sensor, force first, in sensor axes."""
 
     slope: Array
-    """(6,) N/K and N·m/K."""
+    """(6,) change of the bias per kelvin, N/K and N·m/K."""
     sigma: Array
-    """(6,) one standard deviation."""
+    """(6,) standard deviation of the slope."""
     n: int
-    """Runs."""
+    """Number of runs."""
     coldest_C: float
     warmest_C: float
     error: Array
-    """(2,) rms error of the bias of a run that was left out, an axis, predicted with the temperature; N and N·m."""
+    """(2,) leave-one-out rms error of the bias per axis, predicted with the temperature, N and N·m."""
     error_without: Array
-    """(2,) the same from the other runs alone."""
+    """(2,) leave-one-out rms error of the bias per axis, predicted without the temperature, N and N·m."""
     p_value: Array
-    """(2,) probability of steeper slopes if there is none, of force and torque."""
+    """(2,) p-values of the slopes of force and torque."""
 
     @property
     def predicts(self) -> tuple[bool, bool]:
-        """Whether force and torque of left-out runs are predicted better with the temperature."""
+        """Whether the temperature improves the prediction of the bias of force, and of torque."""
         force, torque = (self.error < self.error_without) & (self.p_value < SURE)
         return bool(force), bool(torque)
 
     def change(self, from_C: float, to_C: float) -> tuple[Array, Array]:
-        """Return the change (6,) of the bias between two temperatures and its sigma; 0 where nothing is predicted.
+        """Return the change (6,) of the bias between two temperatures and its sigma; 0 where it is not predicted.
 
-        Beyond the temperatures of the runs it stays as at the nearest of them.
+        Temperatures beyond those of the runs are clipped to the nearest of them.
         """
         used = np.repeat(self.predicts, 3)
         step_K = float(np.diff(np.clip([from_C, to_C], self.coldest_C, self.warmest_C))[0])
@@ -357,29 +357,30 @@ class BiasTemperature:
 
 
 def spans_temperature(temperature_C: Array, fewest: int) -> bool:
-    """Whether so many runs, over 3 K at least, can show a change with the temperature."""
+    """Whether there are at least `fewest` runs, over at least 3 K, so that a dependence can be estimated."""
     return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= _LEAST_K)
 
 
 def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Array) -> BiasTemperature | None:
-    """Fit the bias of one sensor, in one mounting, against its temperature.
+    """Return the dependence of the bias of one sensor, in one mounting, on its temperature.
 
     Parameters
     ----------
     t_days : array, shape (n,)
-        Ascending.
+        Ascending times of the runs.
     temperature_C : array, shape (n,)
     bias : array, shape (n, 6)
-        N and N·m, sensor axes.
+        Bias of each run, N and N·m, in sensor axes.
     sigma : array, shape (n, 6)
-        One standard deviation of each.
+        Standard deviation of each bias.
 
     Returns
     -------
     BiasTemperature or None
-        None for fewer than 6 runs, or within 3 K.
+        None for fewer than 6 runs, or for runs within 3 K.
     """
-    t_days, T, y, sigma = (np.asarray(one, dtype=np.float64)[-_MOST:] for one in (t_days, temperature_C, bias, sigma))
+    columns = (t_days, temperature_C, bias, sigma)
+    t_days, T, y, sigma = (np.asarray(column, dtype=np.float64)[-_MOST:] for column in columns)
     n = len(T)
     if not spans_temperature(T, FEWEST):
         return None
@@ -399,14 +400,14 @@ def bias_temperature(t_days: Array, temperature_C: Array, bias: Array, sigma: Ar
 class _TemperatureFit(NamedTuple):
     # (k, 3) coefficients of the columns.
     x: Array
-    # (3,) of the last coefficient.
+    # (3,) standard deviation of the last coefficient.
     sigma: Array
-    # Rms of what each run differs from its prediction by the others.
+    # Leave-one-out rms error.
     left_out: float
 
 
 def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _TemperatureFit:
-    """Fit columns X (n, k) to the components y (n, 3); each scatter and walk counts by its likelihood."""
+    """Return the fit of columns X (n, k) to components y (n, 3), averaged over scatter and walk by likelihood."""
     spread = float(np.mean(np.square(y - X @ np.linalg.lstsq(X, y, rcond=None)[0])))
     tried, likelihood = list[tuple[Array, float, Array]](), list[float]()
     for scatter in _SHARES**2 * spread:
@@ -414,14 +415,14 @@ def _fit_columns(X: Array, walk: Array, y: Array, noise: Array) -> _TemperatureF
             W = np.linalg.inv(np.diag(noise + scatter + 1e-9 * spread + 1e-24) + walked * walk)
             information = X.T @ W @ X
             C = np.linalg.inv(information)
-            P = W - W @ X @ C @ X.T @ W  # what the columns leave, weighted
+            P = W - W @ X @ C @ X.T @ W  # maps y to weighted residuals
             left = P @ y
             tried.append((C @ X.T @ W @ y, float(C[-1, -1]), left / np.diag(P)[:, None]))
             determinants = 3 * (np.linalg.slogdet(W)[1] - np.linalg.slogdet(information)[1])
             likelihood.append((determinants - float(np.sum(y * left))) / 2)
     weights = np.exp(np.array(likelihood) - max(likelihood))
     weights /= weights.sum()
-    x, variance, left_out = (np.array(one) for one in zip(*tried, strict=True))
+    x, variance, left_out = (np.array(values) for values in zip(*tried, strict=True))
     mean = np.tensordot(weights, x, 1)
     scattered = np.tensordot(weights, np.square(x[:, -1] - mean[-1]), 1)
     rms = float(np.sqrt(np.mean(np.square(np.tensordot(weights, left_out, 1)))))

@@ -1,7 +1,7 @@
-"""Update or tare a calibration after a change of bias, payload, mounting or base, from a few new poses.
+"""Update or tare of a calibration after a change of bias, payload, mounting or base, from a few new poses.
 
-Parameters that are not estimated keep their values and their uncertainty. The uncertainty counts as an error common to
-all readings, both in the weights (generalised least squares) and in the covariance of the result.
+Parameters that are not estimated keep their values and their uncertainty, which is an error common to all readings. It
+is part of the weights (generalised least squares) and of the covariance of the result.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ from ftcalib.result import CalibrationResult
 from ftcalib.sensor_matrix import Calibrated, Response
 
 SIGNIFICANT_SIGMAS = 5.0
-# Squared step in standard deviations at which the iteration ends.
+# Convergence: squared step in standard deviations.
 SETTLED = 1e-20
 MOST_STEPS = 30
-# Smallest singular value of the scaled equations over the largest.
+# Smallest accepted ratio of the singular values of the scaled equations.
 UNDETERMINED = 1e-6
 
 Block = Literal["weight", "centre of mass", "bias", "gravity direction", "mounting"]
-# Kinds of update, and what each estimates.
+# Kinds of update, and the parameters that each estimates.
 BLOCKS: Mapping[str, tuple[Block, ...]] = {
     "bias": ("bias",),
     "weight": ("weight",),
@@ -45,21 +45,21 @@ BLOCKS: Mapping[str, tuple[Block, ...]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Update(Calibrated):
-    """Parameters after an update, which can be updated again."""
+    """Updated parameters with covariance; an update can be updated again."""
 
     parameters: Parameters
     covariance: Array
-    """(15, 15) of the error coordinates `PARAMETER_NAMES`, kept parameters included."""
+    """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`, including kept parameters."""
     chi2: float
-    """Misfit of the new readings; about `dof` if only noise and the old uncertainty act."""
+    """Chi2 of the new readings; about `dof` if they agree with noise and previous uncertainty."""
     dof: int
-    """0 if no reading is left for a check."""
+    """Degrees of freedom; 0 if no reading is left for a check."""
     kind: str = ""
-    """One of `BLOCKS`."""
+    """Kind of update, a key of `BLOCKS`."""
     residuals: Array = field(default_factory=lambda: np.zeros((0, 6)))
-    """(n, 6) of the new readings, N and N·m, in the sensor frame."""
+    """(n, 6) residuals of the new readings, N and N·m, in the sensor frame."""
     response: Response | None = None
-    """Gain and cross-talk of the sensor are kept; their covariance with the parameters is that after the update."""
+    """Gain and cross-talk of the sensor, which are kept, with their joint covariance after the update."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", read_only(self.covariance))
@@ -67,15 +67,15 @@ class Update(Calibrated):
 
 
 def with_bias_change(calibration: Calibrated, change: Array, variance: Array, *, measured: bool = False) -> Update:
-    """Return a calibration or an update of it whose bias has changed by so much.
+    """Return a calibration, or an update of it, with a changed bias.
 
     Parameters
     ----------
     calibration : CalibrationResult or Update
     change, variance : array, shape (6,)
-        N and N·m, sensor axes, and their squares.
+        Change of the bias in N and N·m, sensor axes, and its variance.
     measured : bool
-        Whether the variance is that of the new bias itself, and not of the change alone.
+        Whether `variance` is the total variance of the new bias, instead of the variance of the change.
     """
 
     def changed(covariance: Array) -> Array:
@@ -92,14 +92,14 @@ def with_bias_change(calibration: Calibrated, change: Array, variance: Array, *,
 
 
 def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noise: Array, kind: str) -> Update:
-    """Estimate some of the parameters again by generalised least squares; keep the others.
+    """Return an update in which some parameters are re-estimated by generalised least squares, and the others kept.
 
-    With x the parameters of `kind`, one of `BLOCKS`, and e the errors of the old calibration, a reading is h(x) + K e
-    + noise, with the covariance `noise` (6n, 6n) of all mean readings, pose by pose. The weights are the inverse of
-    noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with G the matrix of the estimate.
+    With the parameters x of `kind` (a key of `BLOCKS`) and the errors e of the old calibration, the readings are h(x) +
+    K e + noise, where `noise` (6n, 6n) is the covariance of all mean readings, pose by pose. The weights are the
+    inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with the estimator matrix G.
 
-    Raises `BadDataset` for shapes that do not fit each other, and `NotObservable` where the poses do not determine
-    these parameters, or the weight is not significant.
+    Raises `BadDataset` for inconsistent shapes, and `NotObservable` if the poses do not determine the parameters, or if
+    the weight is not significant.
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
     R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
@@ -132,12 +132,12 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
             break
         new = _move(new, estimated, x, BLOCKS[kind])
     else:
-        raise NotObservable(f"the new {kind} has not settled in {MOST_STEPS} steps: calibrate again.")
+        raise NotObservable(f"the update of {kind} has not converged in {MOST_STEPS} steps: calibrate again.")
     estimated_15 = np.zeros((len(C), len(x)))
     estimated_15[:15] = estimated
     gain = estimated_15 @ G
     mixed = kept - gain @ K
-    # The old error of a kept parameter goes into the new ones, so both are correlated.
+    # The errors of kept parameters affect the new ones, so they are correlated.
     covariance = gain @ noise @ gain.T + mixed @ C @ mixed.T
     covariance = (covariance + covariance.T) / 2
     joint, dof = calibration.with_joint(covariance), 6 * n - len(x)
@@ -147,20 +147,20 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
 def apply_update(
     calibration: CalibrationResult, update: Update, provenance: Mapping[str, Any] | None = None
 ) -> CalibrationResult:
-    """Make a new calibration of an update.
+    """Return a new calibration from an update.
 
-    `residuals`, `chi2`, `dof` and `p_value` are those of the new readings. Noise beyond the measured one
-    (`components`) and the verdict are those of the old calibration, because new readings are too few for them. The
-    matrix of the sensor stays, and the mass by a scale unless the weight is estimated again.
+    `residuals`, `chi2`, `dof` and `p_value` are those of the new readings. Components of the noise and the verdict are
+    taken from the old calibration, because the new readings are too few for them. The matrix of the sensor is kept, and
+    the weighed mass too, unless the weight was re-estimated.
 
     Parameters
     ----------
     calibration : CalibrationResult
-        That the update was made from.
+        Calibration from which the update was made.
     update : Update
     provenance : mapping, optional
-        Where the new readings come from. The id of the old calibration is added to its `parent`, and the kind of update
-        as `update`.
+        Origin of the new readings. The id of the old calibration is added to its `parent`, and the kind of update as
+        `update`.
 
     Raises
     ------
@@ -168,8 +168,8 @@ def apply_update(
         No reading is left for a check.
     """
     if update.dof == 0:
-        raise NotObservable("one pose leaves no reading for a check of the new bias: use 2 poses or more.")
-    given = dict(provenance or {})
+        raise NotObservable("one pose is not enough to check the new bias: use 2 poses or more.")
+    provenance = dict(provenance or {})
     note = Finding.of("updated", kind=update.kind, n_poses=len(update.residuals), parent=calibration.id)
     return CalibrationResult(
         parameters=update.parameters,
@@ -183,8 +183,8 @@ def apply_update(
         method=calibration.method,
         findings=(*calibration.findings, note),
         provenance={
-            **given,
-            "parent": {**given.get("parent", {}), "id": calibration.id},
+            **provenance,
+            "parent": {**provenance.get("parent", {}), "id": calibration.id},
             "update": update.kind,
         },
         p_value=float(chi2_sf(update.dof, update.chi2)),
@@ -199,9 +199,9 @@ def apply_update(
 
 
 def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
-    """Error coordinates (15, k) of what is estimated: weight first, biases force first.
+    """Return a basis (15, k) of the estimated error coordinates.
 
-    With a new weight the centre of mass is estimated as their product, in which the readings are linear.
+    With a new weight, the product of weight and centre of mass is estimated, in which the readings are linear.
     """
     weight_N = p.weight_N
     columns = []
@@ -212,7 +212,6 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
             weight[9:12, 0] = -p.p_sensor_com_m / weight_N
         columns.append(weight)
     if "centre of mass" in blocks:
-        # The product of weight and centre of mass is estimated: readings are linear in it.
         columns.append(np.eye(15)[:, 9:12] / weight_N)
     if "bias" in blocks:
         columns.append(np.eye(15)[:, BIASES])
@@ -226,7 +225,7 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
 
 
 def _kept_derivative(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
-    """Derivative (size, size) of the new errors by the old ones, where they are kept."""
+    """Return the derivative (size, size) of the new errors by the errors of kept parameters."""
     kept = np.eye(size)
     if "mounting" in blocks:
         kept[:3, :3] = 0.0
@@ -248,43 +247,43 @@ def _move(p: Parameters, estimated: Array, x: Array, blocks: Sequence[Block]) ->
     weight_N = p.weight_N
     if "weight" in blocks:
         step[9:12] *= weight_N / (weight_N + x[0])
-    elif "gravity direction" in blocks:  # along the sphere
+    elif "gravity direction" in blocks:  # keep the norm of the gravity force
         moved = p.gravity_force_base_N + step[3:6]
         step[3:6] = moved * weight_N / np.linalg.norm(moved) - p.gravity_force_base_N
     return p.moved(step)
 
 
 def _invert_information(information: Array, kind: str, n: int) -> Array:
-    """Invert; raise `NotObservable` if the poses leave a parameter free."""
+    """Return the inverse of an information matrix; raise `NotObservable` if a parameter is not determined."""
     scale = np.sqrt(np.diag(information))
     units = np.outer(scale, scale)
     try:
         value = np.linalg.eigvalsh(information / units) if (scale > 0).all() else np.zeros(1)
         if value[0] > UNDETERMINED**2 * value[-1] and len(scale) <= 6 * n:
             return np.asarray(np.linalg.inv(information / units) / units)
-    except np.linalg.LinAlgError:  # rounding hides from the eigenvalues that it is singular
+    except np.linalg.LinAlgError:  # singular, but rounding made the eigenvalues look acceptable
         pass
     raise NotObservable(
         f"{n} {'pose does' if n == 1 else 'poses do'} not determine {kind}: add poses with other tilts of the tool."
     )
 
 
-# Tare: the biases again, from a few seconds of a free tool.
+# Tare: a new estimate of the biases from a few seconds of a free tool.
 
 # Share of good tares that are rejected.
 FALSE_ALARMS = 1e-3
-# A wrist sensor over hours: temperature, mounting, wear.
+# Usual drift of a wrist sensor over hours, due to temperature, mounting and wear; one standard deviation.
 USUAL_DRIFT_N, USUAL_DRIFT_NM = 1.0, 0.03
 
 
 def compare_with_prediction(
     calibration: Calibrated, R_base_flange: Array, wrench: Array, wrench_cov: Array, drift_N: float, drift_Nm: float
 ) -> tuple[Array, Array]:
-    """Compare mean readings (n, 6) of a free tool, as measured, with the prediction; `wrench_cov` (n, 6, 6) is theirs.
+    """Return residuals (n, 6) of mean readings of a free tool, and their Mahalanobis distances (n,).
 
-    `drift_N` and `drift_Nm` are the expected drift of the biases, one standard deviation an axis. Returns measured
-    minus predicted (n, 6), and the Mahalanobis distances (n,) with noise, drift and the uncertainty of the
-    calibration.
+    `wrench` (n, 6) are mean readings as measured with covariances `wrench_cov` (n, 6, 6). `drift_N` and `drift_Nm` are
+    standard deviations per axis of the drift of the biases. The distances account for noise, drift and the uncertainty
+    of the calibration.
     """
     p, response = calibration.parameters, calibration.response
     change = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
@@ -301,12 +300,12 @@ def tare(
     drift_N: float = USUAL_DRIFT_N,
     drift_Nm: float = USUAL_DRIFT_NM,
 ) -> Update:
-    """Estimate the biases again, with the weight of the tool subtracted; reject readings under load.
+    """Return an update of the biases from readings of the free tool; raise for readings under load.
 
-    The test is the Mahalanobis distance d² of each reading from its prediction. Its covariance holds the noise of the
-    reading, the uncertainty of the calibration, and a bias drift of `drift_N`, `drift_Nm` (one standard deviation an
-    axis). The limit is the 99.9 % quantile of chi-square with 6 degrees of freedom, 22.5. From two poses on, the
-    readings must also agree on one bias, with the same probability.
+    The test is the squared Mahalanobis distance d² of each reading from its prediction. The covariance contains the
+    noise of the reading, the uncertainty of the calibration, and a drift of the bias of `drift_N`, `drift_Nm` (standard
+    deviation per axis). The limit is the 99.9 % quantile of chi-square with 6 degrees of freedom, 22.5. With two or
+    more poses, the readings must also agree on one bias, at the same significance.
 
     Parameters
     ----------
@@ -316,8 +315,8 @@ def tare(
     dwells : sequence of n arrays, shape (N, 6)
         Consecutive samples in each pose, N >= 20, as measured, N and N·m, in the sensor frame.
     drift_N, drift_Nm : float
-        Expected drift of the biases since the calibration. A push of up to about four times this passes for drift,
-        because one pose does not distinguish them.
+        Expected drift of the biases since the calibration. A push of up to about four times this size is not detected,
+        because one pose cannot distinguish it from drift.
 
     Raises
     ------
@@ -326,8 +325,8 @@ def tare(
         contact, or the payload has changed.
     """
     if len(dwells) == 0:
-        raise BadDataset("there is no dwell: record at least one pose.")
-    # The covariance of a mean holds only for a reading at rest.
+        raise BadDataset("no dwell was given: record at least one pose.")
+    # The covariance of a mean is valid only for a stationary reading.
     for i, dwell in enumerate(dwells):
         if not is_stationary(dwell):
             raise BadDataset(f"pose {i + 1}: the reading changes during the dwell: keep arm and tool still.")
@@ -343,7 +342,7 @@ def tare(
             f"(d² {sigmas[i] ** 2:.0f}, limit {limit:.1f}): free the tool, or calibrate again if the payload has "
             "changed."
         )
-    # What the fit does not know of the sensor acts on a part that is weighed after the tare.
+    # Gain and cross-talk are kept, with their uncertainty, for parts that are weighed after the tare.
     known = Calibrated(calibration.parameters, calibration.covariance, calibration.shown_response)
     update = reestimate(known, R_base_flange, wrench, block_diag(*wrench_cov), "bias")
     if update.dof and update.chi2 > chi2_isf(update.dof, FALSE_ALARMS):

@@ -1,21 +1,21 @@
-"""Verification: whether new poses agree with a calibration and, if not, what has changed since.
+"""Verification: whether new poses agree with a calibration and, if not, what has changed.
 
-All residuals are tested jointly. Their covariance holds the noise of the readings, the errors of each pose that the fit
-found (`components`), the drift of the bias since, and the uncertainty of the calibration, which all poses share:
+All residuals are tested jointly. Their covariance contains the noise of the readings, the errors of each pose that the
+fit found (`components`), the drift of the bias since then, and the uncertainty of the calibration, common to all poses:
 
     S = noise + J C J' + drift,    chi2 = r' S^-1 r
 
-What a fit of few poses estimated is uncertain, and so is what acts on its readings. Two explanations are kept:
+The noise model of a fit of few poses is uncertain. Two explanations of its residuals are therefore considered:
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
-* The measured noise, by a factor that only the residuals of the fit show, and what sensor, arm and cable usually do
-  (`response_columns`, `_smooth_errors`). The residuals show its size, but not what other joint angles do in one
-  orientation.
+* The measured noise times a factor, and usual errors of sensor, arm and cable (`response_columns`,
+  `_smooth_error_covariance`). The residuals of the fit show the size of these errors, but not their dependence on joint
+  angles in one orientation.
 
-Under the second, with the ratio of both variances given, the squared distance of new readings from their prediction
-over the mean square of the fit's residuals has exactly an F distribution (predictive test of Chow, Econometrica 28,
-1960). Its probability is averaged over the ratios, each weighted by its restricted likelihood in the fit (posterior
-predictive probability), so an error that the fit cannot find widens the limit as much as the data allow.
+Under the second explanation, for given ratios of the variances, the squared distance of new readings from their
+prediction, relative to the mean square residual of the fit, has exactly an F distribution (predictive test of Chow,
+Econometrica 28, 1960). Its probability is averaged over the ratios with weights from their restricted likelihood
+(posterior predictive probability), so an error that the fit cannot detect widens the limit as far as the data allow.
 """
 
 from collections.abc import Mapping
@@ -51,7 +51,7 @@ from ftcalib.sensor_matrix import SIZE, USUAL, response_columns
 
 Change = Literal["bias", "payload", "centre of mass", "mounting", "base", "several"]
 
-# Kind of update that makes up for each change.
+# The change that corresponds to each kind of update.
 _SINGLE: Mapping[str, Change] = {
     "bias": "bias",
     "weight": "payload",
@@ -61,26 +61,26 @@ _SINGLE: Mapping[str, Change] = {
     "base": "base",
 }
 _SEVERAL = ("bias and payload", "all")
-# Each parameter must lower chi2 by more than this: one in 200 does by chance.
+# Required reduction of chi2 per parameter of a change; one in 200 passes by chance.
 _COST = 8.0
-# Probability of the remaining misfit below which a change does not explain the readings.
+# Smallest p-value of the remaining misfit of a change that explains the readings.
 _UNEXPLAINED = 1e-3
-# Two changes whose chi2 differ by less are not distinguished: odds of 100 to 1.
+# Two changes with a smaller difference of chi2 are not distinguished: odds of 100 to 1.
 _INDISTINCT = 9.2
 FEWEST = 2
 
-# Sizes of gain and cross-talk that the fit did not find, and of smooth errors of arm and cable, relative to usual ones.
+# Trial sizes of gain and cross-talk that the fit did not find, and of smooth errors, relative to usual ones.
 _USUAL_GAINS = np.array([0.1, 1.0])
 _USUAL_SMOOTH = np.geomspace(0.15, 2, 3)
-# Share of smooth errors that is not one of the orientation, where a fit reaches orientations with various joint angles.
+# Share of smooth errors that depends on joint angles rather than on the orientation, if the fit shows this share.
 _OTHER_JOINTS = 0.8
-# Else what other joint angles add: variances of the size that the fit shows, and at least those of a usual arm.
+# Otherwise, variances for other joint angles, as multiples of those in the fit, and at least those of a usual arm.
 _BEYOND, _LEAST_BEYOND = 2.0, np.array([1.0, 0.0])
-# Of more poses every second, third, ... shows smooth errors.
+# Largest number of poses of the fit from which smooth errors are estimated.
 _FEW_TO_SMOOTH = 100
-# Least share of the measured noise: readings of a coarse sensor may agree far better than their stated noise, by luck.
+# Smallest factor of the measured noise: readings of a coarse sensor may agree much better than their stated noise.
 _LEAST_FACTOR = 0.1
-# Smooth errors, one sigma an axis: of the orientations of a calibrated arm, and of the pull of a cable.
+# Usual smooth errors, standard deviation per axis: orientation of a calibrated arm, force and torque of a cable.
 _TURN_RAD, _CABLE = float(np.deg2rad(0.1)), np.repeat([0.05, 0.012], 3)
 
 _AXES = {name: [k] for k, name in enumerate(("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm"))}
@@ -89,21 +89,21 @@ _CHANNELS = _AXES | {"force_N": [0, 1, 2], "torque_Nm": [3, 4, 5]}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Expected:
-    """What unchanged readings scatter by, under one explanation."""
+    """Predictive distribution of the readings of an unchanged cell, under one explanation."""
 
     calibration: Update
-    """The calibration, with the drift of the bias since then in its covariance."""
+    """Calibration whose covariance includes the drift of the bias since then."""
     noise: Array
-    """(6n, 6n) of the new readings: measured noise, errors of each pose, drift from the first to each."""
+    """(6n, 6n) covariance of the new readings: measured noise, errors of each pose, drift since the first new pose."""
     freedom: float
-    """Degrees of freedom from which the fit estimated this noise, or its factor; infinite if neither."""
+    """Degrees of freedom of the estimate of the noise, or of its factor; infinite if it was not estimated."""
     factor: float = 1.0
-    """By which all variances are multiplied, noise and calibration; chi2 is without it."""
+    """Factor of all variances, of noise and calibration; chi2 does not include it."""
     weight: float = 1.0
-    """Probability of the explanation, relative to the others of its kind."""
+    """Probability of the explanation among others of its kind."""
 
     def distance(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, float]:
-        """Return the residuals (n, 6), their sigma (n, 6), and chi2 of all of them together."""
+        """Return the residuals (n, 6), their sigma (n, 6), and their joint chi2."""
         p, response = self.calibration.parameters, self.calibration.response
         residual = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)
         S = self.noise + self.common(R_base_flange)
@@ -111,29 +111,29 @@ class Expected:
         return residual, np.sqrt(self.factor * np.diag(S)).reshape(residual.shape), chi2
 
     def common(self, R_base_flange: Array) -> Array:
-        """Return the covariance (6n, 6n) of the predictions: the uncertainty of the calibration, without `factor`."""
+        """Return the covariance (6n, 6n) of the predictions due to the calibration, without `factor`."""
         K = self.calibration.jacobian(R_base_flange).reshape(6 * len(R_base_flange), -1)
         return np.asarray(K @ self.calibration.joint_covariance @ K.T)
 
     def p_value(self, chi2: float, dof: int) -> float:
-        """Probability of a larger chi2."""
+        """Return the probability of a larger chi2."""
         chi2 /= self.factor
         return float(chi2_sf(dof, chi2) if np.isinf(self.freedom) else f_sf(dof, self.freedom, chi2 / dof))
 
     def deviance(self, chi2: float, dof: int) -> float:
-        """-2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
+        """Return -2 log likelihood: chi2, or that of Student's distribution if the noise was estimated."""
         chi2 /= self.factor
         return chi2 if np.isinf(self.freedom) else (self.freedom + dof) * float(np.log1p(chi2 / self.freedom))
 
     def bias_change(self, R_base_flange: Array, wrench: Array) -> tuple[Array, Array, Array]:
-        """Return the change (6,) of the biases, as if nothing else had changed, and both sigmas as in `Verification`.
+        """Return the change (6,) of the biases, if nothing else has changed, and both sigmas as in `Verification`.
 
-        The residuals are r = H b + K e + noise, with b the change, H the identity for each pose, and e the errors of
-        the calibration, which all its verifications share. By generalised least squares,
+        The residuals are r = H b + K e + noise, with the change b, H the identity for each pose, and the errors e of
+        the calibration, common to all its verifications. By generalised least squares,
 
             b = G r,    G = (H' S^-1 H)^-1 H' S^-1,    S = noise + K C K',
 
-        with the covariance G noise G' from this verification, and G K C K' G' from the calibration.
+        with the covariance G noise G' due to this verification, and G K C K' G' due to the calibration.
         """
         residual, _, _ = self.distance(R_base_flange, wrench)
         common = self.common(R_base_flange)
@@ -145,11 +145,11 @@ class Expected:
 
 
 def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wrench_cov: Array) -> Expected:
-    """Add up what the fit found beyond the measured noise, as if the new poses continued the tour.
+    """Return the distribution of new readings with the components of the fit, as if the new poses continued the tour.
 
-    A random walk of variance q² a pose moves the bias by q² to the first new pose, and from the mean of the N poses of
-    the tour, which earlier files have, by q² (N / 3 + 1). A linear drift goes on for as long as the tour. If the fit
-    found nothing, the measured noise has the factor chi2 / dof of the fit.
+    A random walk with variance q² per pose adds q² up to the first new pose, or q² (N / 3 + 1) to the mean bias of N
+    poses, as in earlier files. A linear drift is continued for the duration of the tour. Without components, the
+    measured noise has the factor chi2 / dof of the fit.
     """
     n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
     n_used = calibration.n_poses - len(calibration.rejected_poses)
@@ -163,22 +163,22 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
         freedom = len(c) * calibration.dof / 6
         if kind == "walk":
             part[:, c, :, c], since[c] = sigma**2 * np.minimum.outer(later, later), sigma**2 * (to_end + 1)
-            freedom = len(c) * (n_used - 1) / 2  # the other half is that of the white noise
+            freedom = len(c) * (n_used - 1) / 2  # the other half belongs to the white noise
         elif kind == "slope":
             part[:, c, :, c], since[c] = sigma**2 * np.outer(later, later) / n_used**2, sigma**2
             freedom = len(c)
-        elif kind == "rotation":  # turns about gravity do not show
+        elif kind == "rotation":  # rotations about gravity have no effect
             turn = jacobian(calibration.parameters, R_base_flange)[..., :3]
             part[range(n), :, range(n)] = sigma**2 * (turn @ np.swapaxes(turn, 1, 2))
             freedom = max(2 * n_used - 6, 2)
-        elif kind == "white":  # with unmeasured noise all of it
+        elif kind == "white":  # includes all noise if it was not measured
             known = np.zeros_like(wrench_cov) if calibration.noise_source == "measured" else wrench_cov
             for k in c:
                 part[range(n), k, range(n), k] = np.maximum(sigma**2 - known[:, k, k], 0.0)
         elif kind == "hysteresis":  # six shares, one for each axis
             T = hysteresis_columns(calibration.parameters, R_base_flange).reshape(6 * n, -1)
             part, freedom = (sigma**2 * T @ T.T).reshape(n, 6, n, 6), 6
-        else:  # gain and cross-talk act through the response
+        else:  # gain and cross-talk are part of the response
             continue
         gap += since
         part[:, range(6), :, range(6)] += since[:, None, None]
@@ -189,7 +189,7 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
     if not (parts or calibration.components) and calibration.noise_source == "measured":
         factor = max(calibration.chi2 / calibration.dof, _LEAST_FACTOR)
         return Expected(drifted, noise, calibration.dof, factor)
-    # Satterthwaite: the variances of independent estimates add up, each by its share of the noise
+    # Satterthwaite's degrees of freedom, with each component weighted by its share of the noise
     inverse = np.linalg.inv(total)
     spread = sum((float(np.vdot(inverse, part)) / (6 * n)) ** 2 / freedom for part, freedom in parts)
     return Expected(drifted, noise, 1 / spread if spread else np.inf)
@@ -198,14 +198,15 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
 def expected_with_smooth_errors(
     calibration: CalibrationResult, fitted: CalibrationDataset, R_base_flange: Array, wrench_cov: Array
 ) -> list[Expected]:
-    """Explain the fit by scaled measured noise, and by usual errors of sensor, arm and cable of various sizes.
+    """Return distributions of new readings with scaled measured noise, and usual errors of sensor, arm and cable.
 
-    Empty if the noise was not measured, for parameters that were known or not estimated by maximum likelihood. The
-    weights sum to 1. Gain and cross-talk that the fit found have the variance that it gave them.
+    The list covers various sizes of the errors, with weights that sum to 1. It is empty if the noise was not measured,
+    if parameters were known, or if they were not estimated by maximum likelihood. Gain and cross-talk that the fit
+    found have their estimated variance.
 
-    What they do to the new poses follows from what they have done to those of the fit, and grows with the distance.
-    Where joint angles vary for themselves, a part of it does not follow from the orientation. Either the fit shows that
-    part, or its poses turn the wrist alone and cannot.
+    The errors at the new poses are predicted from those of the fit, with a variance that increases with the distance in
+    orientation. A part depends on joint angles and not on the orientation. The fit shows this part only if its poses
+    vary more than the wrist joints.
     """
     p = calibration.parameters
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
@@ -216,11 +217,10 @@ def expected_with_smooth_errors(
     R, dof = fitted.R_base_flange[rows], 6 * len(rows) - 15
     D = block_diag(*pooled_covariance(fitted.wrench_cov, fitted.n_samples)[rows])
     e = (fitted.wrench[rows] - predict(p, R)).ravel()
-    J, J_new = (jacobian(p, one).reshape(-1, 15) for one in (R, R_base_flange))
-    T, T_new = (response_columns(p, one).reshape(-1, SIZE) for one in (R, R_base_flange))
-    smooth, between, new = (
-        _smooth_error_covariance(p, *pair) for pair in ((R, R), (R_base_flange, R), (R_base_flange,) * 2)
-    )
+    J, J_new = (jacobian(p, poses).reshape(-1, 15) for poses in (R, R_base_flange))
+    T, T_new = (response_columns(p, poses).reshape(-1, SIZE) for poses in (R, R_base_flange))
+    pairs = (R, R), (R_base_flange, R), (R_base_flange, R_base_flange)
+    smooth, between, new = (_smooth_error_covariance(p, *pair) for pair in pairs)
     alone, alone_new = (whole * np.kron(np.eye(whole.shape[1] // 6), np.ones((6, 6))) for whole in (smooth, new))
     sizes = np.repeat([calibration.components.get(name, 0.0) for name in ("gain", "cross_talk")], [5, 6])
     coefficients = calibration.shown_response.coefficients
@@ -248,9 +248,9 @@ def expected_with_smooth_errors(
         off, B = white_new.T @ left + J_new @ x - T_new @ coefficients, J_new - white_new.T @ white_J
         total = block_diag(*wrench_cov) + np.tensordot(alike, new, 1) + (T_new * gain) @ T_new.T
         total -= white_new.T @ white_new
-        # Where joint angles follow from the orientation in the fit, others may do more than it shows.
+        # If joint angles follow from the orientation in the fit, other joint angles may have larger errors.
         total += np.tensordot(share * square if share else _BEYOND * square + _LEAST_BEYOND, alone_new, 1)
-        # The prediction as stored is off by what this explanation moves it.
+        # Under this explanation the estimates move, so the stored prediction has an additional error.
         total += B @ C @ B.T + np.outer(off, off) / factor
         value, vector = np.linalg.eigh(total - stored / factor)
         noise = (vector * np.maximum(value, 1e-6 * value[-1])) @ vector.T
@@ -258,11 +258,11 @@ def expected_with_smooth_errors(
         update = Update(p, calibration.covariance / factor, 0.0, 0, response=joint)
         explanations.append(Expected(update, noise, dof, factor))
     weights = np.exp(np.array(likelihood) - max(likelihood))
-    return [replace(one, weight=weight) for one, weight in zip(explanations, weights / weights.sum(), strict=True)]
+    return [replace(each, weight=weight) for each, weight in zip(explanations, weights / weights.sum(), strict=True)]
 
 
 def _components(calibration: CalibrationResult) -> Mapping[str, float]:
-    """Components of the noise, and a linear drift that was part of the model."""
+    """Return the components of the noise, including a linear drift that was part of the model."""
     found = dict(calibration.components)
     if calibration.drift is not None and not any(name.startswith(("walk", "slope")) for name in found):
         found |= {f"slope_{name}": float(abs(calibration.drift.change[c[0]])) for name, c in _AXES.items()}
@@ -270,7 +270,7 @@ def _components(calibration: CalibrationResult) -> Mapping[str, float]:
 
 
 def _smooth_error_covariance(p: Parameters, R_base_flange: Array, others: Array) -> Array:
-    """Give the covariances (2, 6n, 6m) that smooth errors of the arm, and of a cable, cause between orientations."""
+    """Return the covariances (2, 6n, 6m) between two sets of orientations, for smooth errors of arm and cable."""
     correlated = alike(R_base_flange, others)
     turn, turn_other = (jacobian(p, R)[..., :3] * _TURN_RAD for R in (R_base_flange, others))
     of_arm = np.einsum("nm,nik,mjk->nimj", correlated, turn, turn_other)
@@ -284,33 +284,34 @@ class Verification:
     residual: Array
     """(n, 6) measured minus predicted, N and N·m, in the sensor frame."""
     predicted_sigma: Array
-    """(n, 6) standard deviation of that: noise, drift and uncertainty of the calibration."""
+    """(n, 6) standard deviation of the residuals from noise, drift and uncertainty of the calibration, N and N·m."""
     chi2: float
-    """Chi2 of all residuals together."""
+    """Joint chi2 of all residuals."""
     dof: int
     p_value: float
     """Probability of a larger chi2 if nothing has changed."""
     passed: bool
     change: Change | None
-    """What has changed; None if passed, or if no change explains the readings."""
+    """The change; None if passed, or if no change explains the readings."""
     reason: str
+    """Sentence with the result of the test and the change."""
     bias_change: Array
-    """(6,) new bias minus that of the calibration, as if nothing else had changed; force first, N and N·m."""
+    """(6,) change of the bias since the calibration if nothing else has changed; force first, N and N·m."""
     bias_sigma: Array
-    """(6,) one standard deviation from the readings of this verification, independent of any other."""
+    """(6,) standard deviation of `bias_change` due to this verification, independent of other verifications."""
     calibration_sigma: Array
-    """(6,) one standard deviation from the calibration: nearly the same error in all its verifications."""
+    """(6,) standard deviation of `bias_change` due to the calibration, nearly common to all its verifications."""
     alternatives: tuple[Change, ...] = ()
-    """Other changes that explain the readings as well."""
+    """Other changes that explain the readings equally well."""
     update: Update | None = None
-    """The smallest update that makes up for the change; None if passed, or if none does."""
+    """Smallest update that accounts for the change; None if passed, or if there is none."""
 
     def __post_init__(self) -> None:
         for name in ("residual", "predicted_sigma", "bias_change", "bias_sigma", "calibration_sigma"):
             object.__setattr__(self, name, read_only(getattr(self, name)))
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return the content as JSON; `update` is its kind, chi2 and dof."""
+        """Return the verification as a JSON object; `update` contains only its kind, chi2 and dof."""
         update = self.update
         bias = {"value": self.bias_change, "sigma": self.bias_sigma, "calibration_sigma": self.calibration_sigma}
         return {
@@ -337,66 +338,66 @@ def verify_calibration(
     fitted: CalibrationDataset | None = None,
     false_alarms: float = 0.01,
 ) -> Verification:
-    """Test whether new poses agree with a calibration; on an alarm, name the change and propose the smallest update.
+    """Return whether new poses agree with a calibration; on an alarm, also the change and the smallest update.
 
-    An alarm is a p-value below `false_alarms` under both explanations of what acted on the fit: the components that it
-    found, and smooth errors of sensor, arm and cable. The change is named under the one that makes the new readings
-    likeliest.
+    An alarm is a p-value below `false_alarms` under both explanations of the residuals of the fit: the components that
+    it found, and smooth errors of sensor, arm and cable. The change is determined under the explanation with the higher
+    likelihood of the new readings.
 
-    Each change is a model that estimates some parameters again and keeps the others with their uncertainty. It explains
-    the readings unless its remaining misfit exceeds that of 999 in 1000 good fits. Of these changes, the one with the
-    lowest chi2 plus 8 a parameter is named. If there is none, bias and payload together are tried, then all.
+    Each kind of change re-estimates some parameters and keeps the others with their uncertainty. It explains the
+    readings unless its misfit exceeds that of 999 in 1000 good fits. Among these, the change with the lowest chi2 plus
+    8 per parameter is reported. If there is none, bias and payload together are tried, then all parameters.
 
     Parameters
     ----------
     calibration : CalibrationResult
     R_base_flange : array, shape (n, 3, 3)
-        n >= 2 poses that were not used in the calibration, in the order of measuring. 6 separate all causes.
+        n >= 2 poses that were not used in the calibration, in the order of measurement. 6 poses separate all causes.
     wrench : array, shape (n, 6)
         Mean readings of the free tool as measured, N and N·m, in the sensor frame.
     wrench_cov : array, shape (n, 6, 6)
-        Covariance of those means, pooled if they come from fewer than 100 samples (`ftcalib.data.dataset`).
+        Covariances of the means, pooled if they are from fewer than 100 samples (`ftcalib.data.dataset`).
     fitted : CalibrationDataset, optional
-        The poses of the calibration. They show how uncertain the noise is that a fit of few poses found.
+        Poses of the calibration, which show the uncertainty of its noise model.
     false_alarms : float
-        Share of unchanged sensors that do not pass, in poses like those of the calibration. In others it is about
-        three times as large where arm, cable or sensor do more than usual.
+        Share of unchanged cells that fail, in poses like those of the calibration. In other poses it is up to about
+        three times as large, if errors of arm, cable or sensor are larger than usual.
 
     Raises
     ------
     BadDataset
-        Fewer than two poses, or shapes that do not fit each other.
+        Fewer than two poses, or inconsistent shapes.
     """
     n = len(wrench)
     if n < FEWEST:
         raise BadDataset(f"{n} {'pose is' if n == 1 else 'poses are'} too few for a verification: record 2 or more.")
-    R_base_flange, wrench = (
-        require_finite("R_base_flange", R_base_flange, (n, 3, 3)),
-        require_finite("wrench", wrench, (n, 6)),
-    )
+    R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
+    wrench = require_finite("wrench", wrench, (n, 6))
     wrench_cov = require_finite("wrench_cov", wrench_cov, (n, 6, 6))
     if not 0 < false_alarms < 1:
         raise ValueError(f"false_alarms is {false_alarms}, expected a share between 0 and 1")
     if fitted is not None and len(fitted) != calibration.n_poses:
-        raise BadDataset(f"{len(fitted)} poses are not those of the calibration, which has {calibration.n_poses}.")
+        raise BadDataset(
+            f"`fitted` has {len(fitted)} poses, but the calibration has {calibration.n_poses}: give its dataset."
+        )
     explanations = [[expected_as_found(calibration, R_base_flange, wrench_cov)]]
 
     def probability(kind: list[Expected]) -> float:
-        return sum(one.weight * one.p_value(one.distance(R_base_flange, wrench)[2], 6 * n) for one in kind)
+        return sum(each.weight * each.p_value(each.distance(R_base_flange, wrench)[2], 6 * n) for each in kind)
 
     p_values = [probability(explanations[0])]
-    # The second explanation has the larger sigma, so it is asked only where the first fails.
+    # The second explanation has larger sigmas, so it is evaluated only if the first fails.
     if fitted is not None and p_values[0] < false_alarms:
         smooth = expected_with_smooth_errors(calibration, fitted, R_base_flange, wrench_cov)
         if smooth:
             explanations.append(smooth)
             p_values.append(probability(smooth))
-    likeliest = [max(kind, key=lambda one: one.weight) for kind in explanations]
-    # An alarm needs both explanations to fail: the sensor that passes under one of them may be unchanged.
+    likeliest = [max(kind, key=lambda each: each.weight) for kind in explanations]
+    # An alarm requires that both explanations fail, because a cell that passes under one of them may be unchanged.
     p_value = max(p_values)
     if p_value >= false_alarms:
         return _compare(likeliest[p_values.index(p_value)], p_value, R_base_flange, wrench, passed=True)
-    changes = [_possible_updates(calibration, one, R_base_flange, wrench) for one in likeliest]
+    changes = [_possible_updates(calibration, expected, R_base_flange, wrench) for expected in likeliest]
     best = min(range(len(changes)), key=lambda k: min((cost for cost, _ in changes[k].values()), default=np.inf))
     alarm = _compare(likeliest[best], p_value, R_base_flange, wrench, passed=False)
     return _explain_alarm(alarm, calibration, changes[best])
@@ -423,12 +424,12 @@ def _compare(expected: Expected, p_value: float, R_base_flange: Array, wrench: A
 def _possible_updates(
     calibration: CalibrationResult, expected: Expected, R_base_flange: Array, wrench: Array
 ) -> dict[str, tuple[float, Update]]:
-    """Find the changes that explain the readings: -2 log likelihood plus the cost of the parameters, and the update."""
+    """Return the changes that explain the readings, each with its penalised -2 log likelihood and its update."""
     dof = wrench.size
     unchanged = expected.deviance(expected.distance(R_base_flange, wrench)[2], dof)
     logdet = float(np.linalg.slogdet(expected.noise + expected.common(R_base_flange))[1])
     logdet += dof * float(np.log(expected.factor))
-    found = {}
+    updates = {}
     for kind in (*_SINGLE, *_SEVERAL):
         try:
             update = reestimate(expected.calibration, R_base_flange, wrench, expected.noise, kind)
@@ -439,21 +440,21 @@ def _possible_updates(
             continue
         cost = expected.deviance(update.chi2, dof) + _COST * (dof - update.dof)
         if cost < unchanged and expected.p_value(update.chi2, update.dof) > _UNEXPLAINED:
-            found[kind] = logdet + cost, update
-    return found
+            updates[kind] = logdet + cost, update
+    return updates
 
 
 def _explain_alarm(
     alarm: Verification, calibration: CalibrationResult, found: Mapping[str, tuple[float, Update]]
 ) -> Verification:
-    """Name the change, with the update that makes up for it."""
+    """Return the alarm with the change that explains it, and with the corresponding update."""
     misfit = f"chi2 {alarm.chi2:.0f} for {alarm.dof} readings"
     single = sorted((kind for kind in found if kind in _SINGLE), key=lambda kind: found[kind][0])
     if single:
         least, update = found[single[0]]
         change = _SINGLE[single[0]]
         blocks = set(BLOCKS[single[0]])
-        # A payload includes its weight: such a pair is no alternative, but more of the same.
+        # Changes that include each other, such as payload and weight, are no alternatives.
         apart = [kind for kind in single if not (blocks <= set(BLOCKS[kind]) or blocks >= set(BLOCKS[kind]))]
         others = tuple(dict.fromkeys(_SINGLE[kind] for kind in apart if found[kind][0] < least + _INDISTINCT))
         reason = f"{_describe_update(calibration, update)} ({misfit}, {update.chi2:.0f} after the update)"
@@ -465,8 +466,8 @@ def _explain_alarm(
     for kind in _SEVERAL:
         if kind in found:
             update = found[kind][1]
-            what = "bias and payload" if kind == "bias and payload" else "several quantities"
-            reason = f"{what} have changed: {_describe_update(calibration, update)} ({misfit})"
+            names = "bias and payload" if kind == "bias and payload" else "several quantities"
+            reason = f"{names} have changed: {_describe_update(calibration, update)} ({misfit})"
             return replace(alarm, change="several", update=update, reason=reason)
     worst = int(np.argmax(np.linalg.norm(alarm.residual / alarm.predicted_sigma, axis=1)))
     force_N, torque_Nm = (float(np.linalg.norm(alarm.residual[worst, c])) for c in (slice(3), slice(3, 6)))
@@ -479,10 +480,10 @@ def _explain_alarm(
 
 
 def _turned_shift(calibration: CalibrationResult, new: Parameters, R_base_flange: Array) -> Array:
-    """Give the covariance (6n, 6n) of what the gain makes of a shift of the centre of mass.
+    """Return the covariance (6n, 6n) of the readings due to the gain after a shift of the centre of mass.
 
-    The antisymmetric part a of the gain turns all forces as the mounting does, which the calibration cannot separate.
-    The torque does not turn with them: of a shift d it is d x (u - a x u), if u is the weight as the forces show it.
+    The antisymmetric part a of the gain rotates all forces like the mounting, and the calibration cannot separate them.
+    The torque is not rotated: for a shift d it is d x (u - a x u), with u the weight as measured.
     """
     shift = skew(new.p_sensor_com_m - calibration.p_sensor_com_m)
     columns = np.zeros((len(R_base_flange), 6, 3))

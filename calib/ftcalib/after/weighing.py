@@ -1,15 +1,15 @@
-"""Weigh what a gripper holds beyond its calibrated tool: mass and centre of mass from readings at rest.
+"""Weighing of a part held by the calibrated tool: mass and centre of mass from readings at rest.
 
-With u the wrench of 1 kg as the sensor feels it, a held part of mass m and centre of mass p adds
+With u the force of 1 kg in the sensor frame, a held part of mass m and centre of mass p adds
 
     force_N = m u        torque_Nm = (m p) x u        u = R_base_sensor.T @ g_base
 
-which is linear in m and m p. Both are estimated by generalised least squares. The covariance has the noise of the
-readings, the errors of the calibration, which are common to all of them and grow with the held weight, and the drift of
-the bias. One pose determines m p across gravity only. So a part counts as near a point of the gripper, `REACH_M` is one
-standard deviation, and that alone determines its centre of mass along gravity.
+which is linear in m and m p. Both are estimated by generalised least squares. The covariance contains the noise of the
+readings, the errors of the calibration, which are common to all readings and grow with the held weight, and the drift
+of the bias. One pose determines m p only perpendicular to gravity. A prior therefore places the part near a point of
+the gripper, with a standard deviation `REACH_M`, and determines the centre of mass along gravity.
 
-A weight has no force across gravity and no torque about it. What a reading has there is a fault: see `Fault`.
+A weight has no force perpendicular to gravity and no torque about gravity. Such readings are a fault: see `Fault`.
 """
 
 from collections.abc import Callable
@@ -38,29 +38,29 @@ from ftcalib.sensor_matrix import (
     shown_gain,
 )
 
-# A part is held so near to the given point, one standard deviation an axis.
+# Standard deviation per axis of the centre of mass of a part from the gripping point.
 REACH_M = 0.1
-# Share of clean weights that a test takes for a fault.
+# False-alarm probability of the test for a fault.
 FALSE_ALARMS = 1e-5
-# A mass of so many sigmas differs from zero.
+# Number of sigmas from which a mass differs from zero.
 LEAST_SIGMAS = 4.0
 # Usual drift of a bias, one standard deviation, N/h and N·m/h: warm sensors drift less.
 _DRIFT_PER_H = np.repeat([5.0, 0.15], 3)
 # Usual change of a bias within days, one standard deviation, N and N·m.
 _USUAL_DRIFT = np.repeat([USUAL_DRIFT_N, USUAL_DRIFT_NM], 3)
 
-# Why force and torque do not belong to one weight: "contact", a force across gravity; "cable", a torque that no weight
-# near the gripper exerts; "changed", each pose has a weight, but not the same; "lifted", less than the tool alone.
+# Why force and torque are not those of one weight: "contact", a force perpendicular to gravity; "cable", a torque that
+# no weight near the gripper exerts; "changed", different weights in different poses; "lifted", less than the tool.
 Fault = Literal["contact", "cable", "changed", "lifted"]
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Weight(Displayed):
-    """What is held beyond the tool. Arrays are read-only, sensor axes, from the sensor origin.
+    """Weight of a part held by the tool. Arrays are read-only, in sensor axes, from the sensor origin.
 
     Examples
     --------
-    `weigh` returns it:
+    Weigh the part in an emulated gripper:
 
     >>> import ftdrive
     >>> with ftdrive.open_stream(simulate=True) as stream:
@@ -71,23 +71,24 @@ class Weight(Displayed):
 
     mass_kg: float
     mass_sigma_kg: float
-    """Noise, calibration and drift; not the scale of the sensor, see `scale_sigma`."""
+    """Standard deviation from noise, calibration and drift, without the scale of the sensor (`scale_sigma`), kg."""
     least_kg: float
-    """Smallest mass that this weighing can distinguish from zero."""
+    """Smallest mass that this weighing can distinguish from zero, kg."""
     p_sensor_com_m: Array
-    """(3,) meaningless unless `is_something`."""
+    """(3,) centre of mass; meaningless unless `is_something`."""
     com_covariance: Array
-    """(3, 3)"""
+    """(3, 3) covariance of the centre of mass, m²."""
     line: Array | None
-    """(3,) unit vector along which the centre of mass is only assumed, because one pose does not show it; else None."""
+    """(3,) unit vector along which only the prior determines the centre of mass; None with enough poses."""
     fault: Fault | None
+    """Why the readings are not those of one weight; None if they are."""
     chi2: float
     dof: int
     poses: int
     scale_sigma: float = 0.0
-    """Relative error of the scale of the sensor, one standard deviation, if set: common to all weights, tool too."""
+    """Relative standard deviation of the sensor's scale, common to all weights and the tool; 0 if not determined."""
     in_motion: bool = False
-    """Whether it was weighed while the arm carried it; then `poses` is 0."""
+    """Whether the part was weighed while the arm moved; `poses` is then 0."""
     moment: tuple[Array, Array] = field(default=(np.zeros(4), np.zeros((4, 4))), repr=False)
     """Mass and mass times centre of mass (4,), and their covariance."""
 
@@ -106,26 +107,26 @@ class Weight(Displayed):
 
     @property
     def is_something(self) -> bool:
-        """Whether the mass differs from zero."""
+        """Whether the mass differs significantly from zero."""
         return self.mass_kg > self.least_kg
 
     @property
     def com_sigma_m(self) -> Array:
-        """(3,) one standard deviation along the axes of the sensor."""
+        """(3,) standard deviations of the centre of mass along the sensor axes, m."""
         return np.asarray(np.sqrt(np.diag(self.com_covariance)))
 
     @property
     def com_in_words(self) -> list[str]:
-        """x, y and z of the centre of mass with their standard deviations, mm in sensor axes."""
+        """Centre of mass x, y and z with standard deviations as text, mm in sensor axes."""
         return [with_sigma(1e3 * x, 1e3 * s) for x, s in zip(self.p_sensor_com_m, self.com_sigma_m, strict=True)]
 
 
 def drift_since(seconds: float, per_h: Array = _DRIFT_PER_H) -> Array:
-    """Return one standard deviation (6,) of the change of a bias since so long, N and N·m; infinite is never zeroed."""
+    """Return the standard deviation (6,) of the change of a bias within a time, N and N·m; infinity: never zeroed."""
     return np.asarray(np.minimum(per_h * max(seconds, 0.0) / 3600, _USUAL_DRIFT))
 
 
-def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
+def weigh_load(  # noqa: PLR0913 - readings, noise and prior knowledge
     reference: Calibrated,
     R_base_flange: Array,
     wrench: Array,
@@ -137,34 +138,34 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
     orientation_sigma_rad: float = 0.0,
     contact: ContactResponse | None = None,
 ) -> Weight:
-    """Weigh what is held in readings of one load.
+    """Return the weight of a held part from readings at rest.
 
     Parameters
     ----------
     reference : CalibrationResult or Update
-        The empty gripper: a calibration, or its tare.
+        Calibration of the empty gripper, or its tare.
     R_base_flange : array, shape (n, 3, 3)
         One pose is enough for the mass.
     wrench : array, shape (n, 6)
-        Means as measured, N and N·m, in the sensor frame.
+        Mean readings as measured, N and N·m, in the sensor frame.
     noise : array, shape (n, 6, 6)
-        Covariances of these means.
+        Covariances of the mean readings.
     drift : array, shape (6,)
         One standard deviation of the change of the bias since the reference, see `drift_since`.
     g_m_s2 : float
         Gravity of the calibration.
     p_sensor_near_m : array, shape (3,)
-        Where the gripper holds parts, sensor frame.
+        Gripping point in the sensor frame.
     orientation_sigma_rad : float
-        Error of each reported orientation, one standard deviation an axis.
+        Standard deviation per axis of each reported orientation.
     contact : ContactResponse, optional
-        How the sensor reads a contact, where known loads have shown it: mass and centre of mass are then decoded, and
-        `scale_sigma` is what its errors leave. `moment` remains as the sensor reads it.
+        Response of the sensor determined with known loads. Mass and centre of mass are then decoded, and `scale_sigma`
+        is due to the remaining errors. `moment` is not decoded.
 
     Raises
     ------
     BadDataset
-        Shapes that do not fit each other, or a tool without weight: the direction of gravity is unknown then.
+        Inconsistent shapes, or a tool without weight, so that the direction of gravity is unknown.
     """
     n = len(wrench)
     R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
@@ -185,7 +186,7 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
 
     fit = _fit_load(left, A, covariance_of, p_sensor_near_m)
     x, S, dof = fit.x, fit.S, 6 * n - 1
-    # A gain that depends on the load shows in none of its poses with the tool alone, and is no contact.
+    # A gain that depends on the load must not be reported as a contact.
     loads = LOAD * response_columns(_part(tool, x * g_m_s2), R_base_flange).reshape(6 * n, -1)
     S = S + loads @ loads.T
     chi2 = float(fit.misfit @ np.linalg.solve(S, fit.misfit) + np.sum((fit.near @ x) ** 2))
@@ -223,18 +224,19 @@ def weigh_load(  # noqa: PLR0913 - the readings and what is known of them
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _LoadFit:
-    """Mass and mass times centre of mass (4,), with what the estimate rests on."""
+    """Least-squares estimate of mass and mass times centre of mass."""
 
     x: Array
+    """(4,) mass and mass times centre of mass, kg and kg·m."""
     covariance: Array
     S: Array
     """(6n, 6n) covariance of the readings."""
     H: Array
-    """(6n, 4)"""
+    """(6n, 4) derivative of the readings by `x`."""
     near: Array
-    """(3, 4) the prior of the place."""
+    """(3, 4) prior of the centre of mass, in standard deviations."""
     misfit: Array
-    """(6n,)"""
+    """(6n,) residuals of the readings."""
 
     @property
     def sigma_kg(self) -> float:
@@ -242,18 +244,18 @@ class _LoadFit:
 
 
 def _fit_load(left: Array, A: Array, covariance_of: Callable[[Array], Array], p_sensor_near_m: Array) -> _LoadFit:
-    """Estimate by generalised least squares; the covariance of the readings depends on what is held."""
+    """Return the generalised least-squares estimate; the covariance of the readings depends on the estimate."""
     n, x = len(left), np.zeros(4)
     for step in range(4):
         S = covariance_of(x)
-        if step == 0:  # the force alone, to know how heavy it is
+        if step == 0:  # a first estimate of the mass from the forces alone
             rows = np.arange(6 * n).reshape(n, 6)[:, :3].ravel()
             a, W = A[:, :3, 0].ravel(), np.linalg.inv(S[np.ix_(rows, rows)])
             x[0] = a @ W @ left[:, :3].ravel() / (a @ W @ a)
             x[1:], sigma_kg = x[0] * p_sensor_near_m, float(1 / np.sqrt(a @ W @ a))
             continue
         W = np.linalg.inv(S)
-        # In moments (m p) the prior of the place scales with the mass, of which at least one sigma counts.
+        # The prior of the moment m p is proportional to the mass, with at least one sigma of the mass.
         near = np.column_stack([-p_sensor_near_m, np.eye(3)]) / (REACH_M * max(abs(x[0]), sigma_kg))
         H = A.reshape(6 * n, 4)
         covariance = np.linalg.inv(H.T @ W @ H + near.T @ near)
@@ -269,22 +271,22 @@ def _unit_readings(u: Array) -> Array:
 
 
 def _by_sensor(by_reading: Array, mass_kg: float, contact: ContactResponse, held: Array) -> Array:
-    """Return the covariance (4, 4) of an estimate by errors of the sensor, if these wrenches (n, 6) are held.
+    """Return the covariance (4, 4) of an estimate due to errors of the sensor, for held wrenches (n, 6).
 
     `by_reading` (4, 6n) is the derivative of the estimate by the readings.
     """
     by_entry = by_reading @ contact.error_columns(held).reshape(held.size, -1)
-    # Errors that are not linear are alike in all poses at worst.
+    # In the worst case nonlinear errors are equal in all poses.
     F = ranges(contact.sensor.lever_m)
     share = contact.sensor.floor**2 * np.sum((held / F) ** 2) / max(float(np.sum(held[:, :3] ** 2)), 1e-12)
     return np.asarray(by_entry @ contact.error_covariance @ by_entry.T + share * mass_kg**2 * np.diag(F[2:] ** 2))
 
 
 def moment_as_read(moment: tuple[Array, Array], contact: ContactResponse) -> tuple[tuple[Array, Array], Array]:
-    """Return what the sensor reads as mass and moment of a part that it carries in all directions.
+    """Return mass and moment of a part as the sensor reads them over all directions, with covariances.
 
-    `moment` holds the true mass (kg) and mass times centre of mass (kg m) of the part (4,), and their covariance
-    (4, 4). Returns the same as read, and the covariance (4, 4) of the true ones by errors of the sensor.
+    `moment` contains the true mass (kg) and mass times centre of mass (kg·m) of the part (4,), and their covariance
+    (4, 4). The results are the same values as read, and the covariance (4, 4) due to errors of the sensor.
     """
     (x, covariance), A = moment, _unit_readings(np.eye(3))
     by_reading = np.asarray(np.linalg.pinv(A.reshape(18, 4)), dtype=np.float64)
@@ -293,7 +295,7 @@ def moment_as_read(moment: tuple[Array, Array], contact: ContactResponse) -> tup
 
 
 def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:
-    """Return mass (kg) and centre of mass (3,) of the tool, without errors that known loads have shown."""
+    """Return mass (kg) and centre of mass (3,) of the tool, corrected for sensor errors known from loads."""
     if (contact := calibration.known_contact) is None:
         return calibration.mass_kg, calibration.p_sensor_com_m
     weight_N, p_sensor_com_m = contact.true_load(calibration.shown_response)
@@ -301,7 +303,7 @@ def true_tool(calibration: CalibrationResult) -> tuple[float, Array]:
 
 
 def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | None:
-    """Name what does not belong to one weight: first in each pose alone, then between poses."""
+    """Return why the readings are not those of one weight: first in each pose alone, then between poses."""
     parts = [S[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(n)]
     alone = [_misfit(left[k, :3], A[k, :3, :1], part[:3, :3]) for k, part in enumerate(parts)]
     if min(chi2_sf(2, chi2) for chi2 in alone) < FALSE_ALARMS:
@@ -314,7 +316,7 @@ def _fault(left: Array, A: Array, S: Array, p_value: float, n: int) -> Fault | N
 
 
 def _misfit(y: Array, A: Array, S: Array) -> float:
-    """Return chi2 of readings against columns, which may depend on each other."""
+    """Return chi2 of readings after fitting columns, which may be linearly dependent."""
     L = np.linalg.cholesky(S)
     y, A = np.linalg.solve(L, y), np.linalg.solve(L, A)
     scale = np.linalg.norm(A, axis=0)
@@ -332,9 +334,9 @@ def _covariance(
     *,
     sensor: bool,
 ) -> Array:
-    """Covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, with a part of weight x_N[0].
+    """Return the covariance (6n, 6n) of readings minus prediction: noise, calibration and drift, for a held part.
 
-    Without `sensor` the sensor has no errors of its own for the part.
+    `x_N` is its weight and moment. If `sensor` is false, errors of the sensor for the part are left out.
     """
     tool, response = known.parameters, known.response
     n, held = len(noise), _part(tool, x_N)
@@ -357,7 +359,7 @@ def _covariance(
 
 
 def _part(tool: Parameters, x_N: Array) -> Parameters:
-    """Return weight (N) and moment (N·m) of a part as parameters without bias."""
+    """Return parameters without bias for the weight (N) and moment (N·m) of a part."""
     com_m = x_N[1:] / x_N[0] if x_N[0] else np.zeros(3)
     return Parameters(tool.R_flange_sensor, x_N[0] * tool.down, np.zeros(3), com_m, np.zeros(3))
 
@@ -367,9 +369,9 @@ def _projector_across(v: Array) -> Array:
 
 
 def holding(empty: Calibrated, weight: Weight, g_m_s2: float) -> Update:
-    """Join the calibrated tool and a part that was weighed to one load, which compensates and can be tared.
+    """Return the calibrated tool and a weighed part as one load, which can be compensated and tared.
 
-    The error of the weighing counts as independent of that of the calibration.
+    The error of the weighing is taken as independent of that of the calibration.
     """
     tool = empty.parameters
     x, cov = weight.moment

@@ -1,4 +1,4 @@
-"""Whether a sensor reads a known weight right: one weight on a string, in one pose or several."""
+"""Check of a sensor with one known weight on a string, in one or several poses."""
 
 from math import isfinite
 from typing import NamedTuple
@@ -12,40 +12,42 @@ from ftcalib.model import Array, cross
 from ftcalib.result import CalibrationResult
 from ftcalib.sensor_matrix import Calibrated
 
-# So many sigmas of what the sensor promises are within it.
+# Largest error within the promised accuracy, in sigmas.
 _WITHIN = 2.0
 
 
 class LoadCheck(NamedTuple):
-    """What a known weight shows."""
+    """Result of a check with a known weight."""
 
     read_N: float
-    """Force along gravity, mean over the poses."""
+    """Measured force along gravity, mean over the poses, N."""
     expected_N: float
+    """Weight of the load, N."""
     scale_error: float
-    """The one over the other, less 1."""
+    """Relative error of the measured force: `read_N` / `expected_N` - 1."""
     scale_sigma: float
-    """One standard deviation of that, without the sensor's own errors."""
+    """Standard deviation of `scale_error` without errors of the sensor."""
     promised_sigma: float
-    """What the sensor may be off at this load, one standard deviation."""
+    """Relative standard deviation of the sensor at this load, according to its declared or known accuracy."""
     off_vertical_rad: float
-    """Angle between the force and gravity, mean over the poses."""
+    """Angle between force and gravity, mean over the poses, rad."""
     off_m: float
-    """Distance of the line of action from the place of the load; NaN where no place is given."""
+    """Distance of the line of action from the position of the load, m; NaN if no position is given."""
     off_sigma_m: float
+    """Standard deviation of `off_m`, m."""
 
     @property
     def is_within(self) -> bool:
-        """Whether the error is within what the sensor promises."""
+        """Whether the error is within the promised accuracy of the sensor."""
         return abs(self.scale_error) <= _WITHIN * float(np.hypot(self.scale_sigma, self.promised_sigma))
 
     @property
     def is_significant(self) -> bool:
-        """Whether the check shows an error at all."""
+        """Whether the error is significant."""
         return abs(self.scale_error) > _WITHIN * self.scale_sigma
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return it as JSON, without a number that is not known."""
+        """Return the check as a JSON object; unknown numbers are None."""
         values: dict[str, JSON] = {key: value if isfinite(value) else None for key, value in self._asdict().items()}
         return values | {"is_within": self.is_within}
 
@@ -59,21 +61,21 @@ def check_hung_load(
     drift: Array,
     p_flange_sensor_m: Array,
 ) -> LoadCheck:
-    """Compare readings with the load that hangs there.
+    """Return the comparison of readings with a known load that hangs on the tool.
 
     Parameters
     ----------
     calibration : CalibrationResult
-        Of the tool.
+        Calibration of the tool.
     reference : CalibrationResult or Update
-        The same, or its tare.
+        The calibration, or its tare.
     load : KnownLoad
     poses : array, shape (n, 3, 3), array, shape (n, 6), and array, shape (n, 6, 6)
         R_base_flange, mean readings as measured, and their covariances.
     drift : array, shape (6,)
         One standard deviation of the change of the bias since the reference.
     p_flange_sensor_m : array, shape (3,)
-        Sensor origin from the flange.
+        Sensor origin from the centre of the flange face.
     """
     R_base_flange, wrench, noise = poses
     tool, contact = reference.parameters, calibration.contact
@@ -83,7 +85,7 @@ def check_hung_load(
     down = tool.down @ (R_base_flange @ tool.R_flange_sensor)
     expected_N = load.mass_kg * calibration.g_m_s2
     read_N = float(np.mean(np.sum(force * down, axis=1)))
-    # The error of the bias is the same in all poses.
+    # Errors of calibration and bias are common to all poses.
     common = reference.wrench_covariance(R_base_flange) + np.diag(drift**2)
 
     def along(C: Array) -> float:

@@ -1,9 +1,10 @@
-"""The forward model of runs with known loads, and the sizes of what disturbs them.
+"""Forward model of runs with known loads, and the standard deviations of their disturbances.
 
     reading = (I + E) blk(R', R') w + b - h (w - w before) + noise      w = [m u; s x u], R = R_flange_sensor
 
-about the sensor origin, in flange axes, with u gravity there, m the sum of the masses and s the sum of mass times
-place. A weight that hangs on a string from a point is a mass at that point. Each run has its own bias b.
+about the sensor origin, in flange axes, with u the acceleration of gravity, m the sum of the masses and s the sum of
+mass times position. A weight on a string is a mass at the point where the string is attached. Each run has its own
+bias b.
 """
 
 from collections.abc import Mapping, Sequence
@@ -19,10 +20,10 @@ from ftcalib.display import Displayed
 from ftcalib.model import Array, cross, rotation_of, skew
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 
-# All places share an error of the sensor origin, one sigma.
+# Standard deviation of the sensor origin, an error common to all positions.
 ORIGIN_M = 0.0005
-# The usual size of each disturbance, one sigma, and by which factor it may differ, as the sigma of its logarithm.
-# Without a measured noise of the poses their noise is part of the white one.
+# Usual standard deviation of each disturbance, and the sigma of its logarithm. If the noise of the poses was not
+# measured, it is part of the white noise.
 SIZES: Mapping[str, tuple[float, float]] = {
     "white_N": (0.01, 1.5),
     "white_Nm": (0.0005, 1.5),
@@ -34,16 +35,16 @@ SIZES: Mapping[str, tuple[float, float]] = {
     "matrix": (1.0, 0.5),
 }
 _WIDTHS = np.array([width for _, width in SIZES.values()])
-# Priors that say nothing, one sigma: rotation, tilt, mass of the tool, places, bias of force and torque.
+# Uninformative priors, one sigma: rotation, tilt, mass of the tool, positions, bias of force and torque.
 _ANY_RAD, _ANY_TILT, _ANY_KG, _ANY_M = np.pi, 0.3, 100.0, 0.5
 _ANY_BIAS = np.repeat([1e4, 1e3], 3)
-# No mass is known better.
+# Smallest sigma of a mass.
 _LEAST_KG = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
 class KnownLoad:
-    """A weighed load on the tool, hung from a point or rigid.
+    """Weighed load on the tool, rigid or hung from a point.
 
     Examples
     --------
@@ -56,13 +57,14 @@ class KnownLoad:
     mass_kg: float
     mass_sigma_kg: float
     p_flange_m: tuple[float, float, float] | None = None
-    """Where it hangs, or the centre of mass of a rigid one, from the centre of the flange face; None: unknown."""
+    """Suspension point, or centre of mass of a rigid load, from the centre of the flange face, m; None: unknown."""
     place_sigma_m: float = 0.0005
+    """Standard deviation of the position per axis, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoadRun(Displayed):
-    """Poses at rest with one load on the tool, or with the tool alone.
+    """Run of static poses with one load on the tool, or with the tool alone.
 
     Examples
     --------
@@ -81,21 +83,21 @@ Kind = Literal["mass", "place", "tool_mass", "moved", "bumped", "touched", "pull
 
 @dataclass(frozen=True, slots=True)
 class Mistake:
-    """A free quantity beside the model, which explains what a mistake in a run does."""
+    """Mistake in a run, with additional free quantities that model its effect."""
 
     kind: Kind
     run: int = 0
-    """Row of the run; of no meaning for the mass of the tool."""
+    """Index of the run; unused for the mass of the tool."""
     pose: int = 0
-    """Row of the first pose of a change, or of the pose that was touched."""
+    """Index of the first pose after a change, or of the touched pose."""
 
     @property
     def sigma(self) -> Array:
-        """Prior of the quantities: kg, m, N and N·m."""
+        """Prior standard deviations of the free quantities, kg, m, N or N·m."""
         return np.array(_MISTAKES[self.kind])
 
 
-# One sigma of each quantity that a mistake frees.
+# Prior standard deviations of the free quantities of each mistake.
 _MISTAKES: Mapping[Kind, list[float]] = {
     "mass": [1.0],
     "place": [0.1] * 3,
@@ -109,35 +111,37 @@ _MISTAKES: Mapping[Kind, list[float]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """The model about its present values, run by run."""
+    """Model linearised at its present values; one list entry per run."""
 
     J: list[Array]
-    """(6n, k) derivative of the readings by all unknowns."""
+    """(6n, k) derivatives of the readings by all unknowns."""
     residual: list[Array]
     """(6n,) readings minus model."""
     noise: list[Mapping[str, Array]]
-    """(6n, 6n) covariances of the disturbances, for size 1, by their name in `SIZES`."""
+    """(6n, 6n) covariances of the disturbances for standard deviation 1, by their name in `SIZES`."""
     readout: list[Array]
-    """(6, 6) that reads a wrench in flange axes."""
+    """(6, 6) matrix that maps a wrench in flange axes to the reading."""
     wrench: list[Array]
-    """(n, 6) true wrench of all that hangs on the sensor, in its axes."""
+    """(n, 6) true wrench of the load on the sensor, in sensor axes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evaluated:
-    """The marginal likelihood at given sizes, and the step to the best values."""
+    """Marginal likelihood at given sizes of the disturbances, and the Gauss-Newton step."""
 
     cost: float
-    """Minus twice its logarithm, but for a constant; the priors of the sizes included."""
+    """-2 log marginal likelihood up to a constant, including the priors of the sizes."""
     gradient: Array
+    """Derivative of the cost by the logarithms of the sizes."""
     step: Array
+    """(k,) step of all unknowns."""
     covariance: Array
-    """(k, k) of all unknowns."""
+    """(k, k) covariance of all unknowns."""
     unexplained: list[tuple[Array, Array]]
-    """Of each run: weighted residual (6n,), and its covariance (6n, 6n) if the model is right."""
+    """Weighted residual (6n,) of each run, and its covariance (6n, 6n) under the model."""
 
     def gain_of(self, run: int, columns: Array, sigma: Array) -> float:
-        """Return by how much the cost falls if quantities with priors `sigma` act by `columns` (6n, m) in one run."""
+        """Return the cost reduction by further quantities with derivatives (6n, m) and priors `sigma` in one run."""
         residual, projection = self.unexplained[run]
         b, M = (columns.T @ residual) * sigma, columns.T @ projection @ columns * np.outer(sigma, sigma)
         with_prior = np.eye(len(b)) + M
@@ -145,11 +149,11 @@ class Evaluated:
 
 
 class LoadModel:
-    """All unknowns of runs with known loads, at their present values.
+    """Model of runs with known loads: all unknowns at their present values.
 
-    It begins with a mounting and with `tool`, mass (kg) and centre of mass from the sensor origin in flange axes. The
-    direction of `gravity_base_m_s2` is as declared, and an unknown. `tool_mass_kg` are the mass as weighed, and its
-    sigma.
+    The initial values are a mounting and `tool`: mass (kg) and centre of mass from the sensor origin, flange axes. The
+    direction of `gravity_base_m_s2` is the declared one, and is estimated too. `tool_mass_kg` is the weighed mass with
+    its sigma.
     """
 
     mistakes: tuple[Mistake, ...] = ()
@@ -174,7 +178,7 @@ class LoadModel:
         names += [f"load {k}" for k in range(len(self.loads))] + [f"bias {k}" for k in range(len(self.runs))]
         ends = np.cumsum(sizes).tolist()
         self.at = {name: slice(end - size, end) for name, size, end in zip(names, sizes, ends, strict=True)}
-        # A rotation has no value but 0: its steps are applied to R.
+        # The value of the rotation stays 0, because its steps are applied to R.
         self.x, self.expected, sigma = np.zeros(ends[-1]), np.zeros(ends[-1]), np.ones(ends[-1])
         mass_kg, com_m = tool
         self._set("matrix", prior.error.ravel())
@@ -192,14 +196,14 @@ class LoadModel:
         for k in range(len(self.runs)):
             sigma[self.at[f"bias {k}"]] = _ANY_BIAS
         self.information = np.diag(sigma**-2.0)
-        # The rotation of a new run is any, whatever that of the earlier mounting was.
+        # Only the matrix has an informative prior; the mounting may have changed.
         self._matrix_information = np.linalg.inv(prior.covariance[3:, 3:])
 
     def _set(self, name: str, values: Array) -> None:
         self.x[self.at[name]] = self.expected[self.at[name]] = values
 
     def with_mistake(self, mistake: Mistake) -> "LoadModel":
-        """Return a copy that has one more mistake, at the present values."""
+        """Return a copy with one more mistake, at the present values."""
         other, size = copy(self), len(mistake.sigma)
         end = len(self.x)
         other.at = {**self.at, f"mistake {len(self.mistakes)}": slice(end, end + size)}
@@ -218,11 +222,11 @@ class LoadModel:
 
     @property
     def error(self) -> Array:
-        """(6, 6) E."""
+        """(6, 6) error matrix E."""
         return self.x[self.at["matrix"]].reshape(6, 6)
 
     def linear(self) -> Linear:
-        """Linearise about the present values."""
+        """Return the model linearised at the present values."""
         at, x = self.at, self.x
         g = self.g + self._across @ x[at["tilt"]]
         turn = np.kron(np.eye(2), self.R.T)
@@ -267,15 +271,15 @@ class LoadModel:
 
     @property
     def tool_is_weighed(self) -> bool:
-        """Whether the mass of the tool is given."""
+        """Whether the tool was weighed."""
         return bool(self.information[self.at["tool"].start, self.at["tool"].start] > _ANY_KG**-2.0)
 
     def load_of(self, run: int) -> int:
-        """Return the row in `loads` of the load of a run."""
-        return sum(one.load is not None for one in self.runs[:run])
+        """Return the index in `loads` of the load of a run."""
+        return sum(earlier.load is not None for earlier in self.runs[:run])
 
     def columns_of(self, mistake: Mistake, run: int, J: Array, readout: Array) -> Array:
-        """Return what the quantities of a mistake do to the readings (n, 6, m) of a run, from those of the others."""
+        """Return the derivative (n, 6, m) of the readings of a run by the free quantities of a mistake."""
         kind, n = mistake.kind, len(J)
         if kind == "tool_mass":
             return np.asarray(J[..., self.at["tool"]][..., :1])
@@ -297,7 +301,7 @@ class LoadModel:
         return columns
 
     def evaluate(self, logarithms: Array, linear: Linear) -> Evaluated:
-        """Return the marginal likelihood with sizes `SIZES` times exp(`logarithms`)."""
+        """Return the marginal likelihood for sizes of `SIZES` times exp(`logarithms`)."""
         sizes = sizes_of(logarithms)
         P, matrix, lag = self.information.copy(), self.at["matrix"], self.at["hysteresis"]
         P[matrix, matrix] = self._matrix_information / sizes["matrix"] ** 2
@@ -337,12 +341,12 @@ class LoadModel:
 
 
 def sizes_of(logarithms: Array) -> dict[str, float]:
-    """Return the sizes by name, from the logarithms of their ratios to the usual ones."""
+    """Return the sizes of the disturbances by name, from the logarithms of their ratios to the usual sizes."""
     return {name: usual * float(np.exp(y)) for (name, (usual, _)), y in zip(SIZES.items(), logarithms, strict=True)}
 
 
 def _known_load_columns(mass_kg: float, place_m: Array, u: Array) -> Array:
-    """Return the derivative (n, 6, 4) of the wrench by mass and place of a load, flange axes."""
+    """Return the derivative (n, 6, 4) of the wrench by mass and position of a load, in flange axes."""
     columns = np.zeros((len(u), 6, 4))
     columns[:, :3, 0], columns[:, 3:, 0], columns[:, 3:, 1:] = u, cross(place_m, u), -mass_kg * skew(u)
     return columns

@@ -1,8 +1,8 @@
-"""The matrix of a sensor from runs with known loads: one fit of all, and the mistakes that would spoil it.
+"""Calibration of a sensor's matrix from runs with known loads: a joint fit of all runs, and detection of mistakes.
 
 Source: S. Traversaro, D. Pucci, F. Nori, "In situ calibration of six-axis force-torque sensors using accelerometer
-measurements", ICRA 2015 (arXiv 1410.0885), with a prior of the matrix, unknown places and sizes of the disturbances
-from the marginal likelihood.
+measurements", ICRA 2015 (arXiv 1410.0885), extended by a prior of the matrix, unknown positions, and disturbances whose
+standard deviations are estimated by marginal likelihood.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ from ftcalib.model import STANDARD_GRAVITY_M_S2, Array
 from ftcalib.sensor_matrix import SensorMatrix, ranges
 from ftcalib.solver import solve
 
-# By which minus twice the logarithm of the likelihood falls, for a mistake to count; per pose it could be in many.
+# Required reduction of -2 log likelihood by a mistake, in addition to `_penalty`.
 _CLEARLY = 12.0
 _MOST_MISTAKES = 4
-# Candidates whose sizes are estimated again.
+# Largest number of candidate mistakes that are fitted completely.
 _TRIED = 4
-# Of the load, beyond which a sensor is not linear.
+# Largest residual of a linear sensor, as a share of the load.
 _MOST_REMAINING = 0.03
-# Of the prior of the matrix, in sigmas.
+# Largest accepted change of an entry of the matrix, in sigmas of the prior.
 _MOST_CHANGE = 5.0
 _POUND_KG = 0.45359237
 AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
@@ -38,16 +38,16 @@ AXES = ("Fx", "Fy", "Fz", "Tx", "Ty", "Tz")
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class LoadSolution(Displayed):
-    """What runs with known loads give."""
+    """Result of runs with known loads: the matrix of the sensor, estimated loads and findings."""
 
     sensor: SensorMatrix
     findings: tuple[Finding, ...]
     loads: tuple[Mapping[str, JSON], ...]
-    """Of each run with a load: `run`, `name`, `mass_kg`, `mass_sigma_kg`, `p_flange_m`, `p_sigma_m`."""
+    """Estimates for each run with a load: `run`, `name`, `mass_kg`, `mass_sigma_kg`, `p_flange_m`, `p_sigma_m`."""
     sizes: Mapping[str, float]
-    """Of the disturbances, by name and unit."""
+    """Standard deviations of the disturbances, by name and unit."""
     remaining: tuple[float, ...]
-    """Of each run: root mean square of what the fit leaves, relative to the load in units of the ranges."""
+    """Rms residual of each run, relative to the load in units of the ranges."""
     tool_mass_kg: float
     tool_mass_sigma_kg: float
 
@@ -57,11 +57,11 @@ class LoadSolution(Displayed):
         return verdict_of(self.findings)
 
     def to_dict(self) -> dict[str, JSON]:
-        """Return it as JSON."""
+        """Return the result as a JSON object."""
         return {
             "verdict": self.verdict,
-            "findings": [one.to_dict() for one in self.findings],
-            "loads": [dict(one) for one in self.loads],
+            "findings": [finding.to_dict() for finding in self.findings],
+            "loads": [dict(load) for load in self.loads],
             "sizes": dict(self.sizes),
             "remaining": list(self.remaining),
             "tool_mass_kg": self.tool_mass_kg,
@@ -80,33 +80,33 @@ def solve_loads(
     tool_mass_kg: tuple[float, float] | None = None,
     provenance: Mapping[str, JSON] | None = None,
 ) -> LoadSolution:
-    """Fit the matrix of a sensor to runs with known loads.
+    """Return the matrix of a sensor from runs with known loads.
 
     Parameters
     ----------
     runs : sequence of LoadRun
-        With the tool alone, and with loads. Each has a bias of its own.
+        Runs with the tool alone and with loads. Each has its own bias.
     prior : SensorMatrix, optional
-        That of earlier loads, or of the data sheet; by default `SensorMatrix.usual()`.
+        Matrix from earlier loads or from the data sheet; by default `SensorMatrix.usual()`.
     p_flange_sensor_m : array, shape (3,), optional
-        Sensor origin, from the centre of the flange face; by default there. It moves the torque, not the force.
+        Sensor origin from the centre of the flange face; by default at that centre. It affects the torque only.
     g_m_s2 : float
-        Where the arm stands: an error of it is one of all forces.
+        Acceleration of gravity at the cell; its relative error is an error of all forces.
     setup : Setup, optional
-        Its up direction is where gravity is sought.
+        Description of the cell, whose up direction is the initial value of the direction of gravity.
     tool_mass_kg : float and float, optional
-        Mass of the tool as weighed, and its sigma.
+        Weighed mass of the tool, and its sigma.
     provenance : mapping, optional
         Stored with the matrix.
 
     Raises
     ------
     NotObservable
-        No run has a known load, or the poses of none determine the mounting.
+        No run has a known load, or no run determines the mounting.
 
     Examples
     --------
-    The poses of one tool, which we here pretend to be of two bodies: a tool of 1.035 kg, and 0.2 kg that hang on it.
+    Poses of a tool of 1.235 kg, taken here as a tool of 1.035 kg with a load of 0.2 kg:
 
     >>> import ftcalib, ftdrive
     >>> poses = ftdrive.read_dataset("poses.csv")
@@ -158,7 +158,10 @@ def _first_model(
     setup: Setup,
     tool_mass_kg: tuple[float, float] | None,
 ) -> LoadModel:
-    """Begin at the calibration of the run that shows the mounting best: without a load, with the most poses."""
+    """Return the initial model, from the calibration of the run that determines the mounting best.
+
+    It is a run without a load, if there is one, with the most poses.
+    """
     first = max(runs, key=lambda run: (run.load is None, len(run.dataset)))
     alone = solve(first.dataset, g_m_s2=g_m_s2, setup=setup)
     mass_kg, com_m = alone.mass_kg, alone.R_flange_sensor @ alone.p_sensor_com_m
@@ -176,7 +179,7 @@ def _first_model(
 
 
 def _fit_loads(model: LoadModel, logarithms: Array) -> tuple[LoadModel, Array, Evaluated]:
-    """Move a model to its best values, with the sizes of the disturbances that explain them best."""
+    """Return a model at its best values, with the most likely sizes of the disturbances."""
     for _ in range(2):
         for _ in range(3):
             model.move(model.evaluate(logarithms, model.linear()).step)
@@ -193,68 +196,68 @@ def _best_sizes(model: LoadModel, logarithms: Array) -> Array:
         return at.cost, at.gradient
 
     bounds = [(-5, 5)] * len(SIZES)
-    found = minimize(cost, logarithms, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
-    return np.asarray(found.x)
+    best = minimize(cost, logarithms, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 30})
+    return np.asarray(best.x)
 
 
 def _mistake_candidates(model: LoadModel, run: int) -> list[Mistake]:
     n, load = len(model.runs[run].dataset), model.runs[run].load
-    found = [Mistake("touched", run, pose) for pose in range(n)]
-    found += [Mistake("bumped", run, pose) for pose in range(2, n - 1)]
+    mistakes = [Mistake("touched", run, pose) for pose in range(n)]
+    mistakes += [Mistake("bumped", run, pose) for pose in range(2, n - 1)]
     if load is not None:
-        found += [Mistake("mass", run), Mistake("pulled", run)]
-        found += [Mistake("moved", run, pose) for pose in range(2, n - 1)]
-        found += [Mistake("place", run)] if load.p_flange_m is not None else []
-    return [one for one in found if one not in model.mistakes]
+        mistakes += [Mistake("mass", run), Mistake("pulled", run)]
+        mistakes += [Mistake("moved", run, pose) for pose in range(2, n - 1)]
+        mistakes += [Mistake("place", run)] if load.p_flange_m is not None else []
+    return [mistake for mistake in mistakes if mistake not in model.mistakes]
 
 
 def _best_mistake(
     begun: LoadModel, model: LoadModel, logarithms: Array, at: Evaluated
 ) -> tuple[LoadModel, Array, Evaluated] | None:
-    """Return the fit with the mistake that explains the readings best; None if none does so clearly.
+    """Return the fit with the mistake that explains the readings best; None if there is no clear mistake.
 
-    Each begins where the first fit has begun: a fit that lacks a mistake may be far from all that is right.
+    Each fit starts from the initial model, because a fit without the mistake may be far from the solution.
     """
-    # Sizes that a mistake has raised would hide it.
+    # A mistake increases the sizes of the disturbances, which would hide the mistake.
     usual, linear = np.minimum(logarithms, 0.0), model.linear()
     plain = model.evaluate(usual, linear)
     gains: dict[Mistake, float] = {}
     for run, (flat, readout) in enumerate(zip(linear.J, linear.readout, strict=True)):
         J = flat.reshape(-1, 6, flat.shape[1])
-        for one in _mistake_candidates(model, run):
-            columns = model.columns_of(one, run, J, readout).reshape(6 * len(J), -1)
-            gains[one] = plain.gain_of(run, columns, one.sigma) - _penalty(one, model)
+        for candidate in _mistake_candidates(model, run):
+            columns = model.columns_of(candidate, run, J, readout).reshape(6 * len(J), -1)
+            gains[candidate] = plain.gain_of(run, columns, candidate.sigma) - _penalty(candidate, model)
     weighed = Mistake("tool_mass")
     if model.tool_is_weighed and weighed not in model.mistakes:
         other = model.with_mistake(weighed)
         gains[weighed] = plain.cost - other.evaluate(usual, other.linear()).cost
     for mistake in model.mistakes:
         begun = begun.with_mistake(mistake)
-    tried = [_fit_loads(begun.with_mistake(one), usual) for one in _most(gains)]
+    tried = [_fit_loads(begun.with_mistake(mistake), usual) for mistake in _most(gains)]
     if not tried:
         return None
-    best = min(tried, key=lambda one: one[2].cost + _penalty(one[0].mistakes[-1], model))
+    best = min(tried, key=lambda fit: fit[2].cost + _penalty(fit[0].mistakes[-1], model))
     gain = at.cost - best[2].cost - _penalty(best[0].mistakes[-1], model)
     return best if gain > _CLEARLY else None
 
 
 def _most(gains: Mapping[Mistake, float]) -> list[Mistake]:
-    """Return the candidates that are worth a fit: the best of each kind, as long as it explains something."""
+    """Return the candidates to fit: the best of each kind and run, if its predicted gain is sufficient."""
     best: dict[str, Mistake] = {}
-    for one in sorted(gains, key=lambda one: -gains[one]):
-        if gains[one] > _CLEARLY:
-            best.setdefault(f"{one.kind} {one.run}", one)
+    for mistake in sorted(gains, key=lambda candidate: -gains[candidate]):
+        if gains[mistake] > _CLEARLY:
+            best.setdefault(f"{mistake.kind} {mistake.run}", mistake)
     return list(best.values())[:_TRIED]
 
 
 def _penalty(mistake: Mistake, model: LoadModel) -> float:
-    """Return what a mistake that could be in any pose has to explain beyond others."""
+    """Return the additional gain required of a mistake that could be in any pose."""
     per_pose = mistake.kind in ("touched", "bumped", "moved")
     return 2 * float(np.log(len(model.runs[mistake.run].dataset))) if per_pose else 0.0
 
 
 def _remaining(model: LoadModel) -> list[float]:
-    """Return what the fit leaves of each run, relative to its load."""
+    """Return the rms residual of each run, relative to its load."""
     linear, F = model.linear(), ranges(model.prior.lever_m)
     shares = []
     for r, wrench in zip(linear.residual, linear.wrench, strict=True):
@@ -264,7 +267,7 @@ def _remaining(model: LoadModel) -> list[float]:
 
 
 def _found_load(model: LoadModel, run: int) -> tuple[float, Array]:
-    """Return mass (kg) and place (3,) of the load of a run from the sensor origin, with what mistakes add."""
+    """Return the estimated mass (kg) and position (3,) of the load of a run, from the sensor origin."""
     x = model.x
     own = x[model.at[f"load {model.load_of(run)}"]]
     mass_kg, place = float(own[0]), own[1:] + x[model.at["origin"]]
@@ -340,14 +343,14 @@ def _mass_finding(name: str, found_kg: float, sigma_kg: float, given_kg: float) 
 
 
 def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
-    """Find two loads that hang each where the other was declared: that explains more than all else."""
+    """Return a finding if exchanging the declared positions of two loads explains the readings better."""
     rows = [k for k, run in enumerate(begun.runs) if run.load is not None and run.load.p_flange_m is not None]
     for a, b in combinations(rows, 2):
-        one, other = (begun.at[f"load {begun.load_of(row)}"] for row in (a, b))
+        first, second = (begun.at[f"load {begun.load_of(row)}"] for row in (a, b))
         exchanged = copy(begun)
         exchanged.x, exchanged.expected = begun.x.copy(), begun.expected.copy()
         for values in (exchanged.x, exchanged.expected):
-            values[one][1:], values[other][1:] = values[other][1:].copy(), values[one][1:].copy()
+            values[first][1:], values[second][1:] = values[second][1:].copy(), values[first][1:].copy()
         if at.cost - _fit_loads(exchanged, np.zeros(len(SIZES)))[2].cost > _CLEARLY:
             names = [load.name for row in (a, b) if (load := begun.runs[row].load) is not None]
             return Finding.of("loads_swapped", first=names[0], second=names[1])
@@ -355,7 +358,7 @@ def _swapped(begun: LoadModel, at: Evaluated) -> Finding | None:
 
 
 def _accuracy_limits(model: LoadModel, prior: SensorMatrix, remaining: list[float]) -> list[Finding]:
-    """Judge whether the sensor is linear, and its change."""
+    """Return findings for a nonlinear sensor, and for a matrix that contradicts its prior."""
     if model.mistakes:
         return []
     findings = []

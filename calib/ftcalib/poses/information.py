@@ -1,8 +1,8 @@
-"""Predicted information of a set of poses before any measurement, and pose sets that are known to be good.
+"""Predicted accuracy of a set of poses before any measurement, and sets that are known to be good.
 
-The Fisher information of the model depends on the orientations, a guess of the tool and the noise, not on readings.
-Pose sets hardly depend on the guess; predictions in newtons and radians do. `ftcalib.poses.selection` selects poses
-from those that an arm can reach.
+The Fisher information of the model depends on the orientations, a guess of the tool, and the noise, but not on
+readings. The best poses hardly depend on the guess; predictions in newtons and radians do. `ftcalib.poses.selection`
+selects poses that an arm can reach.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,35 +27,36 @@ from ftcalib.model import (
 )
 from ftcalib.sensor_matrix import SensorMatrix
 
-# Smaller eigenvalues of the scaled information, as a share of the largest, count as zero.
+# Eigenvalues of the scaled information below this share of the largest are taken as zero.
 OBSERVABLE = 1e-9
 
 TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
 
-# Numbers of the tetrahedral subgroup of the paper's 24 orientations: per pose as good as all 24, for every tool.
+# Numbers of the tetrahedral subgroup of the paper's 24 orientations: as accurate per pose as all 24, for every tool.
 T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
-# Nearly the best six of the 24 that have one solution, second-basin gap 0.28.
+# Nearly the best six of the 24 with a unique solution; second-basin gap 0.28.
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guess:
-    """Expected tool, noise and base. Angles and offsets as in a calibration file."""
+    """Expected tool, noise and base, with angles and offsets as in a calibration file."""
 
     mass_kg: float
-    """Mass of the load on the measuring side."""
+    """Mass of the load on the sensor, kg."""
     sigma_force_N: float
-    """Standard deviation of one axis in the mean of one pose."""
+    """Standard deviation of one force axis in the mean of one pose, N."""
     sigma_torque_Nm: float
+    """Standard deviation of one torque axis in the mean of one pose, N·m."""
     p_sensor_com_m: ArrayLike = (0.0, 0.0, 0.08)
     R_flange_sensor: ArrayLike = field(default_factory=lambda: np.eye(3))
     tilt_alpha_rad: float = 0.0
     tilt_beta_rad: float = 0.0
     g_m_s2: float = STANDARD_GRAVITY_M_S2
     sensor: SensorMatrix | None = None
-    """What is known of the sensor's own errors. None: predicted from noise alone, as for a perfect sensor."""
+    """Prior of the errors of the sensor's matrix; None: a perfect sensor, predictions from noise alone."""
     orientation_rad: float = NOTHING.orientation_rad
-    """One standard deviation of an axis of the arm's orientation."""
+    """Standard deviation per axis of the arm's orientation, rad."""
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "sigma_force_N", "sigma_torque_Nm", "g_m_s2"):
@@ -65,17 +66,17 @@ class Guess:
 
     @property
     def gain_sigma(self) -> float:
-        """Of the gain of one axis of the sensor; 0 for a perfect one."""
+        """Standard deviation of the gain of one axis of the sensor; 0 for a perfect sensor."""
         return 0.0 if self.sensor is None else float(self.sensor.sigma[0, 0])
 
     @property
     def weight_N(self) -> float:
-        """Mass times gravity."""
+        """Weight of the load, N."""
         return self.mass_kg * self.g_m_s2
 
     @property
     def parameters(self) -> Parameters:
-        """The guess as parameters, without bias, because information does not depend on bias."""
+        """Guessed parameters without bias, because the information does not depend on the bias."""
         alpha, beta = self.tilt_alpha_rad, self.tilt_beta_rad
         down = -np.array([np.cos(alpha) * np.sin(beta), -np.sin(alpha), np.cos(alpha) * np.cos(beta)])
         R_flange_sensor = np.asarray(self.R_flange_sensor, dtype=np.float64)
@@ -93,24 +94,25 @@ class Guess:
 
     @property
     def wrench_sigma(self) -> Array:
-        """(6,) standard deviations, N and N·m."""
+        """(6,) standard deviations of the mean wrench of a pose, N and N·m."""
         return np.repeat([self.sigma_force_N, self.sigma_torque_Nm], 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Expected accuracy of a calibration from given poses, as `CalibrationResult` will state it."""
+    """Expected accuracy of a calibration from given poses."""
 
     n_poses: int
     sigma: Mapping[str, Array | float]
     """Standard deviations, named as in `CalibrationResult.sigma`; infinite if not determined by the poses."""
     force_rms_N: float
-    """Error of the compensation (norm), root mean square over all orientations."""
+    """Rms force error (norm) of the compensation over all orientations, N."""
     torque_rms_Nm: float
+    """Rms torque error (norm) of the compensation over all orientations, N·m."""
     cond9: float
-    """Condition of the nine force parameters' equations: 1.22 at best, above 4 fair, above 8 poor."""
+    """Condition number of the force equations with nine parameters: at best 1.22, fair above 4, poor above 8."""
     cond_u1: float
-    """Condition of gravity directions beside a constant, which LROM needs: 1.7 at best, above 8 fair, above 25 poor."""
+    """Condition number of gravity directions with a constant, for LROM: at best 1.7, fair above 8, poor above 25."""
     second_basin_gap: float
     """See `second_basin`."""
 
@@ -121,15 +123,15 @@ def special(numbers: Sequence[int]) -> Array:
 
 
 def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
-    """Jacobian (n, 6, 15) in noise standard deviations per unit of `Guess.scale`: its square is the information."""
+    """Return the Jacobian (n, 6, 15) in noise standard deviations per unit of `Guess.scale`."""
     return np.asarray(jacobian(guess.parameters, R_base_flange) * guess.scale / guess.wrench_sigma[:, None])
 
 
 def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
-    """Predict the uncertainty of a calibration from its poses (Cramér-Rao bound of the joint model).
+    """Return the predicted accuracy of a calibration from its poses (Cramér-Rao bound of the joint model).
 
-    If the errors of the sensor are guessed too, mounting, weight and centre of mass have what these, and errors of arm
-    and mounts, hide in them.
+    If the guess includes errors of the sensor, the sigmas of mounting, weight and centre of mass include the hidden
+    errors of sensor, arm and mounts.
 
     Parameters
     ----------
@@ -174,9 +176,10 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
 
 
 def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
-    """Matrices (15, 15) whose scalar product with a covariance is the mean square error over these orientations.
+    """Return matrices (15, 15) whose scalar product with a covariance is the mean square error over orientations.
 
-    In the units of `Guess.scale`; of force, in sigma_force_N², and of torque, in sigma_torque_Nm².
+    The first is for force, in sigma_force_N², the second for torque, in sigma_torque_Nm². The covariance is in the
+    units of `Guess.scale`.
     """
     J = whitened_jacobian(R_base_flange, guess)
     force, torque = (np.einsum("nki,nkj->ij", rows, rows) / len(J) for rows in (J[:, :3], J[:, 3:]))
@@ -184,12 +187,12 @@ def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array
 
 
 def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters | None]:
-    """Compute the separation of the true mounting from the best other one by the forces; also that solution or None.
+    """Return the gap between the true mounting and the best other one, and that solution; None if there is no other.
 
-    The gap is the lowest residual sum of squares of a second minimum over the rotations, fitted to exact forces of the
-    guessed tool and divided by n weight². It is 8/9 for the special 24, weak below 0.05, and 0 if exactly
-    ambiguous (all tool axes at one angle to the vertical, or too few poses). The chi2 of the
-    second solution is larger by gap n (weight / sigma_force_N)².
+    The gap is the residual sum of squares at the second minimum over the rotations, fitted to exact forces of the
+    guessed tool, divided by n weight². It is 8/9 for the special 24, weak below 0.05, and 0 if exactly ambiguous (all
+    tool axes at one angle to the vertical, or too few poses). The chi2 of the second solution is larger by
+    gap n (weight / sigma_force_N)².
     """
     if len(R_base_flange) < 3:
         return 0.0, None  # the solutions form a continuum
@@ -203,7 +206,7 @@ def second_basin(R_base_flange: Array, guess: Guess) -> tuple[float, Parameters 
 
 
 def force_rows(R_base_flange: Array, guess: Guess) -> Array:
-    """Force equations (n, 3, 9) of rotation, weight and bias per weight: [-R [g]x, R A, 1]."""
+    """Return the force equations (n, 3, 9) of rotation, weight and bias, divided by the weight: [-R [g]x, R A, 1]."""
     return np.asarray((jacobian(guess.parameters, R_base_flange) * guess.scale / guess.weight_N)[:, :3, :9])
 
 
@@ -218,14 +221,14 @@ class _Variance:
         self._null = V[:, ~observable]
 
     def __call__(self, rows: Array) -> Array:
-        """(k,) variances of rows (k, 15) times the error."""
+        """Return the variances (k,) of rows (k, 15) times the error vector."""
         scaled = rows * self._scale
         blind = ((scaled @ self._null) ** 2).sum(axis=1) > OBSERVABLE * (scaled**2).sum(axis=1)
         return np.where(blind, np.inf, ((scaled @ self._root) ** 2).sum(axis=1))
 
 
 def _weight_and_tilt_rows(guess: Guess) -> Array:
-    """Derivatives (3, 15) of weight, alpha and beta by the error coordinates."""
+    """Return the derivatives (3, 15) of weight, alpha and beta by the error coordinates."""
     F_b = guess.parameters.gravity_force_base_N
     turn = skew(F_b / guess.weight_N**2)  # of a small rotation of F_b: cross(F_b, dF_b) / weight²
     alpha, beta = guess.tilt_alpha_rad, guess.tilt_beta_rad
@@ -238,7 +241,7 @@ def _weight_and_tilt_rows(guess: Guess) -> Array:
 
 
 def _condition(M: Array) -> float:
-    """Condition number; infinite if a column is not determined."""
+    """Return the condition number of a matrix; infinite if it lacks full column rank."""
     singular = np.linalg.svd(M, compute_uv=False)
     if len(singular) < M.shape[1] or singular[-1] <= OBSERVABLE * singular[0]:
         return float("inf")

@@ -1,4 +1,4 @@
-"""The published methods by name, all of one shape: the wrenches of the poses in, the parameters out."""
+"""Published methods by name, with a common interface: from the wrenches of the poses to the parameters."""
 
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -20,23 +20,23 @@ from ftcalib.published.carlson import (
 )
 from ftcalib.published.yu import lrom, mixed, special_numbers, srom
 
-# Earlier methods that assume more: the mounting of the sensor, or all of it but a yaw, and the direction of gravity.
+# Earlier methods that assume more: the mounting of the sensor, possibly up to a yaw, and the direction of gravity.
 #
-# The papers are not freely available. The forms below rest on the description of these methods by Yu, Shi, Lou 2021
-# (introduction and section IV-B), for Vougioukas also on public programs that cite him. What such a method assumes is
-# not checked by it. With 20 N of weight and 24 poses in all directions, the rms error of a compensated force axis is
+# The papers are not freely available. The implementations follow the description of these methods by Yu, Shi, Lou 2021
+# (introduction and section IV-B), for Vougioukas also public programs that cite him. These methods do not check their
+# assumptions. With 20 N of weight and 24 poses in all directions, the rms error of a compensated force axis is
 #
 # * 0.82 N for a sensor that is turned by 5 deg about flange z (Vougioukas, Wang),
 # * 0.33 N for one that is tilted by 2 deg (all three),
 # * 0.40 N for a base that is tilted by 2 deg (Vougioukas),
 #
-# where maximum likelihood has 0.013 N from the same noise. All three take the force bias from the poses.
+# compared with 0.013 N for maximum likelihood with the same noise. All three estimate the force bias from the poses.
 
 
 def vougioukas(
     R_base_flange: Array, wrench: Array, *, R_flange_sensor: Array, gravity_direction_base: Array
 ) -> Parameters:
-    """Weight, centre of mass and biases by one linear least squares; mounting and direction of gravity are known.
+    """Return weight, centre of mass and biases by linear least squares, for known mounting and direction of gravity.
 
     Source: S. Vougioukas, "Bias estimation and gravity compensation for force-torque sensors", 2001. With the unit
     vectors u_i of gravity in the sensor frame, `F_i = w u_i + F0` and `T_i = (w P) x u_i + T0` are 6n linear equations
@@ -45,13 +45,13 @@ def vougioukas(
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-        Three poses or more, which tilt the tool about two axes.
+        Three or more poses that tilt the tool about two axes.
     wrench : array, shape (n, 6)
         N and N·m, in the sensor frame.
     R_flange_sensor : array, shape (3, 3)
-        Taken as exact.
+        Mounting, taken as exact.
     gravity_direction_base : array, shape (3,)
-        Down, in base axes, of any length. Taken as exact.
+        Direction of gravity in base axes, of any length, taken as exact.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def vougioukas(
 
 
 def wang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> ForceFit:
-    """Weight, tilt of the base and force bias by linear least squares; the mounting is known.
+    """Return weight, tilt of the base and force bias by linear least squares, for a known mounting.
 
     Source: N. Wang, J. Zhou, X. Zhang, "Research on the estimation of sensor bias and parameters of load based on
     force-feedback", 2018. `F_i = R A_i F_b + F0` is linear in F_b and F0. Centre of mass and torque bias follow from
@@ -107,7 +107,7 @@ def wang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> For
 
 
 def yang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> ForceFit:
-    """Weight, tilt of the base, force bias and yaw of the sensor; the mounting is known but for that yaw.
+    """Return weight, tilt of the base, force bias and yaw of the sensor, for a mounting known up to the yaw.
 
     Source: X. Yang, F. Li, R. Gao, R. Song, Y. Li, "Force perception of industrial robot based on multi-parameter
     coupled model", 2019. Given the yaw about flange z, the problem is that of `wang`, so what is left is a quadratic
@@ -126,8 +126,8 @@ def yang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> For
     Raises
     ------
     NotObservable
-        As of `wang`, or forces that leave the yaw open: they do not change across flange z, or a second yaw explains
-        them nearly as well (costs less than 12 noise variances apart, estimated from the residuals).
+        As for `wang`, or forces that do not determine the yaw: they do not change perpendicular to flange z, or a
+        second yaw explains them almost as well (difference of costs below 12 noise variances, from the residuals).
     BadDataset
         A pose or force is not finite.
     """
@@ -150,7 +150,7 @@ def _equations(R_base_flange: Array, force_N: Array, method: str) -> ForceEquati
 
 
 def _best_yaw(M: Array, size: float, dof: int) -> float:
-    """Yaw that minimises v^T M v for v = (cos, sin, 1); `size` is the square of all forces."""
+    """Return the yaw that minimises v^T M v for v = (cos, sin, 1); `size` is the sum of the squared forces."""
 
     def derivatives(yaw: float) -> tuple[float, float, float]:
         v = np.array([np.cos(yaw), np.sin(yaw), 1.0])
@@ -162,10 +162,10 @@ def _best_yaw(M: Array, size: float, dof: int) -> float:
     minima = list[tuple[float, float]]()
     for yaw in stationary.tolist():
         cost, slope, curvature = derivatives(yaw)
-        if abs(slope) <= 1e-6 * size and curvature > 1e-9 * size:  # the angle of a root off the unit circle is none
+        if abs(slope) <= 1e-6 * size and curvature > 1e-9 * size:  # skip roots that are not on the unit circle
             minima.append((cost, yaw - slope / curvature))
     if not minima:
-        raise NotObservable("the forces leave the yaw of the sensor open: add poses that tilt the tool")
+        raise NotObservable("the forces do not determine the yaw of the sensor: add poses that tilt the tool")
     (cost, best), *others = sorted(minima)
     if others and others[0][0] - cost <= max(12 * cost / max(dof, 1), 1e-12 * size):
         apart = np.degrees(abs(np.angle(np.exp(1j * (others[0][1] - best)))))
@@ -176,7 +176,7 @@ def _best_yaw(M: Array, size: float, dof: int) -> float:
     return best
 
 
-# Takes the mean wrenches (n, 6) of fixed poses, returns the parameters.
+# Function from the mean wrenches (n, 6) of fixed poses to the parameters.
 Estimator = Callable[[Array], Parameters]
 
 _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
@@ -187,7 +187,7 @@ _GRAVITY_UNKNOWN: Mapping[str, Callable[..., ForceFit]] = {
 }
 
 CARLSON = ("carlson-relaxation", "carlson-cayley", *_GRAVITY_UNKNOWN)
-# Methods that take the gravity force from the 24 special orientations.
+# Methods that compute the gravity force from the 24 special orientations.
 SPECIAL = ("srom", "mixed")
 BASELINES = ("vougioukas", "wang", "yang")
 PUBLISHED = (*SPECIAL, "lrom", *CARLSON, *BASELINES)
@@ -202,10 +202,10 @@ def published(
     R_flange_sensor: Array | None = None,
     as_published: bool = False,
 ) -> Estimator:
-    """Prepare a published method for a set of poses.
+    """Return the estimator of a published method for a set of poses.
 
-    Yu's methods and Vougioukas' are complete. Those of Wang and Yang leave the torques to Yu's torque step (eqs 43-45).
-    Carlson's run in their form with bias and the same torque step, or as published without bias.
+    The methods of Yu and Vougioukas are complete. Those of Wang and Yang use Yu's torque step (eqs 43-45). Carlson's
+    methods run in their form with bias and the same torque step, or as published without bias.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def published(
     NotObservable
         The method needs other poses, or a weight.
     ValueError
-        `as_published` for a method that has one form only.
+        `as_published` for a method that has only one form.
     """
     if as_published:
         require_printed_form(method)
@@ -255,16 +255,16 @@ def _carlson(
     if method != "carlson-cayley":
         return _GRAVITY_UNKNOWN[method]
     if weight_N is None:
-        raise NotObservable("the weight is unknown, and the method needs it: give the mass on the sensor (--mass-kg).")
+        raise NotObservable("the method needs the weight, which is unknown: give the mass on the sensor (--mass-kg).")
     gravity_N = weight_N * gravity_direction_base / np.linalg.norm(gravity_direction_base)
     return partial(carlson.cayley, gravity_force_base_N=gravity_N, as_published=as_published)
 
 
 def require_printed_form(method: str) -> None:
-    """Raise `ValueError` if a method has no printed form of its own: only Carlson's methods are extended here."""
+    """Raise `ValueError` unless a method has a separate printed form, which only Carlson's methods have."""
     if method in CARLSON:
         return
-    reason = "runs as published already" if method in PUBLISHED else "is no published method"
+    reason = "runs as published already" if method in PUBLISHED else "is not a published method"
     raise ValueError(f"{method} {reason}: use as_published with one of {', '.join(CARLSON)}")
 
 

@@ -305,7 +305,7 @@ def test_carlsons_printed_form_is_judged_by_the_bias_that_it_leaves_out() -> Non
     printed = solve(data, "carlson-nullspace", as_published=True)
     assert printed.verdict == "rejected"
     np.testing.assert_array_equal(printed.sigma["force_bias_N"], 0)
-    for method, words in (("srom", "srom runs as published already"), ("ml", "ml is no published method")):
+    for method, words in (("srom", "srom runs as published already"), ("ml", "ml is not a published method")):
         with pytest.raises(ValueError, match=words):
             solve(data, method, as_published=True)  # type: ignore[arg-type]  # literals in a loop
 

@@ -306,5 +306,5 @@ def test_shapes_that_do_not_fit_are_rejected() -> None:
         reestimate(exact(truth()), tilted(0), predict(truth(), R), joint(2), "payload")
     with pytest.raises(BadDataset, match="R_base_flange"):
         tare(exact(truth()), R, [dwell(truth(), R[0], np.random.default_rng(0))])
-    with pytest.raises(BadDataset, match="there is no dwell"):
+    with pytest.raises(BadDataset, match="no dwell was given"):
         tare(exact(truth()), R, [])

@@ -294,7 +294,7 @@ def test_poses_of_another_kind_of_fit_explain_nothing() -> None:
         assert expected_with_smooth_errors(other, fitted, R, noise_of(6)) == []
     unmeasured = replace(fitted, wrench_cov=None)
     assert expected_with_smooth_errors(calibration, unmeasured, R, noise_of(6)) == []
-    with pytest.raises(BadDataset, match="6 poses are not those of the calibration, which has 24"):
+    with pytest.raises(BadDataset, match="has 6 poses, but the calibration has 24"):
         verify_calibration(calibrated(), R, readings(TRUTH, R, 0), noise_of(6), fitted=fitted)
 
 

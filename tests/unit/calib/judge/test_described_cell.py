@@ -396,7 +396,7 @@ def test_payload_and_lean_limit_and_accompany_a_result() -> None:
 
 def test_a_setup_is_checked() -> None:
     for wrong in ({"up_in_base": (0, 0, 0)}, {"up_in_base": (0, 1)}, {"cylinders_m": [(0.0, 0.1)]}):
-        with pytest.raises(ValueError, match=r"expected three numbers|give from, to"):
+        with pytest.raises(ValueError, match=r"expected three numbers|give start, end"):
             Setup(**wrong)
 
 

@@ -191,7 +191,7 @@ def test_of_ten_poses_a_second_the_rests_count(jitter_s: float) -> None:
 
 def test_too_few_poses_without_rests_are_refused() -> None:
     fast = means_of(record(TRUTH, sweep(SWEEP_S, hz=(0.4, 0.6, 0.8)), SWEEP_S, 1, rates_Hz=(500.0, 10.0)))
-    with pytest.raises(NotObservable, match=r"parts at rest are only .* s long: record at 50 Hz"):
+    with pytest.raises(NotObservable, match=r"at rest for only .* s: record at 50 Hz"):
         solve_motion(*fast)
 
 

@@ -64,13 +64,13 @@ def test_gain_and_cross_talk_are_kept() -> None:
     [
         pytest.param(
             {"mounting_rotvec": OLD.mounting_rotvec * (1 + np.radians(1.0) / 0.8)},
-            r"the sensor is mounted otherwise, by (1|0\.9\d)°",
+            r"the mounting of the sensor has changed, by (1|0\.9\d)°",
             marks=pytest.mark.slow,
             id="mounting",
         ),
         pytest.param(
             {"gravity_m_s2": Rotation.from_rotvec([2, 0, 0], degrees=True).apply(OLD.gravity_m_s2)},
-            "the base leans otherwise, by 2°",
+            "the base has tilted, by 2°",
             id="base",
         ),
     ],

@@ -62,7 +62,7 @@ def test_without_positions_slow_rows_count() -> None:
     rows = replace(rows, speed_rad_s=np.where(np.arange(100) < 42, 0.14, 0.16))
     assert _select_rows(rows, np.inf) is rows
     assert len(_select_rows(rows, SLOW_RAD_S)) == 42
-    with pytest.raises(BadDataset, match=r"these are 4\.9 s long"):
+    with pytest.raises(BadDataset, match=r"it lasts 4\.9 s"):
         _select_rows(rows[1:], SLOW_RAD_S)
 
 

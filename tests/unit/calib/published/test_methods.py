@@ -222,7 +222,7 @@ def test_yang_is_refused_where_noise_alone_decides_between_two_yaws() -> None:
 
 def test_yang_is_refused_if_the_forces_show_no_yaw() -> None:
     along_z = predict(Parameters(np.eye(3), 20 * DOWN, *np.ones((3, 3))), R24)[:, :3] * [0, 0, 1]
-    with pytest.raises(NotObservable, match="leave the yaw of the sensor open"):
+    with pytest.raises(NotObservable, match="do not determine the yaw of the sensor"):
         yang(R24, along_z, R_flange_sensor=np.eye(3))
 
 
