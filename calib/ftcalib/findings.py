@@ -1,8 +1,8 @@
-"""Findings about a calibration: code, severity and values as data; their words, their order and the verdict they give.
+"""Findings about a calibration: code, severity and values as data, with their sentences, order and verdict.
 
-`CODES` is the table of all codes. Its order is their rank: a cause stands before its consequences. A template has its
-values in braces, and the key of a value ends with its unit, which is written with it. ``{key:?yes|no}`` writes "yes" if
-the value is there, else "no". ``{key:~sigma}`` writes a value to the place of its sigma, a value named `sigma`.
+`CODES` is the table of all codes, ordered by rank: causes come before their consequences. A template contains values in
+braces. The name of a value ends with its unit, which is written after the value. ``{key:?yes|no}`` writes "yes" if the
+value is present, else "no". ``{key:~sigma}`` rounds a value to the last decimal of the value named `sigma`.
 """
 
 import json
@@ -16,13 +16,13 @@ from typing import Any, Final, Literal, Self
 from ftcalib.display import Displayed, Summary
 from ftcalib.rounding import decimals, to_place_of
 
-# What a finding does to the result: rejected, usable at best, or not worse for it.
+# Effect of a finding on the result: rejected, at best usable, or none.
 Severity = Literal["reject", "limit", "note"]
 Verdict = Literal["good", "usable", "rejected"]
 
-# The worst first.
+# Verdict for each severity, the worst first.
 _VERDICTS: Final[Mapping[Severity, Verdict]] = {"reject": "rejected", "limit": "usable", "note": "good"}
-# The place of a value in a template, with its form.
+# Placeholder of a value in a template, with its format.
 _PLACE: Final = re.compile(r"\{(\w+)(?::([^}]*))?\}")
 _UNITS: Final = {
     "N": " N", "Nm": " N·m", "mNm": " mN·m", "kg": " kg", "m": " m", "s": " s", "mm": " mm", "deg": "°",
@@ -32,30 +32,30 @@ _UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Code:
-    """What a code means."""
+    """Definition of a finding code."""
 
     severities: Sequence[Severity]
-    """Severities that a finding can have. With several, its size decides."""
+    """Possible severities; with several, the size of the problem decides."""
     found: str
-    """What was found: a template."""
+    """Template of the description of the problem."""
     fix: str = ""
-    """What to do about it: a template."""
+    """Template of the remedy."""
 
     @property
     def values(self) -> set[str]:
-        """Names of the values that the templates need."""
+        """Names of the values that the templates require."""
         places = [place for place in _PLACE.finditer(self.found + self.fix) if place[2] not in _OPTIONAL]
         return {place[1] for place in places} | {place[2][1:] for place in places if (place[2] or "")[:1] == "~"}
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Finding(Displayed):
-    """One finding. A code that this version does not know, from a file of a later one, has no sentence.
+    """Finding with code, severity and values. An unknown code, from a file of a later version, has no sentence.
 
     Raises
     ------
     ValueError
-        An unknown severity, or a value that the sentence needs is missing.
+        The severity is unknown, or a value required by the sentence is missing.
 
     Examples
     --------
@@ -70,7 +70,7 @@ class Finding(Displayed):
     code: str
     severity: Severity
     values: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers and strings, or lists of them, by names with units; None is not known."""
+    """Numbers, strings, or lists of them, by names with units; None means unknown."""
 
     def __post_init__(self) -> None:
         if self.severity not in _VERDICTS:
@@ -81,7 +81,7 @@ class Finding(Displayed):
 
     @classmethod
     def of(cls, code: str, severity: Severity | None = None, /, **values: Any) -> Self:
-        """Return a finding of the table; `severity` only for a code that has several.
+        """Return a finding with a code of the table; `severity` is needed only for codes with several severities.
 
         Raises
         ------
@@ -95,65 +95,65 @@ class Finding(Displayed):
 
     @property
     def found(self) -> str:
-        """What was found, in words."""
+        """Description of the problem."""
         if self.code in CODES:
             return _write(CODES[self.code].found, self.values)
         return f"{self.code} ({json.dumps(dict(self.values), ensure_ascii=False)}), which this version does not know"
 
     @property
     def fix(self) -> str:
-        """What to do about it, in words; empty if nothing."""
+        """Description of the remedy; empty if there is none."""
         return _write(CODES[self.code].fix, self.values) if self.code in CODES else ""
 
     @property
     def words(self) -> str:
-        """The sentence: what was found, and what to do about it."""
+        """Sentence with problem and remedy."""
         return f"{self.found}: {self.fix}" if self.fix else self.found
 
     def _summary(self) -> Summary:
         return Summary(f"{self.code} ({self.severity}): {self.words}")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return what files and `--json` have of it."""
+        """Return the JSON object of the finding for files and `--json`."""
         return {"code": self.code, "severity": self.severity, "values": dict(self.values), "words": self.words}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Self:
-        """Build from `to_dict`. Raises `ValueError` if it is damaged."""
+        """Return the finding of a JSON object; raise `ValueError` if the object is damaged."""
         try:
             finding = cls(document["code"], document["severity"], document["values"])
-            _ = finding.words  # which values of another type do not have
+            _ = finding.words  # raises for values of a wrong type
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"finding {json.dumps(document)}: {error}") from error
         return finding
 
 
 def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Return findings by rank, the first one to be fixed first; notes come last."""
+    """Return findings sorted by rank, in the order in which to fix them; notes come last."""
     rank = {code: place for place, code in enumerate(CODES)}
-    return tuple(sorted(findings, key=lambda one: (one.severity == "note", rank.get(one.code, len(rank)))))
+    return tuple(sorted(findings, key=lambda each: (each.severity == "note", rank.get(each.code, len(rank)))))
 
 
 def folded(findings: Iterable[Finding]) -> list[Finding]:
-    """Leave out what a cause among ordered findings explains; the cause then counts as much as that."""
+    """Return ordered findings without the consequences of a cause, which gets the worst severity among them."""
     findings, worse = list(findings), [*_VERDICTS].index
     for causes, consequences in _EXPLAINS:
-        cause = next((one for one in findings if one.code in causes), None)
+        cause = next((each for each in findings if each.code in causes), None)
         if cause is None:
             continue
-        severities = [one.severity for one in findings if one is cause or one.code in consequences]
+        severities = [each.severity for each in findings if each is cause or each.code in consequences]
         worst = min(severities, key=worse)
         if worst in CODES[cause.code].severities:
             findings[findings.index(cause)] = cause = replace(cause, severity=worst)
         findings = [
-            one for one in findings if one.code not in consequences or worse(one.severity) < worse(cause.severity)
+            each for each in findings if each.code not in consequences or worse(each.severity) < worse(cause.severity)
         ]
     return findings
 
 
 def verdict_of(findings: Iterable[Finding]) -> Verdict:
-    """Return the verdict of the worst finding; good without any."""
-    severities = {one.severity for one in findings}
+    """Return the verdict of the worst finding; "good" without findings."""
+    severities = {each.severity for each in findings}
     return next((verdict for severity, verdict in _VERDICTS.items() if severity in severities), "good")
 
 
@@ -180,22 +180,22 @@ def _format_value(name: str, value: Any, form: str) -> str:
         return "unknown"
     unit = _UNITS.get(name.rpartition("_")[2], "")
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {format(one, form)}" for key, one in value.items())
+        return ", ".join(f"{key} {format(each, form)}" for key, each in value.items())
     if isinstance(value, list):
-        listed = ", ".join(format(one, form) for one in value)
+        listed = ", ".join(format(each, form) for each in value)
         return f"({listed}){unit}" if form else listed
     return f"{format(value, form)}{unit}"
 
 
 def _format_poses(value: Any) -> str:
-    """Write rows, from 1, as "pose 5" or "poses 5, 7", and names such as R05 as they are."""
+    """Return row numbers as "pose 5" or "poses 5, 7"; names such as R05 are not changed."""
     rows = value if isinstance(value, list) else [value]
     listed = ", ".join(map(str, rows))
     return listed if isinstance(rows[0], str) else f"pose{'s' if len(rows) > 1 else ''} {listed}"
 
 
 def _format_units(pairs: Sequence[Sequence[str]]) -> str:
-    """Write suspected units of force and torque, such as [["lbf", "N·m"]]."""
+    """Return a phrase with suspected units of force and torque, such as [["lbf", "N·m"]]."""
     each = (
         " and ".join([f"forces in {force}"] * (force != "N") + [f"torques in {torque}"] * (torque != "N·m"))
         for force, torque in pairs
@@ -204,31 +204,31 @@ def _format_units(pairs: Sequence[Sequence[str]]) -> str:
 
 
 def _format_axes(corrections: Sequence[Sequence[Any]]) -> str:
-    """Write from which channels axes should be taken, such as [["force", ["-x", "y", "z"]]]."""
+    """Return a phrase with the channels from which axes should be taken, such as [["force", ["-x", "y", "z"]]]."""
     return ", or ".join(f"{group} {_format_channels(channels)}" for group, channels in corrections)
 
 
 def _format_channels(channels: Sequence[str]) -> str:
-    if [one[-1] for one in channels] == list("xyz"):
-        return f"{' and '.join(one[1:] for one in channels if len(one) > 1)} reversed"
+    if [channel[-1] for channel in channels] == list("xyz"):
+        return f"{' and '.join(channel[1:] for channel in channels if len(channel) > 1)} reversed"
     return f"x, y, z taken from ({', '.join(channels)})"
 
 
 def _format_orders(orders: Sequence[str]) -> str:
-    """Write the orders of quaternions that would make gravity point down."""
+    """Return a phrase with the orders of quaternions with which gravity would point down."""
     each = " or ".join(f"({order})" for order in orders)
     return f", such as quaternions {each} read inverted and in another order" if orders else ""
 
 
 def _format_scale(unit_N: Sequence[float] | None) -> str:
-    """Write what a unit of force is by a known mass, and its sigma, both in N."""
+    """Return a sentence with the size of the unit of force by a known mass, and its sigma, both in N."""
     if not unit_N:
         return ""
-    unit, sigma = (to_place_of(one, unit_N[1]) for one in unit_N)
+    unit, sigma = (to_place_of(value, unit_N[1]) for value in unit_N)
     return f". By the known mass 1 unit = {unit} N (sigma {sigma} N)"
 
 
-# Forms of values that files of earlier versions lack.
+# Formats of values that files of earlier versions lack.
 _OPTIONAL: Final = frozenset(("scale",))
 _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
     "poses": _format_poses, "units": _format_units, "axes": _format_axes, "orders": _format_orders,
@@ -237,13 +237,13 @@ _FORMS: Final[Mapping[str, Callable[[Any], str]]] = {
 
 
 def _json_value(value: Any) -> Any:
-    """Return arrays and numpy's numbers as JSON has them; None for what is not finite."""
+    """Return a value as JSON; arrays and numpy numbers are converted, and numbers that are not finite become None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {name: _json_value(one) for name, one in value.items()}
+        return {name: _json_value(each) for name, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_json_value(one) for one in value]
+        return [_json_value(each) for each in value]
     return None if isinstance(value, float) and not isfinite(value) else value
 
 
@@ -259,9 +259,9 @@ _LIMIT_OR_NOTE: Final = ("limit", "note")
 # fmt: off
 CODES: Final[Mapping[str, Code]] = {
     # Data that cannot be right
-    "other_recording": Code(_REJECT, "{left_percent:.0f} of the change of the wrench do not follow the poses",
-        "keep the tool free of contact, and check that wrench and poses are of one recording on one clock, and the "
-        "form of the rotations"),
+    "other_recording": Code(_REJECT, "{left_percent:.0f} of the variation of the wrench does not follow the poses",
+        "keep the tool free of contact, check the form of the rotations, and check that wrench and poses are from one "
+        "recording on one clock"),
     "stuck_channels": Code(_REJECT, "the reading of {channels} is the same in all poses",
         "check the sensor for a channel that is stuck"),
     "quantised": Code(_LIMIT, "the readings come in steps of {step_N:.2g} and {step_Nm:.2g}",
@@ -286,20 +286,20 @@ CODES: Final[Mapping[str, Code]] = {
         "order{also:?, or read them as |}{also}"),
     "columns_swapped": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} with forces and torques "
         "exchanged", 'exchange the columns of force and torque (--columns "fx=NAME,...")'),
-    "pairing_shifted": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if each wrench is that "
-        "of the pose {neighbour} it", "pair each wrench with the pose at which it was measured"),
+    "pairing_shifted": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if each wrench is paired "
+        "with the pose {neighbour} it", "pair each wrench with the pose at which it was measured"),
     "zeroed_each_pose": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if the sensor was "
         "zeroed at each pose", "zero the sensor at most once, before the first pose, and record again"),
-    "pairing_or_rotations": Code(_REJECT, "forces fit a weight of {weight_N:.3g} to {radial_N:.2g} in size, but to "
-        "{residual_N:.2g} in direction", "check the pairing, and look for Euler angles (--euler), degrees or another "
-        "order"),
-    "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by about {turn_deg:.1f}, as forces fit to "
-        "{radial_N:.2g} in size, to {residual_N:.2g} in direction",
+    "pairing_or_rotations": Code(_REJECT, "the norm of the forces fits a weight of {weight_N:.3g} within "
+        "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and poses, Euler angles "
+        "(--euler), degrees, and the order of the rotations"),
+    "orientations_off": Code(_REJECT_OR_LIMIT, "the orientations are wrong by about {turn_deg:.1f}: the norm of the "
+        "forces fits within {radial_N:.2g}, their direction only within {residual_N:.2g}",
         "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
         "model"),
-    "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the change of the torques do not follow the "
-        "weight, as the forces do", "check that forces and torques are of one sensor and one recording, then cables "
-        "and contact"),
+    "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the variation of the torques does not follow "
+        "the weight, although the forces do", "check that forces and torques are from one sensor and one recording, "
+        "then check for cables and contact"),
     "axes_disagree": Code(_REJECT, "torque residual {residual_Nm:.2g}, but {corrected_Nm:.2g} with other axes of "
         "force or torque", "try {corrections:axes} (--columns), or check the wiring of the axes and the sensor's "
         "matrix"),
@@ -314,12 +314,12 @@ CODES: Final[Mapping[str, Code]] = {
         "as |}{corrections:axes}"),
     # Units, drift and changes of one session
     "bias_implausible": Code(_REJECT_OR_LIMIT, "the bias is {force_N:.5g} and {torque_Nm:.5g} for a weight of "
-        "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m by the factors of the sensor. A known "
-        "mass shows that of the force (--mass-kg){unit_N:scale}"),
-    "payload_units": Code(_LIMIT, "{load_kg:.2f} hang on the sensor, but {expected_kg:.2f} by the payload in the "
-        "controller", "check the units of the sensor{units:units} before you correct the payload"),
-    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is {shift_mm:.2g} off, as if the "
-        "load had shifted", "fix the load and calibrate again"),
+        "{weight_N:.3g}, as with raw counts", "convert the counts to N and N·m with the factors of the sensor. A known "
+        "mass shows the factor of the force (--mass-kg){unit_N:scale}"),
+    "payload_units": Code(_LIMIT, "the load on the sensor is {load_kg:.2f}, but the payload in the controller implies "
+        "{expected_kg:.2f}", "check the units of the sensor{units:units} before you correct the payload"),
+    "com_shifted": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the centre of mass is shifted by {shift_mm:.2g}, as if "
+        "the load had slipped", "fasten the load and calibrate again"),
     "load_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the weight has changed by {change_N:+.2g} and the "
         "centre of mass by {shift_mm:.2g}", "check whether something was lost, picked up or shifted, and calibrate "
         "again"),
@@ -328,16 +328,16 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it reads like another sensor, turned "
-        "{turn_deg:.2g}, bias {force_N:.2g} and {torque_Nm:.2g} off",
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings look like another sensor, turned by "
+        "{turn_deg:.2g}, with a bias different by {force_N:.2g} and {torque_Nm:.2g}",
         "calibrate each sensor by itself"),
-    "sensors_alternate": Code(_REJECT, "every other pose reads like another sensor, turned {turn_deg:.2g}, bias "
-        "{force_N:.2g} and {torque_Nm:.2g} off", "separate the readings of the sensors"),
+    "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor, turned by {turn_deg:.2g}, with a "
+        "bias different by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
     "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
         "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
-        "of {sigma_N:.2g}", "record the raw wrench if it is compensated already or zeroed "
-        "at each pose, keep the tool free of contact, or hang something heavier on the sensor"),
+        "of {sigma_N:.2g}", "record the raw wrench if it was compensated, or zeroed at each pose. Otherwise keep the "
+        "tool free of contact, or hang something heavier on the sensor"),
     "second_solution": Code(_REJECT, "{probability_percent:.2g} probability of a very different mounting, which "
         "explains the data almost as well", "add poses with another angle between the tool and the vertical"),
     "torques_about_point": Code(_LIMIT, "the centre of mass is {inside_mm:.0f} behind the sensor, as if torques were "
@@ -357,11 +357,11 @@ CODES: Final[Mapping[str, Code]] = {
     "com_too_near": Code(_LIMIT, "the centre of mass is only {distance_mm:.2g} from the sensor, as with forces in mN "
         "or torques in kN·m", "check the units of force and torque"),
     # Directions and signs
-    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} off the direction of the declared mounting",
+    "gravity_off_mounting": Code(_LIMIT, "gravity is {off_deg:.0f} away from the direction of the declared mounting",
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
         "direction of the rotations{orders:orders}"),
-    "mounting_undeclared": Code(_LIMIT, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, but no mounting "
-        "is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order and the "
+    "mounting_undeclared": Code(_LIMIT, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, but no "
+        "mounting is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order and the "
         "direction of the rotations{orders:orders}"),
     "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
         "add --sign -1 ([sensor] sign = -1) if the sensor reports the reaction, or correct axes that are reversed or "
@@ -371,11 +371,11 @@ CODES: Final[Mapping[str, Code]] = {
         "behind the sensor", "push the tip aside. If that gives almost no torque, add --sign -1 --wrench-frame tcp "
         "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in right-handed axes"),
     # The described cell
-    "tool_mass_mismatch": Code(_LIMIT, "{load_kg:.3g} hang on the sensor, but the described tool has {tool_kg:.3g}",
-        "check the sensor's units{units:units}, what is mounted, and whether the controller compensates a part, or "
-        "correct [tool] mass_kg{unit_N:scale}"),
-    "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but {load_kg:.2f} hang on the "
-        "sensor{sensor_kg:?|, whose own mass is not configured}",
+    "tool_mass_mismatch": Code(_LIMIT, "the load on the sensor is {load_kg:.3g}, but the described tool has "
+        "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller compensates part of the "
+        "load, or correct [tool] mass_kg{unit_N:scale}"),
+    "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but the load on the sensor is "
+        "{load_kg:.2f}{sensor_kg:?|, and the mass of the sensor is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
         "sensor and adapter ([sensor] mass_kg)}"),
     "com_outside_tool": Code(_REJECT_OR_LIMIT, "the centre of mass, {com_mm:.0f} from the {origin} in flange axes, "
@@ -384,40 +384,41 @@ CODES: Final[Mapping[str, Code]] = {
     # Recordings in motion
     "zeroed": Code(_LIMIT, "the sensor was zeroed within the recording, at {at_s:.2f} from its start",
         "zero it before the recording only"),
-    "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g}, too far for the weight, as if they "
-        "were in {unit}", "give them in m"),
+    "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g}, and their acceleration does not match "
+        "the weight: they look like {unit}", "give them in m"),
     "wrench_compensated": Code(_REJECT_OR_LIMIT, "the load weighs {weight_N:.2g}, but has the inertia of "
-        "{mass_kg:.2g}, as if it were partly compensated", "record the wrench as the sensor measures it, or set the "
-        "controller's payload to 0 before"),
+        "{mass_kg:.2g}, as if its weight were partly compensated", "record the wrench as the sensor measures it, or "
+        "set the controller's payload to 0 before recording"),
     "clocks_differ": Code(_REJECT, "the wrench follows the poses if its times are divided by {ratio:.4g}",
         "give the true rate of wrench and poses"),
-    "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and acceleration of the poses agree with times {factor:~sigma} "
-        "times as long (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the stated one, the "
-        "unit of the times, or the wrench as the sensor measures it"),
+    "clock_rate": Code(_REJECT_OR_LIMIT, "gravity and acceleration of the poses agree if the times are multiplied "
+        "by {factor:~sigma} (sigma {sigma:~sigma})", "give the true rate, which is {rate:.4g} times the stated one, "
+        "check the unit of the times, or record the wrench as the sensor measures it"),
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed: the signs of weight, acceleration and inertia "
         "disagree", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
-    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, not on z, as if "
-        "they were of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
+    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, not on their z "
+        "axis, as with poses of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
     "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques are about {point_mm:.0f} in the axes of the poses, "
         "beyond the centre of mass", "give the torques about the sensor origin, and the poses of the "
         "flange"),
     "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
         "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
         "poses, then the clock"),
-    "height_impossible": Code(_REJECT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
-        "{sigma_mm:~sigma_mm}), where none is", "check that the poses are those of the flange, then the axes and units "
-        "of wrench and poses, then the clock"),
-    "motion_coarse": Code(_LIMIT, "each pose is {off_deg:.2g} off those beside it, so only the parts at rest count "
-        "({share_percent:.0f})", "record poses and wrench at 50 Hz or more, each with its own time"),
-    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned only {range_deg:.0f}, which leaves mounting ± "
-        "{mounting_deg:.2g}, weight ± {weight_N:.2g} (1 sigma)",
+    "height_impossible": Code(_REJECT, "according to the motion the sensor is {height_mm:~sigma_mm} above the flange "
+        "(sigma {sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the "
+        "axes and units of wrench and poses, then the clock"),
+    "motion_coarse": Code(_LIMIT, "the poses differ by {off_deg:.2g} from an interpolation of their neighbours, so "
+        "only rows at rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
+        "of each sample"),
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}, so the uncertainty (1 sigma) is "
+        "{mounting_deg:.2g} for the mounting and {weight_N:.2g} for the weight",
         "turn wrist 2 and wrist 3 by 60° or more"),
-    "clock_offset": Code(_LIMIT, "the wrench follows the poses by {delay_s:.3f}", "correct the clock of one of the "
-        "two, or check that the times of both files mean the same"),
-    "positions_missing": Code(_LIMIT, "positions are missing, so only slow parts count ({share_percent:.0f}), with "
-        "errors up to {force_N:.2g}", "give the position of the flange too"),
-    "height_differs": Code(_LIMIT, "by the motion the sensor lies {height_mm:~sigma_mm} above the flange (sigma "
-        "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
+    "clock_offset": Code(_LIMIT, "the wrench lags behind the poses by {delay_s:.3f}", "correct one of the clocks, or "
+        "check that the times of both files have the same meaning"),
+    "positions_missing": Code(_LIMIT, "positions are missing, so only slow motion is used ({share_percent:.0f}), with "
+        "errors of up to {force_N:.2g}", "give the position of the flange too"),
+    "height_differs": Code(_LIMIT, "according to the motion the sensor is {height_mm:~sigma_mm} above the flange "
+        "(sigma {sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
     "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
         "{force_N:.2g}", "keep the tool free for most of the recording"),
     "contacts_left_out": Code(_NOTE, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
@@ -436,26 +437,26 @@ CODES: Final[Mapping[str, Code]] = {
         "of {residual_N:.2g}", "check the known values and what the method assumes, or take more poses"),
     "known_values_misfit_torque": Code(_LIMIT, "method ml without known values fits the torques to {free_Nm:.2g} "
         "instead of {residual_Nm:.2g}", "check the known values and what the method assumes, or take more poses"),
-    "response_not_linear": Code(_LIMIT_OR_NOTE, "{share_percent:.2g} of the weight is not linear in the sensor, which "
-        "is not compensated", "stay within the range of the sensor, or have it calibrated"),
-    "cable_acts": Code(_LIMIT_OR_NOTE, "something pulls by {force_N:.2g} and {torque_Nm:.2g} as the tool turns, like "
-        "a cable, not compensated", "give cables and hoses more slack"),
-    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "{turn_deg:.2g} is the error of the orientations, smooth over "
-        "the poses", "fasten base, sensor and tool, take the factory calibration of the arm, or stiffen the mount"),
+    "response_not_linear": Code(_LIMIT_OR_NOTE, "the response of the sensor is nonlinear by {share_percent:.2g} of the "
+        "weight, which is not compensated", "stay within the range of the sensor, or have it calibrated"),
+    "cable_acts": Code(_LIMIT_OR_NOTE, "something, such as a cable, pulls with {force_N:.2g} and {torque_Nm:.2g} as "
+        "the tool turns, which is not compensated", "give cables and hoses more slack"),
+    "orientations_smoothly_off": Code(_LIMIT_OR_NOTE, "the orientations have smooth errors of {turn_deg:.2g}",
+        "fasten base, sensor and tool, use the factory calibration of the arm, or stiffen the mount"),
     "noise_exceeded": Code(_LIMIT_OR_NOTE, "the residuals are {factor:.1f} times the measured noise "
         "({components:?found: |not in the sigmas}{components:.2g})",
         "look for drift, cables, contact and inexact orientations"),
     "poses_rejected": Code(_LIMIT_OR_NOTE, "{count} of {n_poses} poses were rejected because they do not fit the "
         "others", "repeat {poses:poses}"),
     "few_poses": Code(_LIMIT, "there are only {n_poses} poses", "take {recommended} or more"),
-    "gain_unknown": Code(_LIMIT, "{n_poses} poses do not show gain and cross-talk: {gain_percent:.2g} is assumed, and "
-        "part of all sigmas", "take {recommended} or more, or declare its accuracy_percent"),
+    "gain_unknown": Code(_LIMIT, "{n_poses} poses do not determine gain and cross-talk, so {gain_percent:.2g} is "
+        "assumed in all sigmas", "take {recommended} poses or more, or declare accuracy_percent of the sensor"),
     "poses_unchecked": Code(_LIMIT, "{poses:poses} cannot be checked because the others do not determine all "
         "parameters", "add similar poses"),
     # Known loads
-    "loads_swapped": Code(_REJECT, "the loads {first} and {second} hang each where the other was declared",
+    "loads_swapped": Code(_REJECT, "the positions of the loads {first} and {second} are exchanged",
         "exchange their places in --at"),
-    "load_absent": Code(_REJECT, "no weight shows at {name}", "hang the load there, and repeat that run"),
+    "load_absent": Code(_REJECT, "the readings show no weight at {name}", "hang the load there, and repeat that run"),
     "load_in_pounds": Code(_REJECT, "the load at {name} weighs {found_kg:.3f}, not {given_kg:.3f}: it was given in lb",
         "give its mass in kg"),
     "load_in_kilograms": Code(_REJECT, "the load at {name} weighs {found_kg:.3f}, not {given_kg:.3f}, as if kg were "
@@ -474,30 +475,30 @@ CODES: Final[Mapping[str, Code]] = {
         "repeat that run"),
     "sensor_not_linear": Code(_REJECT, "the sensor is not linear: {remaining_percent:.1f} of the load remain in the "
         "readings", "use a load within its range, or have the sensor calibrated by its maker"),
-    "matrix_changed": Code(_REJECT, "the matrix of the sensor differs by {sigmas:.1f} sigma of what was known, most in "
-        "{entry}", "check masses and places, then accept it with --accept"),
+    "matrix_changed": Code(_REJECT, "the matrix of the sensor differs by {sigmas:.1f} sigma from the previous one, "
+        "most in {entry}", "check masses and places, then accept it with --accept"),
     # Notes
     **{f"gain_{axis}": Code(_NOTE, f"the gain of the sensor along {axis} is {{gain_percent:+.1f}} off, corrected"
         ) for axis in "xyz"},
     "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected"),
     "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected"),
     "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected"),
-    "cable_spring": Code(_NOTE, "{torque_Nm:.2g} turn with the orientation, as of a cable; the centre of mass may be "
-        "{shift_mm:.2g} off", "give the cable more slack"),
+    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g} varies with the orientation, like that of a cable, and "
+        "the centre of mass may be wrong by {shift_mm:.2g}", "give the cable more slack"),
     "residuals_alike": Code(_NOTE, "the residuals of successive poses correlate by {correlation:.2f}, most likely "
         "from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
-    "gravity_tilted": Code(_NOTE, "gravity is {off_deg:.0f} off, along {direction:.2f} in base, as for a robot on a "
-        "slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
+    "gravity_tilted": Code(_NOTE, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, as for a robot on "
+        "a slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side} "
         "from the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "chi2 does not test the fit, because the noise was estimated from the residuals",
         "state the noise of each pose to test it (columns sigma_fx to sigma_tz)"),
-    "orientations_deviate": Code(_NOTE, "the poses are up to {off_deg:.2f} off the method's 24 orientations, a force "
-        "error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
-    "earlier_cell": Code(_NOTE, "mounting, base and gain of {parent} count as known, within their sigmas"),
-    "together": Code(_NOTE, "{n_runs} runs as one fit, each with a bias of its own; the bias is that of the last"),
+    "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the method's 24 orientations, "
+        "which causes a force error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
+    "earlier_cell": Code(_NOTE, "mounting, base and gain are taken from {parent}, with their sigmas"),
+    "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the last bias"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
     # Hints about single poses, beside the result
     "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
@@ -506,19 +507,19 @@ CODES: Final[Mapping[str, Code]] = {
     "pose_off": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}"),
     "pose_touched": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, as if touched, bumped or "
         "pulled by a cable", "repeat it"),
-    "load_swings": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}, torque without force",
+    "load_swings": Code(_NOTE, "{pose:poses} is off by {force_N:.2g} and {torque_Nm:.2g}: a torque without a force",
         "check whether the load tilts or swings"),
     "cable_pulls": Code(_NOTE, "something pulls in {poses:poses}",
         "give slack to a cable that is too short there, and repeat these poses"),
-    "sensor_drifts": Code(_NOTE, "the first pose reads otherwise at the end, and the poses between drift alike",
+    "sensor_drifts": Code(_NOTE, "the reading of the first pose differs at the end, and the poses between drift too",
         "let the sensor warm up for 15 to 30 min, then calibrate again"),
-    "return_differs": Code(_NOTE, "{pose:poses} reads otherwise at the end, and the poses between do not drift, as if "
-        "it was touched then", "repeat the last stop"),
+    "return_differs": Code(_NOTE, "the reading of {pose:poses} differs at the end, but the poses between do not drift, "
+        "as if the tool was touched", "repeat the last stop"),
 }
 # fmt: on
 
-# What is found beside the first because of it: beside wrong units or another point of the torques, and beside mistakes
-# in the data and changes in mid-session, which spoil the fit.
+# Consequences of causes: of wrong units or another reference point of the torques, and of mistakes in the data or
+# changes during the session, which spoil the fit.
 _OF_UNITS: Final = frozenset((
     "weight_compensated", "weight_implausible", "com_too_far", "com_too_near", "com_outside_tool", "tool_mass_mismatch",
 ))  # fmt: skip

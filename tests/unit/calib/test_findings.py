@@ -43,14 +43,14 @@ def test_words_come_from_the_table_and_the_values() -> None:
         (
             "payload_mismatch",
             {"payload_kg": 3, "load_kg": 1.5, "sensor_kg": 0.0, "set_kg": 1.5},
-            "1.50 kg hang on the sensor: set the payload in the controller to 1.50 kg, with sensor and adapter",
+            "the load on the sensor is 1.50 kg: set the payload in the controller to 1.50 kg, with sensor and adapter",
         ),
         (
             "payload_mismatch",
             {"payload_kg": 3, "load_kg": 1.5, "sensor_kg": None, "set_kg": 1.5},
-            "own mass is not configured: set the payload in the controller to 1.50 kg plus the mass",
+            "mass of the sensor is not configured: set the payload in the controller to 1.50 kg plus the mass",
         ),
-        ("clock_rate", {"factor": 2.0, "sigma": 0.01, "rate": 0.5}, "long (sigma 0.010): give"),
+        ("clock_rate", {"factor": 2.0, "sigma": 0.01, "rate": 0.5}, "multiplied by 2.000 (sigma 0.010): give"),
     ],
 )
 def test_forms_and_units(code: str, values: dict[str, object], says: str) -> None:
