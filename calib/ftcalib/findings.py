@@ -293,8 +293,8 @@ CODES: Final[Mapping[str, Code]] = {
     "pairing_or_rotations": Code(_REJECT, "the norm of the forces fits a weight of {weight_N:.3g} within "
         "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and poses, Euler angles "
         "(--euler), degrees, and the order of the rotations"),
-    "orientations_off": Code(_REJECT_OR_LIMIT, "the orientations are wrong by about {turn_deg:.1f}: the norm of the "
-        "forces fits within {radial_N:.2g}, their direction only within {residual_N:.2g}",
+    "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by {turn_deg:.1f}: forces fit within {radial_N:.2g} "
+        "in norm, {residual_N:.2g} in direction",
         "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
         "model"),
     "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the variation of the torques does not follow "
@@ -328,11 +328,11 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the readings look like another sensor, turned by "
-        "{turn_deg:.2g}, with a bias different by {force_N:.2g} and {torque_Nm:.2g}",
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it looks like another sensor: turned by {turn_deg:.2g}, "
+        "bias changed by {force_N:.2g} and {torque_Nm:.2g}",
         "calibrate each sensor by itself"),
-    "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor, turned by {turn_deg:.2g}, with a "
-        "bias different by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
+    "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor: turned by {turn_deg:.2g}, bias "
+        "changed by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
     "drift": Code(_LIMIT_OR_NOTE, "the bias drifted by {force_N:.2g} and {torque_Nm:.2g} from the first pose to the "
         "last", "let the sensor warm up and calibrate again"),
     "weight_insignificant": Code(_REJECT, "the weight, {weight_N:.3g}, is not {least_sigmas:g} times its uncertainty "
@@ -361,8 +361,8 @@ CODES: Final[Mapping[str, Code]] = {
         "correct the mounting ([workcell] mounting, --up), here and in the controller, or check the order and the "
         "direction of the rotations{orders:orders}"),
     "mounting_undeclared": Code(_LIMIT, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, but no "
-        "mounting is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order and the "
-        "direction of the rotations{orders:orders}"),
+        "mounting is declared", "declare the mounting, such as a wall ([workcell] mounting, --up), or check the order "
+        "and the direction of the rotations{orders:orders}"),
     "weight_upwards": Code(_LIMIT, "the weight pulls upwards ({off_deg:.0f} from down)",
         "add --sign -1 ([sensor] sign = -1) if the sensor reports the reaction, or correct axes that are reversed or "
         "swapped in forces and torques alike. If the robot hangs so, declare its mounting ([workcell] mounting, --up). "
@@ -372,8 +372,8 @@ CODES: Final[Mapping[str, Code]] = {
         "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in right-handed axes"),
     # The described cell
     "tool_mass_mismatch": Code(_LIMIT, "the load on the sensor is {load_kg:.3g}, but the described tool has "
-        "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller compensates part of the "
-        "load, or correct [tool] mass_kg{unit_N:scale}"),
+        "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller compensates part "
+        "of the load, or correct [tool] mass_kg{unit_N:scale}"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but the load on the sensor is "
         "{load_kg:.2f}{sensor_kg:?|, and the mass of the sensor is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
@@ -384,8 +384,8 @@ CODES: Final[Mapping[str, Code]] = {
     # Recordings in motion
     "zeroed": Code(_LIMIT, "the sensor was zeroed within the recording, at {at_s:.2f} from its start",
         "zero it before the recording only"),
-    "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g}, and their acceleration does not match "
-        "the weight: they look like {unit}", "give them in m"),
+    "positions_unit": Code(_REJECT, "the positions spread over {spread_m:.3g} and do not match the weight: they look "
+        "like {unit}", "give them in m"),
     "wrench_compensated": Code(_REJECT_OR_LIMIT, "the load weighs {weight_N:.2g}, but has the inertia of "
         "{mass_kg:.2g}, as if its weight were partly compensated", "record the wrench as the sensor measures it, or "
         "set the controller's payload to 0 before recording"),
@@ -396,29 +396,29 @@ CODES: Final[Mapping[str, Code]] = {
         "check the unit of the times, or record the wrench as the sensor measures it"),
     "reversed_in_motion": Code(_REJECT, "the {channels} look reversed: the signs of weight, acceleration and inertia "
         "disagree", "reverse the {channels}, or give wrench and orientations in right-handed axes"),
-    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, not on their z "
-        "axis, as with poses of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
+    "poses_of_tcp": Code(_REJECT_OR_LIMIT, "the sensor is at {point_mm:.0f} in the axes of the poses, off the z axis, "
+        "as with poses of a TCP", "give the poses of the flange{units:?, or correct the units|}{units:units}"),
     "torques_about_tcp": Code(_REJECT_OR_LIMIT, "the torques are about {point_mm:.0f} in the axes of the poses, "
         "beyond the centre of mass", "give the torques about the sensor origin, and the poses of the "
         "flange"),
     "inertia_impossible": Code(_REJECT, "no body has the principal moments of inertia {principal_gm2:.2f} g·m² (sigma "
         "{sigma_gm2:.2g} g·m²)", "check that the poses are those of the flange, then the axes and units of wrench and "
         "poses, then the clock"),
-    "height_impossible": Code(_REJECT, "according to the motion the sensor is {height_mm:~sigma_mm} above the flange "
-        "(sigma {sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the "
+    "height_impossible": Code(_REJECT, "by the motion the sensor is {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), which is impossible", "check that the poses are those of the flange, then the "
         "axes and units of wrench and poses, then the clock"),
-    "motion_coarse": Code(_LIMIT, "the poses differ by {off_deg:.2g} from an interpolation of their neighbours, so "
-        "only rows at rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
+    "motion_coarse": Code(_LIMIT, "poses differ by {off_deg:.2g} from their interpolated neighbours, so only rows at "
+        "rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
         "of each sample"),
-    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}, so the uncertainty (1 sigma) is "
-        "{mounting_deg:.2g} for the mounting and {weight_N:.2g} for the weight",
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}: sigma is {mounting_deg:.2g} for the "
+        "mounting, {weight_N:.2g} for the weight",
         "turn wrist 2 and wrist 3 by 60° or more"),
     "clock_offset": Code(_LIMIT, "the wrench lags behind the poses by {delay_s:.3f}", "correct one of the clocks, or "
         "check that the times of both files have the same meaning"),
     "positions_missing": Code(_LIMIT, "positions are missing, so only slow motion is used ({share_percent:.0f}), with "
         "errors of up to {force_N:.2g}", "give the position of the flange too"),
-    "height_differs": Code(_LIMIT, "according to the motion the sensor is {height_mm:~sigma_mm} above the flange "
-        "(sigma {sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
+    "height_differs": Code(_LIMIT, "by the motion the sensor is {height_mm:~sigma_mm} above the flange (sigma "
+        "{sigma_mm:~sigma_mm}), not {configured_mm:.3g}", "correct [sensor] height_mm, or check the positions"),
     "mostly_contact": Code(_LIMIT, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
         "{force_N:.2g}", "keep the tool free for most of the recording"),
     "contacts_left_out": Code(_NOTE, "contact was left out: {count} times, {share_percent:.0f} of the time, up to "
@@ -483,20 +483,20 @@ CODES: Final[Mapping[str, Code]] = {
     "axes_mixed": Code(_NOTE, "the sensor mixes forces along {axes} by {share_percent:.1f}, corrected"),
     "cross_talk": Code(_NOTE, "the sensor reads up to {torque_mNm:.2g} of torque for 1 N of force, corrected"),
     "response_small": Code(_NOTE, "the sensor has a small error of gain or cross-talk, corrected"),
-    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g} varies with the orientation, like that of a cable, and "
-        "the centre of mass may be wrong by {shift_mm:.2g}", "give the cable more slack"),
+    "cable_spring": Code(_NOTE, "a torque of {torque_Nm:.2g}, as of a cable, may shift the centre of mass by "
+        "{shift_mm:.2g}", "give the cable more slack"),
     "residuals_alike": Code(_NOTE, "the residuals of successive poses correlate by {correlation:.2f}, most likely "
         "from drift", "let the sensor warm up and mix the order of the poses"),
     "pose_deviates": Code(_NOTE, "{pose:poses} deviates from the others by {sigmas:.1f} sigma",
         "consider repeating it"),
-    "gravity_tilted": Code(_NOTE, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, as for a robot on "
-        "a slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
+    "gravity_tilted": Code(_NOTE, "gravity is tilted by {off_deg:.0f}, along {direction:.2f} in base, as for a robot "
+        "on a slope", "declare the mounting ([workcell] mounting, --up), or check the base frame and the orientations"),
     "base_leans": Code(_NOTE, "the base leans {lean_deg:~sigma_deg} (sigma {sigma_deg:~sigma_deg}) towards its {side} "
         "from the declared mounting", "level the base, or set its mounting in the controller"),
     "noise_unknown": Code(_NOTE, "chi2 does not test the fit, because the noise was estimated from the residuals",
         "state the noise of each pose to test it (columns sigma_fx to sigma_tz)"),
-    "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the method's 24 orientations, "
-        "which causes a force error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
+    "orientations_deviate": Code(_NOTE, "the poses deviate by up to {off_deg:.2f} from the 24 orientations: a force "
+        "error of {force_N:.2g}", "use --method lrom or ml, which take the orientations as they are"),
     "earlier_cell": Code(_NOTE, "mounting, base and gain are taken from {parent}, with their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the last bias"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
@@ -513,8 +513,8 @@ CODES: Final[Mapping[str, Code]] = {
         "give slack to a cable that is too short there, and repeat these poses"),
     "sensor_drifts": Code(_NOTE, "the reading of the first pose differs at the end, and the poses between drift too",
         "let the sensor warm up for 15 to 30 min, then calibrate again"),
-    "return_differs": Code(_NOTE, "the reading of {pose:poses} differs at the end, but the poses between do not drift, "
-        "as if the tool was touched", "repeat the last stop"),
+    "return_differs": Code(_NOTE, "{pose:poses} differs at the end, but the poses between do not drift, as if the tool "
+        "was touched", "repeat the last stop"),
 }
 # fmt: on
 
