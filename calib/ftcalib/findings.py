@@ -291,10 +291,10 @@ CODES: Final[Mapping[str, Code]] = {
     "zeroed_each_pose": Code(_REJECT, "force residual {residual_N:.2g}, but {corrected_N:.2g} if the sensor was "
         "zeroed at each pose", "zero the sensor at most once, before the first pose, and record again"),
     "pairing_or_rotations": Code(_REJECT, "the norm of the forces fits a weight of {weight_N:.3g} within "
-        "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and poses, Euler angles "
-        "(--euler), degrees, and the order of the rotations"),
-    "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by {turn_deg:.1f}: forces fit within {radial_N:.2g} "
-        "in norm, {residual_N:.2g} in direction",
+        "{radial_N:.2g}, but their direction only within {residual_N:.2g}", "check the pairing of wrenches and "
+        "poses, Euler angles (--euler), degrees, and the order of the rotations"),
+    "orientations_off": Code(_REJECT_OR_LIMIT, "orientations are off by {turn_deg:.1f}: forces fit within "
+        "{radial_N:.2g} in norm, {residual_N:.2g} in direction",
         "fasten base, sensor and tool, give the measured poses rather than the planned ones, and check the arm's "
         "model"),
     "torques_unrelated": Code(_REJECT_OR_LIMIT, "{left_percent:.0f} of the variation of the torques does not follow "
@@ -328,8 +328,8 @@ CODES: Final[Mapping[str, Code]] = {
         "program zeroes it, look for a cable that pulls"),
     "sensor_turned": Code(_REJECT_OR_LIMIT, "from {pose:poses} on the sensor is turned by {turn_deg:.2g}",
         "fasten its screws and calibrate again"),
-    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it looks like another sensor: turned by {turn_deg:.2g}, "
-        "bias changed by {force_N:.2g} and {torque_Nm:.2g}",
+    "sensor_changed": Code(_REJECT_OR_LIMIT, "from {pose:poses} on it looks like another sensor: turned by "
+        "{turn_deg:.2g}, bias changed by {force_N:.2g} and {torque_Nm:.2g}",
         "calibrate each sensor by itself"),
     "sensors_alternate": Code(_REJECT, "every other pose looks like another sensor: turned by {turn_deg:.2g}, bias "
         "changed by {force_N:.2g} and {torque_Nm:.2g}", "separate the readings of the sensors"),
@@ -372,8 +372,8 @@ CODES: Final[Mapping[str, Code]] = {
         "--tcp X,Y,Z,RX,RY,RZ. Otherwise reverse the forces, or give the orientations in right-handed axes"),
     # The described cell
     "tool_mass_mismatch": Code(_LIMIT, "the load on the sensor is {load_kg:.3g}, but the described tool has "
-        "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller compensates part "
-        "of the load, or correct [tool] mass_kg{unit_N:scale}"),
+        "{tool_kg:.3g}", "check the sensor's units{units:units}, the mounted tool, and whether the controller "
+        "compensates part of the load, or correct [tool] mass_kg{unit_N:scale}"),
     "payload_mismatch": Code(_LIMIT, "the controller has a payload of {payload_kg:.2f}, but the load on the sensor is "
         "{load_kg:.2f}{sensor_kg:?|, and the mass of the sensor is not configured}",
         "set the payload in the controller to {set_kg:.2f}{sensor_kg:?, with sensor and adapter| plus the mass of "
@@ -410,8 +410,8 @@ CODES: Final[Mapping[str, Code]] = {
     "motion_coarse": Code(_LIMIT, "poses differ by {off_deg:.2g} from their interpolated neighbours, so only rows at "
         "rest are used ({share_percent:.0f})", "record poses and wrench at 50 Hz or more, with the time "
         "of each sample"),
-    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}: sigma is {mounting_deg:.2g} for the "
-        "mounting, {weight_N:.2g} for the weight",
+    "motion_narrow": Code(_REJECT_OR_LIMIT, "the tool turned by only {range_deg:.0f}: sigma is {mounting_deg:.2g} for "
+        "the mounting, {weight_N:.2g} for the weight",
         "turn wrist 2 and wrist 3 by 60° or more"),
     "clock_offset": Code(_LIMIT, "the wrench lags behind the poses by {delay_s:.3f}", "correct one of the clocks, or "
         "check that the times of both files have the same meaning"),
