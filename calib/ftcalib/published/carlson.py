@@ -1,18 +1,18 @@
-"""Carlson's methods, from forces alone: first those for an unknown gravity vector, then those for a known one.
+"""Carlson's methods, which use only forces: first those for an unknown gravity vector, then those for a known one.
 
 F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, sections 2 (gravity known, from
 `relaxation` on) and 3.
 
-The paper's letters: `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flange_sensor`, `g = gravity_force_base_N`
-(the mass is inside), so that at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks
+In the paper's letters `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flange_sensor`, `g = gravity_force_base_N`
+(including the mass), so that at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks
 columns: `vec(X) = R_flange_sensor.T.ravel()`. Without noise all methods find the same solution. With noise they do so
-(section 4.2) only when the forces point equally in all directions: prefer `polynomial`, which is least squares.
+(section 4.2) only if the forces are distributed isotropically. Prefer `polynomial`, which is least squares.
 
 The paper has no sensor bias. Every method has two forms:
 
 * `bias=False` is the paper's model. A bias then causes an unreported error: with 20 N of weight, 24 random poses and
   0.05 N of noise, a bias of 0, 0.1, 1, 5 and 20 N makes the rotation wrong by 0.07, 0.10, 0.75, 3.7 and 10 to 20 deg
-  (rms) and the gravity force by 0.1, 0.14, 1.0, 5 and 21 %, much the same for all methods.
+  (rms) and the gravity force by 0.1, 0.14, 1.0, 5 and 21 %, with little difference between the methods.
 * `bias=True` estimates the bias too: `X f_i = A_i g + h` with `h = X f_0`. Subtracting the mean over the poses
   eliminates h exactly, so each method runs on `f_i - mean f` and `A_i - mean A`.
 """
@@ -34,47 +34,47 @@ class ForceFit:
     """Result of a method that uses forces only: mounting of the sensor, weight and force bias."""
 
     R_flange_sensor: Array
-    """(3, 3) maps sensor to flange coordinates."""
+    """(3, 3) mounting of the sensor: maps sensor to flange coordinates."""
     gravity_force_base_N: Array
     """(3,) weight of the load on the sensor, in base axes."""
     force_bias_N: Array
-    """(3,) in sensor axes; zero in the form without bias."""
+    """(3,) force bias in sensor axes; zero in the form without bias."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceEquations:
-    """The equations `X f_i = A_i g` of all poses, minus their mean in the form with bias."""
+    """Equations `X f_i = A_i g` of all poses, centred in the form with bias."""
 
     A: Array
-    """(n, 3, 3) base to flange; in the form with bias minus `A_mean`."""
+    """(n, 3, 3) orientations that map base to flange coordinates; in the form with bias minus `A_mean`."""
     f: Array
-    """(n, 3) N in sensor axes; in the form with bias minus `f_mean`."""
+    """(n, 3) forces in sensor axes, N; in the form with bias minus `f_mean`."""
     A_mean: Array
-    """(3, 3), zero in the form without bias."""
+    """(3, 3) mean of the orientations; zero in the form without bias."""
     f_mean: Array
-    """(3,) N, zero in the form without bias."""
+    """(3,) mean of the forces, N; zero in the form without bias."""
 
     @property
     def D(self) -> Array:
-        """(3n, 3), eq. 17."""
+        """(3n, 3) matrix D of eq. 17."""
         return self.A.reshape(-1, 3)
 
     @property
     def F(self) -> Array:
-        """(3n, 9) rows `f_i^T (x) I`, eq. 17."""
+        """(3n, 9) matrix F of eq. 17, with rows `f_i^T (x) I`."""
         return kron_identity(self.f)
 
     def gravity(self, R_flange_sensor: Array) -> Array:
-        """(3,) N: the least-squares gravity force of a rotation (eq. 20)."""
+        """Return the least-squares gravity force (3,), N, for a given mounting (eq. 20)."""
         return np.asarray(np.linalg.lstsq(self.D, (self.f @ R_flange_sensor.T).ravel())[0], dtype=np.float64)
 
     def fit(self, R_flange_sensor: Array, gravity_N: Array) -> ForceFit:
-        """Add the bias that follows from the means."""
+        """Return the fit with the bias that follows from the means."""
         return ForceFit(R_flange_sensor, gravity_N, self.f_mean - R_flange_sensor.T @ self.A_mean @ gravity_N)
 
 
 def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
-    """Check the input of a method and form its equations; `bias` estimates a force bias too, which needs one more pose.
+    """Return the equations of a method after checking its input; estimating a `bias` needs one more pose.
 
     Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a pose or force that is not finite, and
     `ValueError` for other shapes than (n, 3, 3) and (n, 3).
@@ -97,7 +97,7 @@ def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method:
 
 
 def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by eigendecomposition (theorem 1).
+    """Return the fit for unknown gravity by eigendecomposition (theorem 1).
 
     vec(X) is the eigenvector of `K = F^+ D D^+ F` with the largest eigenvalue, which is 1 without noise. That is the
     smallest principal angle between the ranges of F and D, the form computed here. It minimises `|F r - D g| / |F r|`.
@@ -132,7 +132,7 @@ def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
 
 def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by the nullspace method (section 3.2) in O(n).
+    """Return the fit for unknown gravity by the nullspace method (section 3.2) in O(n).
 
     The sum of squares over all pairwise differences is exactly n times `|(I - D D^+) F r|^2`, so the least singular
     vector of `(I - D D^+) F` is the published solution (eqs. 22-26) without its n^2 blocks. With bias it is the LROM of
@@ -153,7 +153,7 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
 
 def iterative(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by iterative linear least squares (section 3.4, algorithm 1).
+    """Return the fit for unknown gravity by iterative linear least squares (section 3.4, algorithm 1).
 
     Alternates between the rotation of a given gravity, projected onto SO(3), and the gravity of a given rotation. The
     error shrinks in each step by the second eigenvalue of K: 0.04 for 100 random orientations, but without bias 0.78,
@@ -194,13 +194,13 @@ def iterative(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
 
 def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by polynomial optimisation (section 3.3, eq. 27).
+    """Return the fit for unknown gravity by polynomial optimisation (section 3.3, eq. 27).
 
-    Gravity and bias are linear given the rotation, so eq. 27 is the minimum of a quadratic form in vec(X) over SO(3):
-    the least-squares solution, which for isotropic noise is the most likely one. The paper follows 2^18 homotopy
-    paths in 10 minutes; the form has only 40 complex critical rotations, and `ftcalib.likelihood.rotation_minima` finds
-    all its minima in milliseconds. (The residual in eq. 27 must be
-    `R_TF^S f - A g` for the paper's count of paths.)
+    For a given rotation gravity and bias are linear, so eq. 27 is the minimum of a quadratic form in vec(X) over SO(3):
+    the least-squares solution, which is the maximum likelihood solution for isotropic noise. The paper follows 2^18
+    homotopy paths in 10 minutes. The form has only 40 complex critical rotations, and
+    `ftcalib.likelihood.rotation_minima` finds all minima in milliseconds. (The residual in eq. 27 must be
+    `R_TF^S f - A g`, or the number of paths is not that of the paper.)
 
     Parameters
     ----------
@@ -232,12 +232,12 @@ def polynomial(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
 
 def kron_identity(f: Array) -> Array:
-    """(3n, 9) stack of `f_i^T (x) I` for (n, 3) vectors: times vec(X) it gives the stack of `X f_i`."""
+    """Return the stack (3n, 9) of `f_i^T (x) I` for vectors (n, 3); its product with vec(X) is the stack of `X f_i`."""
     return np.asarray(np.einsum("nj,ik->nijk", f, np.eye(3)).reshape(-1, 9))
 
 
 def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str) -> ForceEquations:
-    """Form the equations of a method that is linear in all nine entries of the rotation, if the poses suffice."""
+    """Return the equations of a method that is linear in the nine entries of the rotation; raise for too few poses."""
     eq = force_equations(R_base_flange, force_N, bias=bias, method=method, min_poses=4)
     require_turns_and_weight(eq)
     _require_varied_forces(eq.f, 0)
@@ -245,7 +245,7 @@ def _linear_equations(R_base_flange: Array, force_N: Array, *, bias: bool, metho
 
 
 def _rotation_of_vec(r: Array) -> Array:
-    """Rotation closest to the matrix with columns in r (9,), times a factor of either sign (theorem 1, eqs. 28-29)."""
+    """Return the rotation closest to a multiple of the matrix with columns r (9,) (theorem 1, eqs. 28-29)."""
     X = r.reshape(3, 3).T
     return nearest_rotation(X if np.linalg.det(X) > 0 else -X)
 
@@ -258,7 +258,7 @@ def _fit_vec(eq: ForceEquations, r: Array) -> ForceFit:
 
 
 def _complement(eliminated: Array, kept: Array) -> Array:
-    """Few rows with the Gram matrix of `kept` minus its projection on the columns of `eliminated`."""
+    """Return a small matrix with the Gram matrix of `kept` minus its projection on the columns of `eliminated`."""
     k = eliminated.shape[1]
     return np.linalg.qr(np.hstack([eliminated, kept])).R[k:, k:]
 
@@ -268,13 +268,13 @@ def _least_singular_vector(eliminated: Array, kept: Array) -> Array:
 
 
 # --- observability ---
-# The checks use the forces `A_i g` of the fitted gravity, because noise lifts the singular values of measured forces
-# above any bound, and degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise
-# in the fitted direction hides it. Only a comparison with the second solution, as in `polynomial`, detects that.
+# The checks use the forces `A_i g` of the fitted gravity, because noise increases the singular values of measured
+# forces, so that degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise in
+# the fitted direction hides it. Only a comparison with the second solution, as in `polynomial`, detects this.
 
 
 def spanned_dimensions(rows: Array, size: float) -> int:
-    """Number of dimensions spanned by the rows; `size` is their norm before a mean was subtracted, for rounding."""
+    """Return the number of dimensions spanned by rows; `size` is their norm before centring, for rounding errors."""
     singular = np.linalg.svd(rows, compute_uv=False)
     return int(np.sum(singular > max(3e-5 * singular[0], 1e-9 * size)))
 
@@ -286,11 +286,14 @@ def require_weight(eq: ForceEquations) -> None:
 
 
 def require_turns_and_weight(eq: ForceEquations) -> None:
-    """Raise `NotObservable` for poses that leave the force of a known rotation open, and as `require_weight`."""
+    """Raise `NotObservable` if all poses turn about one base axis, along which weight and bias cannot be separated.
+
+    Raises also like `require_weight`.
+    """
     if spanned_dimensions(eq.D, len(eq.A) ** 0.5) < 3:
         raise NotObservable(
-            "all poses turn about one base axis, and a weight along it resembles a bias: add poses turned about "
-            "another axis"
+            "all poses turn about one base axis, and a weight along it cannot be separated from a bias: add poses "
+            "turned about another axis"
         )
     require_weight(eq)
 
@@ -305,7 +308,7 @@ def _require_varied_forces(f: Array, size: float) -> None:
 
 
 def _require_single_null_vector(eq: ForceEquations, gravity: Array) -> None:
-    """The equations relaxed to any matrix X must have one solution."""
+    """Raise `NotObservable` unless the equations, relaxed to any matrix X, have a unique solution."""
     f = eq.A @ gravity
     size = len(f) ** 0.5 * float(np.linalg.norm(gravity))
     _require_varied_forces(f, size)
@@ -318,7 +321,7 @@ def _require_single_null_vector(eq: ForceEquations, gravity: Array) -> None:
 
 
 def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
-    """The Jacobian in rotation (of 1 rad) and gravity (of its own size) must have full rank."""
+    """Raise `NotObservable` unless the Jacobian by rotation and gravity, scaled by 1 rad and weight, has full rank."""
     weight = float(np.linalg.norm(gravity))
     J = np.concatenate([skew(eq.A @ gravity), weight * eq.A], axis=2).reshape(-1, 6)
     missing = 6 - spanned_dimensions(J, len(eq.A) ** 0.5 * weight)
@@ -329,17 +332,16 @@ def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
         )
 
 
-# Carlson's methods for a known gravity vector, from forces alone.
+# Carlson's methods for a known gravity vector (section 2), from forces alone.
 #
-# F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, section 2. Letters and the two
-# forms, without and with a bias, are those above. A bias has the same effect on the form without bias
-# (Cayley transform: 22 deg if the bias is as large as the weight).
+# Letters and the two forms, without and with bias, are the same as above. A bias has the same effect on the form
+# without bias (Cayley transform: 22 deg if the bias is as large as the weight).
 #
-# "Known" means exact: if the base is tilted by 2 deg more than assumed, the result is wrong without any sign of it.
+# Gravity must be known exactly: with the base tilted by 2 deg more than assumed, the result is wrong, unwarned.
 
 
 def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
-    """Weight and rotation by convex relaxation, gravity known in direction (eq. 3 and appendix A).
+    """Return weight and rotation by convex relaxation, for a known direction of gravity (eq. 3 and appendix A).
 
     The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
     mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
@@ -374,7 +376,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
 def cayley(
     R_base_flange: Array, force_N: Array, gravity_force_base_N: Array, *, bias: bool, as_published: bool = False
 ) -> ForceFit:
-    """Rotation by the Cayley transform, gravity known with the weight (eqs. 6-11).
+    """Return the rotation by the Cayley transform, for known direction of gravity and weight (eqs. 6-11).
 
     The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
     the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept. An error of the weight goes into
@@ -409,7 +411,7 @@ def cayley(
 
 
 def cayley_rotation(f: Array, a: Array) -> Array:
-    """Rotation R with `f_i = R a_i` by one Cayley transform, as published (eqs. 7-11).
+    """Return the rotation R with `f_i = R a_i` by one Cayley transform, as published (eqs. 7-11).
 
     `R = (I + <s>)^-1 (I - <s>)` makes the problem linear in s: `<f_i + a_i> s = f_i - a_i`. (Eq. 11 has the opposite
     right-hand side because `<a> b = <b> a` lacks a sign; as printed it gives the transpose.) The noise of f is in the
@@ -431,7 +433,7 @@ def cayley_rotation(f: Array, a: Array) -> Array:
 
 
 def centre_of_mass(R_base_flange: Array, torque_Nm: Array, fit: ForceFit) -> Array:
-    """Centre of mass of a known rotation and gravity force, without torque bias (eqs. 4-5).
+    """Return the centre of mass for known rotation and gravity force, without torque bias (eqs. 4-5).
 
     `R_TF^S tau_i = r x A_i g` is linear in r. (The matrix of eq. 5 is -<A_i g>, because `<a> b = -<b> a`, as in eq. 11;
     as printed it gives -r.) The paper's r is in the flange frame; the result is in the sensor frame.
@@ -456,9 +458,9 @@ def centre_of_mass(R_base_flange: Array, torque_Nm: Array, fit: ForceFit) -> Arr
 def _equations_of_known_direction(
     R_base_flange: Array, force_N: Array, gravity_base: Array, needed: int, *, bias: bool, method: str
 ) -> tuple[ForceEquations, Array]:
-    """Form the equations of a method that needs as many poses and gravity axes; also the unit vector (3,) of gravity.
+    """Return the equations of a method that needs `needed` poses and axes of gravity, and the unit vector of gravity.
 
-    The spread is judged on the known directions, because noise of the forces would hide a degenerate pose set.
+    The spread is judged by the known directions, because noise of the forces would hide a degenerate pose set.
     """
     length = np.linalg.norm(gravity_base)
     if not length > 0:
@@ -477,12 +479,12 @@ def _equations_of_known_direction(
 
 
 def _least_squares_factor(f: Array, a: Array, R_sensor_flange: Array) -> float:
-    """Least-squares factor from R a_i to f_i."""
+    """Return the least-squares factor between R a_i and f_i."""
     return float(np.sum(f * (a @ R_sensor_flange.T)) / np.sum(a**2))
 
 
 def _require_pull_downwards(f: Array, a: Array) -> None:
-    """Reject forces f (n, 3) that a rotation explains much better with gravity -a than with a (n, 3)."""
+    """Raise `BadDataset` if a rotation explains the forces f (n, 3) much better with gravity -a than with a (n, 3)."""
     residual, reversed_residual = (
         float(np.sum((f - _least_squares_factor(f, side, R) * side @ R.T) ** 2))
         for side, R in ((a, nearest_rotation(f.T @ a)), (-a, nearest_rotation(-f.T @ a)))

@@ -19,14 +19,14 @@ from ftcalib.model import Array, Parameters, SPECIAL_R_flange_base, nearest_rota
 
 Indices = NDArray[np.intp]
 
-# Deviation from one of the 24 that is always accepted: more than an arm with calibrated kinematics misses by.
+# Deviation from one of the 24 orientations that is always accepted: more than the error of calibrated kinematics.
 TOLERANCE_RAD = np.deg2rad(1.0)
-# Deviation that rounded poses have. A larger one is worth a note.
+# Largest deviation of rounded poses; a larger one is reported as a note.
 ROUNDING_RAD = np.deg2rad(0.05)
 
-# The mean turn of the base is itself uncertain if all poses deviate.
+# Largest accepted deviation, because the common rotation of the base is itself uncertain if all poses deviate.
 _RECOGNISED_RAD = 1.3 * TOLERANCE_RAD
-# Distance of the sums of `_likely_members` of poses 2° apart.
+# Distance between the invariants of `_likely_members` for poses 2° apart.
 _NEIGHBOURS = 0.065
 
 # Numbers of the orientations whose forces are added and subtracted: p_kj for k, j = 1, 2, 3 (eqs 17-23).
@@ -38,10 +38,10 @@ _SUMS = (
 
 
 def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
-    """Calibrate from the 24 special orientations, in any order, possibly all turned by one common rotation.
+    """Return the parameters from the 24 special orientations, in any order, possibly all turned by one rotation.
 
-    The gravity force is that of the 24 as printed (eqs 14-23). Rotation, biases and centre of mass follow from the
-    orientations as they are (eqs 36-45).
+    The gravity force is computed for the nominal orientations (eqs 14-23). Rotation, biases and centre of mass follow
+    from the actual orientations (eqs 36-45).
 
     Parameters
     ----------
@@ -49,20 +49,20 @@ def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | 
     wrench : array, shape (24, 6)
         N and N·m, in the sensor frame.
     numbered : tuple, optional
-        What `special_numbers` returns for these orientations.
+        Result of `special_numbers` for these orientations.
 
     Raises
     ------
     NotObservable
-        As `special_numbers`.
+        Like `special_numbers`.
     """
     return _from_special(R_base_flange, wrench, *(numbered or special_numbers(R_base_flange)))
 
 
 def mixed(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
-    """Calibrate with the gravity force of the 24 special orientations, and all else from all poses: case 8, Table III.
+    """Return parameters with the gravity force from the 24 special orientations, and the others from all poses.
 
-    The 24 are found among the poses. The forces of an orientation that occurs several times are averaged.
+    This is case 8 of Table III. The 24 are recognised among the poses. Forces of repeated orientations are averaged.
 
     Parameters
     ----------
@@ -85,16 +85,16 @@ def _from_special(R_base_flange: Array, wrench: Array, number: Indices, Y: Array
     force_N = np.zeros((24, 3))
     np.add.at(force_N, number[special], wrench[special, :3])
     force_N /= np.bincount(number[special], minlength=24)[:, None]
-    # With A_i = R_i Y.T the published formulas see the gravity force in the turned base, Y.T F_b.
+    # With A_i = R_i Y.T the published formulas give the gravity force in the turned base, Y.T F_b.
     return _remaining_steps(R_base_flange, wrench, Y @ srom_gravity_force(force_N))
 
 
 def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
-    """Calibrate from at least five orientations: eqs 24-34.
+    """Return the parameters from at least five orientations: eqs 24-34.
 
-    Eq 34 chooses the sign by the mounting of the robot. Lines 1 and 2 of the rule are right for the alpha of eq 48 as
-    printed. With eq 48 corrected (`ftcalib.model.weight_and_tilt`) alpha is another angle, by which an upright robot
-    would get the wrong sign. det R > 0 replaces the rule and needs no knowledge of the mounting.
+    Eq 34 chooses the sign from the mounting of the robot. Lines 1 and 2 of the rule are correct for the alpha of eq 48
+    as printed. With the corrected eq 48 (`ftcalib.model.weight_and_tilt`) alpha is another angle, and an upright robot
+    would get the wrong sign. The condition det R > 0 is used instead and does not depend on the mounting.
 
     Parameters
     ----------
@@ -125,9 +125,9 @@ def lrom(R_base_flange: Array, wrench: Array) -> Parameters:
 
 
 def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: Array) -> Parameters:
-    """Rotation and force bias for a known gravity force (Wahba's problem, eqs 36-42 and 39), and eqs 43-45.
+    """Return all parameters for a known gravity force: Wahba's problem (eqs 36-42 and 39), then eqs 43-45.
 
-    The text after eq 42 names a case "rank D = 1, det D < 0", which cannot exist: det D is 0 below rank 3.
+    The text after eq 42 mentions a case "rank D = 1, det D < 0", which is impossible: det D is 0 below rank 3.
     """
     force_N, gravity_flange_N = wrench[:, :3], gravity_force_base_N @ R_base_flange
     D = (force_N - force_N.mean(axis=0)).T @ (gravity_flange_N - gravity_flange_N.mean(axis=0))
@@ -138,7 +138,7 @@ def _remaining_steps(R_base_flange: Array, wrench: Array, gravity_force_base_N: 
 
 
 def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indices, Array]:
-    """Recognise the 24 special orientations.
+    """Return the number of the special orientation of each pose, and the common rotation of the base.
 
     Parameters
     ----------
@@ -149,16 +149,16 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
     Returns
     -------
     number : int array, shape (n,)
-        Row i is orientation number[i] + 1 of the paper, or another one if number[i] is -1.
+        Row i is orientation number[i] + 1 of the paper, or none of the 24 if number[i] is -1.
     Y : array, shape (3, 3)
-        R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T, about: the identity where that fits as well as
-        rounded poses do, else the smallest rotation that fits best.
+        Rotation with R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T approximately: the identity if it fits
+        within rounding errors, else the smallest rotation that fits best.
 
     Raises
     ------
     NotObservable
-        An orientation is missing or too far off, or without `others` repeated; the message gives the numbers. Up to 1°
-        is always accepted and more than 1.3° never, because Y is itself uncertain.
+        An orientation is missing or deviates too much, or is repeated without `others`. The message gives the numbers.
+        Up to 1° is always accepted and more than 1.3° never, because Y is itself uncertain.
     """
     match = _Match(R_base_flange, np.eye(3))
     if match.seen < 24 or match.angle_rad[match.number >= 0].max() > ROUNDING_RAD:
@@ -181,7 +181,7 @@ def special_deviation_rad(R_base_flange: Array, number: Indices, Y: Array) -> fl
 
 
 class _Match:
-    """The special orientation nearest to each pose, when the base is turned by Y."""
+    """Match of each pose with its nearest special orientation, for a base that is turned by Y."""
 
     def __init__(self, R_base_flange: Array, Y: Array, tolerance_rad: float = _RECOGNISED_RAD) -> None:
         trace = (Y.T @ R_base_flange).reshape(-1, 9) @ np.swapaxes(SPECIAL_R_flange_base, 1, 2).reshape(24, 9).T
@@ -193,12 +193,12 @@ class _Match:
         self.seen = int(np.count_nonzero(self.times_seen))
 
     def of_the_24(self, R_base_flange: Array) -> NDArray[np.bool_]:
-        """Find (n,) the poses of the 24 and their repetitions, not one of another set that only lies near one of them.
+        """Return which poses (n,) are one of the 24 or a repetition, or are far from all of them.
 
-        True for other poses farther away: they do no harm.
+        False for a pose of another set that is only near one of the 24.
         """
         order = np.argsort(self.angle_rad)
-        first_of_each = np.unique(self.number[order], return_index=True)[1][-24:]  # number -1, if any, stands before
+        first_of_each = np.unique(self.number[order], return_index=True)[1][-24:]  # without number -1, which is first
         nearest = R_base_flange[order[first_of_each]][self.number]
         apart = Rotation.from_matrix(np.swapaxes(R_base_flange, 1, 2) @ nearest).magnitude()
         return np.asarray((self.number < 0) | (apart <= ROUNDING_RAD))
@@ -233,7 +233,7 @@ class _Match:
 
 
 def _best_match(R_base_flange: Array) -> _Match:
-    """Match all poses for the common rotation that finds most of the 24."""
+    """Return the match with the common rotation that recognises most of the 24 orientations."""
     matches = list[_Match]()
     for seed in chain([np.eye(3)], _likely_members(R_base_flange)):
         matches.append(_Match(R_base_flange, _common_rotation(R_base_flange, seed)))
@@ -243,10 +243,11 @@ def _best_match(R_base_flange: Array) -> _Match:
 
 
 def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
-    """Yield a pose (3, 3) of each of the fullest groups of poses that are equal but for a rotation of the cube.
+    """Yield one pose (3, 3) of each of the largest groups of poses that differ by rotations of the cube.
 
-    Trying each pose as a member of the 24 costs O(n^2). Sums of fourth powers over the columns of a rotation do not
-    change with a rotation of the cube on its right, so poses of one group are neighbours in the space of these sums.
+    Trying each pose as a member of the 24 would cost O(n^2). Sums of fourth-order products over the columns of a
+    rotation are invariant to a rotation of the cube on its right, so poses of one group are neighbours in the space of
+    these sums.
     """
     i, j, k, m = np.array(list(combinations_with_replacement(range(3), 4))).T
     R = R_base_flange
@@ -262,15 +263,15 @@ def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
 
 
 def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
-    """Estimate Y from all poses in the group of `seed`, and return the smallest of its 24 equivalents."""
+    """Return Y estimated from all poses in the group of `seed`: the smallest of 24 equivalent rotations."""
     Y = seed
-    for tolerance_rad in (4 * TOLERANCE_RAD, 2 * TOLERANCE_RAD, _RECOGNISED_RAD):  # `seed` itself is off at first
+    for tolerance_rad in (4 * TOLERANCE_RAD, 2 * TOLERANCE_RAD, _RECOGNISED_RAD):  # `seed` itself deviates at first
         number = _Match(R_base_flange, Y, tolerance_rad).number
         near = number >= 0
         if near.any():
             Y = nearest_rotation(np.einsum("nij,njk->ik", R_base_flange[near], SPECIAL_R_flange_base[number[near]]))
     equivalents = Y @ SPECIAL_R_flange_base
-    rounded = equivalents.round(4)  # so that a tie, as at 45°, has the same result in every order of rows
+    rounded = equivalents.round(4)  # makes ties, for example at 45°, independent of the order of rows
     smallest = min(range(24), key=lambda i: (-np.trace(rounded[i]), *rounded[i].ravel()))
     return np.asarray(equivalents[smallest])
 
@@ -281,7 +282,10 @@ def _list(indices: Indices, most: int = 6) -> str:
 
 
 def srom_gravity_force(force_N: Array) -> Array:
-    """Gravity force (3,) in base from the 24 forces (24, 3) in the sensor frame, in the paper's order: eqs 14-23."""
+    """Return the gravity force (3,) in base from the forces (24, 3) in the sensor frame, in the paper's order.
+
+    The formulas are eqs 14-23.
+    """
     F_b = np.empty(3)
     for k, sums in enumerate(_SUMS):
         p = [
