@@ -135,7 +135,7 @@ def solve(
     measured_sigma = None if wrench_cov is None else np.sqrt(np.einsum("nii->ni", wrench_cov).mean(axis=0))
     cell = replace(setup, sensor_has_arbitrary_zero=setup.sensor_has_arbitrary_zero or _zero_is_arbitrary(dataset))
     quality = _judge(Case(found, dataset.t_s, cell, known, free, g_m_s2, _written(dataset)), measured_sigma)
-    deviation = _deviation(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
+    deviation = _deviation_findings(method, estimator, best.parameters, dataset.R_base_flange) if estimator else []
     printed = {"as_published": True} if as_published else {}
     declares_sensor = setup.sensor_accuracy_percent is not None or setup.sensor_range is not None
     return CalibrationResult(
@@ -402,7 +402,7 @@ def estimator_of(
     )
 
 
-def _deviation(method: Method, estimator: Estimator, truth: Parameters, R_base_flange: Array) -> list[Finding]:
+def _deviation_findings(method: Method, estimator: Estimator, truth: Parameters, R_base_flange: Array) -> list[Finding]:
     """Return a finding if poses deviate from the special orientations of the method, with the resulting force error."""
     if method not in SPECIAL:
         return []

@@ -341,11 +341,11 @@ def _unexpected(R_base_flange: Array, wrench: Array, rows: NDArray[np.intp], cha
     squares = np.sum((wrench[others] - X @ slope) ** 2, axis=0).reshape(2, 3).sum(axis=1)
     noise = np.repeat(np.sqrt(squares / (3 * dof)), 3)  # of force and of torque
     leverage = np.einsum("ni,ij,nj->n", design[rows], np.linalg.pinv(X.T @ X), design[rows])
-    limit = -stdtrit(3 * dof, BY_CHANCE) * noise * np.sqrt(1 + leverage)[:, None] + _resolution(wrench)
+    limit = -stdtrit(3 * dof, BY_CHANCE) * noise * np.sqrt(1 + leverage)[:, None] + _channel_steps(wrench)
     return bool((np.abs(design[rows] @ slope - wrench[rows]) > limit)[:, channels].any())
 
 
-def _resolution(wrench: Array) -> Array:
+def _channel_steps(wrench: Array) -> Array:
     """Return the resolution (6,) of the readings: the smallest difference in each channel, within plausible limits."""
     gaps = [np.diff(np.unique(channel)).min(initial=np.inf) for channel in wrench.T]
     finest, coarsest = ROUNDING * np.abs(wrench).max(axis=0), np.sqrt(12) * COARSE * np.ptp(wrench, axis=0)
