@@ -84,8 +84,7 @@ def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTA
 def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
     """Return the errors of the estimates, each divided by its standard deviation.
 
-    The error of the mounting is the rotation vector from truth to estimate, about the flange axes. The error of an
-    angle is at most 180°.
+    The error of the mounting is the rotation vector from truth to estimate, about the flange axes, of at most 180°.
     """
     errors = {}
     for _, _, _, key, values, sigma, _ in result.estimates:

@@ -167,8 +167,7 @@ def table_iii(
     numbers : sequence of int
         Number of each pose, as returned by `ftcalib.poses.selection.set_numbers`.
     truth : Parameters, optional
-        Reference for mass, centre of mass and mounting; default: the maximum likelihood estimate from all poses
-        except those of D.
+        Reference for mass, centre of mass and mounting; default: the maximum likelihood estimate from all poses but D.
     g_m_s2 : float
         Acceleration of gravity at the cell.
 

@@ -107,8 +107,7 @@ class Parameters(Displayed):
         ----------
         step : array, shape (15,)
             Error vector in the order of `PARAMETER_NAMES`. The first three entries are a small rotation vector delta in
-            rad, about the flange axes: s_eR <- s_eR exp([delta]x), that is R_flange_sensor <- exp([delta]x).T
-            R_flange_sensor.
+            rad about the flange axes: s_eR <- s_eR exp([delta]x), R_flange_sensor <- exp([delta]x).T R_flange_sensor.
         """
         return type(self)(
             rotation_of(-step[:3]) @ self.R_flange_sensor,
@@ -309,8 +308,7 @@ class DriftResult:
     sigma: Array
     """(6,) one standard deviation of `change`."""
     course: Array | None = None
-    """(n, 6) bias of each pose minus the mean bias, in the order of the poses; None in a calibration result, which
-    stores only the change."""
+    """(n, 6) bias of each pose minus the mean bias, in the order of measurement; None in a calibration result."""
 
     def __post_init__(self) -> None:
         keep_finite(self, "the drift's ", change=(6,), sigma=(6,))

@@ -32,14 +32,7 @@ from ftcalib.model import (
 )
 from ftcalib.result_file import document_of, fields_of, is_edited
 from ftcalib.rounding import counted
-from ftcalib.sensor_matrix import (
-    SIZE,
-    SQUARES,
-    Calibrated,
-    ContactResponse,
-    Response,
-    SensorMatrix,
-)
+from ftcalib.sensor_matrix import SIZE, SQUARES, Calibrated, ContactResponse, Response, SensorMatrix
 from ftcalib.shown import ShownEstimate, data_frame, shown_estimates, summary_rows, wrench_figure
 
 # Number of sigmas of the sensor's gain from which weighed and estimated mass contradict each other.

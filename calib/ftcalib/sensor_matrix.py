@@ -349,8 +349,7 @@ class SensorMatrix(Displayed):
         ----------
         gain_sigma : float
             Standard deviation of the diagonal entries. Half of the variance is common to all axes, because calibration
-            masses, ageing and temperature affect all of them. The other entries have half of this standard deviation,
-            relative to the ranges.
+            masses, ageing and temperature affect all of them. The others have half of it, relative to the ranges.
         lever_m : float
         source : {"assumed", "data sheet"}
         """

@@ -15,15 +15,7 @@ from ftcalib.judge.described_cell import contradictions
 from ftcalib.judge.faults import CORRECTED, faults, no_weight, other_poses
 from ftcalib.judge.observability import ACCEPTED_DELTA_CHI2, require_observable, require_orientations
 from ftcalib.judge.session_change import SessionChange, possible_changes
-from ftcalib.judge.verdict import (
-    SIGNIFICANT_SIGMAS,
-    Case,
-    Quality,
-    find_mistakes,
-    find_other_poses,
-    judge,
-    statistics,
-)
+from ftcalib.judge.verdict import SIGNIFICANT_SIGMAS, Case, Quality, find_mistakes, find_other_poses, judge, statistics
 from ftcalib.known import NOTHING, Known, Setup
 from ftcalib.likelihood.descent import column_scale
 from ftcalib.likelihood.fit import Estimate, Fit, fit
@@ -80,13 +72,11 @@ def solve(
         (`known`, default: axes of sensor and flange agree), or a mounting known up to a rotation about flange z.
         For comparison, one of `ftcalib.published.methods.PUBLISHED`.
     drift : {"auto", "none", "linear", "random-walk"}
-        Model of the bias during the session; "auto": chosen from the data. Poses without times are taken as equally
-        spaced in their order.
+        Model of the bias during the session; "auto": chosen from the data. Poses without times count as equally spaced.
     known : Known, optional
         Known mounting, direction of gravity and mass. Published methods use the values that they need as exactly known:
         Carlson's methods gravity, "vougioukas" the mounting (default: axes of sensor and flange agree) and the
-        direction of gravity (default: the up direction of `setup`), "wang" the mounting, "yang" the mounting up to a
-        rotation about flange z.
+        direction of gravity (default: the up direction of `setup`), "wang" the mounting, "yang" that but its yaw.
     g_m_s2 : float
         Acceleration of gravity; the mass is the weight divided by it.
     setup : Setup

@@ -22,13 +22,7 @@ from ftcalib.findings import Finding
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import BIASES, Array, Parameters, angle_between, angle_between_vectors, predict, skew
 from ftcalib.result import CalibrationResult
-from ftcalib.sensor_matrix import (
-    LOAD,
-    SIZE,
-    Response,
-    response_columns,
-    sensor_error_columns,
-)
+from ftcalib.sensor_matrix import LOAD, SIZE, Response, response_columns, sensor_error_columns
 
 # False-alarm probability of the test of the prior.
 FALSE_ALARMS = 1e-4

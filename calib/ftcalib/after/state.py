@@ -159,8 +159,7 @@ def apply_update(
         Calibration from which the update was made.
     update : Update
     provenance : mapping, optional
-        Origin of the new readings. The id of the old calibration is added to its `parent`, and the kind of update as
-        `update`.
+        Origin of the new readings. The id of the old calibration becomes its `parent`, and the kind of update `update`.
 
     Raises
     ------
@@ -282,8 +281,7 @@ def compare_with_prediction(
     """Return residuals (n, 6) of mean readings of a free tool, and their Mahalanobis distances (n,).
 
     `wrench` (n, 6) are mean readings as measured with covariances `wrench_cov` (n, 6, 6). `drift_N` and `drift_Nm` are
-    standard deviations per axis of the drift of the biases. The distances account for noise, drift and the uncertainty
-    of the calibration.
+    standard deviations per axis of the drift of the biases. The distances account for noise, drift and calibration.
     """
     p, response = calibration.parameters, calibration.response
     change = np.asarray(Compensator(p, response=response).batch(wrench, R_base_flange), dtype=np.float64)

@@ -21,8 +21,7 @@ from ftcalib.shown import data_frame
 
 FORMAT = "ftdrive.dataset/1"
 
-# Rotations that map flange to base coordinates, like a robot pose, or base to flange coordinates, like e_bR in the
-# papers.
+# Rotations that map flange to base coordinates, like a robot pose, or the inverse, like e_bR in the papers.
 Orientation = Literal["R_base_flange", "R_flange_base"]
 
 # Largest accepted value in N, N·m or their squares, so that powers of it do not overflow.

@@ -164,8 +164,7 @@ def is_quiet(wrench: Array, level: Array) -> bool:
     doubles, so quiet dwells fail as rarely as in `is_stationary`. With 2 s at 500 Hz, 0.15 % fail for white noise, and
     0.4, 0.9 and 6 % after a low-pass filter of 10, 5 and 2 Hz, because 2 s contain few independent samples.
 
-    `level` (6,) is the result of `noise_level`. Raises `BadDataset` for fewer than 20 samples, or a value that is not
-    finite.
+    `level` (6,) is the result of `noise_level`. Raises `BadDataset` for fewer than 20 samples, or if one is not finite.
     """
     return is_stationary(wrench) and not restless_channels(wrench, level).any()
 

@@ -85,8 +85,7 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
 def _quaternion_orders(gravity_direction_base: Array, up: Array, written: str) -> list[str]:
     """Return the true orders of quaternions with which gravity would point down, if they were read wrongly.
 
-    Quaternions read inverted and in the wrong order give `U R V` of the true orientations with fixed rotations U and V,
-    so they fit as well.
+    Quaternions read inverted and in the wrong order give `U R V` of the true R with fixed rotations U, V: they fit too.
     """
     if written not in ("", "quaternion"):
         return []

@@ -56,8 +56,7 @@ class Observability:
     advised_R_base_flange: Array
     """(k, 3, 3) orientations of the poses to add; the set is then sound, if five poses suffice."""
     second_gap: float
-    """Mean squared force residual of the best other solution, relative to the weight squared: at most 8/9, 0 if
-    ambiguous."""
+    """Mean squared force residual of the best other solution over the weight squared: at most 8/9, 0 if ambiguous."""
 
     @property
     def sound(self) -> bool:

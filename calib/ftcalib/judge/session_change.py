@@ -413,8 +413,7 @@ _AROUND /= np.linalg.norm(_AROUND, axis=1, keepdims=True)
 def cable_of(fit: Fit) -> tuple[Finding, Array] | None:
     """Return the finding of a cable that acts like a spring, and the shift of the estimates; None if not significant.
 
-    The finding contains the rms torque over the poses, and the possible shift of the centre of mass. The shift (15,) is
-    zero for the biases.
+    The finding has the rms torque over the poses and the possible shift of the centre of mass. The shift is (15,).
     """
     n = len(fit.order)
     dof = fit.dof - STIFFNESS - SLACK

@@ -8,8 +8,7 @@ from ftcalib.findings import Finding, Severity
 from ftcalib.model import Parameters
 
 USUAL_COM_M = (0.02, 0.2)
-# Distances of the centre of mass: beyond the first, without a described tool, a result is limited; beyond the second it
-# is rejected.
+# Distances of the centre of mass: beyond the first, an undescribed tool limits a result; beyond the second, any tool.
 FAR_COM_M, FARTHEST_COM_M = 0.25, 0.5
 NEAREST_COM_M = 5e-4
 # Weights outside the first two limits look like forces in another unit: below 30 g, or above the payload of UR arms.

@@ -23,8 +23,7 @@ from ftcalib.model import Array, Parameters, angle_between, skew
 #
 #     Theta = [[b^T (x) R, F0], [[P]x (b^T (x) R), T0]]    (6, 10),    R = R_flange_sensor.T, b = gravity_force_base_N
 #
-# so the weighted squares of a million poses are one 60 x 60 matrix, and the time of a Gauss-Newton step does not depend
-# on the number of poses.
+# so the weighted squares of a million poses are one 60 x 60 matrix, and a Gauss-Newton step takes the same time.
 
 # Number of poses per matrix product, so that their products stay in the cache.
 FEW = 256
@@ -133,8 +132,7 @@ def _sixty(A: Array) -> Array:
 def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
     """Return the sum (16, 16) of row.T @ row with row = (wrench - offset, features), for poses with common noise.
 
-    The offset is the last column of `reference` (6, 10), whose other columns must be zero. Sums of disjoint data can be
-    added.
+    The offset is the last column of `reference` (6, 10), whose other columns are zero. Sums of disjoint data add up.
     """
     n = len(wrench)
     gram = np.zeros((16, 16))
@@ -311,8 +309,7 @@ def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
 # Outliers: poses in which the tool was bumped or touched, or something slipped.
 #
 # Graduated non-convexity with the Geman-McClure cost (Yang, Antonante, Tzoumas, Carlone 2020) starts from every minimum
-# of the least-squares cost. A least-squares fit of the remaining poses follows. The solution with the lowest truncated
-# cost is chosen.
+# of the least-squares cost, then a least-squares fit of the other poses. The lowest truncated cost is chosen.
 
 Kept = NDArray[np.bool_]
 
@@ -333,8 +330,7 @@ def fewest_kept(n: int) -> int:
 def agreeing_poses(descent: Descent, weights: Array, starts: Sequence[Parameters]) -> tuple[Parameters, Kept] | None:
     """Return parameters and the poses (n,) that agree with them, by a robust fit from several starts.
 
-    `weights` (n, 6, 6) are inverse noise covariances. The result is None if fewer than `fewest_kept` poses agree from
-    every start.
+    `weights` (n, 6, 6) are inverse noise covariances. The result is None if all starts leave fewer than `fewest_kept`.
     """
     phi, wrench = features(descent.R), descent.wrench
 

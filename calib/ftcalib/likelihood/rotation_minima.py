@@ -3,8 +3,7 @@
 For a known mounting the force model is linear in gravity and bias. Eliminating them leaves `min r.T @ Q @ r` over the
 rotations, where `r = R.ravel()` and `R = R_flange_sensor.T` maps flange to sensor coordinates (`s_eR` in Yu et al.).
 In unit quaternions the cost is a quartic on the sphere. Newton descents from a fixed set of starts find all minima, and
-a sum-of-squares relaxation proves that no rotation costs less. `given_rotation` and `com_and_torque_bias` then solve
-for the linear unknowns.
+a sum-of-squares relaxation proves which is lowest. `given_rotation` and `com_and_torque_bias` solve for the rest.
 """
 
 from dataclasses import dataclass
@@ -52,8 +51,7 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
     -------
     Q : (9, 9)
         Symmetric, positive semidefinite up to rounding. `r.T @ Q @ r` with `r = R_flange_sensor.T.ravel()` is
-        `min sum(w * |force - R_flange_sensor.T @ R_base_flange.T @ gravity - bias|**2)` over gravity and bias; exactly
-        so for scalar weights.
+        `min sum(w * |force - R_flange_sensor.T @ R_base_flange.T @ gravity - bias|**2)`, exactly so for scalar weights.
 
     Notes
     -----
@@ -161,8 +159,7 @@ def certificate(Q: Array, R: Array) -> float:
     -------
     float
         Gap of at least 0: no rotation costs less than `cost(R) - gap * trace(Q) / 3`. The unit `trace(Q) / 3` is the
-        mean cost of all rotations, so it is meaningful even if the lowest cost is zero. Below 1e-8 R is a global
-        minimum.
+        mean cost of all rotations, so it is meaningful even if the lowest cost is 0. Below 1e-8 the minimum is global.
 
     Raises
     ------
@@ -176,8 +173,7 @@ def certificate(Q: Array, R: Array) -> float:
     gamma. The largest gamma is the solution of a semidefinite program of 21 variables, by a primal-dual interior-point
     method (the direction of Helmberg, Rendl, Vanderbei and Wolkowicz 1996). The bound is the smallest eigenvalue of
     that matrix minus a margin for rounding. It is valid even if the method stops early, so the gap can be too large,
-    but never too small. A quartic need not be such a sum of squares: all of 8000 simulated calibrations were, 4 of 6000
-    other random Q were not.
+    but never too small. It was such a sum in all of 8000 simulated calibrations, but not for 4 of 6000 random Q.
     """
     if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
         raise ValueError(f"the certificate needs a 3x3 rotation matrix, not {R.tolist()}")

@@ -3,8 +3,7 @@
     V = blockdiag(D_i) + S (K (x) I6) S + slopes + effects,    S = diag(walk)
 
 K is the covariance of a random walk minus its mean over the poses, if the bias is the mean bias, or minus its value at
-one pose, if the bias is that of the pose. Its inverse is tridiagonal, and Woodbury's identity makes every operation
-O(n).
+one pose, if the bias is that of the pose. Its inverse is tridiagonal: by Woodbury's identity, all operations are O(n).
 """
 
 from collections.abc import Iterator

@@ -522,8 +522,7 @@ def estimates_of_unknown_variances(at: Point) -> tuple[Array, Array]:
 
     The correction is of first order. Estimates change with the variances, and the covariance at the best variances is
     too small by twice that contribution (Kenward, Roger 1997; Prasad, Rao 1990). The covariance itself is uncertain, so
-    sigma is widened by (z² + 1) / (4 nu), like the 95 % interval of Student's distribution, with nu by Satterthwaite
-    (1946).
+    sigma is widened by (z² + 1) / (4 nu), like the 95 % interval of Student's distribution (nu: Satterthwaite 1946).
     """
     x, C = parameter_estimates(at)
     if not at.components or len(at.problem.r) >= POSES_THAT_SHOW_THE_NOISE:

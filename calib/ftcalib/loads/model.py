@@ -3,8 +3,7 @@
     reading = (I + E) blk(R', R') w + b - h (w - w before) + noise      w = [m u; s x u], R = R_flange_sensor
 
 about the sensor origin, in flange axes, with u the acceleration of gravity, m the sum of the masses and s the sum of
-mass times position. A weight on a string is a mass at the point where the string is attached. Each run has its own
-bias b.
+mass times position. A weight on a string is a mass at the knot. Each run has its own bias b.
 """
 
 from collections.abc import Mapping, Sequence
@@ -152,8 +151,7 @@ class LoadModel:
     """Model of runs with known loads: all unknowns at their present values.
 
     The initial values are a mounting and `tool`: mass (kg) and centre of mass from the sensor origin, flange axes. The
-    direction of `gravity_base_m_s2` is the declared one, and is estimated too. `tool_mass_kg` is the weighed mass with
-    its sigma.
+    direction of `gravity_base_m_s2` is declared, and also estimated. `tool_mass_kg` is the weighed mass with its sigma.
     """
 
     mistakes: tuple[Mistake, ...] = ()

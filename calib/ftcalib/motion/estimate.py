@@ -28,17 +28,7 @@ from ftcalib.motion.model import (
     motion_states,
     places_in_runs,
 )
-from ftcalib.motion.problem import (
-    DELAY_S,
-    EXPECTED,
-    GYRATION_M,
-    HEIGHT_M,
-    NEVER,
-    RIDGE,
-    ROUGH_ROWS,
-    NormalSolution,
-    Problem,
-)
+from ftcalib.motion.problem import DELAY_S, EXPECTED, GYRATION_M, HEIGHT_M, NEVER, RIDGE, ROUGH_ROWS, Problem, Solution
 from ftcalib.motion.samples import MotionRows
 
 # Squared Mahalanobis distance from which a row is in contact.
@@ -104,8 +94,7 @@ class MotionFit:
     distance: Array
     """(n,) squared Mahalanobis distance of each residual: chi-square with 6 degrees of freedom without contact."""
     drift: DriftResult | None
-    """Drift from the first to the last row; its course is relative to the bias of `load`, which is the last one. None
-    without a walk."""
+    """Drift over the rows; its course is relative to the bias of `load`, the last one. None without a walk."""
     mean_bias: Array | None = None
     """(6,) mean of the bias over the rows, N and N·m; None without drift."""
     components: Mapping[str, float] = field(default_factory=dict)
@@ -162,7 +151,7 @@ def fit_motion(
     r = rows.wrench - problem.predict(load, rows)
     kept = _untouched(r) if guarded else _first_kept(problem, load)
     effects, sizes = np.zeros(len(problem.basis)), {**_ROUGH, "walk_N": 3e-3, "walk_Nm": 6e-5}
-    solved = NormalSolution.none()
+    solved = Solution.none()
     for stage in range(_STAGES):
         state = motion_states(rows.speed_rad_s, kept)
         r = problem.residuals(load, effects)
@@ -232,13 +221,13 @@ def _join(
     sizes: Mapping[str, float],
     start: tuple[MovingLoad, Array],
     weighed: tuple[RowNoise, NDArray[np.bool_], NDArray[np.intp]],
-) -> tuple[MovingLoad, Array, NormalSolution, str]:
+) -> tuple[MovingLoad, Array, Solution, str]:
     """Fit rows and prior together, starting from the fit of the rows alone; also return the contradiction to the prior.
 
     `weighed` holds the noise, the kept rows and the states of motion, as determined from the rows alone.
     """
 
-    def fitted(kept: Sequence[int]) -> tuple[MovingLoad, Array, NormalSolution]:
+    def fitted(kept: Sequence[int]) -> tuple[MovingLoad, Array, Solution]:
         """Return load, effects and solution; `kept` as in `CellPrior.rows`."""
         (load, effects), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
@@ -309,8 +298,7 @@ class FreeFit:
     load: MovingLoad
     error: PoseError
     covariance: Array
-    """(37, 37) of the error vector of `MovingLoad.moved`, then of scale and lateral offset, including the effect of
-    smooth errors."""
+    """(37, 37) of the errors of `MovingLoad.moved`, scale and lateral offset, with the effect of smooth errors."""
     residual: Array
     """(2,) standard deviation of the force and torque residuals, from their median, N and N·m."""
 

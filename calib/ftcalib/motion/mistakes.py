@@ -2,8 +2,7 @@
 
 The quantities of `fit_freely` separate the mistakes. The scale of the acceleration relative to gravity shows a wrong
 clock or unit of the positions, its sign reversed forces, the sign of the moments of inertia reversed torques, and the
-lever the point to which the poses belong. Angular velocities alone show none of these, because inertia and lever absorb
-their scale.
+lever the point to which the poses belong. Angular velocities alone show neither: inertia and lever absorb the scale.
 """
 
 from collections.abc import Callable, Mapping
@@ -41,8 +40,7 @@ _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
 # The signs of channels are certain if scale and moment are this many sigmas above 0.
 _SIGNED: Final = 3.0
-# A clock scale that deviates by this share, but only by this many sigmas, limits a result if it is the only mistake.
-# It is not corrected.
+# A clock scale that deviates by this share, but only by this many sigmas, limits a result if alone, uncorrected.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
 # Largest plausible distance between the axes of sensor and flange.
 _FAR_ASIDE_M: Final = 0.03

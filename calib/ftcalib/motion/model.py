@@ -154,8 +154,7 @@ def turn_columns(load: MovingLoad, motion: Motion) -> Array:
 def lever_columns(load: MovingLoad, motion: Motion) -> Array:
     """Return the derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
 
-    Antisymmetric cross-talk shifts the centre of mass seen in the torques of the weight, but not the one seen in the
-    inertial forces.
+    Antisymmetric cross-talk shifts the centre of mass seen in the torques of the weight, not that of inertial forces.
     """
     static = load.static
     dU = -load.mass_kg * static.R_flange_sensor.T @ motion.Omega_rad2_s2 @ static.R_flange_sensor

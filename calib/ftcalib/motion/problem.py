@@ -27,8 +27,7 @@ and the restricted likelihood of s is (Patterson and Thompson, Biometrika 58, 19
 
     -2 log L(s) = r' W r + v' P v - b' H^-1 b + log det H - log det P(s).
 
-Exact constraints of `Known` restrict x to a basis Z, and H becomes Z' H Z. Rows (J, r) of a `CellPrior` are added to H
-and b.
+Exact constraints of `Known` restrict x to a basis Z: H becomes Z' H Z. Rows (J, r) of a `CellPrior` add to H and b.
 """
 
 from collections.abc import Mapping
@@ -229,7 +228,7 @@ class Problem:
             variance[self.groups[name][0]] = size**2
         return np.asarray(self.smooth_columns(load, motion) * np.sqrt(variance[SIZE:][self.smooth_effects]))
 
-    def next_use(self, load: MovingLoad, effects: Array, solved: "NormalSolution") -> Array:
+    def next_use(self, load: MovingLoad, effects: Array, solved: "Solution") -> Array:
         """Return the rms error (2,) of compensating a free tool at rest in the orientations of the rows, N and N·m.
 
         Orientation errors and the cable act as in the recording, and the compensation does not model them.
@@ -300,7 +299,7 @@ class Problem:
         T = block_diag(np.eye(SIZE), self.basis)
         return T.T @ H @ T, T.T @ b, chi2
 
-    def absorb(self, load: MovingLoad, rows: MotionRows, solved: "NormalSolution") -> Array:
+    def absorb(self, load: MovingLoad, rows: MotionRows, solved: "Solution") -> Array:
         """Return a root (n, 6, k) of the covariance of the prediction.
 
         It has no columns before the first solution, or if there are so many rows that the covariance is negligible.
@@ -336,7 +335,7 @@ class Problem:
         load: MovingLoad,
         effects: Array,
         prior: tuple[Array, Array] | None = None,
-    ) -> "NormalSolution":
+    ) -> "Solution":
         """Solve the normal equations for load and effects, given the component sizes and optional rows of a prior."""
         H, b, chi2 = sums
         P, on, log_det = self.components(sizes, load)
@@ -363,7 +362,7 @@ class Problem:
         cost = chi2 + float(value @ P @ value + residuals @ residuals - b @ step)
         criterion = cost + log_det
         criterion += 2 * float(np.log(np.diag(factor[0]) * scale).sum())
-        return NormalSolution(step + removed, cost, criterion, basis / scale, factor)
+        return Solution(step + removed, cost, criterion, basis / scale, factor)
 
     def criteria(
         self,
@@ -400,7 +399,7 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class NormalSolution:
+class Solution:
     """Solution of the normal equations for load and effects."""
 
     step: Array

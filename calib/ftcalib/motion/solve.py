@@ -125,8 +125,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     BadDataset
         The recording is too short, or wrench and poses do not overlap in time.
     NotObservable
-        The motion does not determine the parameters, or contradicts the earlier result. The message names what is
-        missing or has changed.
+        The motion does not determine the parameters, or contradicts the earlier result. The message says why.
     """
     prior = None if earlier is None else CellPrior(earlier)
     data = wrench.result(), poses.result()

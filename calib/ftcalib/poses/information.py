@@ -178,8 +178,7 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
 def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
     """Return matrices (15, 15) whose scalar product with a covariance is the mean square error over orientations.
 
-    The first is for force, in sigma_force_N², the second for torque, in sigma_torque_Nm². The covariance is in the
-    units of `Guess.scale`.
+    For force in sigma_force_N², for torque in sigma_torque_Nm². The covariance is in the units of `Guess.scale`.
     """
     J = whitened_jacobian(R_base_flange, guess)
     force, torque = (np.einsum("nki,nkj->ij", rows, rows) / len(J) for rows in (J[:, :3], J[:, 3:]))

@@ -1,7 +1,6 @@
 """Carlson's methods, which use only forces: first those for an unknown gravity vector, then those for a known one.
 
-F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, sections 2 (gravity known, from
-`relaxation` on) and 3.
+F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, sections 2 (`relaxation` on) and 3.
 
 In the paper's letters `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flange_sensor`, `g = gravity_force_base_N`
 (including the mass), so that at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks

@@ -246,8 +246,7 @@ def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
     """Yield one pose (3, 3) of each of the largest groups of poses that differ by rotations of the cube.
 
     Trying each pose as a member of the 24 would cost O(n^2). Sums of fourth-order products over the columns of a
-    rotation are invariant to a rotation of the cube on its right, so poses of one group are neighbours in the space of
-    these sums.
+    rotation are invariant to a rotation of the cube on its right, so these sums put poses of one group close together.
     """
     i, j, k, m = np.array(list(combinations_with_replacement(range(3), 4))).T
     R = R_base_flange
