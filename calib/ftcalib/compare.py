@@ -95,7 +95,6 @@ def compare(  # noqa: PLR0913 - one argument for each known quantity
 
     Parameters
     ----------
-    dataset : CalibrationDataset
     drift, known, g_m_s2, setup
         As for `solve`. Published methods that need gravity take it from `known`, or assume a level base.
     default : CalibrationResult, optional

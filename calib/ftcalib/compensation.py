@@ -250,9 +250,7 @@ def inertial_wrench(
 
     Parameters
     ----------
-    mass_kg : float
     p_sensor_com_m : array, shape (3,)
-    motion : SensorMotion
     inertia_com_kg_m2 : array, shape (3, 3), optional
         Inertia about the centre of mass, in sensor axes. Default: a point mass.
     """

@@ -121,8 +121,6 @@ def read_lines(file: BufferedReader, error: type[Exception], first: int = 1) -> 
 
     Parameters
     ----------
-    file : BufferedReader
-    error : type
     first : int
         Number of the first line, for the error message.
     """
@@ -170,7 +168,6 @@ def object_of(content: bytes, error: type[Exception], *, accept_changed: bool = 
     ----------
     content : bytes
         Content of the file. A document without a checksum, such as a hand-written one, is accepted.
-    error : type
     accept_changed : bool
         Whether to accept a document that differs from its checksum.
     """

@@ -141,7 +141,6 @@ def gravity_wrench(parameters: Parameters, R_base_flange: Array) -> Array:
 
     Parameters
     ----------
-    parameters : Parameters
     R_base_flange : array, shape (..., 3, 3)
 
     Returns
@@ -197,7 +196,6 @@ def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
 
     Parameters
     ----------
-    parameters : Parameters
     R_base_flange : array, shape (..., 3, 3)
 
     Returns

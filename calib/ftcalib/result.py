@@ -134,8 +134,7 @@ class CalibrationResult(Displayed, Calibrated):
     covariance: Array
     """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, in the sensor frame. The prediction has `response` and the
-    mean bias, but not its drift."""
+    """(n, 6) measured minus predicted wrench in the sensor frame, with `response` and mean bias, without drift."""
     chi2: float
     """Weighted sum of squared residuals of the used poses with the measured noise alone, without drift and
     `components`; with the noise from the residuals if it was not measured."""
@@ -165,8 +164,7 @@ class CalibrationResult(Displayed, Calibrated):
     drift: DriftResult | None = None
     """Drift of the bias; None if no drift was found, or if `drift="none"`."""
     mean_bias: Array | None = None
-    """(6,) mean of the bias over the session, N and N·m; None without drift, or if `parameters` has the mean bias, as
-    in files of an earlier format."""
+    """(6,) mean of the bias over the session; None without drift, or in a file of an earlier format."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None if not found, or if the method does not estimate them."""
     gain_sigma: float = 0.0
@@ -174,8 +172,7 @@ class CalibrationResult(Displayed, Calibrated):
     hidden_covariance: Array = field(default_factory=lambda: np.zeros((15, 15)))
     """(15, 15) covariance of the estimates due to errors of arm and mounts that the poses do not show."""
     cable_shift: Array | None = None
-    """(15,) possible shift of the estimates by a cable that acts like a spring, in the coordinates of `covariance`;
-    None if the readings show no cable."""
+    """(15,) possible shift of the estimates by a cable that acts like a spring, as `covariance`; None without one."""
     second_basin_chi2: float | None = None
     """Increase of chi2 at the second best solution, under the noise model; None if there is no other."""
     quality: Mapping[str, JSON] = field(default_factory=dict)
@@ -467,8 +464,7 @@ class CalibrationResult(Displayed, Calibrated):
         If the measured noise explains the residuals, it is `predicted_error`. Otherwise it is the leave-one-out error,
         which applies to orientations like those of the tour. In both cases the drift of the bias in the minute after
         the last pose is added. For a recording in motion it is the error of load and smooth errors at rest in the
-        recorded orientations. "workspace" is the error over all orientations, and "hour" the error with the drift of
-        one hour, NaN if the tour shows no drift.
+        recorded orientations. "workspace": over all orientations; "hour": with an hour of drift, NaN without a drift.
         """
         if not self.quality:
             return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)
@@ -562,7 +558,6 @@ class CalibrationResult(Displayed, Calibrated):
 
         Parameters
         ----------
-        document : mapping
         accept_edited : bool
             Whether to accept a document that does not match its checksum, id or verdict; `is_edited` is then true.
 

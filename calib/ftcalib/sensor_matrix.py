@@ -208,8 +208,7 @@ class Calibrated:
     def predicted_error(self) -> tuple[float, float]:
         """Return the rms error of the predicted wrench over all orientations, N and N·m, from noise alone.
 
-        The mean square error is quadratic in the orientation matrix, so its mean over the rotations of the cube equals
-        the mean over all rotations.
+        The mean square error is quadratic in the orientation matrix, so the rotations of the cube have the mean of all.
         """
         over = self.wrench_covariance(np.swapaxes(SPECIAL_R_flange_base, 1, 2))
         variance = np.diagonal(over, axis1=1, axis2=2).mean(axis=0)
@@ -272,8 +271,7 @@ def ranges(lever_m: float) -> Array:
 def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
     """Return the variances (36,) of the entries of E of a usual sensor, without the gain common to all axes.
 
-    `gain_sigma` is the standard deviation of the diagonal entries, including the common part, and `lever_m` the ratio
-    of torque range to force range.
+    `gain_sigma` is that of the diagonal, including the common part; `lever_m` is torque range over force range.
     """
     F = ranges(lever_m)
     share = np.where(np.eye(6) > 0, np.sqrt(1 - COMMON_SHARE), CROSS_TALK_SHARE)
@@ -350,7 +348,6 @@ class SensorMatrix(Displayed):
         gain_sigma : float
             Standard deviation of the diagonal entries. Half of the variance is common to all axes, because calibration
             masses, ageing and temperature affect all of them. The others have half of it, relative to the ranges.
-        lever_m : float
         source : {"assumed", "data sheet"}
         """
         covariance = np.diag(np.concatenate([np.full(3, np.pi**2), own_variances(gain_sigma, lever_m)]))
@@ -419,8 +416,7 @@ class SensorMatrix(Displayed):
         # For a sensor that is declared perfect nothing is updated.
         if self.source != "loads" and shown is not None and C.any():
             H, coefficients, remaining = shown_by(p), shown.coefficients, shown.covariance[15:, 15:]
-            # Posterior mean of the variance of differences between the axes (scaled inverse chi-square). The variance
-            # common to all axes keeps its prior.
+            # Posterior mean of the variance between axes (scaled inverse chi-square); the common part keeps its prior.
             squares = (coefficients**2 + np.diag(remaining)) / self.shown_variance(p)
             size = (_USUAL_COUNTS + float(squares.sum())) / (_USUAL_COUNTS + len(H) - 2)
             C = size * (C - self.common) + self.common

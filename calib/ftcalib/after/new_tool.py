@@ -220,15 +220,11 @@ def _fit_tool(prior: CellPrior, R_base_flange: Array, wrench: Array, weights: Ar
         if float(step @ H @ step) < _SETTLED:
             break
     else:
-        raise NotObservable(
-            f"the fit has not converged in {_MOST_STEPS} steps: check the poses, or solve without the earlier result."
-        )
+        raise NotObservable(f"the fit has not converged in {_MOST_STEPS} steps: check the poses, or solve alone.")
     covariance = np.linalg.inv(H)[: 15 + k, : 15 + k]
     weight_N, sigma_N = new.weight_N, new.weight_sigma_N(covariance)
     if weight_N < _SIGNIFICANT * sigma_N:
-        raise NotObservable(
-            f"the weight of the tool, {weight_N:.2g} N (sigma {sigma_N:.2g} N), is not significant: check the sensor."
-        )
+        raise NotObservable(f"the tool weighs {weight_N:.2g} N (sigma {sigma_N:.2g} N), too little: check the sensor.")
     chi2 = float(np.einsum("ni,nij,nj->", left, weights, left) + r @ r)
     dof = 6 * n + len(r) - len(H)
     response = Response(coefficients, covariance) if prior.has_response else None
@@ -278,7 +274,6 @@ def together(results: Sequence[CalibrationResult], provenance: Mapping[str, Any]
     ----------
     results : sequence of CalibrationResult
         Results of runs that were solved separately, the oldest first.
-    provenance : mapping, optional
 
     Returns
     -------

@@ -68,10 +68,6 @@ def calibration_difference(first: EstimatedParameters, second: EstimatedParamete
     A field that is identical in both calibrations was copied, for example by an update of the bias. It is left out of
     the joint test, because its error is common. Gain and cross-talk of the sensor are not compared.
 
-    Parameters
-    ----------
-    first, second : Estimated
-
     Returns
     -------
     Difference

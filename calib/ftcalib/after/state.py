@@ -71,7 +71,6 @@ def with_bias_change(calibration: Calibrated, change: Array, variance: Array, *,
 
     Parameters
     ----------
-    calibration : CalibrationResult or Update
     change, variance : array, shape (6,)
         Change of the bias in N and N·m, sensor axes, and its variance.
     measured : bool
@@ -98,8 +97,7 @@ def reestimate(calibration: Calibrated, R_base_flange: Array, wrench: Array, noi
     K e + noise, where `noise` (6n, 6n) is the covariance of all mean readings, pose by pose. The weights are the
     inverse of noise + K C K'. The error of the new parameters is G (noise - K e) + kept e, with the estimator matrix G.
 
-    Raises `BadDataset` for inconsistent shapes, and `NotObservable` if the poses do not determine the parameters, or if
-    the weight is not significant.
+    Raises `BadDataset` for wrong shapes, `NotObservable` for undetermined parameters or an insignificant weight.
     """
     n, old, response = len(wrench), calibration.parameters, calibration.response
     R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))
@@ -157,7 +155,6 @@ def apply_update(
     ----------
     calibration : CalibrationResult
         Calibration from which the update was made.
-    update : Update
     provenance : mapping, optional
         Origin of the new readings. The id of the old calibration becomes its `parent`, and the kind of update `update`.
 
@@ -307,7 +304,6 @@ def tare(
 
     Parameters
     ----------
-    calibration : CalibrationResult or Update
     R_base_flange : array, shape (n, 3, 3)
         One pose is enough.
     dwells : sequence of n arrays, shape (N, 6)

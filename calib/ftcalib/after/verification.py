@@ -9,8 +9,7 @@ The noise model of a fit of few poses is uncertain. Two explanations of its resi
 
 * The components that the fit found (`CalibrationResult.components`), as if the new poses continued the tour.
 * The measured noise times a factor, and usual errors of sensor, arm and cable (`response_columns`,
-  `_smooth_error_covariance`). The residuals of the fit show the size of these errors, but not their dependence on joint
-  angles in one orientation.
+  `_smooth_error_covariance`). The fit shows the size of these errors, but not how they depend on joint angles.
 
 Under the second explanation, for given ratios of the variances, the squared distance of new readings from their
 prediction, relative to the mean square residual of the fit, has exactly an F distribution (predictive test of Chow,
@@ -205,8 +204,7 @@ def expected_with_smooth_errors(
     found have their estimated variance.
 
     The errors at the new poses are predicted from those of the fit, with a variance that increases with the distance in
-    orientation. A part depends on joint angles and not on the orientation. The fit shows this part only if its poses
-    vary more than the wrist joints.
+    orientation. A part depends on joint angles alone; a fit of turns of the wrist does not show this part.
     """
     p = calibration.parameters
     kept = np.ones(len(fitted), bool) if calibration.weights is None else calibration.weights > 0
@@ -341,8 +339,7 @@ def verify_calibration(
     """Return whether new poses agree with a calibration; on an alarm, also the change and the smallest update.
 
     An alarm is a p-value below `false_alarms` under both explanations of the residuals of the fit: the components that
-    it found, and smooth errors of sensor, arm and cable. The change is determined under the explanation with the higher
-    likelihood of the new readings.
+    it found, and smooth errors of sensor, arm and cable. The likelier one for the new readings determines the change.
 
     Each kind of change re-estimates some parameters and keeps the others with their uncertainty. It explains the
     readings unless its misfit exceeds that of 999 in 1000 good fits. Among these, the change with the lowest chi2 plus
@@ -350,7 +347,6 @@ def verify_calibration(
 
     Parameters
     ----------
-    calibration : CalibrationResult
     R_base_flange : array, shape (n, 3, 3)
         n >= 2 poses that were not used in the calibration, in the order of measurement. 6 poses separate all causes.
     wrench : array, shape (n, 6)

@@ -109,7 +109,6 @@ class CalibrationDataset(Displayed):
         wrench : array_like, shape (n, 6)
         wrench_cov : array_like, shape (n, 6, 6) or (6, 6), optional
         n_samples, t_s : array_like, shape (n,) or one number for all
-        meta : mapping, optional
 
         Raises
         ------

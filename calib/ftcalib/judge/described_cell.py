@@ -52,9 +52,7 @@ def directions(parameters: Parameters, covariance: Array, setup: Setup, written:
 
     Parameters
     ----------
-    parameters : Parameters
     covariance : array, shape (15, 15)
-    setup : Setup
     written : str
         Form in which the orientations were given, see `faults`.
     """
@@ -294,12 +292,10 @@ def contradictions(
 
     Parameters
     ----------
-    known : Known
     estimate : Parameters
         Estimate without known values.
     covariance : array, shape (15, 15)
         Covariance of `estimate`.
-    g_m_s2 : float
     sigmas : float
         Smallest difference that is reported, in standard deviations.
     up_in_base : array_like, shape (3,)

@@ -122,8 +122,7 @@ class _Rough:
 def faults(R_base_flange: Array, wrench: Array, up_in_base: ArrayLike = UP_IN_BASE, written: str = "") -> list[Finding]:
     """Return the mistake that explains a bad fit: form of orientations, zeroing, pairing of wrench and pose, or axes.
 
-    Reversing all three axes of force or torque is not detected here, because it only moves the centre of mass to the
-    other side of the sensor.
+    Reversing all three axes of force or torque is not detected here: it only mirrors the centre of mass.
 
     Parameters
     ----------

@@ -89,7 +89,6 @@ def implausible(
 
     Parameters
     ----------
-    estimate : Parameters
     residual_N : float
         Rms residual of the forces.
     described : bool

@@ -193,8 +193,7 @@ class Quality:
 def statistics(case: Case) -> Quality:
     """Return the statistics of a judgement, without findings.
 
-    Residuals, leave-one-out errors and expected errors over all orientations are compared with the weight, those of
-    torque with the weight at a lever.
+    Residuals, leave-one-out errors and expected errors are compared with the weight, those of torque with its moment.
     """
     found, t_s = case.found, case.t_s
     used, finest = found.weights > 0.5, _finest(found.wrench)

@@ -172,7 +172,6 @@ class Descent:
     ----------
     R_base_flange : array, shape (n, 3, 3)
     wrench : array, shape (n, 6)
-    constraints : Constraints
     """
 
     def __init__(self, R_base_flange: Array, wrench: Array, constraints: Constraints) -> None:

@@ -80,12 +80,10 @@ def select_explanation(
 
     Parameters
     ----------
-    problem : Linearised
     components : sequence of Component
         Components of the initial model.
     theta : array, shape (k,)
         Variances of these components.
-    candidates : sequence of Component
     needed : int, optional
         Number of initial components, the first ones, that must not be dropped; by default all.
     """
@@ -357,8 +355,7 @@ def explain(session: SessionData) -> tuple[Explanation, list[Minimum], float]:
 def _explanation_of_some(session: SessionData) -> Explanation | None:
     """Explain a subset of many poses; return None if the subset shows neither a walk nor structured errors.
 
-    Structured errors look like walks of many axes, which are slow to fit with many poses. The variance of structured
-    errors is not determined better by more poses.
+    Structured errors look like walks of many axes, slow to fit with many poses, which do not determine them better.
     """
     some = session.some(SEARCHED)
     e, _, _ = explain(some)

@@ -284,7 +284,6 @@ def fit(
         Time of each pose. Without times, or if one is NaN, the poses are taken as equally spaced in their order.
     drift : {"auto", "none", "linear", "random-walk"}
         Model of the bias during the session. "auto": chosen by restricted likelihood.
-    known : Known, optional
     g_m_s2 : float
         Used only to convert a known mass to a weight.
     gain_sigma : float

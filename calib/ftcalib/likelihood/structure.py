@@ -25,7 +25,6 @@ def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Arra
 
     Parameters
     ----------
-    parameters : Parameters
     R_base_flange : array, shape (n, 3, 3)
     middle : array, shape (3, 3)
         Mean of the orientations of the session, where errors of cable and arm are part of bias and mounting.
@@ -68,7 +67,6 @@ def hidden_columns(
 
     Parameters
     ----------
-    parameters : Parameters
     R_base_flange : array, shape (n, 3, 3)
     middle : array, shape (3, 3)
         As in `structure_columns`.

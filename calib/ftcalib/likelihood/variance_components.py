@@ -284,7 +284,6 @@ def left_out(noise: Noise, WJ: Array, u: Array, C: Array) -> tuple[Array, Array]
 
     Parameters
     ----------
-    noise : Noise
     WJ : array, shape (n, 6, m)
     u : array, shape (n, 6)
         Inverse noise covariance times the residuals.
@@ -388,8 +387,7 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
 def score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
     """Return the score (k,), the derivative of the restricted log-likelihood by the log variances, and the information.
 
-    The average information is (k, k). For components that are not part of the point, the score is the derivative at
-    variance zero, times `theta`.
+    The average information is (k, k). The score of other components is the derivative at variance zero times `theta`.
     """
     noise, C, G = at.own, at.C, at.G
     WX, u = at.weigh_columns()

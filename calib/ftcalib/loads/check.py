@@ -69,7 +69,6 @@ def check_hung_load(
         Calibration of the tool.
     reference : CalibrationResult or Update
         The calibration, or its tare.
-    load : KnownLoad
     poses : array, shape (n, 3, 3), array, shape (n, 6), and array, shape (n, 6, 6)
         R_base_flange, mean readings as measured, and their covariances.
     drift : array, shape (6,)

@@ -127,10 +127,8 @@ def fit_motion(
 
     Parameters
     ----------
-    rows : MotionRows
     known : Known, optional
         Known values, as in `ftcalib.solve`.
-    g_m_s2 : float
     prior : CellPrior, optional
         Earlier calibration of the cell, added after the last stage. Noise and contact are determined from the rows
         alone, so a wrong prior causes no row to be left out.
@@ -141,8 +139,7 @@ def fit_motion(
         reverses, are not taken for contact: only rows with residuals above `TOUCH_N` or `TOUCH_NM` are, and the noise
         of each row is estimated from its neighbours.
     zeroed_s : array, shape (k,)
-        Times at which the sensor was zeroed; the steps of the bias are already nearly removed from the rows. The bias
-        of the load is that after the last zeroing.
+        Times at which the sensor was zeroed; the rows are nearly free of these steps. The bias of the load is the last.
     """
     problem = Problem(rows, known, g_m_s2, point_mass=point_mass, zeroed_s=zeroed_s)
     # Forces alone allow several mountings: the robust fit of forces and torques with the smallest residuals is chosen.

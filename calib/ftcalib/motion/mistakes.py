@@ -143,7 +143,6 @@ def find_motion_mistakes(rows: MotionRows, free: FreeFit, spread_m: float) -> tu
 
     Parameters
     ----------
-    rows : MotionRows
     free : FreeFit
         Fit to these rows.
     spread_m : float
@@ -214,8 +213,7 @@ def _axis_findings(rows: MotionRows, change: Array) -> list[Finding]:
 def static_wrench(rows: MotionRows) -> tuple[Array, Array]:
     """Return the wrench (n, 6) without the effect of acceleration, and the median residuals (2,) of force and torque.
 
-    The effect of acceleration is taken from the linear function of the motion that fits best, so the result does not
-    depend on correct axes and signs.
+    The effect of acceleration is that of the best linear function of the motion, whatever the axes and signs.
     """
     X = np.column_stack([np.ones(len(rows)), rows.motion.columns()])
     linear = np.linalg.lstsq(X, rows.wrench, rcond=1e-9)[0]

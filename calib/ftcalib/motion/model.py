@@ -128,7 +128,6 @@ def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
     ----------
     load : MovingLoad
         The delay of the load is not applied here; use `Motion.earlier`.
-    motion : Motion
     bias : bool
         Whether to add the bias.
     """
@@ -293,8 +292,7 @@ class RowNoise:
     scale: Array
     """(states, 6) standard deviation of a row in each state, N and N·m."""
     filters: Array
-    """(order + 1, 6, order + 1) prediction-error filters (1, -a_1, …) / sigma_a, indexed by the number of earlier rows
-    in the run, channel and lag."""
+    """(order + 1, 6, order + 1) prediction-error filters (1, -a_1, …) / sigma_a: earlier rows, channel, lag."""
     root: Array
     """(6, 6) inverse square root of the correlation between the channels of the innovations."""
 

@@ -69,8 +69,7 @@ _REACH_M = 0.3
 SLOW_S, _SLOW_KNOT_S, _MOST_SLOW = 5.0, 2.5, 48
 # Prior of the rest of a zeroing step after its removal from the rows, one sigma.
 _ZEROED_N, _ZEROED_NM = 10.0, 1.0
-# Ridge term of the scaled equations: directions that the data do not determine get a standard deviation of 1e6 times
-# their scale instead of infinity.
+# Ridge term of the scaled equations: undetermined directions have a standard deviation of 1e6 times their scale.
 RIDGE = 1e-12
 # Expected standard deviations of the components that are always part of the model, because noise can hide them.
 EXPECTED: Mapping[str, float] = {
@@ -214,8 +213,7 @@ class Problem:
     def unseen(self, load: MovingLoad, residuals: Array) -> Array:
         """Return a root (n, 6, k) of the covariance of the rows due to smooth errors of the arm and a cable.
 
-        The arm's error has its expected standard deviation. That of the cable is the smooth part of the residuals
-        (n, 6) that exceeds the noise.
+        The arm's error has its expected size, and that of the cable is the smooth excess of the residuals (n, 6).
         """
         motion = self.rows.motion.earlier(load.delay_s, self.rows.rate)
         values = np.linalg.qr(self.functions(nearest_rotation(motion.R_base_flange)))[0]

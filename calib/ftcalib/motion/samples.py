@@ -32,8 +32,7 @@ GAP_S = 0.06
 
 # Longer gaps are rejected: the times belong to two recordings, or are wrong.
 LONGEST_GAP_S = 86400.0
-# A longer typical step between samples means that the times are in one of these units; the second number of each entry
-# is the longest step for that unit, s.
+# A longer typical step between samples suggests one of these units; the second number is its longest step, s.
 LONGEST_STEP_S = 0.25
 _TIME_UNITS = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
 # Largest time, s: the number of 10 ms intervals must fit in 64 bits.
@@ -205,8 +204,7 @@ def row_filter(row_s: float) -> Array:
 class Means:
     """Weighted means of one stream at every multiple of 10 ms, accumulated piece by piece.
 
-    The weights of samples fall linearly to 0 within 10 ms, so frequencies above 50 Hz are attenuated equally, whatever
-    the times of the samples.
+    The weights of samples fall linearly to 0 within 10 ms, so frequencies above 50 Hz are attenuated alike.
     """
 
     def __init__(self) -> None:

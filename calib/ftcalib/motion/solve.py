@@ -114,7 +114,6 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
         Whether a contact guard watched the motion, see `ftcalib.motion.estimate.fit_motion`.
     height_m : float, optional
         Configured height of the sensor origin above the flange face, which is compared with the estimate.
-    g_m_s2 : float
     setup : Setup
         The described cell, for the verdict.
     provenance : mapping, optional

@@ -130,13 +130,11 @@ def whitened_jacobian(R_base_flange: Array, guess: Guess) -> Array:
 def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
     """Return the predicted accuracy of a calibration from its poses (Cramér-Rao bound of the joint model).
 
-    If the guess includes errors of the sensor, the sigmas of mounting, weight and centre of mass include the hidden
-    errors of sensor, arm and mounts.
+    If the guess includes errors of the sensor, the sigmas include the hidden errors of sensor, arm and mounts.
 
     Parameters
     ----------
     R_base_flange : array, shape (n, 3, 3)
-    guess : Guess
 
     Returns
     -------

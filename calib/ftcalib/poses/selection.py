@@ -107,7 +107,6 @@ def choose(R_candidates: Array, n: int, guess: Guess) -> Indices:
         Orientations R_base_flange that the arm can reach.
     n : int
         Number of poses, 4 or more.
-    guess : Guess
 
     Returns
     -------
@@ -156,7 +155,6 @@ def next_pose(R_done: Array, R_candidates: Array, guess: Guess) -> Indices:
     R_done : array, shape (n, 3, 3)
         Orientations R_base_flange of the completed poses; n may be 0.
     R_candidates : array, shape (m, 3, 3)
-    guess : Guess
 
     Returns
     -------

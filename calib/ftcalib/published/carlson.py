@@ -442,7 +442,6 @@ def centre_of_mass(R_base_flange: Array, torque_Nm: Array, fit: ForceFit) -> Arr
     R_base_flange : array, shape (n, 3, 3)
     torque_Nm : array, shape (n, 3)
         Sensor axes.
-    fit : ForceFit
 
     Returns
     -------

@@ -39,8 +39,7 @@ def vougioukas(
     """Return weight, centre of mass and biases by linear least squares, for known mounting and direction of gravity.
 
     Source: S. Vougioukas, "Bias estimation and gravity compensation for force-torque sensors", 2001. With the unit
-    vectors u_i of gravity in the sensor frame, `F_i = w u_i + F0` and `T_i = (w P) x u_i + T0` are 6n linear equations
-    for the ten unknowns w, w P, F0 and T0.
+    vectors u_i of gravity in the sensor frame, `F_i = w u_i + F0` and `T_i = (w P) x u_i + T0` are linear equations.
 
     Parameters
     ----------
@@ -83,8 +82,7 @@ def wang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> For
     """Return weight, tilt of the base and force bias by linear least squares, for a known mounting.
 
     Source: N. Wang, J. Zhou, X. Zhang, "Research on the estimation of sensor bias and parameters of load based on
-    force-feedback", 2018. `F_i = R A_i F_b + F0` is linear in F_b and F0. Centre of mass and torque bias follow from
-    the torques, as in eqs 43-45 of Yu.
+    force-feedback", 2018. `F_i = R A_i F_b + F0` is linear in F_b and F0. The torques give the rest, eqs 43-45 of Yu.
 
     Parameters
     ----------

@@ -40,8 +40,7 @@ _SUMS = (
 def srom(R_base_flange: Array, wrench: Array, numbered: tuple[Indices, Array] | None = None) -> Parameters:
     """Return the parameters from the 24 special orientations, in any order, possibly all turned by one rotation.
 
-    The gravity force is computed for the nominal orientations (eqs 14-23). Rotation, biases and centre of mass follow
-    from the actual orientations (eqs 36-45).
+    The gravity force is that of the nominal orientations (eqs 14-23); the rest is from the actual ones (eqs 36-45).
 
     Parameters
     ----------

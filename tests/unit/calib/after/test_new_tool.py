@@ -196,5 +196,5 @@ def test_poses_that_do_not_show_a_tool_are_refused() -> None:
     with pytest.raises(NotObservable, match="do not determine the tool"):
         new_tool(calibrated(), poses(OTHER, np.tile(FOUR[:1], (4, 1, 1)), 0))
     nothing = replace(OTHER, gravity_force_base_N=1e-4 * TRUTH.gravity_force_base_N)
-    with pytest.raises(NotObservable, match=r"the weight of the tool, .* N \(sigma .* N\), is not significant"):
+    with pytest.raises(NotObservable, match=r"the tool weighs .* N \(sigma .* N\), too little"):
         new_tool(calibrated(), poses(nothing, FOUR, 0))
