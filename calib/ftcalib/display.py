@@ -70,8 +70,7 @@ class Summary(NamedTuple):
 class Displayed:
     """Base of objects that print as a short summary and show a table in a notebook.
 
-    A dataclass that inherits from it needs ``repr=False``. Unless `_summary` is overridden, the summary lists the
-    fields: of arrays the shape, and of other objects the title.
+    A dataclass that inherits from it needs ``repr=False``. The summary lists its fields, of arrays the shape.
     """
 
     __slots__ = ()

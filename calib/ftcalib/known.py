@@ -43,7 +43,6 @@ class Known:
     mass_kg: float | None = None
     """Mass of the load on the sensor, kg."""
     mass_tolerance_kg: float = 0.0
-    """Tolerance of the mass, kg."""
 
     def __post_init__(self) -> None:
         if self.R_flange_sensor is not None or self.yaw_only:

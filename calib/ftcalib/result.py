@@ -139,7 +139,6 @@ class CalibrationResult(Displayed, Calibrated):
     """Weighted sum of squared residuals of the used poses with the measured noise alone, without drift and
     `components`; with the noise from the residuals if it was not measured."""
     dof: int
-    """Degrees of freedom of `chi2`."""
     noise_source: NoiseSource
     """Source of the noise: the spread within each pose, or the residuals of the fit."""
     g_m_s2: float
@@ -368,8 +367,7 @@ class CalibrationResult(Displayed, Calibrated):
             As measured, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
         response : bool
-            Whether to apply gain and cross-talk of the sensor to the weight. False: the result of a program that uses
-            only mounting, weight, centre of mass and bias.
+            Whether to apply gain and cross-talk of the sensor to the weight. False: as programs that lack them.
 
         Returns
         -------
@@ -407,8 +405,7 @@ class CalibrationResult(Displayed, Calibrated):
     def shown_response(self) -> Response:
         """Gain and cross-talk as estimated; if not found, zero with the posterior covariance of usual errors.
 
-        A fit of n poses determines a gain as well as n readings of the weight with the leave-one-out error. Half of
-        this information is used, because a small gain is not selected.
+        A fit of n poses determines a gain as well as n readings of the weight do; half of this information is used.
         """
         if self.response is not None:
             return self.response

@@ -8,7 +8,6 @@ class Sampling:
     """Averaging time, time-out and number of attempts at each pose."""
 
     average_s: float = 2.0
-    """Averaging time at a pose, s."""
     still_timeout_s: float = 10.0
     """Time-out for the arm to come to rest, s."""
     attempts: int = 2

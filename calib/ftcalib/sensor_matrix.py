@@ -78,8 +78,7 @@ USUAL = USUAL_GAIN * np.array([1.0, 1.0, *[CROSS_TALK_SHARE] * 9])
 # Sum of the squared entries of each basis matrix, those of the cross-talk relative to the lever.
 SQUARES = np.array([1.0, 1, 2, 2, 2, 1, 1, 1, 2, 2, 2])
 
-# Weights with which the squared coefficients add up to the variance of one entry, if all nine entries are independent.
-# The symmetric part of two entries has half their variance.
+# Weights with which the squared coefficients add up to the variance of one entry, if all nine are independent.
 _WEIGHTS = np.array([1, 1, 2, 2, 2]) / 5
 # Smallest sigma of the gain common to all axes, which no orientation shows.
 LEAST_COMMON_GAIN = 0.002

@@ -80,8 +80,7 @@ def solve(
     g_m_s2 : float
         Acceleration of gravity; the mass is the weight divided by it.
     setup : Setup
-        Description of the cell, for the verdict. Published methods that need gravity use its up direction. A known
-        direction of gravity also declares the up direction.
+        Description of the cell, for the verdict. Methods that need gravity use its up direction; a known one sets it.
     provenance : mapping, optional
         Stored with the result, together with the hash of the dataset. Must be valid JSON.
     as_published : bool

@@ -3,8 +3,7 @@
 `new_tool` uses mounting, direction of gravity, gain and cross-talk of an earlier result, with their covariance, as a
 prior. Weight, centre of mass and bias have no prior. The misfit of poses and prior tests whether the prior still holds.
 
-`together` combines runs of one tool with a different bias in each run. Each run is solved separately, and the shared
-parameters are averaged with information weights.
+`together` combines runs that were solved separately, each with its own bias, by averages weighted by information.
 """
 
 from collections.abc import Callable, Mapping, Sequence

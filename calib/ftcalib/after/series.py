@@ -262,8 +262,7 @@ def trend(t: Array, values: Array, covariance: Array) -> Trend:
     """Return a line fitted by generalised least squares, with a test of its slope against zero.
 
     The slope is tested with the stated covariances (chi-square, k degrees of freedom) and with the scatter about the
-    line (F test, k and k (n - 2)). The p-value is the larger of the two, so neither covariances that are too small nor
-    an accidentally small scatter produces a trend.
+    line (F test, k and k (n - 2)). The p-value is the larger of the two, so both must show the trend.
 
     Parameters
     ----------

@@ -309,8 +309,7 @@ def tare(
     dwells : sequence of n arrays, shape (N, 6)
         Consecutive samples in each pose, N >= 20, as measured, N and N·m, in the sensor frame.
     drift_N, drift_Nm : float
-        Expected drift of the biases since the calibration. A push of up to about four times this size is not detected,
-        because one pose cannot distinguish it from drift.
+        Expected drift of the biases since the calibration. A push of up to about four times this size is not detected.
 
     Raises
     ------

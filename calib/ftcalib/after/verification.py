@@ -147,8 +147,7 @@ def expected_as_found(calibration: CalibrationResult, R_base_flange: Array, wren
     """Return the distribution of new readings with the components of the fit, as if the new poses continued the tour.
 
     A random walk with variance q² per pose adds q² up to the first new pose, or q² (N / 3 + 1) to the mean bias of N
-    poses, as in earlier files. A linear drift is continued for the duration of the tour. Without components, the
-    measured noise has the factor chi2 / dof of the fit.
+    poses, as in earlier files. A linear drift continues as long as the tour. Without components the factor is chi2/dof.
     """
     n, later = len(wrench_cov), np.arange(len(wrench_cov), dtype=np.float64)
     n_used = calibration.n_poses - len(calibration.rejected_poses)
@@ -292,7 +291,6 @@ class Verification:
     change: Change | None
     """The change; None if passed, or if no change explains the readings."""
     reason: str
-    """Sentence with the result of the test and the change."""
     bias_change: Array
     """(6,) change of the bias since the calibration if nothing else has changed; force first, N and N·m."""
     bias_sigma: Array

@@ -159,8 +159,7 @@ def weigh_load(  # noqa: PLR0913 - readings, noise and prior knowledge
     orientation_sigma_rad : float
         Standard deviation per axis of each reported orientation.
     contact : ContactResponse, optional
-        Response of the sensor determined with known loads. Mass and centre of mass are then decoded, and `scale_sigma`
-        is due to the remaining errors. `moment` is not decoded.
+        Response of the sensor determined with known loads. It decodes mass and centre of mass, but not `moment`.
 
     Raises
     ------

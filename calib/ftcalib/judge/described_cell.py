@@ -245,8 +245,7 @@ def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float
     """Return the significant distance of the centre of mass outside the described cylinders; negative inside.
 
     A body's centre of mass lies in its convex hull. The distance from the hull is the maximum over all directions of
-    the extent of the point minus that of the hull, less a multiple of sigma. If the height of the sensor is unknown,
-    its origin may be anywhere between flange face and tip.
+    the extent of the point minus that of the hull, less a multiple of sigma. Unknown heights count as any.
     """
     height_m = setup.sensor_height_m
     lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2

@@ -110,8 +110,7 @@ class _Rough:
     def score(self, up_in_base: Array) -> float:
         """Return the logarithm of the residuals plus a penalty of implausible results; lower is better.
 
-        The penalty decides between interpretations that fit equally well with different mountings of robot and sensor,
-        such as quaternions in another order and inverted orientations.
+        The penalty decides between interpretations that fit equally well with different mountings of robot and sensor.
         """
         p = self.parameters
         cosine = -float(p.gravity_force_base_N @ up_in_base) / (p.weight_N * _vector_norm(up_in_base) or 1.0)

@@ -42,8 +42,7 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
         Measured force, sensor frame.
     weights : (n,) or (n, 3, 3)
         1 / variance of each pose's force, or its information matrix (inverse covariance). Of a matrix only the mean of
-        its diagonal is used, because the cost is quadratic only if the weights do not depend on the rotation. The
-        cost is then an approximation, sufficient for starting points.
+        its diagonal is used, because the cost must be quadratic. This is accurate enough for starting points.
     with_bias : bool
         Whether the sensor has an unknown force bias.
 
@@ -55,8 +54,7 @@ def force_cost(R_base_flange: Array, force_N: Array, weights: Array, *, with_bia
 
     Notes
     -----
-    Yu et al. eliminate the same unknowns in eq. (32) (their `H.T @ H`, with r transposed), but minimise over the sphere
-    of all r, which needs one pose more and is less exact.
+    Yu et al. eliminate the same unknowns in eq. (32), but minimise over the sphere of all r, which needs one pose more.
     """
     gram, _ = _centred_gram(R_base_flange, force_N, weights, with_bias=with_bias)
     return force_cost_from_gram(gram, with_bias=with_bias)
@@ -128,8 +126,7 @@ def minima(Q: Array) -> list[RotationMinimum]:
 
     Notes
     -----
-    Deterministic: Newton's method with limited steps, from evenly spread starts at the same time. Along a direction of
-    negative curvature the absolute curvature is used.
+    Deterministic: Newton's method with limited steps and absolute curvatures, from evenly spread starts at once.
     """
     quartic, _ = _quartic(Q)
     q, cost, curvature = _descend(quartic, _super_fibonacci(_STARTS))

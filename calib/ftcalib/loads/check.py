@@ -22,7 +22,6 @@ class LoadCheck(NamedTuple):
     read_N: float
     """Measured force along gravity, mean over the poses, N."""
     expected_N: float
-    """Weight of the load, N."""
     scale_error: float
     """Relative error of the measured force: `read_N` / `expected_N` - 1."""
     scale_sigma: float
@@ -34,7 +33,6 @@ class LoadCheck(NamedTuple):
     off_m: float
     """Distance of the line of action from the position of the load, m; NaN if no position is given."""
     off_sigma_m: float
-    """Standard deviation of `off_m`, m."""
 
     @property
     def is_within(self) -> bool:

@@ -1,8 +1,7 @@
 """Calibration of a sensor's matrix from runs with known loads: a joint fit of all runs, and detection of mistakes.
 
 Source: S. Traversaro, D. Pucci, F. Nori, "In situ calibration of six-axis force-torque sensors using accelerometer
-measurements", ICRA 2015 (arXiv 1410.0885), extended by a prior of the matrix, unknown positions, and disturbances whose
-standard deviations are estimated by marginal likelihood.
+measurements", ICRA 2015 (arXiv 1410.0885), extended by a prior of the matrix, unknown positions and disturbances.
 """
 
 from collections.abc import Mapping, Sequence

@@ -130,8 +130,7 @@ def fit_motion(
     known : Known, optional
         Known values, as in `ftcalib.solve`.
     prior : CellPrior, optional
-        Earlier calibration of the cell, added after the last stage. Noise and contact are determined from the rows
-        alone, so a wrong prior causes no row to be left out.
+        Earlier calibration of the cell, added after the last stage, so a wrong prior causes no row to be left out.
     point_mass : bool
         Whether the inertia about the centre of mass is known to be 0.
     guarded : bool

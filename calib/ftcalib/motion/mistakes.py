@@ -231,8 +231,7 @@ def _other_point(to_com: Array, com: Array, sigma: Array, *, behind: bool, uprig
 
     `to_com` and `com` are the vectors to the centre of mass from the point of the poses and from the reference point
     of the torques, in the axes of the poses, and `sigma` is the standard deviation of their difference. `behind` means
-    that the centre of mass lies on the robot's side of the sensor although no channel is reversed, `upright` that the
-    z axes of sensor and poses point in the same direction.
+    that the centre of mass lies on the robot's side though no channel is reversed, `upright` that the z axes agree.
     """
     point = to_com - com
     aside_m, height_m = float(np.linalg.norm(point[:2])), float(point[2])

@@ -243,8 +243,7 @@ def _vee(M: Array) -> Array:
     return np.stack([M[..., 2, 1] - M[..., 1, 2], M[..., 0, 2] - M[..., 2, 0], M[..., 1, 0] - M[..., 0, 1]], axis=-1)
 
 
-# Noise model of the rows, from their residuals: autoregressive, correlated between channels, with one scale for each
-# state of motion (at rest, or a class of speed).
+# Noise model of the rows: autoregressive, correlated between channels, one scale for each state of motion.
 
 REST_RAD_S = 0.02
 # Number of speed classes of moving rows.

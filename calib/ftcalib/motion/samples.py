@@ -74,8 +74,7 @@ NARROW_S = 0.28
 class SampleClock:
     """Measurement times of the samples of one device: a line below the times of receipt, updated while samples arrive.
 
-    Each quarter of a second contributes its least delayed sample. The line is fitted below those of the last ten
-    seconds. For a complete recording use `measured_s`.
+    Each quarter of a second contributes its least delayed sample. The line lies below those of the last ten seconds.
 
     Parameters
     ----------
@@ -321,7 +320,6 @@ class MotionRows:
     """Wrench and motion on one clock, with the same filter, wherever both have no gap."""
 
     t_s: Array
-    """(n,) times, s."""
     wrench: Array
     """(n, 6) N and N·m."""
     motion: Motion

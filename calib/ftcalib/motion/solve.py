@@ -334,8 +334,7 @@ def _orientations(rows: MotionRows) -> Array:
 def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
     """Return the wrench (n, 6) that the sensor would read at rest in the orientation of each row.
 
-    If the fit is poor, its inertial wrench is wrong. Then that of the best linear function of the motion is subtracted
-    instead, which does not depend on correct axes and signs.
+    If the fit is poor, the inertial wrench is that of the best linear function, whatever the axes and signs.
     """
     static = predict(best.load.static, nearest_rotation(rows.motion.R_base_flange)) + best.residuals
     kept = best.residuals[best.kept, :3]

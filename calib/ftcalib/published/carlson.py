@@ -75,8 +75,7 @@ class ForceEquations:
 def force_equations(R_base_flange: Array, force_N: Array, *, bias: bool, method: str, min_poses: int) -> ForceEquations:
     """Return the equations of a method after checking its input; estimating a `bias` needs one more pose.
 
-    Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a pose or force that is not finite, and
-    `ValueError` for other shapes than (n, 3, 3) and (n, 3).
+    Raises `NotObservable` for fewer than `min_poses`, `BadDataset` for a value not finite, `ValueError` for shapes.
     """
     n = len(force_N)
     if R_base_flange.shape != (n, 3, 3) or force_N.shape != (n, 3):

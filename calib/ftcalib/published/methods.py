@@ -217,8 +217,7 @@ def published(
     R_flange_sensor : array, shape (3, 3), optional
         Known mounting for vougioukas, wang and, up to a turn about flange z, yang. Default: the identity.
     as_published : bool
-        Run one of `CARLSON` in its printed form: biases of force and torque are zero, the centre of mass follows from
-        his eqs 4-5, and the Cayley transform is applied once.
+        Run one of `CARLSON` as printed: without biases, the centre of mass from his eqs 4-5, one Cayley transform.
 
     Raises
     ------

@@ -150,8 +150,7 @@ def special_numbers(R_base_flange: Array, *, others: bool = False) -> tuple[Indi
     number : int array, shape (n,)
         Row i is orientation number[i] + 1 of the paper, or none of the 24 if number[i] is -1.
     Y : array, shape (3, 3)
-        Rotation with R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T approximately: the identity if it fits
-        within rounding errors, else the smallest rotation that fits best.
+        Rotation with R_base_flange[i] = Y @ SPECIAL_R_flange_base[number[i]].T approximately; the identity if it fits.
 
     Raises
     ------
