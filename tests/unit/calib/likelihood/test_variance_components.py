@@ -29,6 +29,10 @@ from ftcalib.likelihood.variance_components import (
 )
 from ftcalib.model import Array
 
+SLOPE_FORCE, SLOPE_TORQUE = channel_component("slope", FORCE), channel_component("slope", TORQUE)
+WALK_FORCE, WALK_TORQUE = channel_component("walk", FORCE), channel_component("walk", TORQUE)
+WHITE_FORCE, WHITE_TORQUE = channel_component("white", FORCE), channel_component("white", TORQUE)
+
 N = 15
 
 
@@ -97,13 +101,7 @@ def test_the_walk_multiplies_as_its_covariance() -> None:
     np.testing.assert_allclose(walk_times(time, X), K @ X)
 
 
-ALL = (
-    channel_component("white", FORCE),
-    channel_component("white", TORQUE),
-    ROTATION,
-    channel_component("walk", FORCE),
-    channel_component("walk", [5]),
-)
+ALL = (WHITE_FORCE, WHITE_TORQUE, ROTATION, WALK_FORCE, channel_component("walk", [5]))
 THETA = np.array([0.3, 0.2, 0.05 / 400, 0.4, 0.1])
 
 
@@ -137,9 +135,7 @@ def problem(rng: np.random.Generator, n: int, components: tuple[Component, ...],
     )
 
 
-@pytest.mark.parametrize(
-    "components", [ALL, (*ALL[:3], channel_component("slope", FORCE), channel_component("slope", TORQUE))]
-)
+@pytest.mark.parametrize("components", [ALL, (*ALL[:3], SLOPE_FORCE, SLOPE_TORQUE)])
 def test_slope_and_curvature_are_those_of_the_restricted_likelihood(components: tuple[Component, ...]) -> None:
     rng = np.random.default_rng(5)
     p = problem(rng, N, ALL, THETA)
@@ -187,12 +183,12 @@ def test_variances_are_recovered() -> None:
 
 
 def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
-    candidates = [*ALL[:3], channel_component("walk", FORCE), channel_component("walk", TORQUE)]
+    candidates = [*ALL[:3], WALK_FORCE, WALK_TORQUE]
     spurious, right = 0, 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
         spurious += len(select_explanation(problem(rng, 30, (), np.zeros(0)), [], np.zeros(0), candidates).components)
-        walk = channel_component("walk", FORCE)
+        walk = WALK_FORCE
         at = select_explanation(problem(rng, 30, (walk,), np.array([0.02])), [], np.zeros(0), candidates)
         right += walk in at.components
     assert spurious <= 4  # 2 % each, of 100
@@ -201,7 +197,7 @@ def test_nothing_is_found_where_nothing_is_and_the_walk_where_one_is() -> None:
 
 @pytest.mark.parametrize("walk_first", [False, True])
 def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
-    white, walk = channel_component("white", FORCE), channel_component("walk", FORCE)
+    white, walk = WHITE_FORCE, WALK_FORCE
     both = (walk, white) if walk_first else (white, walk)
     rng = np.random.default_rng(7)
     for really, needed, kept in (
@@ -216,7 +212,7 @@ def test_what_others_make_needless_is_dropped(walk_first: bool) -> None:
 
 
 def test_what_is_always_needed_is_not_dropped() -> None:
-    three = (channel_component("walk", FORCE), *ALL[:2])
+    three = (WALK_FORCE, *ALL[:2])
     p = problem(np.random.default_rng(8), 40, ALL[:2], np.full(2, 0.3))
     at = maximise(p, three, np.full(3, 0.1))
     assert _prune(p, at, 1).components == three
@@ -244,10 +240,10 @@ def test_a_linear_drift_is_preferred_where_it_fits_better() -> None:
     rng = np.random.default_rng(9)
     p = problem(rng, 30, (), np.zeros(0))
     p.r[:, :3] += centre(p.time)[:, None] * [2.0, -1.5, 1.0]
-    at = select_explanation(p, [], np.zeros(0), [channel_component("walk", FORCE)])
+    at = select_explanation(p, [], np.zeros(0), [WALK_FORCE])
     assert [c.kind for c in with_slopes_instead(p, at, 0).components] == ["slope"]
-    q = problem(rng, 30, (channel_component("walk", FORCE),), np.array([0.2]))
-    at = select_explanation(q, [], np.zeros(0), [channel_component("walk", FORCE)])
+    q = problem(rng, 30, (WALK_FORCE,), np.array([0.2]))
+    at = select_explanation(q, [], np.zeros(0), [WALK_FORCE])
     assert with_slopes_instead(q, at, 0) is at
 
 
@@ -297,7 +293,7 @@ def test_each_component_has_its_columns() -> None:
             p.X[..., p.columns(channel_component("cable", share))], p.effects["cable"][..., own]
         )
     slopes = centre(p.time)[:, None, None] * np.eye(6)
-    np.testing.assert_array_equal(p.X[..., p.columns(channel_component("slope", TORQUE))], slopes[..., 3:])
+    np.testing.assert_array_equal(p.X[..., p.columns(SLOPE_TORQUE)], slopes[..., 3:])
     np.testing.assert_array_equal(p.X[..., -1], p.r)
     assert all(p.columns(channel_component(kind, FORCE)) is None for kind in ("white", "walk"))
     assert p.columns(ROTATION) is None
@@ -306,30 +302,26 @@ def test_each_component_has_its_columns() -> None:
 def test_numbers_and_limits_of_the_components() -> None:
     p = small()
     sizes = {ROTATION: 20, GAINS: 5, CROSS_TALK: 6, HYSTERESIS: 12}
-    sizes |= {
-        channel_component("white", FORCE): 30,
-        channel_component("walk", [4]): 10,
-        channel_component("slope", TORQUE): 3,
-    }
+    sizes |= {WHITE_FORCE: 30, channel_component("walk", [4]): 10, SLOPE_TORQUE: 3}
     assert {c: p.size(c) for c in sizes} == sizes
     limits = {ROTATION: np.radians(3), GAINS: 0.05, CROSS_TALK: 1.5 * 0.05, HYSTERESIS: 0.03}
     assert {c: p.largest(c) for c in limits} == pytest.approx({c: limit**2 for c, limit in limits.items()})
-    assert p.largest(channel_component("walk", FORCE)) == np.inf
+    assert p.largest(WALK_FORCE) == np.inf
     assert (ROTATION.needed, GAINS.needed, CROSS_TALK.needed, HYSTERESIS.needed) == (2, 3, 3, 3)
-    worth = point(p, (channel_component("white", FORCE), GAINS), np.array([0.1, 0.05**2]))
+    worth = point(p, (WHITE_FORCE, GAINS), np.array([0.1, 0.05**2]))
     assert worth.worth == pytest.approx(worth.loglik - 5)
     assert worth.too_large
-    assert not point(p, (channel_component("white", FORCE), GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
+    assert not point(p, (WHITE_FORCE, GAINS), np.array([0.1, 0.99 * 0.05**2])).too_large
 
 
 def test_in_units_a_component_is_as_large_as_the_white_noise_of_the_used_poses() -> None:
     p = small()
     at = point(p, (), np.zeros(0))
     expected = {
-        channel_component("white", FORCE): 0.04,
+        WHITE_FORCE: 0.04,
         channel_component("white", range(6)): 0.025,
-        channel_component("slope", TORQUE): 0.01,
-        channel_component("walk", TORQUE): 0.01 / 10,
+        SLOPE_TORQUE: 0.01,
+        WALK_TORQUE: 0.01 / 10,
         ROTATION: min(0.04 / 2**2, 0.01 / 1**2),
         GAINS: 0.01 / (10 * 0.5**2),
     }
@@ -338,7 +330,7 @@ def test_in_units_a_component_is_as_large_as_the_white_noise_of_the_used_poses()
 
 @pytest.mark.parametrize("share", [1.0, 0.5, 1e-3])
 def test_the_expected_white_noise_is_that_of_a_normal_likelihood_and_a_uniform_sigma(share: float) -> None:
-    white = channel_component("white", FORCE)
+    white = WHITE_FORCE
     p = problem(np.random.default_rng(12), 8, (white,), np.array([0.05]))
     best = maximise(p, (white,), np.array([0.05]))
     at = point(p, (white,), share * best.theta)
