@@ -58,9 +58,8 @@ def _errors(kind: str, seed: int) -> tuple[np.ndarray, np.ndarray]:
     rows = motion_rows(wrench.result(), poses.result(), truth.delay_s)
     found = fit_motion(rows, None, G_M_S2)
     inertia = truth.inertia_kg_m2[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
-    load = MovingLoad(
-        Parameters(**truth.to_dict()), G_M_S2, inertia, truth.height_m, truth.delay_s - rows.delay_s, response
-    )
+    static, delay_s = Parameters(**truth.to_dict()), truth.delay_s - rows.delay_s
+    load = MovingLoad(static, G_M_S2, inertia, truth.height_m, delay_s, response)
     error = np.concatenate([load.static.difference(found.load.static), found.load.vector[15:] - load.vector[15:]])
     return error, np.sqrt(np.diag(found.covariance))
 

@@ -246,11 +246,7 @@ def test_an_error_that_a_fit_of_six_poses_cannot_find_is_no_false_alarm() -> Non
 def test_a_change_is_found_all_the_same() -> None:
     fitted, R, wrench = inexact(6, 1)
     found = verify_calibration(
-        solve(fitted, setup=EXACT),
-        R,
-        wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]),
-        noise_of(6),
-        fitted=fitted,
+        solve(fitted, setup=EXACT), R, wrench + np.array([0.3, 0.0, 0.4, 0, 0, 0]), noise_of(6), fitted=fitted
     )
     assert (found.passed, found.change) == (False, "bias")
 

@@ -90,12 +90,7 @@ def test_variances_start_at_the_mean_square_of_the_used_poses_or_at_their_noise(
     own = session(R24, residuals=residuals)
     problem = own.linearise(TOOL, np.arange(24) > 0)
     np.testing.assert_array_equal(own.start(problem, []), np.zeros(0))
-    groups = [
-        channel_component("white", FORCE),
-        channel_component("white", TORQUE),
-        channel_component("white", [4]),
-        channel_component("walk", FORCE),
-    ]
+    groups = [*(channel_component("white", on) for on in (FORCE, TORQUE, [4])), channel_component("walk", FORCE)]
     np.testing.assert_allclose(own.start(problem, groups), [0.09, SIGMA_NM**2, SIGMA_NM**2, 0.09 / 240])
 
 

@@ -44,6 +44,7 @@ G = 9.80665
 ROW_S = 0.12
 SIGMA = np.repeat([0.2, 0.01], 3)
 ALL_ON = {"gain": 0.01, "cross_talk": 3e-3, "walk_N": 0.05, "walk_Nm": 2e-3}
+Posed = tuple[Problem, MovingLoad, Array]
 
 
 def rows_of(
@@ -118,7 +119,7 @@ class Dense:
 
 
 @pytest.fixture(scope="module")
-def posed() -> tuple[Problem, MovingLoad, Array]:
+def posed() -> Posed:
     truth = replace(load_of(Truth(), 3e-3), delay_s=0.01)
     rows = rows_of(45, truth, row_s=0.4)
     problem = Problem(rows, None, G, point_mass=False)
@@ -130,7 +131,7 @@ def posed() -> tuple[Problem, MovingLoad, Array]:
     return problem, near, effects
 
 
-def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, MovingLoad, Array]) -> None:
+def test_the_bias_has_a_knot_every_five_seconds(posed: Posed) -> None:
     problem, _, _ = posed
     assert len(problem.knots) == 1 + round(44 * 0.4 / KNOT_S)
     assert (problem.knots[0], problem.knots[-1]) == (0.0, problem.rows.t_s[-1])
@@ -143,9 +144,7 @@ def test_the_bias_has_a_knot_every_five_seconds(posed: tuple[Problem, MovingLoad
 
 
 @pytest.mark.parametrize("off", [(), ("gain",), ("cross_talk", "walk_Nm"), ("walk_N",), tuple(ALL_ON)])
-def test_a_step_is_that_of_generalised_least_squares(
-    posed: tuple[Problem, MovingLoad, Array], off: tuple[str, ...]
-) -> None:
+def test_a_step_is_that_of_generalised_least_squares(posed: Posed, off: tuple[str, ...]) -> None:
     problem, load, effects = posed
     sizes = {name: 0.0 if name in off else size for name, size in ALL_ON.items()}
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
@@ -179,9 +178,7 @@ def test_a_step_is_that_of_generalised_least_squares(
 
 
 @pytest.mark.parametrize("name", _SIZES)
-def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(
-    posed: tuple[Problem, MovingLoad, Array], name: str
-) -> None:
+def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: Posed, name: str) -> None:
     problem, load, effects = posed
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
     sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
@@ -256,7 +253,7 @@ def test_sigma_of_the_bias_is_right_beside_noise_of_seconds() -> None:
     assert 0.7 < np.sqrt(np.mean(errors**2)) < 2.2
 
 
-def test_sums_of_many_rows_are_those_of_their_parts(posed: tuple[Problem, MovingLoad, Array]) -> None:
+def test_sums_of_many_rows_are_those_of_their_parts(posed: Posed) -> None:
     """More rows than are summed at once, noise that is correlated, and rows that are left out."""
     _, load, _ = posed
     rows = rows_of(1010, load, seed=4)

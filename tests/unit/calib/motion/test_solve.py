@@ -188,9 +188,8 @@ def of_range(degrees: float) -> MotionRows:
 
 def test_a_narrow_motion_is_named_by_its_range_or_its_error() -> None:
     covariance = np.zeros((SIZE, SIZE))
-    assert [
-        one.severity for one in _narrow_findings(of_range(44), best_of(covariance=covariance), explained=False)
-    ] == ["limit"]
+    (one,) = _narrow_findings(of_range(44), best_of(covariance=covariance), explained=False)
+    assert one.severity == "limit"
     assert _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False) == []
     covariance[2, 2] = 1.0
     (one,) = _narrow_findings(of_range(46), best_of(covariance=covariance), explained=False)

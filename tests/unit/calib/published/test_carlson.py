@@ -26,13 +26,7 @@ Method = Callable[[Array, Array, Array, bool], ForceFit]
 
 
 def nullspace_all_pairs(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
-    """Unknown gravity by the nullspace method as published, with all pairwise differences (eqs. 22-26, section 5).
-
-    Needs O(n^2) memory and time: for comparison with `nullspace`, which is equal. A must be base to flange in eq. 22
-    (the text says the opposite). With bias the constant h enters the differences as
-    `(A_k A_i^T F_i - F_k) r = (A_k A_i^T - I) h` and is eliminated by least squares.
-
-    """
+    """The nullspace method as published, of all pairwise differences, with A base to flange and h eliminated."""
     eq = carlson._linear_equations(R_base_flange, force_N, bias=bias, method="the nullspace method")
     i, k = np.triu_indices(len(force_N), 1)
     A_k_i = R_base_flange[k].transpose(0, 2, 1) @ R_base_flange[i]
