@@ -25,11 +25,7 @@ TRUTH = Parameters(
 )
 COV = np.tile(np.diag([0.05, 0.05, 0.05, 0.001, 0.001, 0.001]) ** 2, (10, 1, 1))
 DATA = CalibrationDataset(
-    R,
-    predict(TRUTH, R) + RNG.normal(size=(10, 6)) * np.sqrt(np.diag(COV[0])),
-    COV,
-    np.full(10, 1000),
-    np.arange(10.0),
+    R, predict(TRUTH, R) + RNG.normal(size=(10, 6)) * np.sqrt(np.diag(COV[0])), COV, np.full(10, 1000), np.arange(10.0)
 )
 EXACT = Setup(sensor_accuracy_percent=0.0)
 RESULT = solve(DATA, g_m_s2=9.81, setup=EXACT, provenance={"serial": "FT1", "argv": ["calibrate"]})

@@ -202,11 +202,7 @@ def spin(axis: str, tilt_deg: float, n: int = 8) -> Array:
         (R24[:4], "lrom", "4 poses are too few.* 5 .* add 1"),
         (np.tile(R24[:1], (9, 1, 1)), "ml", "9 poses have the same orientation"),
         (np.tile(R24[:3], (3, 1, 1)), "ml", "9 poses have only 3 different"),
-        (
-            spin("z", 150.0),
-            "ml",
-            "the last joint .* cannot be separated",
-        ),
+        (spin("z", 150.0), "ml", "the last joint .* cannot be separated"),
         (spin("x", 0.0), "ml", "about the flange's x axis only: .* cannot be separated"),
         (R24[:23], "srom", "24 orientations .*: missing 24. Use LROM"),
     ],

@@ -10,13 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ftcalib import CalibrationDataset, CalibrationResult, solve
 from ftcalib.judge.faults import rough_fit
-from ftcalib.judge.session_change import (
-    KINDS,
-    SessionChange,
-    _groups,
-    _likeliest_change,
-    bias_steps,
-)
+from ftcalib.judge.session_change import KINDS, SessionChange, _groups, _likeliest_change, bias_steps
 from ftcalib.judge.verdict import Case, statistics
 from ftcalib.likelihood.fit import fit
 from ftcalib.likelihood.session import LEVER_M
@@ -171,8 +165,7 @@ TOUCHED = replace(OTHER, torque_bias_Nm=TOOL.torque_bias_Nm + np.array([0.03, 0,
 
 
 @pytest.mark.parametrize(
-    ("rows", "measured"),
-    [(COUNT >= 3, True), (COUNT >= 10, False), (COUNT >= 21, True), (COUNT % 2 == 1, False)],
+    ("rows", "measured"), [(COUNT >= 3, True), (COUNT >= 10, False), (COUNT >= 21, True), (COUNT % 2 == 1, False)]
 )
 @pytest.mark.parametrize(
     ("after", "code", "values"),

@@ -494,8 +494,7 @@ def test_a_weight_is_one_from_five_sigmas_on(sigmas: float, significant: bool) -
 
 
 @pytest.mark.parametrize(
-    ("factor", "share", "severity"),
-    [(2.9, 0.009, "note"), (3.1, 0.009, "limit"), (2.9, 0.011, "limit")],
+    ("factor", "share", "severity"), [(2.9, 0.009, "note"), (3.1, 0.009, "limit"), (2.9, 0.011, "limit")]
 )
 def test_more_noise_than_measured_is_minor_up_to_three_times_and_one_percent(
     factor: float, share: float, severity: str

@@ -429,15 +429,7 @@ def test_an_exact_constraint_is_the_limit_of_a_tolerance(name: str) -> None:
     p, R = truth(rng), haar(rng, 8)
     wrench = predict(p, R) + noise(rng, 8)
     exact = random_known(name, p, rng)
-    soft = Known(
-        exact.R_flange_sensor,
-        1e-6,
-        exact.yaw_only,
-        exact.gravity_direction_base,
-        1e-6,
-        exact.mass_kg,
-        1e-6,
-    )
+    soft = Known(exact.R_flange_sensor, 1e-6, exact.yaw_only, exact.gravity_direction_base, 1e-6, exact.mass_kg, 1e-6)
     hard, nearly = (fit(R, wrench, WHITE, known=one, gain_sigma=0.0) for one in (exact, soft))
     sigma = np.sqrt(np.diag(nearly.covariance))
     assert (np.abs(hard.parameters.difference(nearly.parameters)) < 1e-3 * sigma + 1e-6).all()

@@ -26,11 +26,7 @@ def off(best: Fit) -> Array:
 
 def test_a_load_that_is_half_as_large_bends_a_quarter_or_an_eighth() -> None:
     half = Parameters(
-        TOOL.R_flange_sensor,
-        TOOL.gravity_force_base_N / 2,
-        TOOL.force_bias_N,
-        TOOL.p_sensor_com_m,
-        TOOL.torque_bias_Nm,
+        TOOL.R_flange_sensor, TOOL.gravity_force_base_N / 2, TOOL.force_bias_N, TOOL.p_sensor_com_m, TOOL.torque_bias_Nm
     )
     whole, part = (structure_columns(p, R24, np.eye(3))["load"] for p in (TOOL, half))
     assert whole.shape == (24, 6, 54)

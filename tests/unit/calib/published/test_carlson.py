@@ -43,12 +43,8 @@ UNKNOWN: dict[str, Method] = {
     "iterative": lambda R, f, _, bias: iterative(R, f, bias=bias),
     "polynomial": lambda R, f, _, bias: polynomial(R, f, bias=bias),
 }
-DIRECTION: dict[str, Method] = {
-    "relaxation": lambda R, f, g, bias: relaxation(R, f, g, bias=bias),
-}
-WEIGHT: dict[str, Method] = {
-    "cayley": lambda R, f, g, bias: cayley(R, f, g, bias=bias),
-}
+DIRECTION: dict[str, Method] = {"relaxation": lambda R, f, g, bias: relaxation(R, f, g, bias=bias)}
+WEIGHT: dict[str, Method] = {"cayley": lambda R, f, g, bias: cayley(R, f, g, bias=bias)}
 METHODS = UNKNOWN | DIRECTION | WEIGHT
 MIN_POSES = dict.fromkeys(UNKNOWN, 4) | {"polynomial": 3, "relaxation": 3} | dict.fromkeys(WEIGHT, 2)
 

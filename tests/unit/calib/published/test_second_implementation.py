@@ -77,12 +77,7 @@ def _poses(method: str, seed: int) -> Array:
 
 
 def _estimates(
-    method: str,
-    truth: Parameters,
-    R_base_flange: Array,
-    *,
-    as_published: bool = False,
-    noise_seed: int | None = None,
+    method: str, truth: Parameters, R_base_flange: Array, *, as_published: bool = False, noise_seed: int | None = None
 ) -> tuple[Parameters, Parameters]:
     """Return our estimate and the other."""
     weight_N = float(np.linalg.norm(truth.gravity_force_base_N))

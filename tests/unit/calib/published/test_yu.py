@@ -49,8 +49,7 @@ def test_srom_knows_its_orientations_in_any_order() -> None:
 
 
 @pytest.mark.parametrize(
-    "Y",
-    [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])],
+    "Y", [turned("z", 45), turned("z", -45), turned("z", 20), turned("x", 170), turned("ZYX", [10, 20, 30])]
 )
 def test_srom_works_when_all_orientations_are_turned_by_a_common_rotation(Y: Array) -> None:
     rng = np.random.default_rng(1)
