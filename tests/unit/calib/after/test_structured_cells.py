@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ftcalib import CalibrationDataset, CalibrationResult, NotObservable, mean_and_covariance, solve
 from ftcalib.after.new_tool import new_tool
-from ftcalib.after.verification import verify
+from ftcalib.after.verification import verify_calibration
 from tests.structured_cell import CELLS, Cell, Load, flange, postures, tour, unit
 
 Array = NDArray[np.float64]
@@ -67,9 +67,9 @@ def failed_verifications(seed: int, name: str) -> dict[str, bool]:
 
     y, cov = means(None)
     changed = {name: means(part)[0] for name, part in loads.items()} | {".5 N": y + np.r_[0.5 * unit(rng), 0, 0, 0]}
-    unchanged = verify(result, R, y, cov, fitted=data)
+    unchanged = verify_calibration(result, R, y, cov, fitted=data)
     return {"": not unchanged.passed} | {
-        change: not verify(result, R, other, cov, fitted=data).passed
+        change: not verify_calibration(result, R, other, cov, fitted=data).passed
         for change, other in changed.items()
         if np.abs((other - y) / unchanged.predicted_sigma).max() >= EVIDENT_SIGMAS
     }
