@@ -39,10 +39,10 @@ from ftdrivers.ur.arm import UrArm
 from tests.benchmarks.common import show
 from tests.wire.conftest import Station
 from tests.wire.laboratory import Laboratory, numbers_in
+from tests.wire.sensor_kinds import KINDS
 from tests.wire.test_sensor_faults import (
     CYCLES,
     HEALTHY,
-    KINDS,
     SCRIPT,
     UNASKED,
     Emulator,

@@ -108,7 +108,7 @@ class FactoryKinematics:
 Message = Started | Stopped | Failed | Code | Note | RobotType | FactoryKinematics
 
 
-def take_package(buffer: bytearray) -> tuple[int, bytes] | None:
+def take_primary_package(buffer: bytearray) -> tuple[int, bytes] | None:
     """Remove the first package from `buffer` and return (type, payload); return None while it is incomplete.
 
     Raises `ProtocolError` if the buffer does not begin with a package.
@@ -138,7 +138,7 @@ def decode(kind: int, payload: bytes) -> Iterator[Message]:
 def _decode_state(payload: bytes) -> Iterator[Message]:
     rest = bytearray(payload)
     with suppress(ProtocolError):
-        while (part := take_package(rest)) is not None:
+        while (part := take_primary_package(rest)) is not None:
             kind, content = part
             if kind == _KINEMATICS:
                 yield FactoryKinematics(_kinematics(_KINEMATIC_DATA.unpack_from(content)))
@@ -205,7 +205,7 @@ class Primary:
                 if len(received) < _RECEIVE_BYTES:
                     break
             self.closed = self.closed or not received
-            while (package := take_package(self._buffer)) is not None:
+            while (package := take_primary_package(self._buffer)) is not None:
                 messages += decode(*package)
         except (BlockingIOError, TimeoutError):
             pass

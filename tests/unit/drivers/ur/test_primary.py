@@ -60,7 +60,7 @@ def test_messages_are_read_as_documented(data: bytes, expected: list[Message], s
     found: list[Message] = []
     for k in range(0, len(data), step):
         buffer += data[k : k + step]
-        while (taken := primary.take_package(buffer)) is not None:
+        while (taken := primary.take_primary_package(buffer)) is not None:
             found += primary.decode(*taken)
     assert found == expected
 
@@ -74,7 +74,7 @@ def test_only_code_210_is_a_read_only_connection() -> None:
 def test_decoding_is_total(data: bytes) -> None:
     buffer = bytearray(data)
     with suppress(ProtocolError):
-        while (taken := primary.take_package(buffer)) is not None:
+        while (taken := primary.take_primary_package(buffer)) is not None:
             list(primary.decode(*taken))
     for kind in (16, 20):
         list(primary.decode(kind, data))
