@@ -283,7 +283,7 @@ def _gain_at(E: Array, p: Array) -> tuple[Array, Array]:
     return E[..., :3, :3] + E[..., :3, 3:] @ P, E[..., 3:, :3] + E[..., 3:, 3:] @ P
 
 
-def vector_of(M: Array) -> Array:
+def _vector_of(M: Array) -> Array:
     """Return the vectors (..., 3) of the antisymmetric part of matrices (..., 3, 3)."""
     A = (M - np.swapaxes(M, -1, -2)) / 2
     return np.stack([A[..., 2, 1], A[..., 0, 2], A[..., 1, 0]], axis=-1)
@@ -291,7 +291,7 @@ def vector_of(M: Array) -> Array:
 
 def _mounting_turn(E: Array, p: Array) -> Array:
     """Return the rotation vector (..., 3), sensor axes, by which E changes the estimated mounting of a tool at p."""
-    return vector_of(_gain_at(E, p)[0])
+    return _vector_of(_gain_at(E, p)[0])
 
 
 def shown_by(p: Array) -> Array:
@@ -576,7 +576,7 @@ class ContactResponse:
         reading += p.weight_N * shown_gain(shown)
         force, torque = np.split(reading if self.decoder is None else self.decoder @ reading, 2)
         weight_N = float(np.trace(force)) / 3
-        return weight_N, vector_of(torque) / (weight_N or 1.0)
+        return weight_N, _vector_of(torque) / (weight_N or 1.0)
 
 
 def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
@@ -591,7 +591,7 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
     columns = np.zeros((15, 36))
     columns[:3] = parameters.R_flange_sensor @ turn.T
     columns[3:6] = np.outer(parameters.gravity_force_base_N, scale)
-    columns[9:12] = (vector_of(torque - skew(p) @ skew(turn)) - np.outer(scale, p)).T
+    columns[9:12] = (_vector_of(torque - skew(p) @ skew(turn)) - np.outer(scale, p)).T
     weight = np.zeros(15)
     weight[3:6] = parameters.gravity_force_base_N
     square = C + np.outer(mean, mean)

@@ -5,9 +5,9 @@ Only ports and buses that the user names are probed. Only read requests are sent
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
+from typing import NamedTuple
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
@@ -26,8 +26,7 @@ _CLOSED_S = 0.1
 _LISTEN_BUS_S = 1.0
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
+class Answer(NamedTuple):
     """A sensor that was found, or one that could not be asked."""
 
     url: str | None
@@ -104,14 +103,14 @@ def probe_can(
         with clock.keeping_up():
             bus.open()
             heard = [frame for left_s in clock.looks(_LISTEN_BUS_S) if (frame := bus.look(min(left_s, clock.poll_s)))]
-            return [answer for probe in probes if probe and (answer := _ask_sensor(probe, heard, bus, clock))]
+            return [answer for probe in probes if probe and (answer := _ask_sensor(probe, heard, bus))]
     except StreamBroken as exc:
         raise ConnectError(exc.found, exc.fix) from exc
     finally:
         bus.close()
 
 
-def _ask_sensor(probe: CanProbe, heard: Sequence[CanFrame], bus: CanBus, clock: Clock) -> Answer | None:
+def _ask_sensor(probe: CanProbe, heard: Sequence[CanFrame], bus: CanBus) -> Answer | None:
     if what := probe.recognize(heard):
         return Answer(probe.url, what)
     if busy := sorted(probe.must_be_silent & {identifier for identifier, _ in heard}):
@@ -121,4 +120,4 @@ def _ask_sensor(probe: CanProbe, heard: Sequence[CanFrame], bus: CanBus, clock: 
             f"{probe.name} was not asked, because another device sends on {some}; "
             f"use {probe.url} if you know that it is there",
         )
-    return Answer(probe.url, what) if (what := probe.ask(bus, clock)) else None
+    return Answer(probe.url, what) if (what := probe.ask(bus)) else None

@@ -21,7 +21,7 @@ from ftdrivers.errors import UNUSABLE, ConnectError, DeviceFault, DeviceTimeout,
 from ftdrivers.interfaces import Array, DeviceInfo, FtSamples
 from ftdrivers.registry import Options, join_url
 from ftdrivers.streaming.sensor import NOTHING, StreamingSensor, scale_facts
-from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames, request_message
+from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames
 from ftdrivers.wires.framing import describe_status
 
 log = logging.getLogger(__name__)
@@ -312,9 +312,9 @@ def can_probe(channel: str, interface: str, bitrate: int | None, base: int) -> C
         ours = [frame for frame in heard if frame[0] in own and frame != request]
         return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= 5 else None
 
-    def ask(bus: CanBus, clock: Clock) -> str | None:
-        serial = request_message(bus, clock, first | Op.SERIAL, b"", replies(Op.SERIAL))
-        firmware = serial and request_message(bus, clock, first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
+    def ask(bus: CanBus) -> str | None:
+        serial = bus.request(first | Op.SERIAL, b"", replies(Op.SERIAL))
+        firmware = serial and bus.request(first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
         if serial is None or firmware is None:
             return None
         major, minor, build = codec.decode_firmware(firmware)

@@ -13,7 +13,7 @@ from ftdrivers.registry import Options, join_url
 from ftdrivers.robotous import codec
 from ftdrivers.robotous.codec import Command, Field
 from ftdrivers.robotous.sensor import RobotousSensor
-from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames, request_message
+from ftdrivers.wires.can_bus import CanBus, CanFrame, CanProbe, join_frames
 
 # Silence between two fields, s, at most half a period. The halves of one field follow each other directly.
 _SILENCE_S = 0.002
@@ -262,8 +262,8 @@ def can_probe(channel: str, interface: str, bitrate: int | None, _base: int) -> 
         plausible = all(sample.overload < 0x40 for sample in samples)
         return "it streams" if plausible and len(samples) >= 5 else None
 
-    def ask(bus: CanBus, clock: Clock) -> str | None:
-        field = request_message(bus, clock, command, codec.encode(Command.MODEL), reply)
+    def ask(bus: CanBus) -> str | None:
+        field = bus.request(command, codec.encode(Command.MODEL), reply)
         try:
             model = field and field[0] == Command.MODEL and codec.decode_text(field)
         except ProtocolError:

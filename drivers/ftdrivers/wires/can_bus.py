@@ -21,6 +21,10 @@ _SEND_S, _LOOK_S = 0.1, 0.05
 _DISCARD_S = 0.1
 
 
+CanFrame = tuple[int, bytes]
+"""Identifier and data."""
+
+
 class CanBus:
     """The connection to one device on a CAN bus with 11-bit identifiers.
 
@@ -165,12 +169,20 @@ class CanBus:
             if self.look(0.0) is None:
                 return
 
+    def request(self, identifier: int, data: bytes, parts: Mapping[int, int], timeout_s: float = 0.25) -> bytes | None:
+        """Send a request and return the first complete message, see `join_frames`; None after the time-out."""
+        self.send(identifier, data)
+        frames: list[CanFrame] = []
+        for left_s in self._clock.looks(timeout_s):
+            frame = self.look(min(left_s, self._clock.poll_s))
+            if frame and len(frame[1]) == parts.get(frame[0]):
+                frames.append(frame)
+                if replies := join_frames(frames, parts):
+                    return replies[0]
+        return None
+
     def _broken(self, exc: Exception) -> StreamBroken:
         return StreamBroken(f"{self._owner}: the CAN interface was lost ({exc})", "plug it in and open it again")
-
-
-CanFrame = tuple[int, bytes]
-"""Identifier and data."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,23 +195,8 @@ class CanProbe:
     """Identifiers that no device may send before the sensor is asked, because they may be commands to other devices."""
     recognize: Callable[[Sequence[CanFrame]], str | None]
     """Returns what received frames show about the sensor; None if they are not its stream."""
-    ask: Callable[[CanBus, Clock], str | None]
+    ask: Callable[[CanBus], str | None]
     """Sends read requests and returns what the sensor reports about itself; None without an answer."""
-
-
-def request_message(
-    bus: CanBus, clock: Clock, identifier: int, data: bytes, parts: Mapping[int, int], timeout_s: float = 0.25
-) -> bytes | None:
-    """Send a request and return the first whole message, see `join_frames`; None if none arrives in time."""
-    bus.send(identifier, data)
-    frames: list[CanFrame] = []
-    for left_s in clock.looks(timeout_s):
-        frame = bus.look(min(left_s, clock.poll_s))
-        if frame and len(frame[1]) == parts.get(frame[0]):
-            frames.append(frame)
-            if replies := join_frames(frames, parts):
-                return replies[0]
-    return None
 
 
 def join_frames(frames: Sequence[CanFrame], parts: Mapping[int, int]) -> list[bytes]:

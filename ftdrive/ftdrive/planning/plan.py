@@ -317,7 +317,7 @@ class Plan(Displayed):
             steps=steps,
             ball_m=ball_m,
             ball_centre_m=tuple(centre_m.tolist()),
-            description={**self.description, "kinematics": describe_kinematics(certifier)},
+            description={**self.description, "kinematics": _describe_kinematics(certifier)},
         )
 
 
@@ -384,7 +384,7 @@ def describe_plan(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[st
     """Return the `description` of a plan."""
     return {
         "model": certifier.arm.name,
-        "kinematics": describe_kinematics(certifier),
+        "kinematics": _describe_kinematics(certifier),
         "tool": [asdict(part) for part in certifier.arm.tool],
         **({} if certifier.arm.hung is None else {"hung": asdict(certifier.arm.hung)}),
         "scene": certifier.scene.describe(),
@@ -399,7 +399,7 @@ def describe_plan(certifier: Certifier, speeds: Speeds, guess: Guess) -> dict[st
     }
 
 
-def describe_kinematics(certifier: Certifier) -> dict[str, Any]:
+def _describe_kinematics(certifier: Certifier) -> dict[str, Any]:
     """Return the entry `kinematics` of a description: source, theta, a, d and alpha of all joints."""
     source = "nominal" if certifier.arm.is_nominal else "controller"
     return {"source": source, **asdict(certifier.arm.kinematics)}
@@ -421,7 +421,7 @@ def fingerprints(certifier: Certifier) -> dict[str, str]:
     hung = [] if certifier.arm.hung is None else [asdict(certifier.arm.hung)]
     return {
         "model": digest(certifier.arm.describe()),
-        "kinematics": digest(describe_kinematics(certifier)),
+        "kinematics": digest(_describe_kinematics(certifier)),
         "tool": digest([*(asdict(part) for part in certifier.arm.tool), *hung]),
         "scene": digest([certifier.scene.describe(), asdict(certifier.margins)]),
     }

@@ -20,7 +20,7 @@ RecordingFile = McapFile | CsvFile | ParquetFile
 """A new file of one format. After any error, `samples` samples remain in the file."""
 
 
-class RecordingFormat(NamedTuple):
+class _RecordingFormat(NamedTuple):
     """A file format."""
 
     new: type[RecordingFile]
@@ -31,14 +31,14 @@ class RecordingFormat(NamedTuple):
 
 
 _FORMATS = {
-    ".mcap": RecordingFormat(McapFile, read_mcap, "mcap"),
-    ".csv": RecordingFormat(CsvFile, read_csv, "csv"),
-    ".parquet": RecordingFormat(ParquetFile, read_parquet, "pyarrow"),
+    ".mcap": _RecordingFormat(McapFile, read_mcap, "mcap"),
+    ".csv": _RecordingFormat(CsvFile, read_csv, "csv"),
+    ".parquet": _RecordingFormat(ParquetFile, read_parquet, "pyarrow"),
 }
 ENDINGS = tuple(_FORMATS)
 
 
-def format_of(path: Path) -> RecordingFormat:
+def format_of(path: Path) -> _RecordingFormat:
     """Return the format of a recording. Raises `ConfigError` if it is unknown or its package is missing."""
     ending = Path(path.name.removesuffix(".partial")).suffix
     if ending not in _FORMATS:

@@ -166,7 +166,7 @@ class Header:
             values["result"] = CalibrationResult.from_dict(document["calibration"])
             if values["verification"] is not None:
                 values["verification"] = VerificationRecord.from_dict(values["verification"])
-            frame, stages = frame_from_dict(document["frame"]), _stages_of(document["stages"])
+            frame, stages = _frame_from_dict(document["frame"]), _stages_of(document["stages"])
             return cls(StreamInfo(**values), frame, stages, document["configuration"])
         except KeyError as error:
             raise BadRecording(f"the header lacks the field {error.args[0]}: the file is damaged") from error
@@ -185,7 +185,7 @@ def _device_info(document: Mapping[str, Any]) -> DeviceInfo:
     return DeviceInfo(document["model"], document["serial"], document["firmware"], facts)
 
 
-def frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
+def _frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
     """Build a frame from the result of `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
@@ -343,7 +343,7 @@ class Recording(Displayed):
 def next_header(header: Header, event: StreamEvent) -> Header:
     """Return the header valid after an event. Raises `BadRecording` for a stage of a newer version."""
     if event.kind == "frame":
-        return replace(header, frame=frame_from_dict(event.values))
+        return replace(header, frame=_frame_from_dict(event.values))
     return replace(header, stages=_stages_of(event.values)) if event.kind == "stages" else header
 
 

@@ -115,7 +115,7 @@ _JOINTS_ONLY = "the table has joint angles but no orientation: add --model, such
 _ANGLES_ONLY = "the order of the three angles is unknown: add --euler, such as ZYX (tool axes) or xyz (base axes)"
 
 
-class ColumnSource(Protocol):
+class _ColumnSource(Protocol):
     """Source of columns that are read in blocks."""
 
     names: Sequence[str]
@@ -128,7 +128,7 @@ class ColumnSource(Protocol):
         """Yield columns (n, k) of consecutive rows, with the share of the source that is read."""
 
 
-class FrameSource:
+class _FrameSource:
     """Columns of a DataFrame of pandas or Polars, a table of pyarrow, or a mapping of names to arrays."""
 
     words, comments = "", 0
@@ -188,8 +188,8 @@ class Table:
         self._found: dict[str, Signal | None] = {}
         with self._named():
             text = self.options.separator, self.options.decimal
-            self.source: ColumnSource = TextTable(source, *text) if isinstance(source, Path) else FrameSource(source)
-            in_memory = isinstance(self.source, FrameSource)
+            self.source: _ColumnSource = TextTable(source, *text) if isinstance(source, Path) else _FrameSource(source)
+            in_memory = isinstance(self.source, _FrameSource)
             self._columns = SignalColumns(
                 self.source.names, self.source.units, self.options.columns, in_memory=in_memory
             )
@@ -360,7 +360,7 @@ class Table:
     def _require_time(self) -> None:
         if self._found["time"] is None and not self.options.rate_Hz:
             words = self._columns.missing("time", "time")
-            rate = "rate_Hz=…" if isinstance(self.source, FrameSource) else "--rate HZ"
+            rate = "rate_Hz=…" if isinstance(self.source, _FrameSource) else "--rate HZ"
             raise BadDataset(f"{self.name}: {words}, or add {rate} if the samples are evenly spaced")
 
     def _require(self, signal: str) -> Signal:

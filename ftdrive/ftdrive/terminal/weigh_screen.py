@@ -8,8 +8,7 @@ from ftcalib.rounding import counted, to_place_of
 from ftdrive.stream.weighing import Weighing, format_scale
 from ftdrive.terminal.canvas import Canvas
 from ftdrive.terminal.lines import STRONG, Line
-from ftdrive.words.stream import name_devices
-from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
+from ftdrive.words.stream import NO_MASS, name_devices, worth_of, zero_in_words
 
 _FIGURES = "0123456789-"
 # Three rows per figure, three characters wide.

@@ -22,8 +22,7 @@ from ftdrive.view import parts, scene
 from ftdrive.view.page import Page
 from ftdrive.view.parts import Part
 from ftdrive.words import stream as words
-from ftdrive.words.stream import ShownWrench, StreamSummary, View
-from ftdrive.words.weight import NO_MASS, worth_of, zero_in_words
+from ftdrive.words.stream import NO_MASS, ShownWrench, StreamSummary, View, worth_of, zero_in_words
 from ftdrivers.interfaces import Array
 from ftdrivers.ur.kinematics import forward
 

@@ -4,14 +4,17 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from itertools import chain, groupby, islice
+from math import isfinite
 from typing import Any
 
 import numpy as np
 
 from ftcalib import CalibrationDataset
+from ftcalib.after.weighing import Weight
 from ftcalib.judge.observability import axes_along
+from ftcalib.rounding import to_place_of
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import AXES
 from ftdrive.errors import ConfigError
@@ -21,6 +24,7 @@ from ftdrive.stream.feed import MEAN_S, SPANS_S, Feed, FeedNote, History, NoiseW
 from ftdrive.stream.samples import Block, FrameTransform, LinkStatus, Stages, StreamInfo, StreamStatus, WrenchFrame
 from ftdrive.stream.sources import STALE_S, RecordingSource
 from ftdrive.stream.stream import RECOVER_S
+from ftdrive.stream.weighing import Weighing
 from ftdrivers.interfaces import NOT_REPORTED, Array
 
 _MOST_NOTES = 200
@@ -479,3 +483,26 @@ def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) ->
     wanted = max(least, 1.05 * float(largest[np.isfinite(largest)].max(initial=0.0)), 1e-6)
     decade = 10.0 ** np.floor(np.log10(wanted))
     return float(next(step * decade for step in (1, 2, 5, 10) if step * decade >= wanted))
+
+
+# -- the screen and page of a scale
+
+NO_MASS = "- - -"
+# A larger smallest mass, kg, is caused by drift since the calibration, and a zero helps.
+_UNZEROED_KG = 0.1
+
+
+def worth_of(weight: Weight) -> str:
+    """Return the sigma and the smallest mass of a weight as text."""
+    sigma_g, least_g = (to_place_of(1e3 * kg, 1e3 * kg) for kg in (weight.mass_sigma_kg, weight.least_kg))
+    return f"sigma {sigma_g} g, smallest mass {least_g} g"
+
+
+def zero_in_words(weighing: Weighing) -> tuple[str, bool]:
+    """Return the age of the zero, and whether another one would help; empty if the bias is tracked."""
+    if weighing.moving:
+        return "", False
+    zeroed_s, weight = weighing.stream.processor.monitor.reference()[1], weighing.shown.measured
+    helps, zeroed = weight is not None and weight.least_kg > _UNZEROED_KG, isfinite(zeroed_s)
+    age = f"zeroed {age_in_words(timedelta(seconds=zeroed_s))} ago" if zeroed else "not zeroed"
+    return age + (f": zero {'again' if zeroed else 'the empty gripper'}" if helps else ""), helps
