@@ -40,7 +40,7 @@ def write_new(path: str | Path, content: str | bytes) -> None:
     """
     path = Path(path)
     require_new(path)
-    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # differs between processes
+    partial = path.with_name(f"{path.name}.{os.getpid()}.partial")  # each process has its own name
     try:
         with partial.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
@@ -49,7 +49,7 @@ def write_new(path: str | Path, content: str | bytes) -> None:
         _give_name(partial, path)
     finally:
         partial.unlink(missing_ok=True)
-    if os.name == "posix":  # so that the new name survives a power failure
+    if os.name == "posix":  # syncing the folder lets the new name survive a power failure
         folder = os.open(path.parent, os.O_RDONLY)
         try:
             os.fsync(folder)

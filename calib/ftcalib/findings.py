@@ -122,7 +122,7 @@ class Finding(Displayed):
         """Return the finding of a JSON object; raise `ValueError` if the object is damaged."""
         try:
             finding = cls(document["code"], document["severity"], document["values"])
-            _ = finding.words  # raises for values of a wrong type
+            _ = finding.words  # a value of a wrong type raises here
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"finding {json.dumps(document)}: {error}") from error
         return finding

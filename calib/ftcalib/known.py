@@ -276,5 +276,5 @@ class Setup:
         return np.asarray(up / np.linalg.norm(up))
 
 
-# A cell without any declaration.
+# A cell of which nothing is declared.
 NOTHING: Final = Setup()

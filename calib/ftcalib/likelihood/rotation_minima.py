@@ -314,7 +314,9 @@ def _descend(quartic: Array, q: Array) -> tuple[Array, Array, Array]:
             there = tuple(np.where(down.reshape(-1, *[1] * (y.ndim - 1)), y, x) for x, y in both)
         here = there
         near = np.abs(here[0] @ here[0].T) > 1 - 1e-6
-        same = (near.argmax(axis=1) < np.arange(len(near))) & (curvature[:, 0] > 0)  # converges with another start
+        same = (near.argmax(axis=1) < np.arange(len(near))) & (
+            curvature[:, 0] > 0
+        )  # another start converges to this minimum
         if done.any():
             ends.append(tuple(x[done] for x in here[:4]))
         if (gone := done | same).any():

@@ -289,7 +289,7 @@ def choose_verification_poses(
 
 # Number of orientations of each set. H is the first half of E.
 COUNTS: Mapping[str, int] = {"A": 24, "B": 12, "C": 12, "D": 150, "E": 24, "F": 24, "G": 48, "H": 12}
-# Sets required for Table III.
+# The sets that Table III of Yu et al. requires.
 EVERY_SET = "A+B+C+D+E+F+G"
 _HALF_ANGLE_RAD = np.pi / 3
 _SIDES = {"E": 1.0, "F": -1.0, "G": 1.0, "H": 1.0}

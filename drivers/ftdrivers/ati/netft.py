@@ -221,7 +221,7 @@ class NetFtSensor(StreamingSensor):
             receive_timeout=_NEVER_S,  # in real time; silence is judged here
             configuration_connect_timeout=self._http_s,
             configuration_timeout=self._http_s,
-            deliver_samples_with_error_status=True,  # so that the fault can be named
+            deliver_samples_with_error_status=True,  # the status word names the fault
             # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
             recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
             reconnect_initial_delay=_NEVER_S,

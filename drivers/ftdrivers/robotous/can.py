@@ -124,7 +124,7 @@ class Halves:
         A clock that was set before is moved by whole periods, because the host may be late.
         """
         clock_ns: float = self._waiting[fields - 1].t_host_ns
-        self._in_step = by_period and self._clock_ns is not None  # otherwise it may be late, and the next fields set it
+        self._in_step = by_period and self._clock_ns is not None  # first fields may be late, so the next ones set it
         if self._clock_ns is not None:
             missed = max(1, math.floor((clock_ns - self._clock_ns) / self._period_ns + _EARLY))
             if by_period:

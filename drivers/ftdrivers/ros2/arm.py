@@ -60,7 +60,7 @@ class Ros2Arm(ReadOnlyArm):
         clock: Clock = REAL,
     ) -> None:
         self._host, self._model, self._clock = host, model, clock
-        self._reader = pose_reader_of(host)  # also rejects wrong options
+        self._reader = pose_reader_of(host)  # this also rejects wrong options
         self._ros: Node | None = None
         self._publishers: dict[str, str] = {}
         self._single: list[OnePublisher] = []

@@ -91,7 +91,7 @@ class Node:
         try:
             self._executor.spin()
         except (self._executors.ExternalShutdownException, self._executors.ShutdownException):
-            pass  # it was closed
+            pass  # the node was closed meanwhile
         except Exception as error:
             self._failure = error
 
@@ -212,7 +212,7 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
     found: list[Any] = []
     for _ in clock.looks(DISCOVERY_S):
         found = ros.node.get_publishers_info_by_topic(topic)
-        if found and not any(_UNNAMED in one.node_name for one in found):  # names arrive later
+        if found and not any(_UNNAMED in one.node_name for one in found):  # names of nodes arrive later
             clock.sleep(_OTHERS_S)
             found = ros.node.get_publishers_info_by_topic(topic)
             break

@@ -46,7 +46,7 @@ class Chain:
     def __init__(self, path: Path, base: str, flange: str) -> None:
         try:
             with path.open("rb") as file:
-                root = ET.fromstring(file.read(_LARGEST).decode())  # of the user's own disk
+                root = ET.fromstring(file.read(_LARGEST).decode())  # the file is on the user's own disk
         except (OSError, UnicodeDecodeError, ET.ParseError) as error:
             raise BadUrl(f"{path} is not a URDF ({error}): give the file with xacro evaluated") from error
         joints = {}

@@ -421,7 +421,7 @@ class StreamingSensor(ForceTorqueSensor):
 
     def _reconnect(self, error: DeviceError) -> None:
         """Try to reconnect to the same device. The first sample ends the interruption."""
-        if self._interruption is None:  # otherwise the last interruption has not ended
+        if self._interruption is None:  # an interruption that has not ended is continued
             self._interruption = error, self._clock.now_s() + self._limits.recover_s
             self._note(str(error))
         first, deadline_s = self._interruption

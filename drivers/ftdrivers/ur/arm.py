@@ -529,7 +529,7 @@ class UrArm(RobotArm):
         stopped = False
         try:
             stopped = self._stop_softly(control)
-        finally:  # also after a second Ctrl-C
+        finally:  # this also runs after a second Ctrl-C
             if not stopped:
                 control.kill()  # on a lost link ur_rtde would restart the program repeatedly
                 if control.has_ended:

@@ -77,7 +77,7 @@ class Calls:
     def progress(self) -> tuple[bool, bool]:
         """Return whether the move has ended, and whether it was stopped because the parent did not watch it."""
         progress = self._control.getAsyncOperationProgressEx()
-        if not self._control.isConnected():  # otherwise a lost connection would look like an arrival
+        if not self._control.isConnected():  # a lost connection would look like an arrival
             raise RuntimeError("the control connection was lost")
         ended = progress.operationId() != self._before and not progress.isAsyncOperationRunning()
         self.moving = self.moving and not ended

@@ -108,7 +108,9 @@ class ControlProcess(Control):
                 ended = self._ended
             if reply is not None:
                 if "error" in reply:
-                    fix = "check the robot and the cable, then open the arm again" if to else ""  # `UrArm` adds one
+                    fix = (
+                        "check the robot and the cable, then open the arm again" if to else ""
+                    )  # `UrArm` adds the fix to an empty one
                     raise StreamBroken(f"ur_rtde reports: {reply['error']}", fix)
                 return reply["value"]
             if ended:

@@ -82,7 +82,7 @@ class OwnProgram:
 
 SIMULATORS: Final = ("localhost", "127.0.0.1", "192.168.56.101")
 """Addresses of URSim, for which ur_rtde does not require remote control."""
-# Oldest minor version by major version: the control script of ur_rtde; registers 24 to 47, and the Robot API.
+# Oldest minor version of each major version that has what a path needs: ur_rtde's script, or registers and Robot API.
 _LEAST: Final[dict[ControlPath, dict[int, int]]] = {"ur-rtde": {3: 4, 5: 4}, "script": {3: 9, 5: 3, POLYSCOPE_X: 11}}
 _LOCAL: Final = (
     "press Local, Remote Control at the top right of the pendant (enable it first under Settings, System, Remote "

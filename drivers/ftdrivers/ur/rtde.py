@@ -166,7 +166,7 @@ class _Connection:
     def _receive(self, timeout_s: float) -> None:
         """Wait for bytes, then read all that have arrived."""
         if timeout_s != self._timeout_s:
-            self._socket.settimeout(timeout_s)  # a system call
+            self._socket.settimeout(timeout_s)  # this is a system call
             self._timeout_s = timeout_s
         received = b"\0" * _RECEIVE_BYTES
         while len(received) == _RECEIVE_BYTES:

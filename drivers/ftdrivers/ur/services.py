@@ -35,7 +35,7 @@ class _Dashboard:
         self._socket.settimeout(_REPLY_S)
         self._lines = self._socket.makefile("r", encoding="utf-8", errors="replace", newline="\n")
         try:
-            self._read()  # the greeting
+            self._read()  # the server sends a greeting first
         except BaseException:
             self.close()
             raise

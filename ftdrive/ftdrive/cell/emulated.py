@@ -206,7 +206,7 @@ def _options(values: Mapping[str, Any], sensor: str) -> tuple[str, ...]:
         options += ["--mass", str(values["tool.mass_kg"])]
     if "sensor.height_mm" in values:
         options += ["--sensor-origin", f"0,0,{values['sensor.height_mm'] / 1e3}"]
-    if "sensor.mass_kg" in values and sensor != "ur-ft":  # which is part of the arm
+    if "sensor.mass_kg" in values and sensor != "ur-ft":  # this sensor is part of the arm
         options += ["--sensor-mass-kg", str(values["sensor.mass_kg"])]
     mounting = values.get("workcell.mounting", "floor")
     if mounting in {"floor", "wall", "ceiling"}:

@@ -303,7 +303,7 @@ def flange_load(
     jacobian[1:, 0:3] = share * skew(arm_m)
     jacobian[1:, 9:12] = share * result.R_flange_sensor
     covariance = jacobian @ result.tool_covariance @ jacobian.T
-    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # see `sigma`
+    gain_variance = float(np.square(result.sigma["mass_kg"])) - covariance[0, 0]  # `sigma` contains the gain
     covariance += max(gain_variance, 0.0) * np.outer(by_mass, by_mass)
     if p_flange_sensor_com_m is None:
         covariance[3, 3] += ((1 - share) * height_m) ** 2 / 12

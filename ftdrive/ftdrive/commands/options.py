@@ -522,7 +522,7 @@ def _checked_stages(_context: click.Context, _parameter: click.Parameter, text: 
             raise ConfigError(f"--stages has no setting '{name}': give NAME=VALUE with one of {', '.join(STAGE_TEXTS)}")
         try:
             found[name] = checked_value(name, parsed_json(value))
-        except ValueError:  # a text
+        except ValueError:  # the value is a text
             found[name] = checked_value(name, value)
     return found
 

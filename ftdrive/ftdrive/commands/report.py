@@ -109,7 +109,7 @@ def report(
         trusted = trust_facts(subject.result, found, store_url, datetime.now(UTC))
         if trusted["store_error"]:
             messages.print(indented(" ! ", MAY_BE_MISSING.format(trusted["store_error"])))
-        if source is not None and found != source:  # unpacked
+        if source is not None and found != source:  # the bundle was unpacked
             command = subject.reproduce.replace(str(found), shlex.quote(str(source)))
             subject = replace(subject, source=source, reproduce=command)
         with working("Comparing methods and drawing"):

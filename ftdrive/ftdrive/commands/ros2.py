@@ -39,8 +39,8 @@ def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> 
     `ros2 param describe` explains each parameter. While a device sends no samples or the calibration does not fit, no
     wrench is published and /diagnostics gives the reason. The arm is only read, never moved. Ctrl-C ends.
     """
-    ros2_module("rclpy")  # before any work
-    from ftdrive.servers.ros2 import Ros2Node  # imports it
+    ros2_module("rclpy")  # a missing package raises here, before any work
+    from ftdrive.servers.ros2 import Ros2Node  # this imports rclpy
 
     given = source.path is not None
     calibration = source.calibration() if given else None

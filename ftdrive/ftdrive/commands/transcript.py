@@ -113,7 +113,7 @@ def play(file: Path | None, simulate: bool, sensor: str | None, as_json: bool) -
             _record_bytes(_emulated_address(sensor), path, 1.0, kept=False)
             loaded = Transcript.load(path)
     elif file is not None:
-        open_file(file).close()  # raises for a pipe or device
+        open_file(file).close()  # a pipe or device raises here
         loaded = Transcript.load(file)
     else:
         raise ConfigError("no transcript is given: add its FILE, or --simulate")

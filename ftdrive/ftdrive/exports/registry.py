@@ -235,7 +235,7 @@ def _assumption_note(v: _Values) -> str:
 _DIAGONAL_FIRST: Final = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
 # Suffixes of names for values in a certain form.
 _FORMS: Mapping[str, Callable[[Any], Any]] = {
-    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # as ROS messages have a vector
+    "xyz": lambda value: dict(zip("xyz", value, strict=True)),  # ROS messages have vectors in this form
     "words": lambda value: ", ".join(map(str, value)),
     "spaced": lambda value: " ".join(map(repr, value)),
     "fixed": lambda value: ", ".join(f"{one:.12f}" for one in value),  # the URScript manual mentions no exponents

@@ -174,7 +174,8 @@ def _plan_hung(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
         f"within {away_mm:.0f} mm of it in the moves, below {1e3 * (speeds.tip_m_s or 0):.0f} mm/s."
     ]
     plan = make_plan("hung", why, certifier, numbers, q, speeds, guess)
-    return replace(plan, why=tuple(why))  # without the predicted error, which ignores the run of the tool alone
+    # The predicted error is left out, because it ignores the run of the tool alone.
+    return replace(plan, why=tuple(why))
 
 
 def _plan_cone(

@@ -129,7 +129,7 @@ def load_recording(path: str | Path, columns: Collection[str] = ROW.names or ())
     reader = RecordingReader(Path(path), columns)
     pieces = list(reader.pieces())
     events = [event for piece in pieces for event in piece.events]
-    reduce(next_header, events, reader.header)  # raises for a stage of a newer version
+    reduce(next_header, events, reader.header)  # a stage of a newer version raises here
     return Recording(reader.header, np.concatenate([piece.rows for piece in pieces]), events, reader.cut)
 
 

@@ -395,7 +395,7 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
     late = t_s / period_s - number
     # minimum over each sample and those before
     earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
-    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # and those after it
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # over this row and those after it
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
     # largest steps first
     for last in possible[np.argsort(-steps[possible])].tolist():

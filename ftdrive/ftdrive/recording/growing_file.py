@@ -72,7 +72,7 @@ def _lock(file: IO[bytes]) -> bool:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
-    except OSError:  # a network drive without locks
+    except OSError:  # some network drives have no locks
         return True
     return True
 

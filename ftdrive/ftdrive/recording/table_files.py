@@ -285,15 +285,15 @@ def read_parquet(path: Path, columns: Collection[str]) -> Generator[Piece, None,
             numbers = flat_layout(kind)
             yield Piece(header, np.zeros(0, kind), [], 0.0)
             names, count = {*(numbers.names or ()), "t_host_ns"}, 0
-            for number in range(file.num_row_groups):  # one by one, because a reader of all keeps its data
+            for number in range(file.num_row_groups):  # a reader of all row groups would keep their data in memory
                 group = file.metadata.row_group(number)
                 if len({group.column(i).compression for i in range(group.num_columns)}) > 1:
-                    raise BadRecording("its footer is inconsistent: the file is damaged")  # it has no checksum
+                    raise BadRecording("its footer is inconsistent: the file is damaged")  # the footer has no checksum
                 for batch in file.iter_batches(2 * _GROUP_ROWS, [number], sorted(names), use_threads=False):
                     rows = np.empty(len(batch), numbers)
                     for name in numbers.names or ():
                         column = batch[name].cast("uint8") if COLUMNS[name].kind == "b" else batch[name]
-                        rows[name] = np.from_dlpack(column)  # without pandas, as above
+                        rows[name] = np.from_dlpack(column)  # pandas is not imported
                     times = np.from_dlpack(batch["t_host_ns"]).view([("t_host_ns", "<i8")])
                     here = sum(place < len(times) for place in places_of(events, times))
                     count += len(rows)

@@ -75,7 +75,7 @@ def find_moved(records: Sequence[PoseRecord]) -> list[Finding]:
 
 
 def _out_of_line(result: CalibrationResult) -> list[int]:
-    if "residual_sigma" not in result.quality:  # as for a new tool or an update
+    if "residual_sigma" not in result.quality:  # results for a new tool, and updates, have none
         return []
     spread = np.asarray(result.quality["residual_sigma"], dtype=np.float64)
     return out_of_line(spread, np.ones(len(spread), bool) if result.weights is None else result.weights > 0.5)

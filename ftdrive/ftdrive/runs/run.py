@@ -278,7 +278,7 @@ class Run(Displayed):
         """Return the contents of run.json; raises `BadDataset` also if the plan of the run is missing."""
         header = self.header()
         for section, key in (("robot", "host"), ("sensor", "url")):
-            header["config"][section][key]  # raises if it is missing
+            header["config"][section][key]  # a missing entry raises here
         if self.mode in ("auto", "step") and not self.plan_path.is_file():
             raise BadDataset(
                 f"{self.plan_path} is missing, and without its plan the run cannot be resumed: {_RESTORE}, or solve "

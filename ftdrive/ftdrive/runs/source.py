@@ -345,7 +345,7 @@ def read_source(source: Path, options: SolveOptions) -> RecordedData:
         data = RecordedData(dataset, {"source": source.name, **recognised, "versions": versions()})
         if table.has_nominal_kinematics:
             data = replace(data, setup=replace(data.setup, orientation_accuracy_deg=NOMINAL_ORIENTATION_DEG))
-        if table.gravity_is_measured:  # so that its direction defines the base
+        if table.gravity_is_measured:  # its direction defines the base
             known = replace(known or Known(), gravity_direction_base=-UP_IN_BASE)
     if options.table is not None and (source.is_dir() or source.suffix == ".json"):
         raise ConfigError(f"{source.name} is not a table: leave out options for tables, such as --columns")

@@ -27,7 +27,7 @@ FILES: Final = "weighings-*.ndjson"
 # change must increase `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
-    "other",  # any code of a newer version
+    "other",  # stands for every code of a newer version
 )
 # Number of bytes at the end of a file that contain a complete line end, even after a power failure.
 _TAIL: Final = 1 << 16

@@ -312,7 +312,7 @@ def _send_at_once(port: int) -> None:
     """
     folder = Path("/dev/fd")  # Windows has none
     for name in [path.name for path in folder.iterdir()] if folder.is_dir() else []:
-        with suppress(OSError):  # closed meanwhile
+        with suppress(OSError):  # the file was closed meanwhile
             if not stat.S_ISSOCK(os.fstat(int(name)).st_mode):
                 continue
             with socket.socket(fileno=os.dup(int(name))) as found:

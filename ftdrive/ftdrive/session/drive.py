@@ -188,7 +188,7 @@ class GuardedCell:
             self.cell.arm.open(control=True)
         except DeviceError:
             with suppress(DeviceError):
-                self.cell.arm.open()  # so that an emergency stop pressed meanwhile is seen
+                self.cell.arm.open()  # a connection shows an emergency stop that was pressed meanwhile
             raise
         try:
             self.cell.sensor.check()
@@ -209,7 +209,7 @@ class GuardedCell:
         self._answered = stop
         self.watcher.begin()
         q = self.cell.arm.state().q_rad
-        with self.watcher.watching(q, q, moving=False):  # raises if the cause persists
+        with self.watcher.watching(q, q, moving=False):  # a cause that persists trips a guard here
             self.watcher.clock.sleep(_LOOK_AGAIN_S)
         self.require_answers()
 

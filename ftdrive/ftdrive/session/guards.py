@@ -167,7 +167,7 @@ class SupervisorGuard(Guard):
     """Row 27: an operator, or a program in their place, follows the session."""
 
     absence: Callable[[], str | None]
-    """As `Operator.absence`."""
+    """Reason why no operator follows, or None, as `Operator.absence`."""
 
     def look(self, seen: Seen) -> None:
         """Trip if the operator is absent."""

@@ -160,7 +160,7 @@ class Journal:
             log.warning("events.ndjson cannot be written: %s", error)
 
     def absence(self) -> str | None:
-        """As `Operator.absence`."""
+        """Return why no operator follows; None if one does."""
         return self._operator.absence()
 
     def require_operator(self) -> None:
@@ -213,12 +213,12 @@ class Journal:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """As `Operator.pressed`."""
+        """Return the newest key pressed; None without one."""
         return self._operator.pressed()
 
     @property
     def pressed_by(self) -> str:
-        """As `Operator.pressed_by`."""
+        """Return who pressed the newest key."""
         return self._operator.pressed_by
 
 

@@ -102,7 +102,7 @@ class Tour:
 
     @property
     def undriven(self) -> list[int]:
-        """As `Progress.undriven`."""
+        """Poses from which the planned move was not driven, as `Progress.undriven`."""
         return self._now.undriven
 
     def _next(self) -> None:

@@ -97,7 +97,7 @@ class Verifying:
 
     @property
     def goal(self) -> str:
-        """As `Task.goal`."""
+        """Condition under which hand-guided poses suffice, as `Task.goal`."""
         return f"{self.poses} poses differ by {np.degrees(FRESH_RAD):.0f}° or more from those of the calibration"
 
     @cached_property
@@ -139,7 +139,9 @@ class Verifying:
             with suppress(BadPlan, BadDataset, PlanRefused, OSError, KeyError, TypeError):
                 plan = Plan.load(path)
                 turns = np.array([step.q_rad[5] for step in plan.steps]) - q_rad[5]
-                near = turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD  # else the cable winds up
+                near = (
+                    turns.min() <= 0 <= turns.max() or np.abs(turns).max() <= WRIST_6_RAD
+                )  # larger turns would wind up the cable
                 if plan.kind == "verification" and len(plan.steps) == poses and near and self._is_mine(path.parent):
                     plan.require(certifier)
                     return plan

@@ -32,7 +32,7 @@ STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 
 # Largest change between the means of two consecutive readings at rest; joint noise is 3e-5 rad.
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
-# From this displacement of the centre of mass on, its inertial wrench counts. It shows before the motion does.
+# Displacement of the centre of mass, m, from which its inertial wrench is considered. Joint angles show motion later.
 _FELT_M = 4e-5
 # Rest begins, and a state of motion ends, this long after its last sample, because links ring, s.
 _HOLD_S, _RINGS_S = 0.5, 0.4
@@ -116,7 +116,9 @@ class MotionTracker:
         classes = np.concatenate([self._classes, present])
         self._classes = classes[n:]
         w = len(classes) - n + 1
-        rung = maximum_filter1d(classes, w, origin=(w - 1) // 2, mode="constant")[w - 1 :]  # with those before
+        rung = maximum_filter1d(classes, w, origin=(w - 1) // 2, mode="constant")[
+            w - 1 :
+        ]  # the largest class of this row and of those before
         return np.where(moving, np.maximum(rung, 1), REST).astype(np.int8), felt
 
     @staticmethod

@@ -307,7 +307,9 @@ class Neighbours:
         if on and np.isfinite(buffer.p_base_flange_m[-1]).all():
             inertial, ready = self.wrench(buffer, load)
             end = end if last else max(ready, self._done)
-            ahead = np.minimum(np.arange(self._done, end) + neighbours, len(self._states) - 1)  # later poses
+            ahead = np.minimum(
+                np.arange(self._done, end) + neighbours, len(self._states) - 1
+            )  # last neighbour of each pose
             state = self._states[ahead]
             # at rest inertia is not subtracted, because that would amplify the noise of the joints
             inertial = np.where((state == REST)[:, None], 0.0, inertial[self._done : end])

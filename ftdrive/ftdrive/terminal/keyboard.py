@@ -107,7 +107,7 @@ class Keyboard:
     def _stop(self) -> None:
         thread, self._thread = self._thread, None
         if thread is not None:
-            # before the terminal discards typed input: a read of a discarded key would never return
+            # the thread ends before the terminal discards typed input: reading a discarded key would never return
             os.close(self._wake)
             thread.join()
         self._restore()

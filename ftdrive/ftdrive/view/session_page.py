@@ -152,7 +152,7 @@ class SessionPage:
         return answer
 
     def absence(self) -> str | None:
-        """As `Operator.absence`; viewers of the page do not count."""
+        """Return why no operator follows, or None. Viewers of the page do not count."""
         return self._operator.absence()
 
     @property

@@ -60,7 +60,7 @@ class Site(Gate):
     """
 
     def __init__(self, page: Page, bound: Address) -> None:
-        _files()  # raises before the port is opened
+        _files()  # a missing file raises before the port is opened
         self.token = secrets.token_urlsafe(18)
         self._page = page
         # For each viewer, its version of the page, and the time at which its buffer was last empty.

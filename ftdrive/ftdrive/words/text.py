@@ -44,7 +44,9 @@ GLUE: Final = "\ue000"
 
 def as_typed(text: str) -> str:
     """Return a message with `uv run` before its commands if this program was started by `uv run`."""
-    return _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text  # uv run sets it
+    return (
+        _COMMAND.sub("uv run ftdrive ", text) if "UV_RUN_RECURSION_DEPTH" in os.environ else text
+    )  # uv run sets this variable
 
 
 def is_command(line: str) -> bool:

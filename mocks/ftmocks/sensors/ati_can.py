@@ -109,7 +109,7 @@ class AtiCanNode(CanSensor):
             self.base, self.bitrate = self._next_base, self._next_bitrate
 
     def _samples(self, _count: int) -> list[CanFrame]:
-        return []  # this one only answers
+        return []  # this sensor only answers requests
 
     def _answer(self, request: CanFrame) -> list[CanFrame]:
         opcode = request.identifier & 0xF
@@ -119,7 +119,7 @@ class AtiCanNode(CanSensor):
             return []
         if len(request.data) not in REQUEST_DLC.get(opcode, ()):
             return []
-        identifier = request.identifier  # before a reset can change the base
+        identifier = request.identifier  # a reset below may change the base
         payloads = self._payloads(opcode, request.data[0] if request.data else 0)
         return [CanFrame(identifier + i, payload) for i, payload in enumerate(payloads)]
 

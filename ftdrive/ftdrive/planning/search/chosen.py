@@ -107,7 +107,7 @@ def _clear_candidates(
 
     for numbers, q in _tours_at(certifier, q_now, candidates, spins, poses, choice, speeds):
         rms = predicted_sigma(certifier.arm.frames(q).R_base_flange, guess).force_rms_N
-        if np.isfinite(rms):  # otherwise a parameter is not observable
+        if np.isfinite(rms):  # infinite if a parameter is not observable
             return Chosen(numbers, q, rms, ideal, elsewhere=False)
     return None
 

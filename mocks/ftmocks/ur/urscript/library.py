@@ -187,7 +187,7 @@ def servoj(
         servo = robot.arm.servo(Command(goal, seconds, lookahead_s, stiffness), program.owner)
     except CannotFollow as error:
         robot.protective_stop(str(error))
-        yield  # paused from here on
+        yield  # the program is paused from here on
         return
     cycle_s = robot.period_s * robot.settings.time_scale
     while servo.ahead_s > cycle_s - 1e-9:

@@ -200,7 +200,7 @@ class Program(ControllerProgram):
             raise ScriptError(f"{name} = a function without a value")
         if statement.index is not None:
             whole, index = self._variable(scope, name), (yield from self._value(scope, statement.index))
-            element(whole, index)  # must exist
+            element(whole, index)  # the element must exist
             whole[index] = single(value)
             return
         is_global = statement.scope == "global" or (
