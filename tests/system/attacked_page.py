@@ -19,17 +19,17 @@ SECRET = "name-behind-the-token"
 PAGE = f"""
 import sys, time
 from ftdrive.view.page import drawing
-from ftdrive.view.site import serve
+from ftdrive.view.site import serve_page
 from ftdrive.view.parts import *
 def use(name): page.on(name, lambda viewer, value: print(viewer, name, repr(value), flush=True))
 def draw():
     dots = {{"kind": "dots", "points": [[time.monotonic()] * 3] * 2000}}
     page.put({{"state": lines("{SECRET}"), "scene/dots": dots}})
     HOOK
-shown = [button("tare", "Tare"), button("off", "Off", disabled=True), check("check", "Check", value=False)]
-shown += [select("axes", "Axes", "base", ["base", "tcp"]), slider("time", "Time", 1, 10)]
+shown = [button("tare", "Tare"), button("off", "Off", disabled=True), check_box("check", "Check", value=False)]
+shown += [choice("axes", "Axes", "base", ["base", "tcp"]), slider("time", "Time", 1, 10)]
 shown += [text_field("name", "Name", "")]
-with serve("{SECRET}") as page:
+with serve_page("{SECRET}") as page:
     page.put({{"controls": controls(*shown)}})
     page.add_stop(lambda viewer: print(viewer, "stop", flush=True))
     for one in (*shown, button("hidden", "")): use(one["name"])

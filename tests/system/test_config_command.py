@@ -106,7 +106,7 @@ def test_without_a_configuration_a_plan_needs_arm_and_tool(arguments: list[str],
     error = run("plan", *arguments).exception
     assert error is not None
     assert exit_code(error) == 2
-    assert f"Give {said}" in str(error)
+    assert f"give {said}" in str(error)
 
 
 def test_settings_are_all_shown() -> None:

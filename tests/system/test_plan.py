@@ -84,7 +84,7 @@ def test_a_plane_with_its_sign_wrong_is_named_at_once() -> None:
 
 def test_the_table_fits_into_80_columns() -> None:
     lines = run(*UR5E, "--all").stdout.splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith("Poses in degrees"))
+    start = next(i for i, line in enumerate(lines) if line.startswith("Joint angles of the poses in degrees"))
     table = lines[start + 1 : lines.index("", start)]
     assert max(map(len, table)) <= 80
     assert len({len(line) for line in table[:-2]}) == 1  # headings stand above their numbers
@@ -97,7 +97,7 @@ def test_the_table_fits_into_80_columns() -> None:
         (["--tool", "200:100:50"], "[200.0, 100.0, 50.0] is not"),
         (["--quick", "--minimal"], "not both"),
         (["--mounting", "sideways"], "mounting"),
-        (["--plane", "0:0:0:1"], "normal is zero"),
+        (["--plane", "0:0:0:1"], ": the normal of"),
         (["--tip-speed-limit", "-1"], "1 to 250"),
         (["--tip-speed-limit", "fast"], "'fast': give mm/s, such as 250, or none"),
         (["--posture", "45,-100"], "3 numbers"),

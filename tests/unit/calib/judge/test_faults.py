@@ -396,7 +396,7 @@ def test_a_drift_is_named_with_its_size() -> None:
 def test_rotation_vectors_in_degrees_are_refused(tmp_path: Path) -> None:
     rows = "\n".join(f"{90 - k},{k},0,1,2,3,4,5,6" for k in range(6))
     (tmp_path / "poses.csv").write_text(f"rx,ry,rz,fx,fy,fz,tx,ty,tz\n{rows}\n")
-    with pytest.raises(BadDataset, match="has degrees, or is three angles"):
+    with pytest.raises(BadDataset, match="is in degrees, or is three angles"):
         read_dataset(tmp_path / "poses.csv")
 
 

@@ -349,7 +349,7 @@ def test_push_names_axis_and_sign(R_base_flange: Any, R_flange_sensor: Any, size
         (None, 0.3, "skipped", "does not report"),
         (1.72, 0.3, "ok", "controller 1.72 kg; identified 1.44 kg + 0.30 kg sensor"),
         (1.72, None, "ok", "identified 1.44 kg + sensor"),
-        (3.0, 0.3, "warning", "payload of 3.00 kg, but 1.44 kg hang"),
+        (3.0, 0.3, "warning", "payload of 3.00 kg, but the load on the sensor is 1.44 kg"),
     ],
 )
 def test_the_payload_is_compared_with_the_weighed_load(
