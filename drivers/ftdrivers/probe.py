@@ -7,7 +7,7 @@ Only ports and buses that the user names are probed. Only read requests are sent
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from ftdrivers.clock import REAL, Clock
 from ftdrivers.errors import ConnectError, ProtocolError, StreamBroken
@@ -35,13 +35,16 @@ class Answer(NamedTuple):
     """What the sensor reports about itself, or why it was not asked."""
 
 
-def _drivers(wire: str) -> Iterator[ModuleType]:
-    return (import_module(kind.driver.partition(":")[0]) for kind in SENSORS.values() if kind.wire == wire)
+def _drivers(wire: str) -> Iterator[tuple[ModuleType, Any]]:
+    """Yield module and class of each driver on this wire."""
+    for name in (kind.driver for kind in SENSORS.values() if kind.wire == wire):
+        module = import_module(name.partition(":")[0])
+        yield module, getattr(module, name.partition(":")[2])
 
 
 def probe_serial(port: str, clock: Clock = REAL) -> Answer | None:
     """Return the sensor that was found on this port, or None. Raises `ConnectError` if the port does not open."""
-    probes = [probe for driver in _drivers("serial") for probe in driver.SERIAL_PROBES]
+    probes = [probe for module, _ in _drivers("serial") for probe in module.SERIAL_PROBES]
     with clock.keeping_up():
         for probe in probes:
             if probe.streams(_receive_from_line(port, probe, b"", _LISTEN_LINE_S, clock)):
@@ -97,7 +100,7 @@ def probe_can(
     ConnectError
         The bus does not open, or is lost.
     """
-    probes = [driver.can_probe(channel, interface, bitrate, base) for driver in _drivers("can")]
+    probes = [driver.probe(channel, interface, bitrate, base) for _, driver in _drivers("can")]
     bus = CanBus(f"{interface} {channel}", channel, interface, bitrate or 250_000, clock=clock)
     try:
         with clock.keeping_up():

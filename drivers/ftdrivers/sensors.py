@@ -10,8 +10,8 @@ class SensorKind:
     """One kind of sensor: what is known before its driver is imported."""
 
     driver: str
-    """Module and class of the driver. The class has `from_url`. On a serial port the module has `SERIAL_PROBES`, on CAN
-    `can_probe`."""
+    """Module and class of the driver. The class has `from_url`, on CAN also `probe`; on a serial port the module has
+    `SERIAL_PROBES`."""
     wire: Literal["can", "serial", "ethernet", "topic"]
     emulated: Mapping[str, str] = field(default_factory=dict)
     """Name of each emulator of this sensor, and its description for the user."""

@@ -41,6 +41,8 @@ _ANOTHER_SLOT = "choose another slot, slot=0 to 15 in its address"
 _MILLION = (1_000_000, 1_000_000)
 # Shortest poll period: about the capacity of a bus at 250 kbit/s. Faster polls would only load the CPU.
 _PERIOD_S = 1e-3
+# Heartbeats of CANopen nodes. On such a bus any lower identifier may be a command, even if none is sent at the moment.
+_HEARTBEATS = frozenset(range(0x701, 0x780))
 
 
 class AtiCanSensor(StreamingSensor):
@@ -110,6 +112,39 @@ class AtiCanSensor(StreamingSensor):
             counts_per_unit=options.counts(),
             sign=sign,
             clock=clock,
+        )
+
+    @staticmethod
+    def probe(channel: str, interface: str, bitrate: int | None, base: int) -> CanProbe:
+        """Return how to recognize a NETCANOEM with this base identifier; the parameters are those of `probe_can`."""
+        first = base << 4
+        own = frozenset(range(first, first + 16))
+        options = {} if interface == "socketcan" else {"interface": interface}
+        options |= {"bitrate": str(bitrate)} if bitrate else {}
+        options |= {"base": f"0x{base:02X}"} if base != 0x20 else {}
+
+        def replies(op: Op) -> dict[int, int]:
+            return {first | opcode: size for opcode, size in codec.REPLIES[op].items()}
+
+        def recognize(heard: Sequence[CanFrame]) -> str | None:
+            request = (first | Op.GAUGES, b"")
+            ours = [frame for frame in heard if frame[0] in own and frame != request]
+            return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= 5 else None
+
+        def ask(bus: CanBus) -> str | None:
+            serial = bus.request(first | Op.SERIAL, b"", replies(Op.SERIAL))
+            firmware = serial and bus.request(first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
+            if serial is None or firmware is None:
+                return None
+            major, minor, build = codec.decode_firmware(firmware)
+            return f"ATI NETCANOEM, serial {codec.decode_serial(serial)}, firmware {major}.{minor} build {build}"
+
+        return CanProbe(
+            f"an ATI NETCANOEM at base 0x{base:02X}",
+            join_url("ati-can", channel, options),
+            own | _HEARTBEATS if first < min(_HEARTBEATS) else own,
+            recognize,
+            ask,
         )
 
     def _connect(self) -> DeviceInfo:
@@ -290,40 +325,3 @@ class AtiCanSensor(StreamingSensor):
 def _scale_text(counts: tuple[int, int], unit_codes: tuple[int, int]) -> str:
     force, torque = unit_names(unit_codes)
     return f"{counts[0]} counts per {force} and {counts[1]} per {torque}"
-
-
-# Heartbeats of CANopen nodes. On such a bus any lower identifier may be a command, even if none is sent at the moment.
-_HEARTBEATS = frozenset(range(0x701, 0x780))
-
-
-def can_probe(channel: str, interface: str, bitrate: int | None, base: int) -> CanProbe:
-    """Return how to recognize a NETCANOEM with this base identifier; the parameters are those of `probe_can`."""
-    first = base << 4
-    own = frozenset(range(first, first + 16))
-    options = {} if interface == "socketcan" else {"interface": interface}
-    options |= {"bitrate": str(bitrate)} if bitrate else {}
-    options |= {"base": f"0x{base:02X}"} if base != 0x20 else {}
-
-    def replies(op: Op) -> dict[int, int]:
-        return {first | opcode: size for opcode, size in codec.REPLIES[op].items()}
-
-    def recognize(heard: Sequence[CanFrame]) -> str | None:
-        request = (first | Op.GAUGES, b"")
-        ours = [frame for frame in heard if frame[0] in own and frame != request]
-        return "another host reads it" if len(join_frames(ours, replies(Op.GAUGES))) >= 5 else None
-
-    def ask(bus: CanBus) -> str | None:
-        serial = bus.request(first | Op.SERIAL, b"", replies(Op.SERIAL))
-        firmware = serial and bus.request(first | Op.FIRMWARE, b"", replies(Op.FIRMWARE))
-        if serial is None or firmware is None:
-            return None
-        major, minor, build = codec.decode_firmware(firmware)
-        return f"ATI NETCANOEM, serial {codec.decode_serial(serial)}, firmware {major}.{minor} build {build}"
-
-    return CanProbe(
-        f"an ATI NETCANOEM at base 0x{base:02X}",
-        join_url("ati-can", channel, options),
-        own | _HEARTBEATS if first < min(_HEARTBEATS) else own,
-        recognize,
-        ask,
-    )

@@ -194,6 +194,35 @@ class RobotousCan(RobotousSensor):
             clock=clock,
         )
 
+    @staticmethod
+    def probe(channel: str, interface: str, bitrate: int | None, _base: int) -> CanProbe | None:
+        """Return how to recognize a Robotous, on a bus at 1 Mbit/s only. The parameters are those of `probe_can`."""
+        if bitrate not in {None, BITRATE}:
+            return None
+        command, *answers = IDS
+        reply = dict.fromkeys(answers, 8)
+
+        def recognize(heard: Sequence[CanFrame]) -> str | None:
+            fields = join_frames([frame for frame in heard if frame[0] in reply], reply)
+            try:
+                samples = [codec.decode_sample(field) for field in fields]
+            except ProtocolError:
+                return None
+            plausible = all(sample.overload < 0x40 for sample in samples)
+            return "it streams" if plausible and len(samples) >= 5 else None
+
+        def ask(bus: CanBus) -> str | None:
+            field = bus.request(command, codec.encode(Command.MODEL), reply)
+            try:
+                model = field and field[0] == Command.MODEL and codec.decode_text(field)
+            except ProtocolError:
+                return None
+            return f"Robotous {model}" if model else None
+
+        options = {} if interface == "socketcan" else {"interface": interface}
+        url = join_url("robotous-can", channel, options)
+        return CanProbe("a Robotous", url, reply.keys() | {command}, recognize, ask)
+
     def _open(self) -> None:
         self._halves = Halves()
         self._bus.open()
@@ -244,32 +273,3 @@ def _parse_ids(text: str) -> tuple[int, int, int]:
             f"ids are '{text}'; give three identifiers, of commands and of both response frames, such as 0xF0,0xF1,0xF2"
         )
     return command, first, second
-
-
-def can_probe(channel: str, interface: str, bitrate: int | None, _base: int) -> CanProbe | None:
-    """Return how to recognize a Robotous, which needs a bus at 1 Mbit/s. The parameters are those of `probe_can`."""
-    if bitrate not in {None, BITRATE}:
-        return None
-    command, *answers = IDS
-    reply = dict.fromkeys(answers, 8)
-
-    def recognize(heard: Sequence[CanFrame]) -> str | None:
-        fields = join_frames([frame for frame in heard if frame[0] in reply], reply)
-        try:
-            samples = [codec.decode_sample(field) for field in fields]
-        except ProtocolError:
-            return None
-        plausible = all(sample.overload < 0x40 for sample in samples)
-        return "it streams" if plausible and len(samples) >= 5 else None
-
-    def ask(bus: CanBus) -> str | None:
-        field = bus.request(command, codec.encode(Command.MODEL), reply)
-        try:
-            model = field and field[0] == Command.MODEL and codec.decode_text(field)
-        except ProtocolError:
-            return None
-        return f"Robotous {model}" if model else None
-
-    options = {} if interface == "socketcan" else {"interface": interface}
-    url = join_url("robotous-can", channel, options)
-    return CanProbe("a Robotous", url, reply.keys() | {command}, recognize, ask)

@@ -24,9 +24,10 @@ def missing(scheme: str, kind: SensorKind) -> Iterator[str]:
         driver = import_module(module)
         if not hasattr(getattr(driver, name, None), "from_url"):
             yield f"{module}: the class {name} with from_url"
-        probe = {"serial": "SERIAL_PROBES", "can": "can_probe"}.get(kind.wire)
-        if probe and not hasattr(driver, probe):
-            yield f"{module}: {probe}, by which `devices --probe` finds the sensor"
+        if kind.wire == "serial" and not hasattr(driver, "SERIAL_PROBES"):
+            yield f"{module}: SERIAL_PROBES, by which `devices --probe` finds the sensor"
+        if kind.wire == "can" and not hasattr(getattr(driver, name, None), "probe"):
+            yield f"{module}: the class {name} with probe, by which `devices --probe` finds the sensor"
     tests = f"tests/unit/drivers/{module.split('.')[1]}"
     if not list((ROOT / tests).glob("test_*.py")):
         yield f"{tests}: a test of the codec with the bytes that the vendor's document prints"
