@@ -141,9 +141,14 @@ def test_ctrl_c_ends_the_form_while_a_device_is_read(tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(described, "look", look)
     form = InitPage(page, described, tmp_path / "draft", "ftdrive.toml", lambda *_: None)
-    form._refresh()  # only a control that is shown can be used
-    page.act("viewer 0", ROBOT, "robot-of-another-network")
-    page.act("viewer 0", "look", None)
+
+    def use() -> None:
+        while "form/write" not in page.since(0)[1]:
+            time.sleep(0.005)
+        page.act("viewer 0", ROBOT, "robot-of-another-network")
+        page.act("viewer 0", "look", None)
+
+    Thread(target=use).start()
     try:
         with pytest.raises(KeyboardInterrupt):
             form.run()

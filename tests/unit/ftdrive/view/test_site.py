@@ -8,15 +8,13 @@ from collections.abc import Iterator
 from contextlib import closing
 from functools import partial
 from http.client import HTTPConnection, HTTPResponse
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
 
-from ftdrive.terminal.console import print_page
 from ftdrive.view.page import Page, drawing
 from ftdrive.view.parts import button, check_box, choice, controls, lines, slider, text_field
-from ftdrive.view.site import announce_page, serve_page
+from ftdrive.view.site import serve_page
 from tests.wire.waiting import wait_until
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
@@ -66,35 +64,6 @@ def page() -> Iterator[Page]:
 
 def wait_for(event: threading.Event) -> None:
     event.wait()
-
-
-def test_a_page_is_served_to_who_has_opened_its_address(page: Page) -> None:
-    viewer = Viewer(page)
-    shell = viewer.ask("GET", "/")
-    assert (shell.status, b"<title>" in shell.body) == (200, True)  # type: ignore[attr-defined]
-    assert "default-src 'none'" in shell.headers["Content-Security-Policy"]
-    for name in ("page.js", "page.css", "scene.js", "uPlot.iife.js", "uPlot.min.css"):
-        assert viewer.ask("GET", f"/{name}").status == 200
-    for target in ("/page.html", "/../page.py", "/site.py", "/%2e%2e/page.py", "//etc/passwd"):
-        assert viewer.ask("GET", target).status == 404
-
-
-def test_without_the_token_nothing_is_served(page: Page) -> None:
-    viewer = Viewer(page)
-    cookie, viewer.cookie = viewer.cookie, ""
-    token = urlsplit(page.url).query
-    for target in ("/", "/parts", "/page.js", "/?token=", f"/?{token[:-1]}", f"/x?{token}", "/?token=%C3"):
-        assert viewer.ask("GET", target).status == 403
-    assert viewer.do("stop") == 403
-    name, _, value = cookie.partition("=")
-    for wrong in (f"{value}1", f"{value}0x", value[1:], "", ".0"):
-        viewer.cookie = f"{name}={wrong}"
-        assert viewer.ask("GET", "/").status == 403
-    for wrong in (f"ftdrive-1={value}", value):
-        viewer.cookie = wrong
-        assert viewer.ask("GET", "/").status == 403
-    viewer.cookie = f"other=1; {cookie}"
-    assert viewer.ask("GET", "/").status == 200
 
 
 def test_parts_arrive_once_and_the_newest_counts(page: Page) -> None:
@@ -169,25 +138,11 @@ def test_controls_take_only_their_own_values(page: Page) -> None:
     assert taken == right
 
 
-def test_controls_are_used_from_the_page_itself(page: Page) -> None:
+def test_controls_are_not_used_from_another_site(page: Page) -> None:
     page.add_stop(lambda _: pytest.fail("a foreign page has stopped the arm"))
     viewer = Viewer(page)
-    for headers in (
-        {"Origin": "https://evil.example"},
-        {"Origin": "null"},
-        {"Origin": f"http://127.0.0.1:{viewer.port}0"},
-        {"Origin": "http://["},
-        {"Sec-Fetch-Site": "same-site"},
-        {"Host": "evil.example"},
-        {"Content-Type": "text/plain"},
-        {"Content-Type": "application/x-www-form-urlencoded"},
-    ):
+    for headers in ({"Origin": "https://evil.example"}, {"Sec-Fetch-Site": "same-site"}, {"Host": "evil.example"}):
         assert viewer.do("stop", **headers) == 403
-    assert viewer.ask("POST", "/do", "{}", **{"Content-Type": JSON}).status == 403  # a program, without an origin
-    for method in ("GET", "PUT", "DELETE", "OPTIONS"):
-        assert viewer.ask(method, "/do", Origin=viewer.origin).status in (404, 405)
-    long = {"Origin": viewer.origin, "Content-Type": JSON, "Content-Length": "45000000"}
-    assert viewer.ask("POST", "/do", "{}", **long).status == 413
 
 
 def test_a_value_that_a_handler_rejects_is_explained(page: Page) -> None:
@@ -202,17 +157,6 @@ def test_a_value_that_a_handler_rejects_is_explained(page: Page) -> None:
     assert (answer.status, answer.body) == (400, b"x is no name\n")  # type: ignore[attr-defined]
 
 
-def test_idle_connections_keep_nobody_out(page: Page) -> None:
-    stopped: list[str] = []
-    page.add_stop(stopped.append)
-    viewer = Viewer(page)
-    idle = [socket.create_connection(("127.0.0.1", viewer.port)) for _ in range(150)]
-    assert viewer.do("stop") == 204
-    assert stopped == ["viewer 0"]
-    for one in idle:
-        one.close()
-
-
 def test_a_page_that_is_not_drawn_any_more_is_stale(page: Page) -> None:
     assert page.stale_s == 0
     page.beat()
@@ -220,19 +164,3 @@ def test_a_page_that_is_not_drawn_any_more_is_stale(page: Page) -> None:
     assert 0 < page.stale_s < 30
     beat = next(data for event, data in Viewer(page).follow() if event == "beat")
     assert isinstance(beat, float | int)
-
-
-def test_the_browser_is_given_a_file_that_only_its_owner_can_read(
-    page: Page, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    opened: list[str] = []
-    monkeypatch.setenv("DISPLAY", ":0")
-    monkeypatch.setattr("webbrowser.open", opened.append)
-    with announce_page(page, None, print_page):
-        (address,) = opened
-        file = Path(urlsplit(address).path)
-        assert "token" not in address
-        assert page.url in file.read_text()
-        assert file.parent.stat().st_mode & 0o077 == 0
-    assert not file.exists()
-    assert page.url in "".join(capsys.readouterr().err.split())
