@@ -19,10 +19,8 @@ from rich.text import Text
 from syrupy.assertion import SnapshotAssertion
 
 import ftdrive.cli as cli_module
-from ftdrive.checks.check import Check
 from ftdrive.cli import cli
 from ftdrive.cli import run as cli_run
-from ftdrive.commands.doctor import _print_checks
 from ftdrive.errors import Declined, in_a_sentence
 from ftdrive.planning import planner
 from ftdrive.planning.plan import Plan
@@ -103,22 +101,6 @@ def test_a_line_that_is_a_command_is_never_broken() -> None:
     assert command in console.file.getvalue()
 
 
-def test_findings_of_doctor_and_their_cures_are_indented(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("TERM", "dumb")  # 80 columns, no colour
-    monkeypatch.setattr(answer, "soft_wrap", False)  # as in a terminal
-    _print_checks([Check("robot.payload", "failed", "found [1] " * 20, "fix it " * 20)], every=True)
-    first, *others = (line.rstrip() for line in capsys.readouterr().out.splitlines())
-    assert first.startswith(" robot       ✘ found [1]")
-    cure = next(k for k, line in enumerate(others) if line.startswith(" " * 15 + "fix: fix"))
-    assert cure > 0
-    assert all(re.match(r" {15}\S", line) for line in others[:cure])
-    assert all(re.match(r" {20}\S", line) for line in others[cure + 1 : -1])
-    assert others[-1] == " Not ready."
-    assert others[cure + 1 :]
-
-
 def test_quiet_leaves_only_errors_and_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     plan_for, plans = planner.plan_for, list[Plan]()
 
@@ -185,7 +167,7 @@ def test_80_columns_hold_whole_words_and_commands_that_a_shell_reads(
 ) -> None:
     monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
     monkeypatch.setattr(messages, "soft_wrap", False)
-    monkeypatch.setattr(messages, "_width", 80)
+    monkeypatch.setenv("COLUMNS", "80")
     command, why = "ftdrive live --calibration runs/2026-11-23T135517Z-with-a-long-name --simulate", "(why it helps)"
     messages.print_next(command, f"{command}   {why}")
     echo("words " * 30)
@@ -244,8 +226,6 @@ def test_a_terminal_that_closes_ends_a_command_unless_it_may(ignored: bool, monk
     handlers: dict[int, object] = {signal.SIGHUP: signal.SIG_IGN if ignored else signal.SIG_DFL}
     monkeypatch.setattr(signal, "getsignal", handlers.__getitem__)
     monkeypatch.setattr(signal, "signal", handlers.__setitem__)
-    for name in ("_open_closed_streams", "_leave_dead_streams"):
-        monkeypatch.setattr(cli_module, name, lambda: False)
     monkeypatch.setattr(cli_module, "run", lambda _: 3)
     assert cli_module.main() == 3
     assert (handlers.pop(signal.SIGHUP) == signal.SIG_IGN) == ignored

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from syrupy.assertion import SnapshotAssertion
 
 from ftcalib.model import Array
 from ftdrive.runs.calibration import FOREIGN
@@ -88,22 +89,13 @@ def directions(*angles_deg: float) -> Array:
     return np.array([np.cos(a) * down + np.sin(a) * across for a in np.radians(angles_deg)])
 
 
-def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View) -> None:
+def test_the_sphere_says_how_near_the_calibrated_orientations_are(view: View, snapshot: SnapshotAssertion) -> None:
     reading = replace(reading_of(view), R_base_flange=R_BASE_FLANGE)
     lines = sphere(replace(view, reading=reading, calibrated=directions(70, 23, 110)))
-    words = [text(line)[2 * live_panels._DISC + 6 :].strip() for line in lines]
-    covariance = view.info.calibration.wrench_covariance(R_BASE_FLANGE)
-    variances = np.diag(covariance)
-    assert words[1:9] == [
-        "direction of gravity",
-        "in flange axes",
-        "● now",
-        "∘ calibrated: 3",
-        "nearest 23° away",
-        "",
-        "calibration sigma here",
-        f"{np.sqrt(variances[:3].sum()):.3f} N, {1e3 * np.sqrt(variances[3:].sum()):.2f} mN·m",
-    ]
+    assert "\n".join(text(line).rstrip() for line in lines) == snapshot
+    variances = np.diag(view.info.calibration.wrench_covariance(R_BASE_FLANGE))
+    sigma = f"{np.sqrt(variances[:3].sum()):.3f} N, {1e3 * np.sqrt(variances[3:].sum()):.2f} mN·m"
+    assert text(lines[8]).rstrip().endswith(sigma)
     assert sum(text(line).count("●") for line in lines) == 2  # one is in the words
     unknown = sphere(replace(view, reading=reading, calibrated=None))
     assert "calibrated:" not in "".join(map(text, unknown))

@@ -10,7 +10,9 @@ import termios
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -96,8 +98,8 @@ def estimated(**changes: Any) -> Estimated:
     return Estimated(**(fields | changes))
 
 
-def view(*events: Event) -> SessionView:
-    found = SessionView()
+def view(*events: Event, command: str = "calibrate") -> SessionView:
+    found = SessionView(command)
     for second, event in enumerate(events):
         found.update(event, float(second))
     return found
@@ -111,6 +113,55 @@ MIDDLE: tuple[Event, ...] = (
 )
 
 
+NONE_YET: dict[str, Any] = {"values": {}, "sigma": {}, "residual_sigma": None, "residual_force_N": None}
+FORCE = np.array([0.3, 0, 0.01, 3e-20, 0, 0])
+FORCE_SIGMA = np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
+DRIFTED = np.array([0.5, 0, 0, 0, 0, 0])
+LONG = "/home/operator/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
+CONTACT = "a force of 77 N where a free tool gives 3 N"
+
+
+def drifting(change: Any, sigma: Any) -> Estimated:
+    return estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
+
+
+def verified() -> Iterator[Event]:
+    for stop, number, off in ((1, 103, 1.0), (2, 101, 20.0)):
+        yield pose(stop, number, stops=3)
+        residual, sigma = np.repeat([0.03 * off, 0.001 * off], 3), np.repeat([0.03, 0.001], 3)
+        yield Compared(stop=stop, number=number, residual=residual, sigma=sigma, poses=stop, light="amber")
+
+
+SCREENS: dict[str, tuple[Event, ...]] = {
+    "middle": (*MIDDLE, Noted(words="R12 was repeated", warning=True)),
+    "preflight": (StateChanged(state=State.PREFLIGHT),),
+    "first-pose": (
+        *(MIDDLE[0], pose(1, 1), estimated(**NONE_YET, cond9=np.inf, cond_u1=np.inf, light="red")),
+        StateChanged(state=State.SAMPLE, stop=3, stops=25),
+    ),
+    "hand-guided": (MIDDLE[0], StateChanged(state=State.SAMPLE, stop=3)),
+    "no-run": (StateChanged(state=State.SAMPLE, stop=3, stops=7), pose(2, 19)),
+    "out-of-line": (*MIDDLE, pose(7, 5, steady=False, attempts=3), estimated(residual_sigma=31.0)),
+    "again-quiet": (pose(1, 19), pose(2, 5), pose(3, 19, mean=np.full(6, 1e-4))),
+    "again-drifted": (pose(1, 19), pose(2, 5), pose(3, 19, mean=DRIFTED)),
+    "drift": (*MIDDLE, drifting(np.full(6, 0.3), np.full(6, 0.02))),
+    "drift-force": (*MIDDLE, drifting(FORCE, FORCE_SIGMA)),
+    "drift-perhaps": (*MIDDLE, drifting(FORCE / 200, FORCE_SIGMA)),
+    "held": (
+        *(*MIDDLE, GuardTripped(hazard=14, words=CONTACT)),
+        *(StateChanged(state=state, words=CONTACT) for state in (State.STOP, State.HOLD)),
+    ),
+    "paused": (*MIDDLE, StateChanged(state=State.HOLD, words="paused by a person")),
+    "precise": (*MIDDLE, estimated(sigma={name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()})),
+    "resumed": (MIDDLE[0], estimated(poses=12)),
+    "long-path": (RunOpened(folder=LONG, resume=f"ftdrive calibrate --resume {LONG}"),),
+    "sweep-on-hold": (
+        *(RunOpened(folder="runs/a", resume=""), StateChanged(state=State.HOLD, words="the operator stopped")),
+    ),
+    "verify": tuple(verified()),
+}
+
+
 def drawn(found: SessionView, *, width: int = 80, height: int = 24, now_s: float = 9.0) -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None, force_terminal=False)
     console.print(draw_session(found, now_s, width=width, height=height))
@@ -119,15 +170,21 @@ def drawn(found: SessionView, *, width: int = 80, height: int = 24, now_s: float
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
-def test_a_long_hold_brings_the_end_no_nearer() -> None:
-    assert drawn(view(*MIDDLE), now_s=5000.0)[0].endswith("6 kept, about 18 s left")
-
-
-def test_everything_needed_is_on_a_screen_of_80_by_24(snapshot: SnapshotAssertion) -> None:
-    lines = drawn(view(*MIDDLE, Noted(words="R12 was repeated", warning=True)))
+@pytest.mark.parametrize("name", SCREENS)
+def test_a_screen_of_80_by_24(name: str, snapshot: SnapshotAssertion) -> None:
+    found = view(*SCREENS[name], command="verify" if name == "verify" else "calibrate")
+    lines = drawn(found, now_s=30.0)
     assert len(lines) <= 23
     assert max(map(len, lines)) <= 80
     assert "\n".join(lines) == snapshot
+
+
+def test_a_question_and_a_long_hold_are_no_progress() -> None:
+    asking = view(*MIDDLE)
+    asking.keys = "asking"
+    lines = drawn(asking, now_s=5000.0)
+    assert lines[0].endswith("6 kept, about 18 s left")
+    assert lines[1] == "WAITS for an answer"
 
 
 @pytest.mark.parametrize(("width", "height"), [(80, 24), (79, 24), (60, 20), (40, 15), (132, 50), (80, 12), (20, 8)])
@@ -145,58 +202,6 @@ def test_nothing_wraps_and_what_matters_most_stays(width: int, height: int) -> N
         assert "0.0011" in text or width < 50
 
 
-def test_only_keys_that_do_something_are_offered() -> None:
-    def keys(**changed: Any) -> str:
-        (line,) = [line for line in drawn(view(MIDDLE[0], StateChanged(**changed))) if "Ctrl-C" in line]
-        return line
-
-    tour = keys(state=State.SAMPLE, stop=3, stops=25)
-    assert "redo" in tour
-    assert "finish" not in tour
-    by_hand = keys(state=State.SAMPLE, stop=3)
-    assert by_hand.startswith(" k  finish   r  redo   s  skip ")
-    assert keys(state=State.PREFLIGHT).startswith("Ctrl-C")
-    assert drawn(view(StateChanged(state=State.SAMPLE, stop=3, stops=7), pose(2, 19)))[-1].endswith(" Ctrl-C ends")
-
-
-def test_before_a_run_there_is_no_table_of_nothing() -> None:
-    lines = drawn(view(StateChanged(state=State.PREFLIGHT)))
-    assert lines[:2] == [
-        "ftdrive calibrate                                                         0 kept",
-        "PREFLIGHT  9 s",
-    ]
-    assert "estimate" not in "\n".join(lines)
-    assert "kept in" not in "\n".join(lines)
-
-
-def test_a_first_pose_shows_its_coverage_and_no_numbers() -> None:
-    first = estimated(
-        values={}, sigma={}, residual_sigma=None, residual_force_N=None, cond9=np.inf, cond_u1=np.inf, light="red"
-    )
-    text = "\n".join(drawn(view(MIDDLE[0], pose(1, 1), first)))
-    assert "coverage  RED   condition >100 " in text
-    assert "out of plane >100 " in text
-    assert "residual: no previous fit" in text
-    assert "drift  not known" in text
-    assert "nan" not in text
-    assert "inf" not in text
-
-
-def test_a_pose_out_of_line_says_which_key_helps() -> None:
-    text = "\n".join(drawn(view(*MIDDLE, pose(7, 5, steady=False, attempts=3), estimated(residual_sigma=31.0))))
-    assert "OUT OF LINE: press r" in text
-    assert "NOT STEADY, 3 attempts" in text
-
-
-def test_the_first_pose_seen_again_shows_the_drift() -> None:
-    quiet = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.full(6, 1e-4)))
-    assert any("drift  first pose again after 2 s" in line and "none seen" in line for line in drawn(quiet))
-    drifted = view(pose(1, 19), pose(2, 5), pose(3, 19, mean=np.array([0.5, 0, 0, 0, 0, 0])))
-    assert any("0.500 N" in line and "15 N/min" in line for line in drawn(drifted))
-    fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, 0.02)})
-    assert any("drift  0.520 ± 0.020 N" in line for line in drawn(view(*MIDDLE, fitted)))
-
-
 def test_only_a_drift_beyond_the_noise_is_yellow() -> None:
     for again, style in ((0.0, ""), (0.5, "bold yellow")):
         assert drift_so_far(view(pose(1, 19), pose(2, 19, mean=np.array([again, 0, 0, 0, 0, 0])))).style == style
@@ -204,43 +209,6 @@ def test_only_a_drift_beyond_the_noise_is_yellow() -> None:
         fitted = estimated(values=VALUES | {"drift": np.full(6, 0.3)}, sigma=SIGMA | {"drift": np.full(6, sigma)})
         found = drift_so_far(view(*MIDDLE, fitted))
         assert (found.style, found.words.endswith(words)) == (style, True)
-
-
-def test_a_drift_of_the_force_alone_is_shown_without_torque() -> None:
-    def certainty(force: str, event: Estimated) -> list[str]:
-        lines = [line for line in drawn(view(*MIDDLE, event)) if line.startswith(f"drift  {force} ")]
-        assert not any("N·m" in line for line in lines)
-        return ["perhaps" if line.endswith("perhaps") else "sure" for line in lines]
-
-    change, sigma = np.array([0.3, 0, 0.01, 3e-20, 0, 0]), np.array([6e-4, 6e-4, 6e-4, 2e-21, 0, 3e-12])
-    fitted = estimated(values=VALUES | {"drift": change}, sigma=SIGMA | {"drift": sigma})
-    assert certainty("0.30017 ± 0.00060 N", fitted) == ["sure"]
-    doubtful = estimated(values=VALUES | {"drift": change / 200}, sigma=SIGMA | {"drift": sigma})
-    assert certainty("0.00150 ± 0.00060 N", doubtful) == ["perhaps"]
-
-
-def test_a_reason_stands_once_on_the_screen() -> None:
-    words = "a force of 77 N where a free tool gives 3 N"
-    held = view(
-        *MIDDLE,
-        GuardTripped(hazard=14, words=words),
-        *(StateChanged(state=s, words=words) for s in (State.STOP, State.HOLD)),
-    )
-    assert "\n".join(drawn(held)).count("77 N") == 1
-    by_key = view(*MIDDLE, StateChanged(state=State.HOLD, words="paused by a person"))
-    assert "\n".join(drawn(by_key)).count("paused by a person") == 1
-
-
-def test_while_a_question_waits_nothing_is_measured() -> None:
-    asking = view(*MIDDLE)
-    asking.keys = "asking"
-    assert drawn(asking)[1] == "WAITS for an answer"
-
-
-def test_numbers_never_touch() -> None:
-    precise = {name: np.full(np.shape(sigma), 1e-6) for name, sigma in SIGMA.items()}
-    lines = drawn(view(*MIDDLE, estimated(sigma=precise)))
-    assert "F bias N        -3.210    7.900 -112.040  ± 0.0000010" in "\n".join(lines)
 
 
 def test_the_tour_of_a_resumed_run_begins_behind_its_checks() -> None:
@@ -254,32 +222,11 @@ def test_the_tour_of_a_resumed_run_begins_behind_its_checks() -> None:
     assert [words for words in shown if words in {"Checks", "Tour"}] == ["Checks", "Tour"]
 
 
-def test_a_resumed_run_counts_the_poses_it_had() -> None:
-    assert drawn(view(MIDDLE[0], estimated(poses=12)))[0].endswith("12 kept")
-
-
 def test_a_warning_stays_until_the_next_pose() -> None:
     warned = view(*MIDDLE, Noted(words="wait", warning=True))
     assert "! wait" in drawn(warned)
     warned.update(pose(7, 5), 10.0)
     assert "! wait" not in drawn(warned)
-
-
-def test_a_long_path_keeps_the_end_that_distinguishes_runs() -> None:
-    long = "/home/operator/" + "deep/" * 20 + "2026-11-20T211503Z-gripper_a"
-    lines = drawn(view(RunOpened(folder=long, resume=f"ftdrive calibrate --resume {long}")))
-    assert [line for line in lines if line.endswith("2026-11-20T211503Z-gripper_a") and len(line) == 80] == lines[-2:]
-
-
-def test_a_sweep_on_hold_shows_that_it_starts_again_and_promises_no_poses() -> None:
-    on_hold = view(RunOpened(folder="runs/a", resume=""), StateChanged(state=State.HOLD, words="the operator stopped"))
-    *_, keys, kept, resume = drawn(on_hold)
-    assert keys.endswith("Ctrl-C ends")
-    assert kept == "kept in runs/a"
-    assert resume.startswith("resume  start again")
-
-
-# The terminal.
 
 
 @contextmanager
@@ -311,10 +258,13 @@ class Shown:
             os.close(self._person)  # the terminal was closed
 
 
-def test_keys_arrive_without_enter_and_all_others_as_another_key(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("ftdrive.terminal.keyboard._WORD_S", 0.0)
+def type_every(seconds: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the keyboard see this time between two strokes."""
+    monkeypatch.setattr("ftdrive.terminal.keyboard.time", SimpleNamespace(monotonic=count(0, seconds).__next__))
+
+
+def test_keys_arrive_without_enter_and_all_others_as_another_key(monkeypatch: pytest.MonkeyPatch) -> None:
+    type_every(10.0, monkeypatch)
     with terminal() as (person, program), Keyboard(program) as keyboard:
         for letter, key in zip(b"krspq", (Key.KEEP, Key.REDO, Key.SKIP, Key.PAUSE, Key.STOP), strict=True):
             os.write(person, bytes([letter]))
@@ -355,7 +305,7 @@ def test_keys_arrive_without_enter_and_all_others_as_another_key(
 def test_letters_of_a_word_are_no_keys_but_those_that_stop(
     strokes: tuple[str, ...], heard: list[Key], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ftdrive.terminal.keyboard._WORD_S", 60.0)
+    type_every(0.0, monkeypatch)
     with terminal() as (person, program), Keyboard(program) as keyboard:
         for stroke in strokes:
             os.write(person, stroke.encode())
@@ -401,13 +351,6 @@ def test_keys_pressed_before_a_question_do_not_answer_it() -> None:
         assert keyboard.pressed() is None
         os.write(person, b"p")
         wait_until(lambda: keyboard.waiting == (Key.PAUSE,))
-
-
-def test_a_pipe_has_no_keys() -> None:
-    reading, writing = os.pipe()
-    assert not Keyboard.usable(reading)
-    os.close(reading)
-    os.close(writing)
 
 
 @pytest.mark.parametrize(("foreground", "usable"), [(7, True), (8, False)])
@@ -602,21 +545,3 @@ def test_the_frame_is_erased_after_success_and_stays_after_an_error(error: type[
     assert ("✔ 6 averages kept in runs/2026" in last) == (error is None)
     assert "SETTLE" in file.getvalue()
     assert "/25 R14: settled" not in file.getvalue(), "the frame shows the poses"
-
-
-@pytest.mark.parametrize("width", [80, 60])
-def test_a_verification_shows_each_pose_beside_its_prediction(width: int) -> None:
-    view = SessionView("verify")
-    for stop, number, off in ((1, 103, 1.0), (2, 101, 20.0)):
-        view.update(pose(stop, number, stops=3), float(stop))
-        residual, sigma = np.repeat([0.03 * off, 0.001 * off], 3), np.repeat([0.03, 0.001], 3)
-        view.update(
-            Compared(stop=stop, number=number, residual=residual, sigma=sigma, poses=stop, light="amber"), float(stop)
-        )
-    lines = [str(line) for line in draw_session(view, 3.0, width=width, height=24).renderables]
-    assert lines[0].startswith("ftdrive verify")
-    assert [line.split() for line in lines if line.startswith(("R103  ", "R101  "))] == [
-        ["R103", "0.052", "±", "0.052", "N", "0.0017", "±", "0.0017", "N·m", "1.0", "sigma"],
-        ["R101", "1.039", "±", "0.052", "N", "0.0346", "±", "0.0017", "N·m", "20.0", "sigma"],
-    ]
-    assert not any("coverage" in line or "estimate" in line for line in lines)

@@ -1,15 +1,17 @@
 """A verification as it is printed."""
 
+import io
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from ftcalib.after.verification import Verification
 from ftdrive.runs.verification import NO_LIMITS
-from ftdrive.terminal import report
 from ftdrive.terminal.console import messages
 from ftdrive.terminal.report import print_verification
 
@@ -100,6 +102,8 @@ def test_a_drift_is_printed_if_it_is_bad(
     assert ("drift: 0.1 N since the first pose" in printed(verified(drift=drift))) is shown
 
 
-def test_only_a_difference_beyond_three_sigma_is_marked() -> None:
-    table = report._verification_table(verified())
-    assert [cast("Any", cell).style for cell in list(table.columns[3].cells)] == ["", "", "bold yellow", ""]
+def test_only_a_difference_beyond_three_sigma_is_marked(monkeypatch: pytest.MonkeyPatch, printed: Any) -> None:
+    coloured = Console(file=(file := io.StringIO()), force_terminal=True, color_system="standard", width=120)
+    monkeypatch.setattr("ftdrive.terminal.report.answer", coloured)
+    printed(verified())
+    assert re.findall(r"\x1b\[1;33m *([^ \x1b]*)", file.getvalue()) == ["0.500"]

@@ -6,7 +6,7 @@ import re
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -25,11 +25,12 @@ from ftdrive.terminal.screen import draw_session
 from ftdrive.view.live_page import texts
 from ftdrive.view.outcome import conclude_calibration
 from ftdrive.view.page import Page
-from ftdrive.view.session_page import _state_panel
+from ftdrive.view.session_page import SessionPage
 from ftdrive.words.session import SessionText, SessionView, state_in_words
 from ftdrive.words.stream import CONTACT, FREE, NOISE_UNKNOWN, StreamSummary, calibration_in_words, state
 from tests.finding_examples import examples
 from tests.unit.ftdrive.exports.example import calibration
+from tests.unit.ftdrive.fake_cell import Scripted
 from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
 
 
@@ -86,7 +87,11 @@ def test_every_state_of_a_session_is_worded_alike(state: State) -> None:
     view.update(event, time.monotonic())
     where, said, words = state_in_words(view, time.monotonic())
     screen = "\n".join(line.plain for line in draw_session(view, time.monotonic()).renderables)  # type: ignore[union-attr]
-    part: Any = _state_panel(view, "", "")["state"]
+    page = Page("ftdrive calibrate")
+    operator = SessionPage(page, Scripted(), "calibrate")
+    operator.show(event)
+    operator.draw()
+    part = json.loads(page.since(0)[1])["state"]
     assert said.startswith(state.upper())
     assert f"{where}  {said}  {words}" in screen
     assert (part["head"], part["lines"]) == (f"{where}  {said}", [words])
