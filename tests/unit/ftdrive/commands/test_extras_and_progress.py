@@ -79,18 +79,9 @@ def test_a_pipe_gets_one_line_of_a_command_that_takes_long(
         assert capsys.readouterr().err == words
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (PLAN, "Planning …"),
-        (("solve", "poses.csv"), "Solving 8 poses …"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [(PLAN, "Planning …"), (("solve", "poses.csv"), "Solving 8 poses …")])
 def test_commands_that_take_long_say_at_what_they_work(
-    arguments: tuple[str, ...],
-    words: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    arguments: tuple[str, ...], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     R = Rotation.random(8, rng=1).as_matrix()

@@ -224,10 +224,7 @@ def test_a_variable_that_would_describe_every_cell_is_refused(
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
-    [
-        (("A", "--due"), "CELL and --due exclude one another"),
-        (("D",), "there is no cell 'D': the cells are A, B, C"),
-    ],
+    [(("A", "--due"), "CELL and --due exclude one another"), (("D",), "there is no cell 'D': the cells are A, B, C")],
 )
 def test_a_wrong_choice_is_refused(arguments: tuple[str, ...], words: str, lab: Lab) -> None:
     code, out, err = lab.run(*arguments)

@@ -131,7 +131,7 @@ def test_a_result_in_motion_is_not_reported_as_poses() -> None:
     found = facts_of(Subject(Path("sweep"), replace(result(), motion=motion), ""))
     named = {section.name: section for section in sections_of(found)}
     assert list(named) == [
-        *("estimates", "error", "contact", "motion", "residuals", "coverage", "tour", "comparison", "provenance"),
+        *("estimates", "error", "contact", "motion", "residuals", "coverage", "tour", "comparison", "provenance")
     ]
     assert "parts of the motion" in named["estimates"].text[0]
     assert [figure.name for figure in named["residuals"].figures] == ["time_residuals"]

@@ -66,12 +66,7 @@ def method(name: str, crossed_N: float | None) -> dict[str, Any]:
     return {"method": name, "residual": fit, "cross_validated": left_out, **known}
 
 
-METHODS = [
-    method("ml", 0.2),
-    method("lrom", 0.15),
-    method("carlson", None),
-    {"method": "srom", "reason": "23 poses"},
-]
+METHODS = [method("ml", 0.2), method("lrom", 0.15), method("carlson", None), {"method": "srom", "reason": "23 poses"}]
 CROSSED: dict[str, Any] = {"force_N": 0.2, "torque_Nm": 0.003, "reason": "", "methods": METHODS}
 UNCROSSED: dict[str, Any] = {"force_N": None, "torque_Nm": None, "reason": "No poses.", "methods": []}
 POSES: list[dict[str, Any]] = [

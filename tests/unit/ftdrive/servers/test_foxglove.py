@@ -275,11 +275,7 @@ def test_a_client_that_never_reads_delays_no_other(
 ) -> None:
     """Every message reaches a client that reads, until the queue of another one overflows and beyond."""
     monkeypatch.setattr(foxglove, "BACKLOG", 128)
-    with (
-        serving(stream) as server,
-        Client.to(server.port, reads=False) as slow,
-        Client.to(server.port) as client,
-    ):
+    with serving(stream) as server, Client.to(server.port, reads=False) as slow, Client.to(server.port) as client:
         slow.subscribe(ros2.RAW, EVENTS)
         client.subscribe(ros2.RAW, EVENTS)
         times_full = 0
@@ -294,10 +290,7 @@ def test_a_client_that_never_reads_delays_no_other(
 
 def test_a_slow_client_can_count_what_it_lost(stream: FakeStream, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foxglove, "BACKLOG", 128)
-    with (
-        serving(stream) as server,
-        Client.to(server.port, reads=False) as slow,
-    ):
+    with serving(stream) as server, Client.to(server.port, reads=False) as slow:
         slow.subscribe(ros2.RAW, STATUS, EVENTS)
         for i in range(100):
             server.add(block(100, 100 * i), [])

@@ -38,7 +38,7 @@ def reports(
 def test_a_healthy_stream_reports_its_state() -> None:
     stream, sensor, arm, calibration = reports()
     assert [(one.part, one.level) for one in (stream, sensor, arm, calibration)] == [
-        *(("stream", Level.OK), ("sensor", Level.OK), ("arm", Level.OK), ("calibration", Level.OK)),
+        *(("stream", Level.OK), ("sensor", Level.OK), ("arm", Level.OK), ("calibration", Level.OK))
     ]
     assert (sensor.text, sensor.hardware) == ("998 Hz", "ATI Mini45 FT12345")
     assert sensor.values == {"rate_Hz": "998.4", "lost": "7", "age_s": "0.001"}

@@ -107,10 +107,7 @@ INFO = StreamInfo(
 )
 
 
-PAST: tuple[tuple[float, EventKind, str], ...] = (
-    (5.0, "mark", "peg in"),
-    (6.1, "contact", "contact 8.0 N, 0.6 s"),
-)
+PAST: tuple[tuple[float, EventKind, str], ...] = ((5.0, "mark", "peg in"), (6.1, "contact", "contact 8.0 N, 0.6 s"))
 
 
 _AnyStream: Any = object

@@ -488,11 +488,7 @@ except KeyboardInterrupt:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "environment", "kind"),
-    [
-        ("Ctrl-C", {"NO_COLOR": "1"}, "Screen"),
-        ("SIGTERM", {}, "Screen"),
-        ("Ctrl-C", {"TERM": "dumb"}, "PlainOperator"),
-    ],
+    [("Ctrl-C", {"NO_COLOR": "1"}, "Screen"), ("SIGTERM", {}, "Screen"), ("Ctrl-C", {"TERM": "dumb"}, "PlainOperator")],
 )
 def test_ctrl_c_and_sigterm_end_the_program_and_restore_the_terminal(
     how: str, environment: dict[str, str], kind: str

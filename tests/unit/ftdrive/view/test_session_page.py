@@ -304,12 +304,7 @@ def test_force_and_torque_are_shown_with_the_limits_of_their_guard(
 
 
 R07 = Compared(
-    stop=2,
-    number=7,
-    residual=np.array([0.3, 0, 0, 0, 0.02, 0]),
-    sigma=np.full(6, 0.1),
-    poses=4,
-    light="green",
+    stop=2, number=7, residual=np.array([0.3, 0, 0, 0, 0.02, 0]), sigma=np.full(6, 0.1), poses=4, light="green"
 )
 
 
