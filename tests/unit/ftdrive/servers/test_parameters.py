@@ -27,7 +27,6 @@ FRAME = WrenchFrame("base", "tcp")
         ("lowpass_Hz", 0, None),
         ("deadband_N", 0, 0.0),
         ("deadband_Nm", 0.5, 0.5),
-        ("count", 5.0, 5),
     ],
 )
 def test_a_value_is_taken_as_the_stages_have_it(name: str, value: Any, wanted: Any) -> None:
@@ -48,7 +47,6 @@ def test_a_value_is_taken_as_the_stages_have_it(name: str, value: Any, wanted: A
         ("lowpass_Hz", True, "set a frequency"),
         ("deadband_N", -0.1, "set a number from 0"),
         ("deadband_Nm", "1", "set a number from 0"),
-        ("count", 2.5, "set a whole number from 0"),
         ("tara", True, "there is no such parameter"),
     ],
 )
@@ -80,7 +78,6 @@ class FakeNode:
 def _no_ros2(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = SimpleNamespace(ParameterDescriptor=SimpleNamespace, SetParametersResult=SimpleNamespace)
     monkeypatch.setattr(of_ros2, "ros2_module", lambda _: fake)
-    monkeypatch.setitem(of_ros2._KINDS, "count", int)  # as of a filter over so many samples
 
 
 def test_a_node_declares_what_it_has_and_what_cannot_change() -> None:

@@ -1,7 +1,7 @@
 """The service for a program: which registers it writes, and how it answers."""
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -10,9 +10,9 @@ import pytest
 from ftdrive.servers.program import CODES, INTEGERS, ProgramService, doubles_of
 from ftdrive.stream.samples import WrenchFrame
 from ftdrivers.errors import StreamBroken
-from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import calibrated, info, replayed
 from tests.unit.ftdrive.stream.test_weighing import NOTHING, POSE, part, rests
+from tests.wire.waiting import wait_until
 
 WEIGH, ZERO, STATUS = 1, 2, 3
 
@@ -52,7 +52,13 @@ class Cell:
         self.registers: Any = FakeRegisters()
         self.said: list[str] = []
         self.log = FakeLog()
-        self.service = ProgramService(self.stream, lambda: self.registers, self.said.append, self.log.keep)
+        self.is_off = False
+        self.service = ProgramService(self.stream, self.connect, self.said.append, self.log.keep)
+
+    def connect(self) -> Any:
+        if self.is_off:
+            raise StreamBroken("still off")
+        return self.registers
 
     def run(self, seconds: float) -> dict[str, float]:
         n = 0
@@ -171,9 +177,9 @@ def test_a_silent_stream_is_reported_once_and_its_return_too(monkeypatch: pytest
     blocks = [cell.stream.read() for _ in range(3)]
     broken = StreamBroken("no sample for 0.3 s")
     unsteady = Unsteady(cell.stream, broken, broken, *blocks[:2], broken, blocks[2])
-    cell.service._stream = cast("Any", unsteady)
+    service = ProgramService(cast("Any", unsteady), cell.connect, cell.said.append)
     with pytest.raises(KeyboardInterrupt):
-        cell.service.run()
+        service.run()
     lost, again = "no sample for 0.3 s. The program sees a stale wrench.", "Samples arrive again."
     assert cell.said == [lost, again, lost, again]
     assert unsteady.taken == 7, "else they would pile up"
@@ -191,27 +197,36 @@ def test_a_program_sees_that_the_service_has_ended() -> None:
     assert (last["state"], last["condition"], closed) == (0, 3, [True])
 
 
+class WatchedClock:
+    def __init__(self, newest_ns: int) -> None:
+        self.newest_ns, self.age_s, self.looks = newest_ns, 0.04, 0
+
+    def now_ns(self) -> int:
+        self.looks += 1
+        return self.newest_ns + round(self.age_s * 1e9)
+
+
 def test_a_wrench_without_new_samples_is_stale_and_a_lost_controller_is_called_again() -> None:
     cell = Cell((POSE, NOTHING))
-    cell.run(0.1)
-    service, clock = cell.service, FakeClock()
-    cell.stream.source.clock = clock
-    written = len(cell.registers.written)
-
-    def no_sample_for(seconds: float) -> None:
-        assert len(cell.registers.written) == written, "before"
-        service._newest_ns = clock.now_ns() - round(seconds * 1e9)
-
-    service._ends = cast("Any", Turns(service, no_sample_for))
-    service._watch()
-    assert [one["condition"] for one in cell.registers.written[written:]] == [3], "once"
-    assert cell.said == ["The controller answers again."]
-    assert service._registers is cell.registers
-    service._connect = lambda: (_ for _ in ()).throw(StreamBroken("still off"))
-    service._registers = None
-    service._reconnect()
-    assert service._registers is None
-    assert cell.ask(9, STATUS, 0.02)["state"], "without registers nothing is written"
+    block = cell.stream.read()
+    cell.service.add(block, [])
+    cell.stream.source.clock = clock = cast("Any", WatchedClock(int(block.t_host_ns[-1])))
+    cell.service.begin(cell.stream)
+    wait_until(lambda: clock.looks > 3)
+    assert [one["condition"] for one in cell.registers.written] == [0]
+    clock.age_s = 0.06
+    wait_until(lambda: len(cell.registers.written) > 1)
+    looks = clock.looks
+    wait_until(lambda: clock.looks > looks + 3)
+    assert [one["condition"] for one in cell.registers.written] == [0, 3], "once"
+    cell.is_off = cell.registers.broken = True
+    cell.service.add(cell.stream.read(), [])
+    cell.service.add(cell.stream.read(), [])
+    assert cell.said == ["the cable is cut. Trying again."], "without registers nothing is written"
+    cell.is_off = cell.registers.broken = False
+    wait_until(lambda: cell.said[-1] == "The controller answers again.")
+    cell.service.end()
+    assert cell.registers.written[-1]["state"] == 0
 
 
 def test_ctrl_c_ends_the_service_while_it_starts_and_says_nothing_of_a_controller_that_has_ended(
@@ -230,22 +245,6 @@ def test_ctrl_c_ends_the_service_while_it_starts_and_says_nothing_of_a_controlle
         cell.service.run()
     assert threading.active_count() == threads
     assert cell.said == []
-
-
-class Turns:
-    """Lets `_watch` look five times: at a new sample, at an old one twice, and then the controller is lost."""
-
-    def __init__(self, service: Any, no_sample_for: Callable[[float], None]) -> None:
-        self.service, self.no_sample_for, self.turn = service, no_sample_for, 0
-
-    def wait(self, seconds: float) -> bool:
-        if seconds == 0.02:
-            self.turn += 1
-        if self.turn <= 2:
-            self.no_sample_for({1: 0.04, 2: 0.06}[self.turn])
-        if self.turn == 4:
-            self.service._registers = None
-        return self.turn > 5
 
 
 def test_answers_of_weighings_are_kept_and_others_are_not() -> None:

@@ -1,5 +1,6 @@
 """The distance of a reading from a free tool, its limit, and what joins readings to contacts."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -8,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from ftcalib.model import Array
-from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia, _hotelling_limit
+from ftdrive.stream.contact import Contact, ContactTest, ContactTracker, Inertia
 from ftdrive.stream.noise import SensorNoise
 from tests.unit.ftdrive.stream.simulated import KnownNoise, calibrated, paired
 
@@ -25,12 +26,18 @@ FRICTION_AXIS = np.array([0.0, 0.6, 0.8])
 
 
 def judged(
-    test: ContactTest, residual: Array, predicted: Array, state: int, felt: Array, inertia: Inertia
+    test: ContactTest,
+    residual: Array,
+    predicted: Array,
+    state: int,
+    felt: Array,
+    inertia: Inertia,
+    known: SensorNoise = NOISE,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
     test.expect(calibrated(), MASS_KG, tensor_known=False)
     n = len(residual)
     motion: Any = np.full(n, state, np.int8), np.tile(felt, (n, 1))
-    noise: Any = KnownNoise(NOISE)
+    noise: Any = KnownNoise(known)
     free: Any = SimpleNamespace(
         windows=SimpleNamespace(steps=lambda n: np.zeros(n, int)),
         add=lambda *_: None,
@@ -40,15 +47,20 @@ def judged(
     return test.judge(residual, predicted, rows, motion, noise, free, delay_sigma_s=0.003, inertia=inertia)
 
 
+def limit_of(rate: float, dof: float) -> float:
+    test, nothing = ContactTest(RATE_HZ, rate, BEYOND, FRICTION_AXIS), np.zeros((2 * SIZE, 6))
+    judged(test, nothing, nothing, 0, np.zeros(6), Inertia.EXACT, replace(NOISE, dof=dof))
+    return test.limit
+
+
 def test_the_limit_is_that_of_an_estimated_covariance() -> None:
     rng, dof, n = np.random.default_rng(1), 20, 10_000
     samples, readings = rng.standard_normal((n, dof, 6)), rng.standard_normal((n, 6))
-    squared = np.einsum(
-        "ni,ni->n", readings, np.linalg.solve(np.swapaxes(samples, 1, 2) @ samples / dof, readings[..., None])[..., 0]
-    )
+    covariances = np.swapaxes(samples, 1, 2) @ samples / dof
+    squared = np.einsum("ni,ni->n", readings, np.linalg.solve(covariances, readings[..., None])[..., 0])
     for rate in (0.1, 0.02):
-        assert (squared > _hotelling_limit(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
-    assert _hotelling_limit(0.01, 6.0) == float("inf") > _hotelling_limit(0.01, 6.1)
+        assert (squared > limit_of(rate, dof)).mean() == pytest.approx(rate, rel=0.1)
+    assert limit_of(0.01, 6.0) == float("inf") > limit_of(0.01, 6.1)
 
 
 @pytest.mark.parametrize("state", [0, 2])
@@ -81,7 +93,6 @@ def test_the_distance_has_all_that_is_not_known_in_its_covariance(state: int, in
         inexact = felt
     covariance += np.outer(inexact, inexact)
     assert chi2[-1] == pytest.approx((reading - OFFSET) @ np.linalg.solve(covariance, reading - OFFSET))
-    assert test.limit == _hotelling_limit(1e-4, NOISE.dof)
     np.testing.assert_array_equal(beyond, chi2 > test.limit)
     np.testing.assert_allclose(test.uncertainty, uncertainty + np.diag(BEYOND))
     restarted = judged(test, np.zeros((0, 6)), np.zeros((0, 6)), state, felt, inertia)

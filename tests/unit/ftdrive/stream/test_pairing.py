@@ -1,5 +1,6 @@
 """Times of measurement, interpolated poses, and which sample gets which pose."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -146,7 +147,7 @@ def recording(delay_s: float, scale: float = 1.0) -> tuple[FtSamples, ArmStates]
     t_ns = T0_NS + np.arange(len(samples)) * 2_000_000
     samples = FtSamples.of(t_ns + round(delay_s * 1e9), samples.seq, samples.wrench)
     exact = T0_NS + np.arange(len(states)) * 2_000_000
-    return samples, ArmStates(exact, *(getattr(states, n) for n in ArmStates._names()[1:]))
+    return samples, replace(states, t_host_ns=exact)
 
 
 PUSHED, DRIFTED = np.zeros((6000, 6)), np.array([1.0, -1.0, 2.0, 0, 0, 0])

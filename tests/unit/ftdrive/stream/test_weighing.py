@@ -10,14 +10,13 @@ from scipy.spatial.transform import Rotation
 
 import ftdrive
 from ftcalib import CalibrationResult
-from ftcalib.data.dwell_mean import mean_and_covariance
 from ftcalib.model import Array
 from ftcalib.sensor_matrix import SensorMatrix
 from ftdrive.errors import ConfigError
 from ftdrive.stream.noise import unexplained_variance
 from ftdrive.stream.samples import Paired
 from ftdrive.stream.stream import Stream
-from ftdrive.stream.weighing import WORDS, CannotWeigh, Scale, _reading, count_of, load_values, weigh_in_motion
+from ftdrive.stream.weighing import WORDS, CannotWeigh, Scale, count_of, load_values, weigh_in_motion
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.stream.simulated import P_FLANGE_SENSOR_M, TRUTH, G, calibrated, info, paired, replayed
 
@@ -202,16 +201,6 @@ def test_parts_are_counted_or_not() -> None:
     assert refusal.value.code == "count"
     with pytest.raises(CannotWeigh):
         count_of(weight, 0.001)  # sigma is larger than such a part
-
-
-def test_a_mean_of_few_samples_counts_less() -> None:
-    for n, factor in ((50, 1.2), (500, 1.02)):
-        rows = paired(np.tile(POSE, (n, 1, 1)), rate_Hz=2.0 * n)
-        R, mean, covariance = _reading(rows, np.full(6, np.inf))
-        dwell = mean_and_covariance(rows.raw)
-        np.testing.assert_array_equal(R, POSE)
-        np.testing.assert_array_equal(mean, dwell.mean)
-        np.testing.assert_allclose(covariance, factor * dwell.covariance)
 
 
 def test_what_a_fit_does_not_explain_is_in_the_reading() -> None:
