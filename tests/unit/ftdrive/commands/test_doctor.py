@@ -1,6 +1,7 @@
 """How `ftdrive doctor` examines an arm and a push, with devices that answer from a list."""
 
 import json
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,7 +15,6 @@ from ftdrive.checks.arm import check_clock, check_flange
 from ftdrive.checks.check import Check
 from ftdrive.checks.sensor import PUSH_S, examine_push
 from ftdrive.commands import doctor
-from ftdrive.commands.doctor import _is_pushing, _print_checks
 from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo, Fact
 from tests.fake_clock import FakeClock
@@ -87,7 +87,7 @@ class Sensor:
         return SimpleNamespace(wrench=np.tile([1.0, 2.0 + push_N, 3.0, 0.0, 0.0, 0.0], (5, 1)))
 
 
-def examined(device: Any, monkeypatch: pytest.MonkeyPatch, line: str = "\n", station: Any = None) -> Any:
+def examined(device: Any, monkeypatch: pytest.MonkeyPatch, *, pushes: bool = True, station: Any = None) -> Any:
     given: list[Any] = []
 
     def check_push(*arguments: Any) -> Any:
@@ -95,15 +95,12 @@ def examined(device: Any, monkeypatch: pytest.MonkeyPatch, line: str = "\n", sta
         return Check("push.sign", "ok", "found"), {}
 
     monkeypatch.setattr(of_sensor, "check_push", check_push)
-    monkeypatch.setattr("sys.stdin", SimpleNamespace(readline=lambda: line))
     arm, blame = cast("Any", Arm(FakeClock())), lambda name, error: Check(name, "failed", error.found)
-    check, _ = examine_push(device, arm, np.eye(3), -1, station, _is_pushing, blame)
+    check, _ = examine_push(device, arm, np.eye(3), -1, station, lambda: pushes, blame)
     return check, given
 
 
-def test_the_largest_change_during_the_push_counts(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_largest_change_during_the_push_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     sensor = Sensor()
     check, (change_N, R_base_flange, R_flange_sensor, sign) = examined(sensor, monkeypatch)
     assert check.state == "ok"
@@ -112,7 +109,6 @@ def test_the_largest_change_during_the_push_counts(
     np.testing.assert_array_equal(R_flange_sensor, np.eye(3))
     assert sign == -1
     assert sum(sensor.collected_s[1:]) == pytest.approx(PUSH_S)
-    assert "Push the tool along +X of the base" in capsys.readouterr().err
 
 
 def test_an_emulated_push_is_along_x_of_the_base_and_ends(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,28 +122,48 @@ def test_an_emulated_push_is_along_x_of_the_base_and_ends(monkeypatch: pytest.Mo
 
 def test_without_a_reading_or_a_push_there_is_no_sign(monkeypatch: pytest.MonkeyPatch) -> None:
     assert examined(None, monkeypatch)[0].state == "skipped"
-    assert examined(Sensor(), monkeypatch, line="")[0].found == "no push: the standard input is closed"
+    assert examined(Sensor(), monkeypatch, pushes=False)[0].found == "no push: the standard input is closed"
     assert examined(Sensor(silent=True), monkeypatch)[0].state == "failed"
 
 
-def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
-    checks = [
+Printed = Callable[..., list[str]]
+
+
+@pytest.fixture
+def printed(lab: Lab, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Printed:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*checks: Check, options: Sequence[str] = ()) -> list[str]:
+        *others, last = checks
+        for name, found in (
+            ("build_sensor", lab.sensor),
+            ("examine_arm", (others, None)),
+            ("examine_sensor", ([], False)),
+            ("computer.check_permissions", []),
+            ("computer.check_disk", last),
+        ):
+            monkeypatch.setattr(f"ftdrive.commands.doctor.{name}", lambda *_, found=found, **__: found)
+        cli.run(["doctor", "--sensor", "bota:///dev/x", *options])
+        return [line.strip() for line in capsys.readouterr().out.splitlines()]
+
+    return run
+
+
+def test_each_subject_is_named_once_and_a_fix_follows_what_is_wrong(printed: Printed) -> None:
+    checks = (
         Check("robot.remote", "ok", "remote control on", "none"),
         Check("robot.speed", "warning", "slider at 30 %", "raise it"),
         Check("sensor.noise", "failed", "saturated", "take the load off"),
-    ]
-    _print_checks(checks, every=True)
-    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    )
+    lines = printed(*checks, options=["--all"])
     assert [line.split()[0] for line in lines] == ["robot", "!", "fix:", "sensor", "fix:", "Not"]
     assert lines[2].split("fix: ")[1] == "raise it"
-    _print_checks(checks[:2], every=True)
-    assert capsys.readouterr().out.endswith(" Usable; see the lines with !.\n")
-    _print_checks(checks[:1], every=True)
-    assert capsys.readouterr().out.endswith(" All checks passed.\n")
+    assert printed(*checks[:2], options=["--all"])[-1] == "Usable; see the lines with !."
+    assert printed(checks[0], options=["--all"])[-1] == "All checks passed."
 
 
-def test_a_summary_has_each_subject_and_all_that_needs_attention(capsys: pytest.CaptureFixture[str]) -> None:
-    checks = [
+def test_a_summary_has_each_subject_and_all_that_needs_attention(printed: Printed) -> None:
+    assert printed(
         Check("robot.reachable", "ok", "it answers"),
         Check("robot.identity", "ok", "UR5e"),
         Check("robot.remote", "ok", "remote control on"),
@@ -155,9 +171,7 @@ def test_a_summary_has_each_subject_and_all_that_needs_attention(capsys: pytest.
         Check("noise.level", "failed", "saturated", "take the load off"),
         Check("noise.change", "skipped", "not known"),
         Check("push.sign", "skipped", "no push"),
-    ]
-    _print_checks(checks, every=False)
-    assert [line.strip() for line in capsys.readouterr().out.splitlines()] == [
+    ) == [
         "robot       ✔ UR5e (2 more checks passed)",
         "! slider at 30 %",
         "fix: raise it",

@@ -1,6 +1,5 @@
-"""Extras are missed before any work, and no command is silent for long on a terminal."""
+"""No command is silent for long on a terminal."""
 
-import importlib.util
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,43 +14,9 @@ from ftdrive.terminal.console import messages, working
 PLAN = ("plan", "--model", "ur5e", "--tool", "0:100:80", "--minimal")
 
 
-@pytest.fixture
-def _without_extras(monkeypatch: pytest.MonkeyPatch) -> None:
-    find = importlib.util.find_spec
-    extras = {"jinja2", "matplotlib", "uplot"}
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name in extras else find(name))
-
-
-@pytest.mark.usefixtures("_without_extras")
-@pytest.mark.parametrize(
-    ("arguments", "extra"),
-    [
-        (("report", "--simulate"), "report"),
-        (("plan", "--simulate", "--view"), "viz"),
-        (("plan", "--simulate", "--png", "a.png"), "viz"),
-        (("calibrate", "--simulate", "--view"), "viz"),
-        (("fleet", "status", "--html", "a.html"), "fleet"),
-    ],
-)
-def test_an_extra_is_missed_before_any_work(
-    arguments: tuple[str, ...],
-    extra: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "ftdrive.cell.emulated.Station.__enter__", lambda _: pytest.fail("an emulated cell has started")
-    )
-    assert cli.run(arguments) == 2
-    assert f"of the extra {extra}: install it with `" in " ".join(capsys.readouterr().err.split())
-    assert not list(tmp_path.iterdir())
-
-
 def test_a_terminal_sees_at_what_a_command_works(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = list[Any]()
-    monkeypatch.setattr(messages, "_force_terminal", True)
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
     monkeypatch.setattr(messages, "status", _Status.of(seen))
     with working("Recording") as show:
         show("3.0 s, 1500 samples, gaps: 0")
@@ -90,7 +55,7 @@ def test_commands_that_take_long_say_at_what_they_work(
     )
     header = "r11,r12,r13,r21,r22,r23,r31,r32,r33,fx,fy,fz,tx,ty,tz"
     np.savetxt("poses.csv", np.c_[R.reshape(8, 9), wrench], delimiter=",", header=header, comments="")
-    monkeypatch.setattr(messages, "_force_terminal", True)
+    monkeypatch.setenv("TTY_COMPATIBLE", "1")
     seen = list[Any]()
     monkeypatch.setattr(messages, "status", _Status.of(seen))
     assert cli.run(arguments) in {0, 7}
@@ -98,8 +63,6 @@ def test_commands_that_take_long_say_at_what_they_work(
 
 
 class _Status:
-    """Notes the words instead of showing them."""
-
     def __init__(self, seen: list[Any]) -> None:
         self.update = seen.append
 

@@ -29,7 +29,6 @@ def run(run: Callable[..., Ran]) -> Callable[..., Ran]:
 
 @pytest.fixture
 def cells(tmp_path: Path) -> Path:
-    """Two cells; the second has no runs."""
     text = 'format = "ftdrive.cells/1"\n'
     for n, name in enumerate(("press", "lathe"), 1):
         config = f'format = "ftdrive.config/1"\n[robot]\nhost = "10.0.0.{n}"\n[tool]\nname = "gripper"\n'

@@ -21,7 +21,6 @@ STATUS = import_module("ftdrive.commands.fleet.status")  # the package has a com
 
 @pytest.fixture
 def run(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ran]:
-    """Run the command on a fake clock; return its exit code and what it prints for people."""
     monkeypatch.setattr(STATUS, "REAL", FakeClock())
 
     def call(*arguments: str | Path) -> Ran:

@@ -23,8 +23,6 @@ Ran = tuple[int, str, str]
 
 @pytest.fixture
 def run(run: Callable[..., Ran], monkeypatch: pytest.MonkeyPatch) -> Callable[..., Ran]:
-    """Run the command with its workers in this process."""
-
     @contextmanager
     def here(_: int | None) -> Iterator[Workers]:
         with ThreadPoolExecutor(1) as thread:

@@ -31,8 +31,6 @@ class Terminal(io.StringIO):
 
 
 class Lab:
-    """Three cells whose sessions and operators are scripts."""
-
     def __init__(self, url: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.url, self.folder = url, folder
         self.answers: list[str | Exception] = []
@@ -85,7 +83,6 @@ class Lab:
 
     @property
     def verified(self) -> list[str]:
-        """Names of the cells that had a session."""
         return [path.parents[2].name for _, path, _ in self.sessions]
 
     def run(self, *arguments: str, answers: Sequence[str | Exception] = (), terminals: str = "ie") -> Ran:

@@ -204,7 +204,6 @@ def test_what_is_no_calibration_is_named(run: Callable[..., Ran], text: str, cod
 
 
 def calibrate_with(monkeypatch: pytest.MonkeyPatch, folder: Path) -> None:
-    """Have `ftdrive calibrate` end with this run."""
     loaded = CalibrationResult.load(folder / "calibration.json")
     outcome = SimpleNamespace(run=Run(folder), result=loaded, drift=None)
     monkeypatch.setattr("ftdrive.commands.calibrate.run_calibration", lambda *_: outcome)

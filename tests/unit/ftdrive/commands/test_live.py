@@ -155,8 +155,6 @@ def test_the_table_ends_with_the_recording_and_breaks_no_word(monkeypatch: pytes
 
 
 class Interrupted(RecordingSource):
-    """It fails for some reads."""
-
     reads, failures, error = 0, 2, ""
 
     def links(self) -> Links:

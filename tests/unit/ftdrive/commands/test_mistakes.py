@@ -131,6 +131,7 @@ VALUES = [
 EXTRAS = [
     ("plan --simulate --png a.png", 2, "viz"),
     ("plan --simulate --view", 2, "viz"),
+    ("calibrate --simulate --view", 2, "viz"),
     ("live --simulate --view", 2, "viz"),
     ("report --simulate", 2, "report"),
     ("fleet status --html a.html", 2, "fleet"),

@@ -245,7 +245,6 @@ def test_a_conversion_is_complete_and_says_what_was_cut(
 
 @pytest.fixture(scope="module")
 def three_seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of 1 kHz."""
     path = tmp_path_factory.mktemp("recorded") / "a.mcap"
     recorder = Recorder([path], info(), {})
     recorder.add(block(3000), [])
@@ -256,7 +255,6 @@ def three_seconds(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def recorded(three_seconds: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A recording, and a calibration."""
     monkeypatch.chdir(tmp_path)
     calibration().save(tmp_path / "c.json")
     return Path(shutil.copy(three_seconds, tmp_path))

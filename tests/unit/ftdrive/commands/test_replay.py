@@ -11,7 +11,6 @@ from tests.unit.ftdrive.stream.simulated import calibrated
 
 
 def moved(result: CalibrationResult, sigmas: float) -> CalibrationResult:
-    """The result with a mass that is off."""
     weight_N = result.parameters.gravity_force_base_N * (1 + sigmas * result.sigma["mass_kg"] / result.mass_kg)
     return replace(result, parameters=replace(result.parameters, gravity_force_base_N=weight_N))
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ TCP = "0.02,-0.01,0.15,0.1,0.2,0.3"
 @pytest.fixture
 def solved(run: Callable[..., tuple[int, str, str]], monkeypatch: pytest.MonkeyPatch) -> Solved:
     """Solve a table in an empty folder; return exit code, stdout and stderr, where no computer is slow."""
-    monkeypatch.setattr("ftdrive.terminal.console._PATIENCE_S", 3600.0)
+    monkeypatch.setattr("ftdrive.terminal.console.Timer", MagicMock())
 
     def call(table: dict[str, np.ndarray], *options: str) -> tuple[int, str, str]:
         Path("poses.csv").write_text(text(table))

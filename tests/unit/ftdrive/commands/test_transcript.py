@@ -2,23 +2,18 @@
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
-from ftdrive.commands.transcript import _describe_bytes
 from ftdrive.errors import ConfigError
-from ftdrivers.errors import DeviceTimeout
 from ftdrivers.interfaces import DeviceInfo
-from ftdrivers.transcript import _watch
 
 
 class Sensor:
-    """Has two samples in the first piece, and one in each other."""
-
     def __init__(self, *, silent: bool = False) -> None:
         self.pieces_s: list[float] = []
         self.silent = silent
@@ -33,25 +28,6 @@ class Sensor:
 
     def health(self) -> Any:
         return SimpleNamespace(lost=4)
-
-
-def test_a_long_recording_is_collected_in_pieces() -> None:
-    sensor = Sensor()
-    seen = _watch(cast("Any", sensor), 150.0)
-    assert sensor.pieces_s == [50.0, 50.0, 50.0]
-    assert (seen["samples"], seen["lost"], seen["duration_s"], seen["error"]) == (4, 4, 150.0, None)
-    mean = (2 * 1 + 2 + 3) / 4
-    assert seen["mean_force_N"] == pytest.approx([mean, -2 * mean, 3 * mean])
-    assert seen["mean_torque_Nm"] == pytest.approx([0.1 * mean, -0.2 * mean, 0.3 * mean])
-    assert _describe_bytes(seen) == (
-        "Mini45, serial FT9: 4 samples, mean (1.750, -3.500, 5.250) N, (0.1750, -0.3500, 0.5250) N·m"
-    )
-    assert (_describe_bytes({"error": "it is gone"}), _describe_bytes({})) == ("it is gone", "interrupted")
-
-
-def test_a_silent_sensor_is_an_error() -> None:
-    with pytest.raises(DeviceTimeout, match="no sample arrived in 2 s"):
-        _watch(cast("Any", Sensor(silent=True)), 2.0)
 
 
 @pytest.mark.parametrize(

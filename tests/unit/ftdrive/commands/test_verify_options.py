@@ -15,15 +15,16 @@ from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified
+from ftdrive.session.events import Question
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.verifying import Verifying, save_wanted_update
-from ftdrive.words.result import _verdict_in_words
+from ftdrive.terminal.screen import open_operator
+from ftdrive.words.result import verification_in_lines
 from tests.unit.ftdrive.recorded import calibration
 
 
 @pytest.fixture
 def begun(tmp_path: Path) -> Path:
-    """An interrupted verification."""
     limits = {"force_N": 0.5, "torque_Nm": None}
     about = {"path": "cell/calibration.json", "id": "1" * 12, "poses": 3, "quick": False, "limits": limits}
     return Run.create(tmp_path, "verify", {"command": "verify", "mode": "auto", "verification": about}).folder
@@ -69,12 +70,10 @@ def failed(folder: Path, limits: Limits) -> Any:
 
 
 def test_the_limits_that_decide_are_named(tmp_path: Path) -> None:
-    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in _verdict_in_words(
-        failed(tmp_path, NO_LIMITS)
-    )
-    given = failed(tmp_path, (1.0, 0.1))
-    assert _verdict_in_words(given) == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
-    assert given.exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
+    words = [verification_in_lines(failed(tmp_path, limits))[0].words for limits in (NO_LIMITS, (1.0, 0.1))]
+    assert "p 1e-09 (false alarms: 1 in 100, near the poses of the fit)" in words[0]
+    assert words[1] == "largest difference 0.52 N, 0.52 N·m; limit 1 N, 0.1 N·m"
+    assert failed(tmp_path, (1.0, 0.1)).exceeded == ("0.52 N·m is above --max-torque 0.1 N·m",)
 
 
 @pytest.mark.parametrize(
@@ -85,7 +84,11 @@ def test_an_update_is_saved_only_if_it_is_wanted(
     update: Any, typed: str, wanted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ftdrive.session.verifying.save_update", lambda _: tmp_path)
-    ask: Any = lambda question: command._ask_on_page(None, True, question)  # noqa: E731
+
+    def ask(question: Question) -> Any:
+        with open_operator(as_json=True) as operator:
+            return operator.ask(question)
+
     with CliRunner().isolation(typed) as (out, *_):
         found = save_wanted_update(failed(tmp_path, NO_LIMITS), update, ask)
         printed = out.getvalue().decode()

@@ -4,14 +4,13 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
 from ftdrive.cli import cli
 from ftdrive.commands.options import SourceOptions
-from ftdrive.commands.weigh import _print_weights
 from ftdrive.errors import ConfigError
 from ftdrive.stream.weighing import CannotWeigh, ScaleState
 from tests.fake_clock import FakeClock
@@ -44,54 +43,7 @@ class Scale:
         return CannotWeigh(shown.refusal or "samples")
 
 
-def printed(
-    scale: Scale,
-    capsys: pytest.CaptureFixture[str],
-    *,
-    once: bool = False,
-    waits: bool = False,
-    poses: int = 1,
-    as_json: bool = False,
-) -> list[str]:
-    _print_weights(cast("Any", scale), scale.turns(), once=once, waits=waits, poses=poses, as_json=as_json)
-    return capsys.readouterr().out.splitlines()
-
-
-def test_each_new_weight_and_fault_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    scale = Scale((MOVING, False), (EMPTY, True), (EMPTY, False), (CABLE, True), (ONE, True))
-    lines = printed(scale, capsys)
-    assert [line.split()[0] for line in lines] == ["nothing:", "not", "0.8123"]
-
-
-def test_once_ends_with_the_first_weight(capsys: pytest.CaptureFixture[str]) -> None:
-    states = (CABLE, True), (EMPTY, True), (ONE, True), (TWO, True), (ONE, True)
-    assert printed(Scale(*states), capsys, once=True)[0].startswith("nothing:")
-    assert printed(Scale(*states), capsys, once=True, poses=2)[0].startswith("0.3000 ")
-    (line,) = printed(Scale(*states), capsys, once=True, waits=True)  # after a zero it waits for a part
-    assert line.startswith("0.8123 ")
-
-
-def test_once_gives_up_after_ten_seconds_unless_it_waits_for_a_part(capsys: pytest.CaptureFixture[str]) -> None:
-    late = [(MOVING, False)] * 10
-    assert printed(Scale(*late[:-1], (ONE, True)), capsys, once=True)
-    with pytest.raises(CannotWeigh) as error:
-        printed(Scale(*late, (MOVING, False), (ONE, True)), capsys, once=True)
-    assert error.value.code == "moving"
-    assert printed(Scale(*late, (MOVING, False), (ONE, True)), capsys, once=True, waits=True)
-    assert printed(Scale(*late, (MOVING, False), (ONE, True)), capsys)
-
-
-def test_json_has_the_weight_and_why_there_is_none(capsys: pytest.CaptureFixture[str]) -> None:
-    scale = Scale((replace(ONE, count=3), True), (CABLE, True))
-    weight, refused = map(json.loads, printed(scale, capsys, as_json=True))
-    assert (weight["schema_version"], weight["mass_kg"], weight["count"], weight["refused"]) == (1, 0.81234, 3, None)
-    assert weight["calibration_id"] == INFO.calibration.id
-    assert weight["marks"] == ["EMULATED"]
-    assert (refused["refused"], refused["mass_kg"]) == ("cable", 0.81234)
-
-
 def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tuple[dict[str, Any], str]:
-    """Run the command on a scale; return how it was opened, and stdout."""
     opened: dict[str, Any] = {}
 
     def open_(_source: object, _stack: object, _frame: object, track: str) -> Any:
@@ -111,8 +63,44 @@ def weighed(scale: Scale, monkeypatch: pytest.MonkeyPatch, *options: str) -> tup
     monkeypatch.setattr("ftdrive.commands.weigh.Weighing", weighing)
     monkeypatch.setattr("ftdrive.commands.weigh.pump", pump)
     outcome = CliRunner().invoke(cli, ["weigh", "--simulate", *options])
-    assert outcome.exit_code == 0, outcome.output
+    if outcome.exception is not None:
+        raise outcome.exception
     return opened, outcome.stdout
+
+
+def test_each_new_weight_and_fault_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    scale = Scale((MOVING, False), (EMPTY, True), (EMPTY, False), (CABLE, True), (ONE, True))
+    assert [line.split()[0] for line in weighed(scale, monkeypatch)[1].splitlines()] == ["nothing:", "not", "0.8123"]
+
+
+@pytest.mark.parametrize(
+    ("options", "line"),
+    [((), "nothing:"), (("--poses", "2"), "0.3000 "), (("--zero",), "0.8123 ")],
+    ids=["one", "poses", "zero"],
+)
+def test_once_ends_with_the_first_weight(options: tuple[str, ...], line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    scale = Scale((CABLE, True), (EMPTY, True), (ONE, True), (TWO, True), (ONE, True))
+    (printed,) = weighed(scale, monkeypatch, "--once", *options)[1].splitlines()
+    assert printed.startswith(line)
+
+
+def test_once_gives_up_after_ten_seconds_unless_it_waits_for_a_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    late = [(MOVING, False)] * 10
+    assert weighed(Scale(*late[:-1], (ONE, True)), monkeypatch, "--once")[1]
+    with pytest.raises(CannotWeigh) as error:
+        weighed(Scale(*late, (MOVING, False), (ONE, True)), monkeypatch, "--once")
+    assert error.value.code == "moving"
+    for options in (("--once", "--zero"), ()):
+        assert weighed(Scale(*late, (MOVING, False), (ONE, True)), monkeypatch, *options)[1]
+
+
+def test_json_has_the_weight_and_why_there_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    scale = Scale((replace(ONE, count=3), True), (CABLE, True))
+    weight, refused = map(json.loads, weighed(scale, monkeypatch, "--json")[1].splitlines())
+    assert (weight["schema_version"], weight["mass_kg"], weight["count"], weight["refused"]) == (1, 0.81234, 3, None)
+    assert weight["calibration_id"] == INFO.calibration.id
+    assert weight["marks"] == ["EMULATED"]
+    assert (refused["refused"], refused["mass_kg"]) == ("cable", 0.81234)
 
 
 def test_in_motion_one_answer_to_a_part_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:

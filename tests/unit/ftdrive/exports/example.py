@@ -58,5 +58,4 @@ def responding(gain: float, cross_talk_m: float) -> CalibrationResult:
 
 
 def rejected() -> CalibrationResult:
-    """Fits badly."""
     return replace(calibration(), findings=(Finding.of("second_solution", probability_percent=40.0),))

@@ -95,7 +95,6 @@ def gravity_m_s2(name: str, made: Exported, calibration: CalibrationResult) -> A
 def compensated(
     name: str, made: Exported, calibration: CalibrationResult, settings: Settings, R_base_flange: Array, wrench: Array
 ) -> Array:
-    """What the target makes of the file."""
     given = calibration.parameters
     assert settings.sensor_com_mm is not None
     context: dict[str, Any] = {

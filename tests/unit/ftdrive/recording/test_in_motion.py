@@ -61,7 +61,6 @@ def test_a_recording_is_solved_from_its_motion(tmp_path: Path, swept: Recorded) 
 
 @pytest.fixture
 def files(tmp_path: Path, swept: Recorded) -> tuple[object, ...]:
-    """The options of wrench and poses as another program writes them."""
     vectors = Rotation.from_matrix(swept.R_base_flange).as_rotvec()
     wrench = table(tmp_path / "w.csv", "t,fx,fy,fz,tx,ty,tz", swept.t_s, swept.wrench)
     poses = table(tmp_path / "p.csv", "t,rx,ry,rz,x,y,z", swept.t_pose_s, vectors, swept.p_base_flange_m)

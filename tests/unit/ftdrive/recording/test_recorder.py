@@ -24,7 +24,6 @@ ENDINGS = (".mcap", ".csv", ".parquet")
 
 
 def partial_of(path: Path) -> Path:
-    """Return the file that holds the samples of a recording until it is complete."""
     grown = grown_as(path)
     return grown.with_name(f"{grown.name}.partial")
 

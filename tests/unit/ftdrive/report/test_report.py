@@ -81,8 +81,6 @@ def html() -> str:
 
 
 class Page(HTMLParser):
-    """Elements with their attributes, and the text outside of styles."""
-
     def __init__(self) -> None:
         super().__init__()
         self.elements: list[tuple[str, dict[str, str]]] = []

@@ -23,7 +23,6 @@ NOW = FIRST + timedelta(days=10)
 
 @pytest.fixture
 def calibrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a calibration of the first day."""
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     folder = tmp_path / "runs" / "calibrate"
     folder.mkdir(parents=True)

@@ -70,8 +70,6 @@ def block(n: int = 70, start: int = 0, frame: WrenchFrame = WrenchFrame(), stage
 
 
 class FakeStream:
-    """Has the parts of a stream that a server uses."""
-
     def __init__(self) -> None:
         self.info = INFO
         self.clock: Any = REAL
@@ -103,7 +101,6 @@ class FakeStream:
 
 @contextmanager
 def serving(stream: FakeStream, **options: Any) -> Iterator[Any]:
-    """A server of a stream, at a free port."""
     from ftdrive.servers.foxglove import FoxgloveServer
 
     server = FoxgloveServer(cast(Any, stream), port=0, **options)
@@ -183,7 +180,6 @@ class Client:
         self.socket.send(struct.pack("<BIII", 2, self.services[service]["id"], 7, 4) + b"json{}")
 
     def answer(self) -> dict[str, Any]:
-        """Read on to the answer of a service, or to its failure."""
         while True:
             received = self.socket.recv(timeout=10)
             if isinstance(received, bytes) and received[0] == 3:

@@ -42,7 +42,6 @@ def client(server: FoxgloveServer) -> Iterator[Client]:
 
 
 def read_cdr(client: Client, topic: str, payload: bytes) -> Any:
-    """Decode by the schema that the server sent."""
     channel = client.channels[topic]
     assert (channel["encoding"], channel["schemaEncoding"]) == ("cdr", "ros2msg")
     store = get_typestore(Stores.EMPTY)
@@ -51,7 +50,6 @@ def read_cdr(client: Client, topic: str, payload: bytes) -> Any:
 
 
 def read_protobuf(client: Client, topic: str, payload: bytes) -> Any:
-    """Decode by the descriptors that the server sent."""
     channel = client.channels[topic]
     assert (channel["encoding"], channel["schemaEncoding"]) == ("protobuf", "protobuf")
     pool = descriptor_pool.DescriptorPool()

@@ -20,10 +20,7 @@ VIEWER = "https://app.foxglove.dev"
 
 
 class Echo(BaseHTTPRequestHandler):
-    """Answers with the path."""
-
     def do_GET(self) -> None:
-        """Answer."""
         self.send_response(200)
         self.end_headers()
         self.wfile.write(self.path.encode())
@@ -34,7 +31,6 @@ class Echo(BaseHTTPRequestHandler):
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """A web server behind a gate."""
     server = HTTPServer(("127.0.0.1", 0), Echo)
     thread = Thread(target=server.serve_forever, args=(0.01,))
     thread.start()

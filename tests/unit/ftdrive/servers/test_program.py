@@ -43,8 +43,6 @@ class FakeLog:
 
 
 class Cell:
-    """A service on a recording."""
-
     def __init__(self, *each: Any, seconds: float = 1.0) -> None:
         self.stream = replayed(
             info(calibrated()), rests(*each, seconds=seconds), frame=WrenchFrame("base", "tcp"), speed=float("inf")
@@ -150,8 +148,6 @@ def test_a_lost_controller_is_reported_once() -> None:
 
 
 class Unsteady:
-    """A stream that reads a list of blocks and errors, then is interrupted."""
-
     def __init__(self, stream: Any, *reads: Any) -> None:
         self.stream, self.reads, self.taken = stream, list(reads), 0
 

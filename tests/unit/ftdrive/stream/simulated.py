@@ -171,7 +171,6 @@ class KnownNoise:
 
 
 def moving(seconds: float, motion: Motion = Motion(), *, noise: float = 1.0) -> Paired:
-    """Samples of a moving tool."""
     t_s = np.arange(0, seconds, 1e-3)
     R, p = motion.pose(t_s)
     raw = motion.wrench(t_s) + noise * NOISE * np.random.default_rng(3).normal(size=(len(t_s), 6))

@@ -10,8 +10,6 @@ from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
 
 
 class Tape(Sink):
-    """A recorder in memory."""
-
     label, keeps_all = "recording", True
 
     def __init__(self, full_after: int = 1000) -> None:

@@ -26,7 +26,6 @@ NOTHING = np.zeros(6)
 
 
 def part(R: Array, mass_kg: float) -> Array:
-    """Wrench (6,) or (n, 6) of a part."""
     down = TRUTH.gravity_force_base_N / np.linalg.norm(TRUTH.gravity_force_base_N)
     force_N = mass_kg * G * down @ (R @ TRUTH.R_flange_sensor)
     return np.concatenate([force_N, np.cross(COM_M, force_N)], axis=-1)

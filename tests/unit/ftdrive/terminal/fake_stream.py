@@ -255,8 +255,6 @@ class FakeStream(_AnyStream):  # type: ignore[misc]  # of no class of the produc
 
 
 class SteppedFeed(Feed):
-    """A feed that reads block by block, without a thread."""
-
     @cached_property
     def _turns(self) -> Iterator[Block | None]:
         return self.turns(until=lambda: False)

@@ -205,7 +205,6 @@ def test_no_name_in_a_table_commands_the_terminal(capsys: pytest.CaptureFixture[
 
 
 def ended(code: str, *arguments: str) -> tuple[int, str]:
-    """Run Python without a reader of its output."""
     read, write = os.pipe()
     os.close(read)
     try:

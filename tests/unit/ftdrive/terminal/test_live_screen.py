@@ -66,7 +66,6 @@ class Screen:
         return [str(line) for line in self.screen.lines(*self.size)]
 
     def press(self, *keys: str) -> list[str]:
-        """Press the keys, and return the lines of the screen."""
         for key in keys:
             self.screen.press(key)
             self.step(1)

@@ -56,8 +56,6 @@ def test_a_restored_gravity_has_the_table_and_its_source() -> None:
 
 
 class FakeLean:
-    """A base that leans."""
-
     def __init__(self, *, is_significant: bool = True) -> None:
         self.is_significant = is_significant
 

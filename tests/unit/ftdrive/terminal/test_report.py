@@ -310,7 +310,6 @@ def test_the_columns_of_table_iii_fit_80_columns_with_three_digits(
 
 
 def rows_of(text: str) -> dict[str, list[str]]:
-    """The table of a result: name and cells."""
     lines = [re.split(r"\s{2,}", line.strip()) for line in text.splitlines()]
     return {
         name: cells for name, *cells in lines if cells and name.rpartition(", ")[2] in {"kg", "mm", "N", "N·m", "deg"}

@@ -231,7 +231,6 @@ def test_a_warning_stays_until_the_next_pose() -> None:
 
 @contextmanager
 def terminal(rows: int = 24, columns: int = 80) -> Iterator[tuple[int, int]]:
-    """Open a pseudo-terminal: the person's end and the program's."""
     person, program = pty.openpty()
     termios.tcsetwinsize(program, (rows, columns))
     try:
@@ -242,8 +241,6 @@ def terminal(rows: int = 24, columns: int = 80) -> Iterator[tuple[int, int]]:
 
 
 class Shown:
-    """What arrives at the person's end."""
-
     def __init__(self, person: int) -> None:
         self.text = ""
         # its own descriptor: another test could get the number of a closed one

@@ -26,8 +26,6 @@ def reader(fd: int) -> TextIO:
 
 
 class Pipes:
-    """A session's standard input and output, and their far ends."""
-
     def __init__(self) -> None:
         stdin, self.answers = os.pipe()
         self.seen, stdout = os.pipe()

@@ -34,8 +34,6 @@ NOTHING = replace(PART, mass_kg=-0.00021, mass_sigma_kg=0.1, least_kg=0.4)
 
 
 class FakeWeighing(Weighing):
-    """A scale that stays in the state it is given, on a fake clock."""
-
     def __init__(self, shown: ScaleState, *, moving: bool = False, fails: Exception | None = None) -> None:
         self.refuses, self.zeroed_s = False, float("inf")
         processor = SimpleNamespace(monitor=SimpleNamespace(reference=lambda: (None, self.zeroed_s)))
@@ -45,7 +43,6 @@ class FakeWeighing(Weighing):
         self._scale = cast("Any", SimpleNamespace(zero=self._rest))
 
     def turns(self) -> Iterator[None]:
-        """Read 0.1 s each time."""
         while True:
             self.stream.clock.sleep(0.11)
             self.add(cast("Any", "a block"), ())

@@ -30,8 +30,6 @@ ANSWERS |= {"sensor.height_mm": "33", f"{TOOL} 1": "0 60 80"}
 
 
 class Form:
-    """A form that runs, as its only viewer."""
-
     def __init__(self, folder: Path) -> None:
         self.page, self.draft = Page("test"), folder / ".ftdrive.toml.draft"
         self.described = Description(REAL, {key: setting.value for key, setting in settings().items()})

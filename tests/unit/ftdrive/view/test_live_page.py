@@ -42,14 +42,11 @@ CELL = CellConfig(RobotConfig(host="10.0.0.2"), SensorConfig(url="x"), ToolConfi
 
 
 def parts_of(page: Page) -> dict[str, Any]:
-    """What a browser shows."""
     shown: dict[str, Any] = json.loads(page.since(0)[1])
     return {name: part for name, part in shown.items() if part is not None}
 
 
 class Shown:
-    """A page of a stream that runs block by block; without a server."""
-
     def __init__(self, stream: Any, *, certifier: Certifier | None = None, controls: bool = False) -> None:
         self.stream, self.page, self.feed = stream, Page("ftdrive live"), SteppedFeed(stream)
         self.page.viewers = 1
@@ -68,7 +65,6 @@ class Shown:
 
 
 def numbers_of(parts: dict[str, Any]) -> tuple[dict[str, str], ...]:
-    """State, force and torque."""
     return tuple(parts["numbers"]["rows"])
 
 
@@ -377,7 +373,6 @@ def test_options_that_would_be_ignored_are_refused() -> None:
 def weighed(
     shown: ScaleState, *, zeroed_s: float = np.inf, moving: bool = False, controls: bool = False, note: str = ""
 ) -> tuple[dict[str, Any], Page, FakeWeighing]:
-    """The parts of the page of a scale, the page, and the scale."""
     weighing = FakeWeighing(shown, moving=moving)
     weighing.shown, weighing.note, weighing.part_kg = shown, note, None if shown.count is None else 0.27
     weighing.zeroed_s = zeroed_s

@@ -112,13 +112,11 @@ def seen(wrench: list[float], t_s: float = 1.0, sample: int = 1) -> Seen:
 
 
 def parts_of(page: Page) -> dict[str, Any]:
-    """Return the parts that browsers show."""
     parts = json.loads(page.since(0)[1])
     return {name: part for name, part in parts.items() if part is not None}
 
 
 def texts(part: dict[str, Any] | None) -> str:
-    """Return the texts of a part."""
     return "" if part is None else "\n".join([part["head"], *part["lines"]])
 
 
@@ -133,7 +131,6 @@ def run_with(lab: Lab, watched: Watched) -> None:
 
 
 def places(parts: dict[str, Any], name: str = "arm") -> list[list[float]]:
-    """Return where the bodies of an arm are."""
     return [parts[f"scene/{name}/{i}"]["at"] for i in range(len(MODEL.names))]
 
 
@@ -442,7 +439,6 @@ def test_drawing_that_goes_on_after_the_end_shows_nothing_live(page: Page, monke
 
 
 def end(lab: Lab, page: Page) -> dict[str, Any]:
-    """Run a session on a page to its end; return what is shown then."""
     options = SessionOptions(lab.folder / "runs", poses=6)
     with on_page(page, lab.operator, options) as (shown, options):
         session.take_poses(Calibrating(lab.cell, options), shown, options)

@@ -22,8 +22,6 @@ JSON = "application/json"
 
 
 class Viewer:
-    """A browser that has opened a page."""
-
     def __init__(self, page: Page) -> None:
         self.port = urlsplit(page.url).port
         self.origin = f"http://127.0.0.1:{self.port}"
@@ -43,7 +41,6 @@ class Viewer:
         return self.ask("POST", "/do", json.dumps({"name": name, "value": value}), **given).status
 
     def follow(self) -> Iterator[tuple[str, dict[str, object]]]:
-        """Yield events of the page with their data."""
         raw = socket.create_connection(("127.0.0.1", self.port), timeout=30)
         raw.sendall(f"GET /parts HTTP/1.1\r\nHost: 127.0.0.1:{self.port}\r\nCookie: {self.cookie}\r\n\r\n".encode())
         with closing(raw), raw.makefile("r", encoding="utf-8") as received:

@@ -35,7 +35,6 @@ from tests.unit.ftdrive.terminal.fake_stream import FakeStream, SteppedFeed
 
 
 def read(result: CalibrationResult) -> str:
-    """Return the text of the report without figures."""
     environment = templates("ftdrive.report", "", "report", "")
     environment.filters["sentence"] = lambda text: with_code(capitalized(text))
     facts = facts_of(Subject(Path("poses.csv"), result, ""))

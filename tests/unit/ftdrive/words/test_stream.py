@@ -19,8 +19,6 @@ BEGIN_NS = 5_000_000_000_000
 
 
 class Rig:
-    """A summary whose stream runs block by block."""
-
     def __init__(self, stream: FakeStream, dataset: CalibrationDataset | None = None, *checks: Check) -> None:
         self.stream = stream
         self.feed = SteppedFeed(stream)
@@ -166,7 +164,6 @@ def test_a_failed_check_is_among_the_events() -> None:
 
 
 def filled(span_s: float, duration_s: float, rate_Hz: int, block: int = 7) -> tuple[History, np.ndarray, np.ndarray]:
-    """A history fed in blocks, with the samples themselves."""
     n = round(duration_s * rate_Hz)
     t_ns = BEGIN_NS + np.arange(n) * (1_000_000_000 // rate_Hz)
     wrench = np.random.default_rng(1).normal(size=(n, 6))
