@@ -103,23 +103,6 @@ def test_rows_and_matrix_agree_and_can_be_undone(axes: Axes, about: Point | tupl
         np.testing.assert_allclose(np.linalg.solve(transform.matrix(R[i]), there[i]), wrench[i], atol=1e-10)
 
 
-@pytest.mark.parametrize("axes", AXES)
-def test_a_push_along_x_of_the_base_is_that_in_every_frame(axes: Axes) -> None:
-    R = dwells(40, 25, seed=5)
-    push = np.zeros((len(R), 6))
-    push[:, :3] = 10.0 * (R @ TRUTH.R_flange_sensor)[:, 0, :]  # x of the base, in sensor axes
-    _, block = processed(paired(R, push=push), block=500, frame=WrenchFrame(axes))
-    R_base_axes = {
-        "sensor": R @ calibrated().R_flange_sensor,
-        "flange": R,
-        "base": np.tile(np.eye(3), (len(R), 1, 1)),
-        "tcp": R @ R_FLANGE_TCP,
-    }[axes]
-    in_base = (R_base_axes @ block.wrench[:, :3, None])[..., 0]
-    np.testing.assert_allclose(in_base.mean(axis=0), [10.0, 0, 0], atol=0.03)
-    assert block.frame.axes == axes
-
-
 def test_a_frame_needs_the_height_of_the_sensor() -> None:
     without = info(calibrated(), height=False)
     FrameTransform(WrenchFrame("base", "sensor"), without)
@@ -285,25 +268,6 @@ def test_a_contact_is_one_event_with_its_line_of_force() -> None:
     assert not block.in_contact[2190:].any()
 
 
-def test_a_contact_is_reported_after_40_ms_and_at_its_end_and_a_shorter_touch_is_not() -> None:
-    push = np.zeros((2800, 6))
-    for start, stop in ((1500, 2100), (2600, 2615)):
-        push[start:stop, 2] = 8.0
-    rows, processor = paired(still(2.8), push=push), Processor(info(calibrated()))
-    processor.process(rows.rows(slice(0, 1400)))
-    changes = []
-    for i in range(1400, len(rows), 10):
-        block = processor.process(rows.rows(slice(i, i + 10)))
-        changes += [(contact, int(block.t_host_ns[-1])) for contact in processor.take_contacts()]
-    (begun, begun_ns), (ended, ended_ns) = changes
-    assert (begun.over, ended.over) == (False, True)
-    assert begun.begin_ns == ended.begin_ns == pytest.approx(T0_NS + 1500e6, abs=20e6)
-    assert 40e6 <= begun_ns - begun.begin_ns <= 60e6
-    assert ended.duration_s == pytest.approx(0.6, abs=0.04)
-    assert 40e6 <= ended_ns - ended.last_ns <= 60e6
-    assert ended.peak_N == pytest.approx(8.0, abs=0.1)
-
-
 def test_two_touches_with_a_short_pause_are_one_contact() -> None:
     push = np.zeros((4000, 6))
     for start in (1500, 1700, 3000):
@@ -436,20 +400,6 @@ def test_a_tare_without_samples_is_refused() -> None:
     assert Processor(info(calibrated())).tare().kind == "tare-refused"
     processor, _ = processed(paired(still(0.1)))
     assert "only 100 samples" in processor.tare().text
-
-
-@pytest.mark.parametrize("per_h", [12.0, 0.0])
-def test_drift_is_found_with_its_sigma_and_warned_of_once(per_h: float) -> None:
-    n = 24_000  # 4 minutes at 100 Hz
-    drift = np.outer(per_h * np.arange(n) / 100 / 3600, np.eye(6)[0])
-    rows = paired(np.tile(UPSIDE_DOWN, (n, 1, 1)), 100.0, push=drift)
-    processor, _ = processed(rows, block=2000, rate_Hz=100.0)
-    status = processor.status(LINKS)
-    rate, sigma = status.drift_N_h, status.drift_sigma_N_h
-    assert sigma < 2.0
-    assert rate == pytest.approx(per_h, abs=6 * sigma)
-    assert kinds(processor).count("drift") == (per_h > 0)
-    assert processor.tare_wrench is None
 
 
 def test_the_bias_follows_the_temperature_in_small_steps_and_events_in_large_ones() -> None:

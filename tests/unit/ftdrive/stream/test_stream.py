@@ -373,14 +373,6 @@ def test_an_emulated_cell_excludes_a_real_one(cell: Cell) -> None:
         _ = stream.station
 
 
-def test_without_a_height_only_the_sensor_origin_is_offered(cell: Cell) -> None:
-    cell.config = replace(cell.config, sensor=SensorConfig("fake://"))
-    with pytest.raises(ConfigError, match="height_mm"), cell.stream(frame=WrenchFrame("base", "tcp")):
-        pass
-    with cell.stream(frame=WrenchFrame("base", "sensor")) as stream:
-        assert len(stream.read())
-
-
 def test_a_stream_is_opened_from_paths(cell: Cell, tmp_path: Any) -> None:
     path = tmp_path / "calibration.json"
     cell.calibration.save(path)
