@@ -83,20 +83,6 @@ def test_axes_and_point_are_chosen_separately(arguments: list[str]) -> None:
     np.testing.assert_allclose(as_measured["compensated"]["force_N"], sensor["raw"]["force_N"], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("more", "why"),
-    [
-        (["--about", "nowhere"], "--about is 'nowhere'"),
-        (["--speed", "2"], None),
-        (["--axes", "base", "--about", "tcp"], None),
-    ],
-)
-def test_options_are_checked(arguments: list[str], more: list[str], why: str | None) -> None:
-    result = CliRunner().invoke(live.live, [*arguments, *more, "--once"])
-    assert (str(result.exception) if result.exception else "").startswith(why or "")
-    assert (result.exception is None) == (why is None)
-
-
 def test_once_prints_one_line(arguments: list[str]) -> None:
     (line,) = run(arguments, "--once").stdout.splitlines()
     assert re.fullmatch(

@@ -63,9 +63,3 @@ def test_a_wrong_udp_address_is_refused_before_any_work(
 ) -> None:
     with pytest.raises(ConfigError, match=f"--udp is '{udp}': give HOST:PORT, such as"):
         run(monkeypatch, tmp_path, "--udp", udp)
-
-
-def test_a_calibration_is_needed() -> None:
-    outcome = CliRunner().invoke(stream.stream, [])
-    assert isinstance(outcome.exception, ConfigError)
-    assert "give --calibration PATH or --tool NAME, or --simulate" in str(outcome.exception)

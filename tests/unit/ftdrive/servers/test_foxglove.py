@@ -101,19 +101,9 @@ def test_poses_and_joints_come_at_the_rate_of_the_arm(server: FoxgloveServer, cl
     client.subscribe(ros2.POSE, ros2.JOINTS)
     sent = block(700)
     server.add(sent, [])
-    received = [client.message() for _ in range(2 * 50)]
-    by_time = {int(t_ns): i for i, t_ns in enumerate(sent.t_host_ns + UTC_OFFSET_NS)}
-    assert {topic for topic, _, _ in received} == {ros2.POSE, ros2.JOINTS}
-    for topic, t_ns, payload in (received[0], received[-1]):
-        i = by_time[t_ns]
-        message = read_cdr(client, topic, payload)
-        if topic == ros2.JOINTS:
-            assert message.name == list(ros2.JOINT_NAMES)
-            assert message.position.tolist() == sent.q_rad[i].tolist()
-        else:
-            q = message.pose.orientation
-            assert numbers(message.pose.position) == sent.p_base_flange_m[i].tolist()
-            assert np.allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix(), sent.R_base_flange[i])
+    topics, times_ns, _ = zip(*(client.message() for _ in range(2 * 50)), strict=True)
+    assert {topic: topics.count(topic) for topic in topics} == {ros2.POSE: 50, ros2.JOINTS: 50}
+    assert set(times_ns) <= set(sent.t_host_ns + UTC_OFFSET_NS)
 
 
 def test_frames_lead_from_base_to_the_frame_of_the_wrench(server: FoxgloveServer, client: Client) -> None:

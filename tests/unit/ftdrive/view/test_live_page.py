@@ -110,25 +110,43 @@ def test_less_than_four_sigmas_has_no_arrow() -> None:
     assert not replace(reading, sigma=np.full(6, np.nan)).is_significant(0)  # the noise is not known yet
 
 
-def test_a_push_has_size_sigma_direction_and_arrows() -> None:
-    shown = Shown(FakeStream("contact", block_s=0.05))
-    summary = StreamSummary(shown.feed)
-    parts = shown.run(240)
-    state, force, torque = numbers_of(parts)
-    view = summary.view()
-    reading = reading_of(view)
-    assert float(force["value"]) == pytest.approx(np.linalg.norm(reading.wrench[:3]), abs=0.02)
-    assert (force["unit"], force["size"], force["note"]) == ("N", "huge", "towards -z of base axes")
-    assert force["sigma"] == f"± {reading.size(0)[1]:.2f} (1 sigma)"  # two digits
-    assert force["label"] == "Force on the tool, contact wrench"
-    assert float(torque["value"]) == pytest.approx(np.linalg.norm(reading.wrench[3:]), abs=0.002)
-    assert (torque["unit"], torque["label"]) == ("N·m", "Torque about the tcp origin")
-    assert state["value"] == f"contact, {view.contact_s:.1f} s"
-    assert state["note"].startswith("line of force ")
-    assert state["tone"] == "warn"
-    start, end = np.array(parts["scene/force"]["ends"])
-    np.testing.assert_allclose(end - start, 0.01 * reading.wrench[:3], rtol=1e-3, atol=1e-4)
-    assert {"scene/torque", "scene/line of action", "scene/flange"} <= parts.keys()
+class Fresh(FakeStream):
+    """The noise is not known yet."""
+
+    def read(self) -> Any:
+        block = super().read()
+        return replace(block, chi2=np.full(len(block), np.nan))
+
+    def sigma_of_mean(self, *_: object, **__: object) -> Any:
+        return np.full(6, np.nan)
+
+
+class Heavy(FakeStream):
+    def __init__(self) -> None:
+        super().__init__()
+        self.stages = replace(self.stages, gravity=False)
+
+
+STREAMS: dict[str, tuple[FakeStream, int]] = {
+    "waiting": (FakeStream(), 0),
+    "free": (FakeStream(), 20),
+    "push": (FakeStream("contact", block_s=0.05), 240),
+    "noise-unknown": (Fresh(), 3),
+    "weight-included": (Heavy(), 30),
+}
+
+
+def in_lines(parts: dict[str, Any]) -> str:
+    """The panels, and the names of what is drawn."""
+    panels = [(name, part) for name, part in parts.items() if name.startswith(("alert", "numbers", "table"))]
+    scene = [name for name in parts if name.startswith("scene")]
+    return "\n".join([*(f"{name}: {json.dumps(part, ensure_ascii=False)}" for name, part in panels), *scene])
+
+
+@pytest.mark.parametrize("name", STREAMS)
+def test_what_the_page_shows(name: str, snapshot: SnapshotAssertion) -> None:
+    stream, blocks = STREAMS[name]
+    assert in_lines(Shown(stream).run(blocks)) == snapshot
 
 
 def test_numbers_end_where_their_sigmas_do() -> None:
@@ -141,31 +159,9 @@ def test_numbers_end_where_their_sigmas_do() -> None:
     assert torque["note"] == "turns about +z of base axes"
 
 
-def test_a_free_tool_has_no_direction_and_no_arrow() -> None:
-    parts = Shown(FakeStream()).run(20)
-    state, force, torque = numbers_of(parts)
-    assert (state["value"], state["tone"]) == ("free", "good")
-    assert force["note"] == torque["note"] == state["note"] == "\u00a0"
-    assert not {"scene/force", "scene/torque", "scene/line of action"} & parts.keys()
-
-
-def test_before_the_noise_is_known_a_tool_is_not_called_free() -> None:
-    class Fresh(FakeStream):
-        def read(self) -> Any:
-            block = super().read()
-            return replace(block, chi2=np.full(len(block), np.nan))
-
-        def sigma_of_mean(self, *_: object, **__: object) -> Any:
-            return np.full(6, np.nan)
-
-    parts = Shown(Fresh()).run(3)
-    shown, force, _ = numbers_of(parts)
-    assert (shown["value"], shown["tone"]) == (NOISE_UNKNOWN, "quiet")
-    assert (force["sigma"], force["note"]) == ("", "\u00a0")
-    assert "nan" not in json.dumps(parts).lower()
+def test_a_limit_of_the_first_estimates_shows_no_free_tool() -> None:
     view = Rig(FakeStream()).run(3)
-    status = replace(view.status, contact_limit=8e10)  # the first estimates have hardly a degree of freedom
-    assert state(replace(view, status=status)) == (NOISE_UNKNOWN, "")
+    assert state(replace(view, status=replace(view.status, contact_limit=8e10))) == (NOISE_UNKNOWN, "")
 
 
 def test_contact_is_marked_in_the_plots() -> None:
@@ -209,20 +205,6 @@ def test_no_old_value_of_a_silent_device() -> None:
 def _still(certifier: Certifier) -> set[str]:
     """What a page shows of a scene before the first sample."""
     return {name for name in parts_of(Shown(FakeStream(), certifier=certifier).page) if name.startswith("scene/")}
-
-
-def test_what_the_numbers_are_is_in_words() -> None:
-    shown = Shown(FakeStream())
-    assert shown.run(0)["table/what"]["lines"] == ["waiting for the first sample"]
-    parts = shown.run(3)
-    assert parts["table"]["lines"] == ["UR5e · ATI Mini45 FT12345 · gripper_a"]
-    assert parts["table/what"]["lines"][0] == "contact wrench, base axes, about the tcp origin; stages: " + (
-        "raw, bias, gravity, low-pass 40 Hz (Butterworth, order 2)"
-    )
-    shown.stream.stages = replace(shown.stream.stages, gravity=False)
-    parts = shown.run(30)
-    assert "weight included" in parts["table/what"]["lines"][0]
-    assert numbers_of(parts)[1]["label"] == "Force on the tool, weight included"
 
 
 def test_the_legend_names_each_colour_of_the_scene() -> None:
@@ -400,8 +382,7 @@ def weighed(
 )
 def test_what_the_scale_shows(shown: ScaleState, options: dict[str, Any], snapshot: SnapshotAssertion) -> None:
     parts, *_ = weighed(shown, **options)
-    kept = {name: part for name, part in parts.items() if name.startswith(("alert", "numbers", "table"))}
-    assert "\n".join(f"{name}: {json.dumps(part, ensure_ascii=False)}" for name, part in kept.items()) == snapshot
+    assert in_lines(parts) == snapshot
 
 
 def test_a_viewer_zeroes_the_scale_only_if_that_is_allowed() -> None:
