@@ -117,24 +117,40 @@ def test_duration_ends_by_the_times_of_the_samples(run_record: Run) -> None:
     assert answer["duration_s"] < 0.5
 
 
-def test_control_c_keeps_the_data(run_record: Run) -> None:
-    code, answer, err = run_record(FakeStream(blocks(3)), "-o", "a.mcap")
-    assert code == 130
+SILENT = DeviceTimeout("sensor silent for 0.3 s", "check its cable")
+STALE = StreamEvent(5_300_000_000, "stale", "sensor: silent")
+GAP = StreamEvent(5_100_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
+LATE_GAP = StreamEvent(5_150_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
+
+
+@pytest.mark.parametrize(
+    ("end", "events", "options", "code", "counts", "words"),
+    [
+        (END, {}, (), 130, (300, 0, 0), "Saved a.mcap: 300 samples, 0.30 s, 1000 Hz, gaps: 0"),
+        (SILENT, {3: STALE}, (), 4, (300, 0, 0), "error: sensor silent for 0.3 s; check its cable"),
+        (END, {2: GAP}, ("--count", "300"), 8, (300, 1, 7), "error: gaps: 1, samples lost: 7"),
+        (END, {2: LATE_GAP}, ("--count", "120"), 0, (120, 0, 0), "Saved a.mcap: 120 samples"),
+    ],
+    ids=["ctrl-c", "lost link", "gap", "gap after the end"],
+)
+def test_whatever_ends_a_recording_keeps_its_data(
+    run_record: Run,
+    end: BaseException,
+    events: dict[int, StreamEvent],
+    options: tuple[str, ...],
+    code: int,
+    counts: tuple[int, ...],
+    words: str,
+) -> None:
+    found, answer, err = run_record(FakeStream(blocks(3), end, dict(events)), "-o", "a.mcap", *options)
+    assert found == code
     assert answer is not None
-    assert answer["samples"] == 300
-    assert "Saved a.mcap: 300 samples, 0.30 s, 1000 Hz, gaps: 0" in err
+    assert tuple(answer[name] for name in ("samples", "gaps", "lost")) == counts
     assert answer["rate_Hz"] == pytest.approx(1000.0, rel=1e-4)
-    assert load_recording(Path("a.mcap")).cut == ""
-
-
-def test_a_lost_link_keeps_the_data(run_record: Run) -> None:
-    stale = StreamEvent(5_300_000_000, "stale", "sensor: silent")
-    stream = FakeStream(blocks(3), DeviceTimeout("sensor silent for 0.3 s", "check its cable"), {3: stale})
-    code, answer, err = run_record(stream, "-o", "a.csv")
-    assert code == 4
-    assert "error: sensor silent for 0.3 s; check its cable" in err
-    assert answer is not None
-    assert [event.kind for event in load_recording(Path("a.csv")).events] == ["stale", "delay"]
+    assert words in err
+    recording = load_recording(Path("a.mcap"))
+    assert (recording.cut, len(recording.rows)) == ("", counts[0])
+    assert [event.kind for event in recording.events if event.kind == "stale"] == ["stale"] * (end is SILENT)
 
 
 def test_a_stream_without_a_sample_leaves_no_file(run_record: Run, tmp_path: Path) -> None:
@@ -164,23 +180,6 @@ def test_a_full_disk_completes_no_file_and_names_what_is_safe(run_record: Run, m
         assert len(load_recording(Path(path)).rows) == samples > 0
     assert not Path("a.mcap").exists()
     assert not Path("a.csv").exists()
-
-
-def test_a_gap_is_exit_code_8(run_record: Run) -> None:
-    gap = StreamEvent(5_100_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
-    code, answer, err = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "300")
-    assert code == 8
-    assert answer is not None
-    assert (answer["gaps"], answer["lost"]) == (1, 7)
-    assert "error: gaps: 1, samples lost: 7" in err
-
-
-def test_a_gap_after_the_end_does_not_count(run_record: Run) -> None:
-    gap = StreamEvent(5_150_000_000, "gap", "7 samples lost", {"lost": 7, "seq": 1})
-    code, answer, _ = run_record(FakeStream(blocks(3), events={2: gap}), "-o", "a.csv", "--count", "120")
-    assert code == 0
-    assert answer is not None
-    assert (answer["samples"], answer["gaps"]) == (120, 0)
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from rich.console import Console
+from syrupy.assertion import SnapshotAssertion
 
 from ftcalib.after.verification import Verification
 from ftdrive.runs.verification import NO_LIMITS
@@ -63,43 +64,26 @@ def printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
     return run
 
 
-def test_each_pose_has_what_was_measured_predicted_and_the_difference(printed: Any) -> None:
-    assert printed(verified(marks=("EMULATED",))) == [
-        "Verification 2 poses, calibration 29ce87",
-        "EMULATED",
-        "measured x, y, z predicted x, y, z differs ± 1 sigma",
-        "R03 N 1.000 2.000 -12.000 0.970 2.040 -12.000 0.050 0.030",
-        "N·m 0.1000 0.2000 0.3000 0.0970 0.2000 0.2960 0.0050 0.0030",
-        "R12 N 0.000 0.000 -10.000 0.000 0.000 -9.500 0.500 0.030",
-        "N·m 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0000 0.0030",
-        "PASS largest difference 0.50 N, 0.0050 N·m; chi2 14 for 12 degrees of freedom, p 0.29 "
-        "(false alarms: 1 in 100, near the poses of the fit)",
-        "? R03 was not steady",
-        "Saved run/verification.json",
-    ]
-
-
-def test_a_failure_has_its_reason_and_what_helps(printed: Any) -> None:
-    changed = replace(FOUND, passed=False)
-    lines = printed(verified(changed, passed=False))
-    assert lines[6].startswith("FAILED largest difference")
-    assert lines[7] == "the difference has a reason"
-    assert lines[-2] == "No update corrects the change: calibrate again."
-    helped = replace(changed, update=cast("Any", "bias"))
-    assert printed(verified(helped, passed=False))[-2] == "? R03 was not steady"
-    noisy = printed(verified(FOUND, passed=False))
-    assert noisy[-2].startswith("No significant change: the differences agree with their sigma.")
-    assert "the difference has a reason" not in noisy
+FAILED = replace(FOUND, passed=False)
 
 
 @pytest.mark.parametrize(
-    ("drift", "verbose", "shown"), [("bad", False, True), ("ok", False, False), ("ok", True, True)]
+    ("one", "verbose"),
+    [
+        pytest.param(verified(marks=("EMULATED",)), False, id="passed"),
+        pytest.param(verified(FAILED, passed=False), False, id="failed"),
+        pytest.param(verified(replace(FAILED, update=cast("Any", "bias")), passed=False), False, id="update"),
+        pytest.param(verified(FOUND, passed=False), False, id="noisy"),
+        pytest.param(verified(drift="bad"), False, id="drift"),
+        pytest.param(verified(drift="ok"), False, id="small-drift"),
+        pytest.param(verified(drift="ok"), True, id="small-drift-verbose"),
+    ],
 )
-def test_a_drift_is_printed_if_it_is_bad(
-    drift: str, verbose: bool, shown: bool, printed: Any, monkeypatch: pytest.MonkeyPatch
+def test_what_is_printed(
+    one: Any, verbose: bool, printed: Any, monkeypatch: pytest.MonkeyPatch, snapshot: SnapshotAssertion
 ) -> None:
     monkeypatch.setattr(messages, "verbose", verbose)
-    assert ("drift: 0.1 N since the first pose" in printed(verified(drift=drift))) is shown
+    assert "\n".join(printed(one)) == snapshot
 
 
 def test_only_a_difference_beyond_three_sigma_is_marked(monkeypatch: pytest.MonkeyPatch, printed: Any) -> None:
