@@ -15,10 +15,8 @@ from ftdrive.commands import verify as command
 from ftdrive.errors import ConfigError
 from ftdrive.runs.run import Run
 from ftdrive.runs.verification import NO_LIMITS, Limits, Verified
-from ftdrive.session.events import Question
 from ftdrive.session.open_session import SessionOptions
 from ftdrive.session.verifying import Verifying, save_wanted_update
-from ftdrive.terminal.screen import open_operator
 from ftdrive.words.result import verification_in_lines
 from tests.unit.ftdrive.recorded import calibration
 
@@ -84,11 +82,7 @@ def test_an_update_is_saved_only_if_it_is_wanted(
     update: Any, typed: str, wanted: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ftdrive.session.verifying.save_update", lambda _: tmp_path)
-
-    def ask(question: Question) -> Any:
-        with open_operator(as_json=True) as operator:
-            return operator.ask(question)
-
+    ask: Any = lambda question: command._ask_on_page(None, True, question)  # noqa: E731
     with CliRunner().isolation(typed) as (out, *_):
         found = save_wanted_update(failed(tmp_path, NO_LIMITS), update, ask)
         printed = out.getvalue().decode()
