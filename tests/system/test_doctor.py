@@ -67,7 +67,7 @@ def test_a_healthy_cell(ftdrive: CommandLine) -> None:
     assert np.linalg.norm(answer["push"]["sensor"]["force_N"]) == pytest.approx(15, abs=15 * GAIN)
     assert not any(ftdrive.folder.iterdir())  # it only looked
     assert re.match(r"payload 0\.75 kg at \(-?\d+, -?\d+, \d+\) mm", checks["robot.payload"]["found"])
-    assert re.search(r"answers within [0-9]+ ms", checks["robot.link"]["found"])
+    assert re.search(r"answers in [0-9]+ ms", checks["robot.link"]["found"])
 
 
 @pytest.mark.slow

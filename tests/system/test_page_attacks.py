@@ -390,7 +390,7 @@ def test_a_command_outlives_its_drawing(
     with Station("can", REAL_PACE) as station:
         page = started(name, ftdrive, station)
         with page.connect(page.head("GET", "/parts", Cookie=page.cookie)):
-            wait_until(lambda: " goes on" in page.printed(), page.process)
+            wait_until(lambda: "continues" in page.printed(), page.process)
             if name == "calibrate":
                 stopped(page, station)
                 return
