@@ -74,11 +74,11 @@ class FakeArm(RobotArm):
         """Of another client, until we take control."""
         self.remote: bool | None = True
         self.asked_limits = 0
-        self.at_move: dict[int, Callable[[], None]] = {}
+        self.at_move: dict[int, Callable[[], object]] = {}
         self.sweeps: list[Sweep] = []
-        self.at_sweep_s: dict[int, tuple[float, Callable[[], None]]] = {}
+        self.at_sweep_s: dict[int, tuple[float, Callable[[], object]]] = {}
         """By the number of the sweep: when something happens in it, and what."""
-        self.at_look: Callable[[], None] = lambda: None
+        self.at_look: Callable[[], object] = lambda: None
         """Called whenever the status is read."""
         self.forbidden: Array | None = None
         self.halted = threading.Event()
@@ -199,7 +199,7 @@ class FakeSensor(ForceTorqueSensor):
         self.stuck = False
         self.heals = False
         self.warm_C: float | None = None
-        self.collecting: Callable[[], None] = lambda: None
+        self.collecting: Callable[[], object] = lambda: None
         self._newest = np.zeros(6)
         self._seq = 0
         self.events: tuple[tuple[int, str], ...] = ()
@@ -259,7 +259,7 @@ class Scripted:
 
     answers: dict[str, list[str]] = field(default_factory=dict)
     on_event: Callable[[Event], None] = lambda _: None
-    at_question: list[tuple[str, Callable[[], None]]] = field(default_factory=list)
+    at_question: list[tuple[str, Callable[[], object]]] = field(default_factory=list)
     """What happens while a question with these words waits for its answer."""
     keys: list[Key] = field(default_factory=list)
     has_keys: bool = True

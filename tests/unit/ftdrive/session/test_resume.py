@@ -20,7 +20,6 @@ from ftdrive.session.events import (
     Checked,
     Estimated,
     Event,
-    GuardTripped,
     Key,
     Noted,
     PoseTaken,
@@ -30,35 +29,57 @@ from ftdrive.session.events import (
 )
 from ftdrive.session.live_fit import faces
 from ftdrive.words.result import drift_in_words
-from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
+from tests.unit.ftdrive.session.scenarios import Case, cases, once, press
+
+ON_ITS_WAY = {
+    "pause holds the arm on its way and goes on": Case(
+        {"move 3": press(Key.PAUSE)}, ("resume",), holds=((3, "paused by the operator"),)
+    ),
+    "a pause without an operator to end it is no fault": Case(
+        {"move 3": press(Key.PAUSE)},
+        ends="paused by the operator",
+        error=Declined,
+        holds=((3, "paused by the operator"),),
+        taken=(1, 2),
+    ),
+    "stop ends the session without a question": Case(
+        {"move 3": press(Key.STOP)}, ends="stopped by the operator", error=Declined, taken=(1, 2), moves=3
+    ),
+    "redo stops the arm and goes back from there": Case(
+        {"move 4": press(Key.REDO)}, taken=(1, 2, 3, 3, 4, 5, 6, 7), asked={"Approach to pose 3": 1}
+    ),
+    **{
+        f"a {key} without a pose to act on stops the arm": Case(
+            {"move 4": press(key)}, ("resume",), holds=((4, ""),), asked={"Approach to pose 4": 1}
+        )
+        for key in (Key.KEEP, Key.OTHER)
+    },
+}
+WHILE_IT_STANDS = {
+    "skip while a pose is measured skips that one": Case(
+        {"measuring 4": press(Key.SKIP)}, taken=(1, 2, 3, 5, 6, 7), moves=7, asked={"Approach to pose 5": 0}
+    ),
+    "skip with no pose under way skips none": Case({"taken 4": press(Key.SKIP)}, noted={"nothing to skip": 1}),
+    "keep has nothing to do in a tour": Case(
+        {"taken 3": press(Key.KEEP)}, noted={"press r to take the last one again": 1}
+    ),
+    "another key means nothing": Case({"taken 3": press(Key.OTHER)}),
+    "redo before any pose or twice does nothing more": Case(
+        {"approach": once(press(Key.REDO)), "taken 2": once(press(Key.REDO, Key.REDO))},
+        ("resume",),
+        holds=((1, ""),),
+        taken=(1, 2, 2, 3, 4, 5, 6, 7),
+        noted={"no pose yet": 1, "pose 2 is already being taken": 1},
+    ),
+}
 
 
-def test_pause_holds_the_arm_on_its_way_and_goes_on_or_ends(lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
-    lab.operator.answers["resume: go on"] = ["resume"]
-    lab.take_poses()
-    assert lab.operator.states().count(State.HOLD) == 1
-    assert lab.operator.of(GuardTripped) == []
-    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-    lab.arm.moves.clear()
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.PAUSE)
-    lab.operator.answers["resume: go on"] = ["quit"]
-    with pytest.raises(Declined, match="paused by the operator"):
-        lab.take_poses()
-
-
-def test_stop_ends_the_session_without_a_question_and_says_how_to_go_on(lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined, match="stopped by the operator"):
-        lab.take_poses()
-    assert lab.arm.halted.is_set()
-    assert State.HOLD not in lab.operator.states()
-    assert "resume" not in lab.operator.asked[-1].text
-    assert lab.stops() == [1, 2]
-    assert f"--resume {lab.run().folder}" in lab.operator.of(Noted)[-1].words
+@cases(ON_ITS_WAY | WHILE_IT_STANDS)
+def test_a_key(case: Case, lab: Lab) -> None:
+    case.play(lab)
 
 
 def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> None:
@@ -72,34 +93,6 @@ def test_skip_on_the_way_stops_the_arm_and_goes_round_that_pose(lab: Lab) -> Non
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
     assert State.HOLD not in lab.operator.states()
     assert "skipped: pose 4; the arm" in lab.said()
-
-
-def test_skip_while_a_pose_is_measured_skips_that_one(lab: Lab) -> None:
-    def skip() -> None:
-        if len(lab.arm.moves) == 4 and not skipped:
-            skipped.append(True)
-            lab.operator.keys.append(Key.SKIP)
-
-    skipped: list[bool] = []
-    lab.sensor.collecting = skip
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 3, 5, 6, 7]
-    assert not [question for question in lab.operator.asked if "Approach to pose 5" in question.text]
-    assert len(lab.arm.moves) == 7
-
-
-def test_skip_with_no_pose_under_way_skips_none(lab: Lab) -> None:
-    lab.press((Key.SKIP, PoseTaken, 4))
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert "nothing to skip" in lab.said()
-
-
-def test_keep_has_nothing_to_do_in_a_tour_and_says_so(lab: Lab) -> None:
-    lab.press((Key.KEEP, PoseTaken, 3))
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-    assert lab.said().count("press r to take the last one again") == 1
 
 
 def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> None:
@@ -117,46 +110,6 @@ def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> Non
     assert lab.arm.stops == 1  # on its way to pose 4
     ways = [question.text for question in lab.operator.asked if "Approach to pose" in question.text]
     assert len(ways) == 1  # the first approach: it was stopped before it had left pose 3
-
-
-def test_redo_on_the_way_stops_the_arm_and_goes_back_from_there(lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.REDO)
-    lab.take_poses()
-    assert lab.arm.stops == 1
-    assert lab.taken() == [1, 2, 3, 3, 4, 5, 6, 7]
-    assert [question for question in lab.operator.asked if "Approach to pose 3" in question.text]
-    assert lab.holds() == []
-
-
-@pytest.mark.parametrize("key", [Key.KEEP, Key.OTHER, Key.PAUSE])
-def test_a_key_without_a_pose_to_act_on_stops_the_arm_on_its_way(lab: Lab, key: Key) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
-    lab.operator.answers["poses are saved"] = ["resume"]
-    lab.take_poses()
-    assert lab.arm.stops == 1
-    assert len(lab.holds()) == 1
-    assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
-
-
-def test_another_key_while_the_arm_stands_means_nothing(lab: Lab) -> None:
-    lab.press((Key.OTHER, PoseTaken, 3))
-    lab.take_poses()
-    assert lab.holds() == []
-
-
-def test_redo_before_any_pose_or_twice_does_nothing_more(lab: Lab) -> None:
-    def twice(event: Event) -> None:
-        if isinstance(event, StateChanged) and event.state is State.APPROACH and not lab.holds():
-            lab.operator.keys.append(Key.REDO)
-        if isinstance(event, PoseTaken) and lab.taken() == [1, 2]:
-            lab.operator.keys.extend([Key.REDO, Key.REDO])
-
-    lab.operator.on_event = twice
-    lab.operator.answers["poses are saved"] = ["resume"]  # on its way to pose 1
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 2, 3, 4, 5, 6, 7]
-    assert "no pose yet" in lab.said()
-    assert "pose 2 is already being taken" in lab.said()
 
 
 def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
@@ -242,24 +195,6 @@ def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
     ways = [question for question in lab.operator.asked if "Approach to pose 4" in question.text]
     assert ["skipped pose 3" in question.text for question in ways] == [False, True]
     assert [question.assumed for question in ways] == ["yes", None]
-
-
-def test_what_would_help_most_is_not_shown_where_the_plan_chooses(lab: Lab) -> None:
-    lab.take_poses()
-    assert {event.hint for event in lab.operator.of(Estimated)} == {""}
-
-
-def test_a_hold_shows_the_reason_and_leaves_the_path_to_the_screen(lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.arm.set_status(
-        fault=DeviceFault("protective stop", "…"), safety_mode="protective stop"
-    )
-    lab.operator.answers["after fixing the cause"] = ["quit"]
-    with pytest.raises(DeviceFault):
-        lab.take_poses()
-    (hold,) = [event for event in lab.operator.of(StateChanged) if event.state is State.HOLD]
-    assert str(lab.folder) not in hold.words + lab.operator.asked[-1].text
-    assert "protective stop" in hold.words
-    assert "3 poses are saved" in lab.operator.asked[-1].text
 
 
 def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None:

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from ftdrive.errors import SupervisorGone, exit_code
-from ftdrive.session.events import Event, GuardTripped, Hazard, Key, State, StateChanged
-from ftdrivers.errors import DeviceFault
+from ftdrive.session.events import Event, GuardTripped
 from tests.unit.ftdrive.fake_cell import Lab, Scripted
 
 WHY = "the reader of standard output is gone"
@@ -67,19 +66,6 @@ def test_the_arm_stops_in_mid_move_before_anything_else(shown: bool, lab: Lab) -
     resumes(lab, 3)
 
 
-def test_a_pose_in_progress_is_given_up(lab: Lab) -> None:
-    def on_event(event: Event) -> None:
-        if isinstance(event, StateChanged) and event.state is State.SAMPLE and event.stop == 3:
-            leave(lab)
-
-    lab.operator.on_event = on_event
-    with pytest.raises(SupervisorGone):
-        lab.take_poses()
-    assert len(lab.arm.moves) == 3
-    assert len(recorded(lab)) == 1
-    resumes(lab, 2)
-
-
 def test_no_question_is_answered_for_an_absent_operator(lab: Lab) -> None:
     lab.operator.gone = WHY
     with pytest.raises(SupervisorGone):
@@ -103,28 +89,3 @@ def test_an_operator_who_leaves_at_a_question_moves_nothing(lab: Lab) -> None:
     assert len(lab.arm.moves) == 4
     assert len(recorded(lab)) == 2
     resumes(lab, 3)
-
-
-def test_a_hold_without_an_operator_ends_with_its_first_cause(lab: Lab) -> None:
-    def gone() -> None:
-        leave(lab)
-        raise SupervisorGone(WHY)
-
-    lab.operator.at_question = [("resume:", gone)]
-    lab.push_on_the_way(4)
-    with pytest.raises(DeviceFault, match="contact"):
-        lab.take_poses()
-    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [Hazard.CONTACT, Hazard.SUPERVISOR_GONE]
-    assert len(recorded(lab)) == 1
-
-
-def test_a_pause_without_an_operator_ends_with_their_absence(lab: Lab) -> None:
-    def gone() -> None:
-        leave(lab)
-        raise SupervisorGone(WHY)
-
-    lab.operator.at_question = [("resume:", gone)]
-    lab.press((Key.PAUSE, StateChanged, 3))
-    with pytest.raises(SupervisorGone):
-        lab.take_poses()
-    assert len(recorded(lab)) == 1

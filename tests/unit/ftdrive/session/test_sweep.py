@@ -16,12 +16,13 @@ from ftdrive.planning.plan import Plan
 from ftdrive.planning.planner import certifier_for, sweep_for
 from ftdrive.runs.motion import MotionRecording
 from ftdrive.session import sweep
-from ftdrive.session.events import Event, GuardTripped, Key, MotionRecorded, State, StateChanged
+from ftdrive.session.events import GuardTripped, Key, MotionRecorded, State
 from ftdrive.session.guards import ExpectedMotion, Seen
 from ftdrive.session.sweep import FreeToolPrediction, on_script_path
 from ftdrivers.clock import REAL
 from ftdrivers.interfaces import ArmState
 from tests.unit.ftdrive.fake_cell import STATUS, Lab
+from tests.unit.ftdrive.session.scenarios import Case, at, cases, press, status
 from tests.unit.ftdrive.session.test_stops import FAULTS
 
 LATE_S = 4.5
@@ -81,42 +82,19 @@ def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
     hazard, inject, repair, _ = FAULTS[fault]
-    lab.arm.at_sweep_s[1] = LATE_S, lambda: inject(lab)
 
-    def on_event(event: Event) -> None:
-        if isinstance(event, StateChanged) and event.state is State.HOLD:
-            assert lab.arm.halted.is_set()
-            assert not lab.run().in_motion
-            repair(lab)
+    def in_hold(lab: Lab) -> None:
+        assert lab.arm.halted.is_set()
+        assert not lab.run().in_motion
+        repair(lab)
 
-    lab.operator.on_event = on_event
+    at(lab, f"sweep {LATE_S}", inject)
+    at(lab, "hold", in_hold)
     lab.operator.answers["resume:"] = ["resume"]
     assert lab.sweep(real=False).in_motion
     assert [event.hazard for event in lab.operator.of(GuardTripped)] == [hazard]
     assert len(lab.arm.sweeps) == 2
     assert lab.holds() == [("resume", "quit")]
-
-
-def test_a_push_that_the_weight_of_a_heavy_tool_would_hide_is_seen_once_the_tool_is_known(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = LATE_S, lambda: setattr(lab.sensor, "push", np.array([0, 22.0, 0, 0, 0, 0]))
-    with pytest.raises(Exception, match="from the weight of the free tool"):
-        lab.sweep(real=False)
-    assert lab.operator.of(GuardTripped)[0].hazard == 14
-    assert not lab.run().in_motion
-
-
-def test_a_joint_off_the_curve_stops_the_arm(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = 1.0, lambda: setattr(lab.arm, "push_rad", np.radians([0, 0, 0, 0, 3.0, 0]))
-    with pytest.raises(Exception, match="off its planned position"):
-        lab.sweep(real=False)
-    assert lab.operator.of(GuardTripped)[0].hazard == 2
-
-
-def test_a_slider_that_moves_stops_the_arm(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = 1.0, lambda: lab.arm.set_status(speed_slider=0.7)
-    with pytest.raises(Exception, match="speed slider was moved from 100 to 70 %"):
-        lab.sweep(real=False)
-    assert lab.operator.of(GuardTripped)[0].hazard == 22
 
 
 @pytest.mark.slow
@@ -129,27 +107,48 @@ def test_a_sweep_starts_at_the_speed_of_the_slider(lab: Lab) -> None:
         lab.sweep(real=False)
 
 
-def test_a_supervisor_that_leaves_stops_the_arm(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = 1.0, lambda: setattr(lab.operator, "gone", "the terminal was closed")
-    with pytest.raises(SupervisorGone):
-        lab.sweep(real=False)
-    assert lab.arm.halted.is_set()
-    assert lab.holds() == []
+WRONG = {
+    "a push that the weight of a heavy tool would hide is seen once the tool is known": Case(
+        {f"sweep {LATE_S}": lambda lab: setattr(lab.sensor, "push", np.array([0, 22.0, 0, 0, 0, 0]))},
+        ends="from the weight of the free tool",
+        rows=(14,),
+        holds=((0, "from the weight of the free tool"),),
+    ),
+    "a joint off the curve stops the arm": Case(
+        {"sweep 1.0": lambda lab: setattr(lab.arm, "push_rad", np.radians([0, 0, 0, 0, 3.0, 0]))},
+        ends="off its planned position",
+        rows=(2,),
+        holds=((0, "off its planned position"),),
+    ),
+    "a slider that moves stops the arm": Case(
+        {"sweep 1.0": status(speed_slider=0.7)},
+        ends="speed slider was moved from 100 to 70 %",
+        rows=(22,),
+        holds=((0, "speed slider"),),
+    ),
+    "a supervisor that leaves stops the arm": Case(
+        {"sweep 1.0": lambda lab: setattr(lab.operator, "gone", "the terminal was closed")},
+        ends="the terminal was closed",
+        error=SupervisorGone,
+        rows=(27,),
+    ),
+    "q ends a sweep": Case(
+        {"sweep 1.0": press(Key.STOP)},
+        ends="stopped by the operator",
+        error=Declined,
+        noted={"sweep not completed": 1},
+    ),
+    "s stops a sweep, which has no pose to skip, and it starts again": Case(
+        {"sweep 1.0": press(Key.SKIP)}, ("resume",), holds=((0, ""),)
+    ),
+}
 
 
-def test_q_ends_a_sweep(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = 1.0, lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined, match="stopped by the operator"):
-        lab.sweep(real=False)
-    assert lab.arm.halted.is_set()
-    assert "sweep not completed" in lab.said()
-
-
-def test_a_sweep_has_no_pose_to_skip_so_s_stops_it_and_it_starts_again(lab: Lab) -> None:
-    lab.arm.at_sweep_s[1] = 1.0, lambda: lab.operator.keys.append(Key.SKIP)
-    lab.operator.answers["resume:"] = ["resume"]
-    assert lab.sweep(real=False).in_motion
-    assert lab.holds() == [("resume", "quit")]
+@cases({name: replace(case, mode="sweep", taken=()) for name, case in WRONG.items()})
+def test_what_ends_a_sweep(case: Case, lab: Lab) -> None:
+    case.play(lab)
+    assert lab.arm.halted.is_set() == bool(case.ends)
+    assert lab.run().in_motion != bool(case.ends)
 
 
 def test_the_other_control_path_is_refused_at_once(lab: Lab) -> None:

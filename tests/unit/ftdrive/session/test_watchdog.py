@@ -84,17 +84,6 @@ def test_a_look_that_takes_long_does_not_delay_the_next() -> None:
     assert len(looks.seen) == pytest.approx(101, abs=2)
 
 
-def test_what_is_wrong_already_is_seen_before_the_arm_moves(lab: Lab) -> None:
-    def on_event(event: Event) -> None:
-        if isinstance(event, PoseTaken) and event.stop == 2:
-            lab.arm.set_status(program="paused")
-
-    lab.operator.on_event = on_event
-    with pytest.raises(DeviceFault, match="paused"):
-        lab.take_poses()
-    assert len(lab.arm.moves) == 2
-
-
 @pytest.mark.parametrize(("between_s", "counted_s"), [(0.01, 0.01), (0.018, 0.018), (0.022, 0.02), (3.0, 0.02)])
 def test_the_time_that_this_computer_takes_counts_only_in_part(between_s: float, counted_s: float) -> None:
     looks = Looks()
@@ -243,16 +232,6 @@ def end(lab: Lab) -> None:
             raise SystemExit
 
     lab.arm.at_look = leave
-
-
-def test_guards_that_ended_on_the_way_are_missed_at_once(lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: end(lab)
-    lab.operator.answers["resume:"] = ["resume", "quit"]
-    with pytest.raises(DeviceFault, match="guard thread has ended"):
-        lab.take_poses()
-    assert [event.hazard for event in lab.operator.of(GuardTripped)] == [18]
-    assert len([event for event in lab.operator.of(Noted) if event.words.startswith("not yet: the guard thread")]) == 1
-    assert len(lab.arm.moves) == 3
 
 
 @pytest.mark.parametrize("stop", [0, 3])
