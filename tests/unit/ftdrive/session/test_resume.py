@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ftcalib.routine import DriftCheck
 from ftdrive.cell.config import ToolConfig
 from ftdrive.errors import ConfigError, Declined, NotAccepted, PlanRefused
 from ftdrive.planning.plan import Plan
 from ftdrive.planning.search.nodes import constant_tour
 from ftdrive.runs.run import Run
-from ftdrive.session import drive, session
+from ftdrive.session import drive
 from ftdrive.session.events import (
     Checked,
     Estimated,
@@ -27,10 +26,8 @@ from ftdrive.session.events import (
     State,
     StateChanged,
 )
-from ftdrive.session.live_fit import faces
 from ftdrive.words.result import drift_in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
-from tests.edited_files import edit
 from tests.unit.ftdrive.fake_cell import Lab
 from tests.unit.ftdrive.session.scenarios import Case, cases, once, press
 
@@ -146,19 +143,6 @@ def test_skip_of_the_first_pose_while_it_is_taken_again_keeps_it_and_names_the_r
     assert outcome.drift is not None
 
 
-def test_a_pose_of_a_run_that_redo_names_stays_when_it_is_skipped(lab: Lab) -> None:
-    lab.take_poses()
-    lab.operator.shown.clear()
-    lab.operator.answers["Pose 3 of 7"] = ["s"]
-    outcome = lab.calibrate(resume=lab.run().folder, redo=(3,), mode="step")
-    assert lab.taken() == []
-    assert "pose 3 keeps" in lab.said()
-    assert "skipped" not in lab.said()
-    assert [event.poses for event in lab.operator.of(Estimated)][-1] == 6
-    assert outcome is not None
-    assert outcome.result.n_poses == 6
-
-
 def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_the_two(lab: Lab) -> None:
     lab.take_poses()
     lab.sensor.push = np.array([0.5, 0, 0, 0, 0, 0])
@@ -173,14 +157,6 @@ def test_a_first_pose_that_is_repeated_after_its_return_gives_the_drift_between_
     words, bad = drift_in_words(drift)
     assert bad
     assert words.startswith(f"first pose, repeated {-drift.elapsed_s:.0f} s after the return to it, 0.")
-
-
-@pytest.mark.parametrize(("elapsed_s", "when"), [(300.0, "again after 300 s"), (-300.0, "repeated 300 s after")])
-def test_the_rate_of_a_drift_is_the_same_whichever_was_first(elapsed_s: float, when: str) -> None:
-    words, bad = drift_in_words(DriftCheck(np.array([0.5, 0, 0, 0, 0, 0]), np.full(6, 0.01), elapsed_s))
-    assert bad
-    assert when in words
-    assert words.endswith("away: 0.1 N/min")
 
 
 def test_an_approach_past_a_skipped_pose_is_shown_and_confirmed_by_the_operator(
@@ -265,10 +241,8 @@ def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
     assert lab.arm.moves == []
 
 
-def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
+def broken_off(lab: Lab) -> Path:
     """Begin a run and stop it at its third move."""
-    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
-    reports(lab, facts=facts)
     lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
     with pytest.raises(Declined):
         lab.take_poses()
@@ -276,34 +250,19 @@ def broken_off(lab: Lab, url: str = "fake://", **facts: Any) -> Path:
     return lab.run().folder
 
 
-def reports(lab: Lab, model: str = "fake", serial: str = "S1", facts: dict[str, Any] | None = None) -> None:
-    """Let the sensor say who it is."""
-    known = {name: Fact(value, "device") for name, value in (facts or {}).items()}
-    lab.sensor.identify = lambda: DeviceInfo(model, serial, "1", known)  # type: ignore[method-assign]
-
-
-@pytest.mark.parametrize(
-    ("then", "now", "cure"),
-    [
-        (("Robotiq FT 300", NOT_REPORTED), ("UR wrist", NOT_REPORTED), "serial=… in its address"),
-        (("Robotiq FT 300", "1"), ("UR wrist", "1"), "connect the sensor of the run"),
-        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", "1"), "serial=… in its address"),
-        (("Robotiq FT 300", NOT_REPORTED), ("Robotiq FT 300", NOT_REPORTED), ""),
-    ],
-)
-def test_a_sensor_without_a_serial_number_is_the_same_where_its_model_is(
-    then: tuple[str, str], now: tuple[str, str], cure: str, lab: Lab
+def report(
+    lab: Lab,
+    model: str = "Robotiq FT 300",
+    serial: str = "S1",
+    facts: dict[str, Any] | None = None,
+    arm: tuple[str, str] = ("UR5e", "A1"),
+    **sensor: Any,
 ) -> None:
-    folder = broken_off(lab)
-    model, serial = then
-    edit(folder / "run.json", lambda header: header["devices"]["sensor"].update(model=model, serial=serial))
-    reports(lab, *now)
-    if not cure:
-        assert lab.take_poses(resume=folder) is not None
-        return
-    with pytest.raises(PlanRefused, match=f"{then[0]}, serial {then[1]}, but {now[0]}.*{cure}"):
-        lab.take_poses(resume=folder)
-    assert lab.arm.moves == []
+    """Let the devices report who they are."""
+    known = {name: Fact(value, "device") for name, value in (BEGUN | (facts or {})).items()}
+    lab.sensor.identify = lambda: DeviceInfo(model, serial, "1", known)  # type: ignore[method-assign]
+    lab.arm.identify = lambda: DeviceInfo(*arm, "5.5")  # type: ignore[method-assign]
+    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, **({"url": "ati-can://can0"} | sensor)))
 
 
 def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab: Lab) -> None:
@@ -316,44 +275,34 @@ def test_a_run_that_another_process_resumes_is_refused_before_anything_moves(lab
     assert lab.take_poses(resume=folder) is not None
 
 
-def test_an_arm_without_a_serial_number_is_the_same_where_its_model_is(lab: Lab) -> None:
-    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
-    folder = broken_off(lab)
-    lab.arm.identify = lambda: DeviceInfo("UR7e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
-    with pytest.raises(PlanRefused, match="not reported, but UR7e"):
-        lab.take_poses(resume=folder)
-    lab.arm.identify = lambda: DeviceInfo("UR5e", NOT_REPORTED, "5.5")  # type: ignore[method-assign]
-    assert lab.take_poses(resume=folder) is not None
-
-
-def test_a_run_is_not_gone_on_with_the_other_sign(lab: Lab) -> None:
-    folder = broken_off(lab)
-    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=-1))
-    with pytest.raises(PlanRefused, match=r"sign .*1 .*-1"):
-        lab.take_poses(resume=folder)
-    assert lab.arm.moves == []
-    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, sign=1))
-    assert lab.take_poses(resume=folder) is not None
+NO_SERIAL = {"serial": NOT_REPORTED}
+BEGUN: dict[str, Any] = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
 
 
 @pytest.mark.parametrize(
-    ("url", "facts", "changed"),
+    ("then", "now", "changed"),
     [
-        ("ati-can://can0?slot=2", {}, "slot was 0"),
-        ("ati-serial:///dev/ttyUSB0?calibration=2", {}, "calibration was 1"),
-        ("ati-can://can0", {"counts_per_N": 200.0}, "counts_per_N was 100.0"),
-        ("ati-can://can0", {"counts_per_Nm": 200.0}, "counts_per_Nm was 1000.0"),
-        ("ati-can://can0", {"range": (99.0,) * 6}, "range was"),
-        ("ati-can:///dev/ttyACM0?interface=slcan&slot=0x0&recover=1&bitrate=250000", {}, ""),
+        (NO_SERIAL, NO_SERIAL | {"model": "UR wrist"}, "serial not reported, but UR wrist.*serial=… in its address"),
+        ({}, {"model": "UR wrist"}, "serial S1, but UR wrist.*connect the sensor of the run"),
+        (NO_SERIAL, {}, "serial=… in its address"),
+        (NO_SERIAL, NO_SERIAL, ""),
+        ({}, {"url": "ati-can://can0?slot=2"}, "slot was 0"),
+        ({}, {"url": "ati-serial:///dev/ttyUSB0?calibration=2"}, "calibration was 1"),
+        ({}, {"url": "ati-can:///dev/ttyACM0?interface=slcan&slot=0x0&recover=1&bitrate=250000"}, ""),
+        ({}, {"sign": -1}, r"sign .*1 .*-1"),
+        ({}, {"facts": {"counts_per_N": 200.0}}, "counts_per_N was 100.0"),
+        ({}, {"facts": {"counts_per_Nm": 200.0}}, "counts_per_Nm was 1000.0"),
+        ({}, {"facts": {"range": (99.0,) * 6}}, "range was"),
+        ({"arm": ("UR5e", NOT_REPORTED)}, {"arm": ("UR7e", NOT_REPORTED)}, "not reported, but UR7e"),
+        ({"arm": ("UR5e", NOT_REPORTED)}, {"arm": ("UR5e", NOT_REPORTED)}, ""),
     ],
 )
-def test_a_run_is_not_gone_on_where_the_numbers_mean_something_else(
-    url: str, facts: dict[str, Any], changed: str, lab: Lab
+def test_a_run_goes_on_only_with_its_arm_and_sensor_and_where_the_numbers_mean_the_same(
+    then: dict[str, Any], now: dict[str, Any], changed: str, lab: Lab
 ) -> None:
-    begun = {"counts_per_N": 100.0, "counts_per_Nm": 1000.0, "range": (300.0,) * 6}
-    folder = broken_off(lab, "ati-can://can0", **begun)
-    lab.cell = replace(lab.cell, sensor=replace(lab.cell.sensor, url=url))
-    reports(lab, facts=begun | facts)
+    report(lab, **then)
+    folder = broken_off(lab)
+    report(lab, **now)
     if not changed:
         assert lab.take_poses(resume=folder) is not None
         return
@@ -407,20 +356,6 @@ def test_by_hand_and_without_keys_the_session_ends_with_a_calibration(lab: Lab) 
     assert outcome.run.calibration_path.exists()
 
 
-def test_by_hand_on_a_wall_a_pose_is_shown_on_the_face_where_it_counts(lab: Lab) -> None:
-    def at_pose(stop: int) -> None:
-        if stop == 4:  # from here on the fit would show how the base leans
-            raise KeyboardInterrupt
-
-    lab.cell = replace(lab.cell, workcell=replace(lab.cell.workcell, mounting="wall"))
-    by_hand(lab, at_pose)
-    with pytest.raises(KeyboardInterrupt):
-        lab.take_poses(mode="manual")
-    shown = np.array([event.gravity_flange for event in lab.operator.of(PoseTaken)])
-    counted = [event.faces for event in lab.operator.of(Estimated)]
-    assert counted == [faces(shown[:poses]) for poses in (1, 2, 3)]
-
-
 def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab) -> None:
     def at_pose(stop: int) -> None:
         if stop == 3:
@@ -434,53 +369,30 @@ def test_a_session_that_is_interrupted_says_how_to_solve_what_is_there(lab: Lab)
     assert lab.run().stops() == [1, 2, 3]
 
 
-def test_a_run_along_a_plan_does_not_go_on_by_hand(lab: Lab) -> None:
-    lab.take_poses()
-    with pytest.raises(ConfigError, match="along a plan"):
-        lab.take_poses(resume=lab.run().folder, mode="listen")
-
-
-@pytest.mark.parametrize("option", [{"dry_run": True}, {"fast": True}, {"plan": Path("plan.json")}])
-def test_by_hand_nothing_is_planned_or_moved(option: dict[str, Any], lab: Lab) -> None:
-    with pytest.raises(ConfigError, match="leave out --" + next(iter(option)).replace("_", "-")):
-        lab.take_poses(mode="manual", **option)
-    assert not (lab.folder / "runs").exists()
-
-
-def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:
-    lab.take_poses()
-    opened, run = lab.arm.opened, lab.run()
-    with pytest.raises(ConfigError, match="name the run with --resume"):
-        lab.take_poses(redo=(3,))
-    with pytest.raises(ConfigError, match="poses 1 to 7"):
-        lab.take_poses(resume=run.folder, redo=(7, 8))
-    passive = Run.create(lab.folder, "passive", {"mode": "passive"}).folder
-    with pytest.raises(ConfigError, match="start again with --passive"):
-        lab.take_poses(resume=passive)
-    damaged = lab.folder / "damaged.json"
-    damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
-    with pytest.raises(PlanRefused):
-        lab.take_poses(plan=damaged)
-    assert lab.arm.opened == opened
-
-
-def test_a_cell_that_cannot_be_built_is_reported_before_its_sensor_opens(
-    lab: Lab, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refuse(_: object) -> None:
-        raise ConfigError("[robot] driver")
-
-    def opened() -> None:
-        raise AssertionError("opened")
-
-    monkeypatch.setattr(session, "build_arm", refuse)
-    monkeypatch.setattr(lab.sensor, "open", opened)
-    with pytest.raises(ConfigError, match="driver"):
-        lab.take_poses()
-
-
 def test_what_the_sensor_went_through_is_written_down(lab: Lab) -> None:
     lab.sensor.events = ((17, "connected again"),)
     lab.take_poses()
     reconnected = [event for event in lab.operator.of(Noted) if "connected again" in event.words]
     assert len(reconnected) == 1
+
+
+def test_options_that_cannot_be_used_are_reported_before_anything_opens(lab: Lab) -> None:
+    lab.take_poses()
+    opened, run = lab.arm.opened, lab.run()
+    passive = Run.create(lab.folder, "passive", {"mode": "passive"}).folder
+    damaged = lab.folder / "damaged.json"
+    damaged.write_text(run.plan_path.read_text().replace('"clearance_m"', '"clearance"', 1))
+    options: dict[str, dict[str, Any]] = {
+        "name the run with --resume": {"redo": (3,)},
+        "poses 1 to 7": {"resume": run.folder, "redo": (7, 8)},
+        "start again with --passive": {"resume": passive},
+        "along a plan": {"resume": run.folder, "mode": "listen"},
+        "leave out --dry-run": {"mode": "manual", "dry_run": True},
+        "leave out --fast": {"mode": "manual", "fast": True},
+        "leave out --plan": {"mode": "manual", "plan": Path("plan.json")},
+        "damaged.json": {"plan": damaged},
+    }
+    for words, given in options.items():
+        with pytest.raises((ConfigError, PlanRefused), match=words):
+            lab.take_poses(**given)
+    assert lab.arm.opened == opened

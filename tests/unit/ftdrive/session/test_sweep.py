@@ -81,7 +81,7 @@ def test_the_plan_of_a_sweep_is_not_driven_as_a_tour(lab: Lab) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_in_a_sweep_stops_the_arm_and_resume_starts_again(fault: str, lab: Lab) -> None:
-    hazard, inject, repair, _ = FAULTS[fault]
+    hazard, inject, repair = FAULTS[fault]
 
     def in_hold(lab: Lab) -> None:
         assert lab.arm.halted.is_set()

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from ftcalib.sampling import Sampling
 from ftdrive.cell.config import WorkcellConfig
@@ -19,14 +18,13 @@ from ftdrive.planning.planner import USUAL_POSTURE_RAD, certifier_for, guess_of,
 from ftdrive.session import preflight
 from ftdrive.session.along_plan import has_completed, remember_completed
 from ftdrive.session.drive import Progress
-from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, RunOpened, State, StateChanged
+from ftdrive.session.events import Asked, Checked, Key, Noted, Planned, PoseTaken, RunOpened, State
 from ftdrive.session.guards import Guard, Limits, RangeGuard, Seen, StallGuard
 from ftdrive.words.session import SessionText, in_words
 from ftdrivers.errors import DeviceFault
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo
 from tests.unit.ftdrive.fake_cell import MODEL, Lab
-
-Array = NDArray[np.float64]
+from tests.unit.ftdrive.session.scenarios import Case, once, press
 
 
 def test_the_states_follow_one_another_and_all_is_written_down(lab: Lab) -> None:
@@ -117,13 +115,10 @@ def test_how_long_to_average_is_chosen_from_the_noise_of_the_sensor(lab: Lab) ->
     assert f"average {average_s:.1f} s at each pose" in " ".join(note.words for note in lab.operator.of(Noted))
 
 
-@pytest.mark.parametrize(
-    "sampling", [pytest.param(Sampling(), marks=pytest.mark.slow), Sampling(average_s=0.3, noise_record_s=0.0)]
-)
-def test_what_is_predicted_before_it_moves_comes_true(sampling: Sampling, lab: Lab) -> None:
+def test_what_is_predicted_before_it_moves_comes_true(lab: Lab) -> None:
     # The fake sensor is perfect, which its data sheet must say.
     tool, sensor = replace(lab.cell.tool, mass_kg=1.2), replace(lab.cell.sensor, accuracy_percent=0.1)
-    lab.cell = replace(lab.cell, sampling=sampling, tool=tool, sensor=sensor)
+    lab.cell = replace(lab.cell, sampling=Sampling(average_s=0.3, noise_record_s=0.0), tool=tool, sensor=sensor)
     outcome = lab.calibrate()
     assert outcome is not None
     (words,) = [
@@ -145,11 +140,39 @@ def has_run(lab: Lab) -> bool:
     return has_completed("A1", str(Plan.load(lab.run().plan_path).to_dict()["sha256"]))
 
 
-@pytest.mark.parametrize("mode", ["auto", "step"])
-def test_a_run_without_interruption_counts_as_complete_and_nothing_is_said_of_it(mode: str, lab: Lab) -> None:
-    lab.take_poses(mode=mode)
-    assert has_run(lab)
-    assert "slow again" not in lab.said()
+RUNS = {
+    "without interruption": (Case({}, noted={"slow again": 0}), True),
+    "in steps": (Case({}, mode="step", noted={"slow again": 0}), True),
+    "a pose skipped where the arm stands": (
+        Case({"measuring 4": press(Key.SKIP)}, taken=(1, 2, 3, 5, 6, 7), noted={"poses are missing": 1}),
+        False,
+    ),
+    "a move broken off": (
+        Case(
+            {"move 4": press(Key.PAUSE)},
+            ("back", "resume"),
+            holds=((4, "paused"), (5, "back at pose 3")),
+            noted={"moves replaced: from pose": 1},
+        ),
+        False,
+    ),
+    "poses taken again and a pause while one is measured": (
+        Case(
+            {"taken 1": once(press(Key.REDO)), "move 4": press(Key.REDO), "measuring 6": press(Key.PAUSE)},
+            ("resume",),
+            holds=((6, "paused"),),
+            taken=(1, 1, 2, 3, 3, 4, 5, 6, 7),
+        ),
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("what", RUNS)
+def test_a_run_counts_as_complete_if_every_move_of_the_plan_was_driven(what: str, lab: Lab) -> None:
+    case, complete = RUNS[what]
+    case.play(lab)
+    assert has_run(lab) == complete
 
 
 def test_a_skipped_pose_counts_against_the_plan_though_resume_takes_it(lab: Lab) -> None:
@@ -174,45 +197,6 @@ def test_a_plan_counts_once_all_its_poses_are_taken_again(lab: Lab) -> None:
     assert "slow again" not in lab.said()
     lab.take_poses(resume=lab.run().folder, redo=(1, 2, 3, 4, 5, 6, 7), fast=True)
     assert max(speed for _, speed, _ in lab.arm.moves) <= np.radians(30) + 1e-9
-    assert has_run(lab)
-
-
-def test_a_pose_that_is_skipped_where_the_arm_stands_counts_against_the_plan(lab: Lab) -> None:
-    lab.sensor.collecting = lambda: lab.operator.keys.append(Key.SKIP) if len(lab.arm.moves) == 4 else None
-    lab.take_poses()
-    assert lab.taken() == [1, 2, 3, 5, 6, 7]
-    assert not has_run(lab)
-    assert "poses are missing" in lab.said()
-
-
-@pytest.mark.parametrize(("key", "answer"), [(Key.PAUSE, "back"), pytest.param(Key.STOP, "", marks=pytest.mark.slow)])
-def test_a_move_that_was_broken_off_counts_against_the_plan(key: Key, answer: str, lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(key)
-    lab.operator.answers["poses are saved"] = [answer, "resume"]
-    if key is Key.STOP:
-        with pytest.raises(Declined):
-            lab.take_poses()
-        lab.take_poses(resume=lab.run().folder)
-    else:
-        lab.take_poses()
-    assert lab.stops() == [1, 2, 3, 4, 5, 6, 7]
-    assert not has_run(lab)
-    assert "moves replaced: from pose" in lab.said()
-
-
-def test_poses_taken_again_and_a_pause_while_one_is_measured_do_not_count_against_the_plan(lab: Lab) -> None:
-    def pause() -> None:
-        if len(lab.taken()) == 5 and not paused:
-            paused.append(True)
-            lab.operator.keys.append(Key.PAUSE)
-
-    paused: list[bool] = []
-    lab.sensor.collecting = pause
-    lab.press((Key.REDO, PoseTaken, 1), (Key.REDO, StateChanged, 4))
-    lab.operator.answers["poses are saved"] = ["resume"]
-    lab.take_poses()
-    assert lab.taken() == [1, 1, 2, 3, 3, 4, 5, 6, 7]
-    assert len(lab.holds()) == 1
     assert has_run(lab)
 
 
@@ -270,18 +254,6 @@ def test_the_plan_is_shown_before_the_checks_and_kept_where_asked(lab: Lab) -> N
     assert Plan.load(lab.folder / "measured.json").measured
 
 
-def test_a_way_that_moves_the_whole_arm_asks_for_its_room(lab: Lab) -> None:
-    path = lab.folder / "plan.json"
-    lab.take_poses(dry_run=True, output=path)
-    lab.arm.q = lab.arm.q + np.radians([20.0, 0, 0, 0, 0, 0])
-    lab.take_poses(plan=path)
-    texts = [question.text for question in lab.operator.asked]
-    assert all(
-        any(word in text and "base 20°" in text and "whole arm" in text for text in texts)
-        for word in ("Is the space within", "Type MOVE")
-    )
-
-
 @pytest.mark.parametrize(("away_deg", "assumed"), [((0.0, 9.0), True), ((9.0, 0.0), False)])
 def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_known(
     away_deg: tuple[float, float], assumed: bool, lab: Lab
@@ -292,8 +264,9 @@ def test_a_way_of_the_whole_arm_is_confirmed_by_a_person_though_the_plan_is_know
     lab.take_poses(plan=plan, fast=True)
     texts = {question.text: question.assumed is not None for question in lab.operator.asked}
     assert [texts[text] for text in texts if text.startswith("Is the")] == [assumed] * 3
-    (way,) = [texts[text] for text in texts if "Type MOVE" in text]
-    assert way == assumed
+    (way,) = [text for text in texts if "Type MOVE" in text]
+    assert texts[way] == assumed
+    assert ("elbow 9°" in way and "whole arm" in way) != assumed
 
 
 def test_a_run_that_goes_on_from_elsewhere_is_confirmed_by_a_person(lab: Lab) -> None:
@@ -377,20 +350,6 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
     assert "moves" not in asked[3]
 
 
-def test_step_mode_says_whether_enter_may_move_the_arm_to_the_first_pose(lab: Lab) -> None:
-    beside = lab.arm.q
-    for yes, words in (
-        (True, "shows it, joint"),
-        (True, "shows it, and moves along it if --yes may confirm it"),
-        (False, "shows it, joint"),
-    ):
-        lab.operator.asked.clear()
-        lab.arm.q = beside
-        lab.take_poses(mode="step", yes=yes)
-        first = next(question.text for question in lab.operator.asked if question.text.startswith("Pose 1"))
-        assert words in first
-
-
 def test_the_plan_shows_how_the_arm_stops(lab: Lab) -> None:
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, stop_deceleration_deg_s2=150.0))
     lab.take_poses(dry_run=True)
@@ -419,17 +378,3 @@ def test_the_arm_stands_until_it_leaves_and_may_return_to_where_it_came_from() -
     now.skipped.clear()
     now.lose_place()
     assert now.came_from is None
-
-
-def test_a_skipped_first_pose_takes_its_return_along_and_a_redo_brings_it_back() -> None:
-    now = begun()
-    assert (now.skip(), now.todo, now.skipped) == ([1, 7], [2, 3, 4, 5, 6], {0})
-    now.redo(1)
-    assert (now.todo[0], now.skipped) == (1, set())
-
-
-def test_a_move_counts_as_driven_only_along_the_plan() -> None:
-    now = begun()
-    now.arrive(3)
-    now.arrive(4, driven_from=3)
-    assert now.undriven == [1, 2, 3, 5, 6]
