@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from ftdrive.cell.config import load, settings
+from ftdrive.cell.config import load
 from ftdrive.cli import cli
 from ftdrive.errors import exit_code
 
@@ -107,11 +107,6 @@ def test_without_a_configuration_a_plan_needs_arm_and_tool(arguments: list[str],
     assert error is not None
     assert exit_code(error) == 2
     assert f"give {said}" in str(error)
-
-
-def test_settings_are_all_shown() -> None:
-    shown = run("config", "show").stdout
-    assert all(f"{key.split('.')[1]} =" in shown for key in settings())
 
 
 def test_a_password_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -169,15 +169,3 @@ def test_devices_of_this_computer_and_of_an_emulated_cell(station: Station, ftdr
     assert all("FT12345" in answer["what"] for answer in emulated["answers"])  # asked, not known
     keys = {"port", "by_id", "description", "usb", "serial_number", "findings"}
     assert all(port.keys() == keys for port in (*own["serial"], *emulated["serial"]))
-
-
-@pytest.mark.slow
-def test_a_sensor_that_is_configured_otherwise_gets_the_cure_its_driver_names(
-    station: Station, cell: Path, ftdrive: CommandLine
-) -> None:
-    cell.write_text(cell.read_text().replace(station.cell.sensor.url, f"{station.cell.sensor.url}?serial=WRONG"))
-    identity = checks_of(ftdrive.run("doctor", "--config", cell, "--json"))["sensor.identity"]
-    assert identity["state"] == "failed"
-    assert "FT12345" in identity["found"]
-    assert "WRONG" in identity["found"]
-    assert "option serial" in identity["fix"]

@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +13,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from ftdrive.cli import cli, run
+from ftdrive.cli import cli
 from ftdrive.errors import ConfigError
 from ftdrive.recording import Recorder
 from tests.system.command_line import CommandLine
@@ -90,16 +89,6 @@ def test_help_fits_into_80_columns(command: str) -> None:
     outcome = CliRunner().invoke(cli, [*command.split(), "--help"], terminal_width=80)
     assert outcome.exit_code == 0
     assert max(map(len, outcome.stdout.splitlines())) <= 80
-
-
-def test_the_error_of_a_wrong_option_has_whole_words(
-    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("os.get_terminal_size", lambda *_: os.terminal_size((80, 24)))
-    assert run(["solve", "--method", "x"]) == 2
-    answer = capfd.readouterr().err
-    assert "'carlson-iterative'" in answer
-    assert max(map(len, answer.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(

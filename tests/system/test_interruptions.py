@@ -59,14 +59,6 @@ def test_unplugged_sensor_stops_the_arm_and_keeps_the_poses(
 
 
 @pytest.mark.slow
-def test_protective_stop_is_a_device_fault(station: Station, tour: subprocess.Popen[str]) -> None:
-    station.control(do="protective-stop")
-    code, printed = left_at_a_hold(tour)
-    assert code == 5, printed
-    assert "protective" in printed
-
-
-@pytest.mark.slow
 def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Popen[str], ftdrive: CommandLine) -> None:
     os.kill(station.pid, signal.SIGKILL)
     code, printed = left_at_a_hold(tour)

@@ -1,7 +1,6 @@
 """The compensated stream of an emulated cell over its real wires: a push, a moving arm, an interruption."""
 
 from dataclasses import replace
-from itertools import islice
 from typing import get_args
 
 import numpy as np
@@ -11,7 +10,7 @@ from ftcalib.model import Array
 from ftdrive.cell.emulated import Station
 from ftdrive.stream.samples import Axes, Stages, WrenchFrame
 from ftdrive.stream.sources import CellSource
-from ftdrive.stream.stream import Stream, pump
+from ftdrive.stream.stream import Stream
 from ftdrivers.errors import DeviceTimeout
 from tests.unit.ftdrive.stream.simulated import calibrated_from
 
@@ -78,17 +77,3 @@ def test_a_push_a_swing_and_an_interruption() -> None:
             read(stream, 0.1)
             kinds = [event.kind for event in stream.take_events()]
             assert kinds.count("stale") == kinds.count("recovered") == 1
-
-
-@pytest.mark.slow
-def test_a_sensor_alone_is_read_again_after_an_interruption() -> None:
-    with Station("serial", OPTIONS) as station, Stream(CellSource(station.cell, None)) as stream:
-        before = read(stream, 0.5).mean(axis=0)
-        station.control(do="sensor-faults", stall=True)
-        with pytest.raises(DeviceTimeout):
-            read(stream, 5.0)
-        station.control(do="sensor-faults", stall=False)
-        assert any(block is not None for block in islice(pump(stream), 30))
-        assert read(stream, 0.5).mean(axis=0) == pytest.approx(before, abs=0.05)
-        kinds = [event.kind for event in stream.take_events()]
-        assert kinds.count("stale") == kinds.count("recovered") == 1

@@ -97,20 +97,3 @@ def test_what_cannot_be_pushed_is_refused_with_the_reason(station: Station, run:
     assert refused("--restore", run)[0] == 6
     assert refused()[0] == 2
     assert not list(run.glob("push*"))
-
-
-def controller_gravity(station: Station) -> list[float]:
-    gravity: list[float] = station.control(do="state")["target_gravity_m_s2"]
-    return gravity
-
-
-def test_a_controller_that_does_not_report_its_gravity_is_left_alone(
-    station: Station, run: Path, ftdrive: CommandLine
-) -> None:
-    before = controller_gravity(station)
-    refused = ftdrive.run("push", run, "--gravity", "--config", "cell.toml", typed="GRAVITY\n")
-    assert refused.returncode == 7
-    assert "does not report its gravity" in refused.stderr
-    assert "set the mounting at the pendant" in refused.stderr
-    assert controller_gravity(station) == before
-    assert not list(run.glob("push*"))

@@ -75,23 +75,6 @@ def test_a_program_of_another_client_and_its_move_go_on(
 
 
 @pytest.mark.slow
-def test_a_dry_run_shows_everything_and_moves_nothing(station: Station, config: Path, ftdrive: CommandLine) -> None:
-    path = ftdrive.folder / "tour.json"
-    outcome = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
-    assert outcome.returncode == 0, outcome.stderr
-    assert Plan.load(path).measured
-    for words in ("24 moves proven clear", "within 0.3", "wrist 3"):
-        assert words in outcome.stderr
-    assert outcome.stdout == "Dry run: nothing has moved.\n"
-    again = ftdrive.run("calibrate", "--config", config, "--dry-run", "--output", path)
-    assert again.returncode == 2
-    assert str(path) in again.stderr
-    assert moves_of(station) == 0
-    assert programs_of(station) == []
-    assert not (ftdrive.folder / "runs").exists()
-
-
-@pytest.mark.slow
 def test_a_new_tool_takes_four_long_poses(station: Station, config: Path, ftdrive: CommandLine) -> None:
     typed = QUESTIONS + FIRST_MOTION
     first = ftdrive.json("calibrate", "--config", config, "--minimal", typed=typed)

@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from ftdrive.cell.config import (
-    _KEYS,
     NOMINAL_ORIENTATION_DEG,
     RULES,
     CellConfig,
@@ -154,11 +153,6 @@ def test_a_variable_that_cannot_be_used_is_named(
     assert all(word in str(error.value) for word in words), error.value
 
 
-def test_degrees_of_the_mounting_are_a_number_too() -> None:
-    Path("ftdrive.toml").write_text(GOOD + "[workcell]\nmounting = 45\n")
-    assert load().workcell.mounting == "45"
-
-
 @pytest.mark.parametrize(
     ("line", "cure"),
     [
@@ -182,11 +176,6 @@ def test_a_wrong_type_says_what_to_give(line: str, cure: str) -> None:
 def test_an_average_that_is_said_alone_needs_no_record(said: str, record_s: float) -> None:
     Path("ftdrive.toml").write_text(f"{GOOD}[sampling]\n{said}")
     assert load().sampling.noise_record_s == record_s
-
-
-def test_other_programs_variables_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("FTDRIVE_REAL_DATA", "/somewhere")
-    assert "default" in {setting.origin for setting in settings().values()}
 
 
 @pytest.mark.parametrize(
@@ -238,27 +227,10 @@ def test_errors_name_file_and_key(text: str, word: str, tmp_path: Path) -> None:
     assert str(path) in str(error.value) or "is not set" in str(error.value)
 
 
-def test_an_error_names_the_first_line_that_is_missing(tmp_path: Path) -> None:
-    path = tmp_path / "cell.toml"
-    path.write_text("[robot]\n")
-    with pytest.raises(ConfigError, match=r'format = "ftdrive\.config/1"'):
-        load(path)
-
-
 def test_a_mark_of_the_byte_order_is_no_text(tmp_path: Path) -> None:
     path = tmp_path / "cell.toml"
     path.write_text(GOOD, encoding="utf-8-sig")  # as an editor on Windows may write it
     assert load(path).robot.host == "10.0.0.2"
-
-
-def test_every_key_has_a_rule_and_every_number_a_range() -> None:
-    assert RULES.keys() == settings().keys()
-    assert all(rule.help for rule in RULES.values())
-    numbers = {key for key, item in _KEYS.items() if item.type in {int, float, float | None}}
-    assert {key for key, rule in RULES.items() if rule.between} == numbers - {"sensor.sign"}
-    assert all(
-        rule.unit for key, rule in RULES.items() if rule.between and key not in {"sampling.attempts", "robot.api_port"}
-    )
 
 
 def test_the_readme_describes_every_key() -> None:

@@ -1,10 +1,12 @@
 """An emulated cell that cannot be started."""
 
+import json
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from ftdrive.cell.emulated import Station, _options
+from ftdrive.cell.emulated import Station
 from ftdrive.errors import ConfigError
 
 
@@ -26,9 +28,12 @@ def test_another_system_than_linux_has_no_emulated_cell(monkeypatch: pytest.Monk
     ],
 )
 def test_a_station_has_the_tool_and_the_mounting_of_the_configuration(
-    values: dict[str, Any], sensor: str, options: str
+    values: dict[str, Any], sensor: str, options: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert " ".join(_options(values, sensor)) == options
+    monkeypatch.chdir(tmp_path)
+    lines = [f"{key} = {json.dumps(value)}" for key, value in ({"robot.simulate": True} | values).items()]
+    Path("ftdrive.toml").write_text("\n".join(['format = "ftdrive.config/1"', *lines]))
+    assert " ".join(Station.of(None, f"emulated://{sensor}").options) == options
 
 
 @pytest.mark.parametrize(

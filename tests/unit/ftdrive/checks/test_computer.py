@@ -11,7 +11,7 @@ import pytest
 
 from ftdrive.cell import config
 from ftdrive.checks import computer as checks
-from ftdrive.checks.check import Check, merge_checks, verdict
+from ftdrive.checks.check import Check
 from ftdrive.checks.computer import SensorAddress
 from ftdrivers.errors import BadUrl
 
@@ -210,11 +210,6 @@ def test_what_is_no_address_is_a_mistake_of_the_user() -> None:
         SensorAddress.of("ati-can://[can0")
 
 
-def test_a_network_sensor_has_no_port() -> None:
-    (found,) = checks.check_permissions(SensorAddress.of("ati-netft://192.168.1.1"))
-    assert found.state == "skipped"
-
-
 def test_disk_that_can_be_written_and_one_that_cannot(tmp_path: Path) -> None:
     fine = checks.check_disk(tmp_path / "not/yet/there")
     assert fine.state in {"ok", "warning"}
@@ -230,23 +225,3 @@ def test_a_disk_with_little_room(free: float, state: str, tmp_path: Path, monkey
     monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=free))
     found = checks.check_disk(tmp_path)
     assert (found.state, found.fix is None) == (state, state == "ok")
-
-
-def test_the_verdict_is_the_worst_state() -> None:
-    def of(*states: Any) -> str:
-        return verdict([Check("x.y", state, "") for state in states])
-
-    assert of("ok", "skipped") == "ok"
-    assert of("ok", "warning") == "warning"
-    assert of("failed", "warning") == "failed"
-
-
-def test_merged_checks_say_what_the_worst_found() -> None:
-    fine, slow, dead = (
-        Check("a", "ok", "1 Hz"),
-        Check("b", "warning", "slow", "wait"),
-        Check("c", "failed", "dead", "go"),
-    )
-    assert merge_checks("x", [fine, fine]) == Check("x", "ok", "1 Hz, 1 Hz")
-    assert merge_checks("x", [fine, slow, slow]) == Check("x", "warning", "slow, slow", "wait; wait")
-    assert merge_checks("x", [dead, slow, fine]) == Check("x", "failed", "dead", "go")

@@ -54,16 +54,6 @@ def test_what_the_sensor_itself_changes_is_reported() -> None:
     assert "132.71" in found["sensor.origin"].found
 
 
-def test_what_is_known_of_a_sensor_is_said_with_its_source() -> None:
-    found = {check.name: check for check in of_sensor.check_identity(DeviceInfo("Gamma", "FT1", "3.8", FACTS))}
-    assert {check.state for check in found.values()} == {"ok"}
-    counts = found["sensor.counts"].found
-    assert counts.startswith("1000000 counts per N and")
-    assert counts.endswith("by the device")
-    assert found["sensor.range"].found.split(" N") == ["±(130, 130, 400)", ", ±(10, 10, 10.5)", "·m, configured"]
-    assert found["sensor.sign"].found.startswith("sign -1, configured")
-
-
 def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
     facts = {name: Fact(1e6, "assumed") for name in ("counts_per_N", "counts_per_Nm")}
     info = DeviceInfo("Mini45", NOT_REPORTED, "3.6", facts)
@@ -281,24 +271,6 @@ def test_a_rate_that_is_too_high(rate_Hz: float, state: str) -> None:
     rate = stream(rate_Hz)["sensor.rate"]
     assert rate.state == state
     assert ("samples are duplicated" in str(rate.fix)) == (state != "ok")
-
-
-@pytest.mark.parametrize(
-    "address", [BY_NETWORK, SensorAddress.of("ur-ft://192.168.1.10?counts_per_N=1&counts_per_Nm=1")]
-)
-def test_a_sensor_on_ethernet_gets_no_advice_about_cables_it_has_not(address: SensorAddress) -> None:
-    found = stream(80, lost=1, address=address)
-    for name in ("sensor.rate", "sensor.lost"):
-        assert "a network of its own" in str(found[name].fix)
-        assert "cable" not in str(found[name].fix)
-    on_can = stream(80, lost=1, address=BY_PCAN)
-    assert "termination" in str(on_can["sensor.lost"].fix)
-
-
-def test_a_polled_sensor_may_lose_samples_to_a_busy_computer() -> None:
-    polled, streaming = (stream(80, lost=1, address=address)["sensor.lost"].fix for address in (BY_PCAN, PORT))
-    assert "fewer programs on this computer" in str(polled)
-    assert "fewer programs" not in str(streaming)
 
 
 GUESS = Guess(1.2, 1.0, 1.0, sensor=SensorMatrix.usual())

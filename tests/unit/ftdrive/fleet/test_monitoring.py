@@ -66,14 +66,3 @@ def test_the_dashboard_asks_valid_questions(promtool: str, tmp_path: Path) -> No
     rules = [{"record": f"panel:n{n}", "expr": expression} for n, expression in enumerate(expressions())]
     (tmp_path / "panels.yml").write_text(yaml.safe_dump({"groups": [{"name": "panels", "rules": rules}]}))
     assert f"{len(rules)} rules found" in run(promtool, "check", "rules", tmp_path / "panels.yml")
-
-
-def test_no_panel_covers_another() -> None:
-    seen = set[tuple[int, int]]()
-    for panel in DASHBOARD["panels"]:
-        at = panel["gridPos"]
-        spots = {(at["x"] + x, at["y"] + y) for x in range(at["w"]) for y in range(at["h"])}
-        assert not seen & spots
-        assert max(x for x, _ in spots) < 24
-        seen |= spots
-    assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from ftdrive.planning.drawing import _title_of, draw_plan
+from ftdrive.planning.drawing import draw_plan
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Box, Plane, Scene
@@ -31,26 +31,6 @@ def plan() -> Plan:
     return plan_tour(certifier, poses=6, speeds=Speeds(), guess=guess_of(certifier))
 
 
-def test_title_says_whether_the_whole_arm_moves(plan: Plan) -> None:
-    first, second, *others = plan.steps
-    moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
-    title = _title_of(plan, certifier_of(), on_its_way=False)
-    assert "stay in this sphere" in title
-    assert "WHOLE ARM" not in title
-    assert "grey: arm at every pose" in title
-    title = _title_of(moving, certifier_of(), on_its_way=True)
-    assert "all that moves" not in title
-    assert "WHOLE ARM moves" in title
-    assert "green" in title
-
-
-def test_what_cannot_be_drawn_is_named(plan: Plan) -> None:
-    shown = certifier_of(scene=Scene((BASE_PLANE, WALL)))
-    assert "not drawn" not in _title_of(plan, shown, on_its_way=False)
-    slanting = certifier_of(scene=Scene((BASE_PLANE, WALL, SLANTING)))
-    assert "slanting planes (1)" in _title_of(plan, slanting, on_its_way=False)
-
-
 def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     figures = pytest.importorskip("matplotlib.figure")
     save, saved = figures.Figure.savefig, list[Any]()
@@ -67,6 +47,7 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
         (certifier_of((TUBE, LUMP)), ()),
         (certifier_of(scene=Scene((BASE_PLANE, WALL), (BOX,))), ()),
         (certifier_of(), np.array([stands, plan.steps[0].q_rad])),
+        (certifier_of(scene=Scene((BASE_PLANE, SLANTING))), ()),
     ]
     for i, (certifier, way_rad) in enumerate(cases):
         draw_plan(plan, certifier, tmp_path / f"{i}.png", way_rad)
@@ -75,6 +56,13 @@ def test_tool_surroundings_and_the_way_are_drawn(plan: Plan, tmp_path: Path, mon
     assert np.subtract(areas[1], areas[0]).tolist() == [6, 6, 6]  # the lump at each pose
     assert np.subtract(areas[2], areas[0]).tolist() == [1, 2, 2]  # the box, and the wall from its edge
     assert np.subtract(lines[3], lines[0]).tolist() == [1, 1, 1]
-    assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False]  # the wall is seen
+    assert [figure.axes[2].get_xlim()[1] > 0.8 for figure in saved] == [False, False, True, False, False]  # the wall
+    titles = [figure.get_suptitle() for figure in saved]
+    assert ["slanting planes (1)" in title for title in titles] == [False, False, False, False, True]
+    assert ["green" in title for title in titles] == [False, False, False, True, False]
+    first, second, *others = plan.steps
+    moving = replace(plan, steps=(first, replace(second, q_rad=(0.5, *second.q_rad[1:])), *others))
+    draw_plan(moving, certifier_of(), tmp_path / "moving.png", ())
+    assert ("WHOLE ARM moves" in saved[-1].get_suptitle()) > ("WHOLE ARM" in titles[0])
     with pytest.raises(FileExistsError, match="never overwritten"):
         draw_plan(plan, certifier_of(), tmp_path / "0.png")

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from ftcalib.poses.information import special
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier, Margins
 from ftdrive.planning.geometry.scene import Box, Plane, Scene
 from ftdrive.planning.motion import Speeds, move_duration_s, tips
 from ftdrive.planning.plan import Plan, digest, fingerprints
-from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, _plan_tool, guess_of, plan_tour
+from ftdrive.planning.planner import NUMBERS, TOOL_POSES, USUAL_POSTURE_RAD, guess_of, plan_for, plan_tour
 from ftdrive.planning.search.tours import shortest_tour
 from ftdrivers.sweep import Sweep
 from ftdrivers.ur.kinematics import MODELS as NOMINAL
@@ -31,6 +32,7 @@ TOOLS = (
     (Cylinder(0, 0.25, 0.1),),
     (Cylinder(0, 0.05, 0.08), Cylinder(0.05, 0.2, 0.15)),
 )
+CELL = CellConfig(RobotConfig("arm"), SensorConfig("fake://"))
 NO_TIP_LIMIT = Speeds(tip_m_s=None)
 
 
@@ -96,7 +98,7 @@ def test_fewer_poses_have_one_solution_and_say_what_they_cost(poses: int) -> Non
 
 def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pytest.MonkeyPatch) -> None:
     certifier = certifier_of()
-    plan = _plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
+    plan = plan_for(CELL, certifier, USUAL_POSTURE_RAD, TOOL_POSES)
     assert (plan.kind, len(plan.steps), plan.certified) == ("tool", TOOL_POSES, True)
     u = -np.array([step.R_base_flange for step in plan.steps])[:, 2]
     X = np.column_stack([u.ravel(), np.tile(np.eye(3), (len(u), 1))])  # force of a weight of 1, and its bias
@@ -105,15 +107,7 @@ def test_poses_of_a_new_tool_spread_gravity_like_a_tetrahedron(monkeypatch: pyte
     assert not any("times that of all 24" in sentence for sentence in plan.why)
     monkeypatch.setattr("ftdrive.planning.planner.chosen_tour", lambda *_: None)  # as without room
     with pytest.raises(PlanRefused, match="new tool"):
-        _plan_tool(certifier, USUAL_POSTURE_RAD, speeds=Speeds(), guess=guess_of(certifier))
-
-
-@pytest.mark.parametrize("pan_deg", [-120.0, 33.0])
-def test_any_pan_serves(pan_deg: float) -> None:
-    q = USUAL_POSTURE_RAD.copy()
-    q[0] = np.radians(pan_deg)
-    assert planned(certifier_of(), q).kind == "constant"
-    assert planned(certifier_of(), q, 12).certified
+        plan_for(CELL, certifier, USUAL_POSTURE_RAD, TOOL_POSES)
 
 
 def test_another_posture_is_proposed_where_the_arm_stands_badly() -> None:
@@ -274,12 +268,6 @@ def test_no_point_of_the_tool_exceeds_its_speed() -> None:
     }  # spins of the last joint are not slowed
 
 
-def test_duration_of_short_and_long_moves_by_hand() -> None:
-    # 60 degrees/s and 80 degrees/s2: the ramps take 45 degrees together.
-    found = move_duration_s(np.radians([90, 20, 0]), np.radians(60), np.radians(80))
-    assert np.allclose(found, [90 / 60 + 60 / 80, 2 * np.sqrt(20 / 80), 0])
-
-
 def test_shortest_tour_is_the_best_of_all() -> None:
     rng = np.random.default_rng(5)
     q = rng.uniform(-2, 2, (15, 6))
@@ -301,14 +289,6 @@ def test_shortest_tour_is_the_best_of_all() -> None:
     assert cost[tour, np.roll(tour, -1)].sum() == pytest.approx(best)
     allowed[group == 2] = allowed[:, group == 2] = False
     assert shortest_tour(cost, group, allowed) is None
-
-
-def test_a_tour_has_two_groups_at_least() -> None:
-    everything = np.ones((3, 3), dtype=bool)
-    tour = shortest_tour(np.ones((3, 3)), np.arange(3), everything)
-    assert tour is not None
-    assert sorted(tour) == [0, 1, 2]
-    assert shortest_tour(np.ones((1, 1)), np.arange(1), everything[:1, :1]) is None
 
 
 def test_posture_that_cannot_be_is_refused() -> None:

@@ -55,11 +55,6 @@ def test_a_plan_that_is_not_proven_does_not_look_proven(plan: Plan) -> None:
     assert "NOT ALL PROVEN" in replace(plan, steps=steps).in_words()
 
 
-def test_what_the_poses_do_not_determine_is_no_crash(plan: Plan) -> None:
-    words = replace(plan, predicted={**plan.predicted, "mass_kg": None, "force_bias_N": [None, 0.1, 0.1]}).in_words()
-    assert "mass nan g" in words
-
-
 def test_a_way_names_the_joints_and_the_range_each_turns_over(snapshot: SnapshotAssertion) -> None:
     stands = USUAL_POSTURE_RAD
     way = stands + np.radians([[0.0] * 6, [0.0, 30, 0, 10, 0, 0.3], [0.0, -20, 0, 10, 0, 0]])

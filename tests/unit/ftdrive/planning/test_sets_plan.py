@@ -7,19 +7,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ftcalib.poses.selection import EVERY_SET, paper_set, set_numbers
+from ftdrive.cell.config import CellConfig, RobotConfig, SensorConfig
 from ftdrive.errors import ConfigError, PlanRefused
 from ftdrive.planning.geometry.arm_model import ArmModel, Cylinder
 from ftdrive.planning.geometry.certify import Certifier
 from ftdrive.planning.geometry.scene import BASE_PLANE, Plane, Scene
 from ftdrive.planning.motion import Speeds
-from ftdrive.planning.planner import USUAL_POSTURE_RAD, _plan_sets, guess_of, plan_verification
+from ftdrive.planning.planner import USUAL_POSTURE_RAD, guess_of, plan_for, plan_verification
 
 CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene((BASE_PLANE,)))
+CELL = CellConfig(RobotConfig("arm"), SensorConfig("fake://"))
 HOW: dict[str, Any] = {"speeds": Speeds(), "guess": guess_of(CERTIFIER)}
 
 
 def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
-    made = _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "A+E", **HOW)
+    made = plan_for(CELL, CERTIFIER, USUAL_POSTURE_RAD, sets="A+E")
     assert made.certified
     assert made.arm_rests
     assert sorted(step.number for step in made.steps) == [*range(1, 25), *set_numbers("E").tolist()]
@@ -30,7 +32,7 @@ def test_one_tour_visits_both_sets_with_the_wrist_alone() -> None:
 
 def test_each_number_has_an_orientation_of_its_set() -> None:
     pan = 0.3
-    made = _plan_sets(CERTIFIER, [pan, *USUAL_POSTURE_RAD[1:]], "A+H", **HOW)
+    made = plan_for(CELL, CERTIFIER, [pan, *USUAL_POSTURE_RAD[1:]], sets="A+H")
     kinds = {
         "A": Rotation.from_euler("z", pan - np.pi / 4).as_matrix() @ paper_set("A"),
         "H": paper_set("H", spare=100),
@@ -44,31 +46,31 @@ def test_each_number_has_an_orientation_of_its_set() -> None:
 
 def test_a_set_hangs_with_the_robot_under_a_ceiling() -> None:
     hanging = Certifier(CERTIFIER.arm, Scene((BASE_PLANE,), lean_rad=np.pi))
-    made = _plan_sets(hanging, USUAL_POSTURE_RAD, "H", **HOW)
+    made = plan_for(CELL, hanging, USUAL_POSTURE_RAD, sets="H")
     tool_axis = np.array([step.R_base_flange for step in made.steps])[:, :, 2]
     assert (tool_axis @ [1, 0, 1] / np.sqrt(2)).min() > 0.49
 
 
 def test_another_posture_for_a_set_is_found_and_named() -> None:
     ceiling = Plane((0.0, 0.0, -1.0), -0.75)
-    made = _plan_sets(Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, "H", **HOW)
+    made = plan_for(CELL, Certifier(CERTIFIER.arm, Scene((BASE_PLANE, ceiling))), USUAL_POSTURE_RAD, sets="H")
     assert made.certified
     assert "A tour exists with joints 1 to 3 at" in made.why[1]
 
 
 def test_wrong_sets_are_refused() -> None:
     with pytest.raises(ConfigError, match="no set 'X'"):
-        _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, "X", **HOW)
+        plan_for(CELL, CERTIFIER, USUAL_POSTURE_RAD, sets="X")
     low = Certifier(CERTIFIER.arm, Scene((BASE_PLANE, Plane((0.0, 0.0, -1.0), -0.45))))
     with pytest.raises(PlanRefused, match="no tour of the sets A"):
-        _plan_sets(low, USUAL_POSTURE_RAD, "A", **HOW)
+        plan_for(CELL, low, USUAL_POSTURE_RAD, sets="A")
     with pytest.raises(PlanRefused, match=r"no tour of the sets A\+H"):  # enough poses, but too few of A
-        _plan_sets(low, USUAL_POSTURE_RAD, "A+H", **HOW)
+        plan_for(CELL, low, USUAL_POSTURE_RAD, sets="A+H")
 
 
 @pytest.mark.slow
 def test_the_sets_of_the_table_are_one_tour() -> None:
-    made = _plan_sets(CERTIFIER, USUAL_POSTURE_RAD, EVERY_SET, **HOW)
+    made = plan_for(CELL, CERTIFIER, USUAL_POSTURE_RAD, sets=EVERY_SET)
     assert made.certified
     assert len(made.steps) == 294
     assert made.motion_time_s < 400

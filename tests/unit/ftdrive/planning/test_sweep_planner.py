@@ -95,29 +95,9 @@ def test_planning_is_deterministic(plan: Plan) -> None:
     assert planned(certifier_of()).sha256 == plan.sha256
 
 
-def test_the_words_name_joints_and_proof(plan: Plan) -> None:
-    words = plan.in_words()
-    assert "proven clear along its whole length" in words
-    assert "wrist 3" in words
-    assert max(len(line) for line in words.splitlines() if line.startswith("  ")) <= 72
-
-
 def test_impossible_durations_and_cells_are_refused() -> None:
     with pytest.raises(ConfigError, match="10 to 120 s"):
         planned(certifier_of(), seconds=5.0)
-
-
-@pytest.mark.parametrize("better", [(0.5, 1.0, 1.0), (1.0, 0.5, 1.0), (1.0, 1.0, 0.5)])
-def test_a_curve_is_better_if_any_error_is_smaller(
-    plan: Plan, monkeypatch: pytest.MonkeyPatch, better: tuple[float, float, float]
-) -> None:
-    assert plan.sweep is not None
-    scores = []
-    for errors in ((2.0, 3.0, 5.0), (2.0 * better[0], 3.0 * better[1], 5.0 * better[2]), (0.2, 0.3, 0.5)):
-        monkeypatch.setattr(sweep_planner, "predicted", lambda *_, errors=errors: errors)
-        guess = replace(guess_of(certifier_of()), mass_kg=1.2)
-        scores.append(sweep_planner._score(certifier_of().arm, plan.sweep, guess))
-    assert scores[2] < scores[1] < scores[0]
 
 
 def test_the_rows_of_a_sweep_are_its_motion_and_their_rates(plan: Plan) -> None:

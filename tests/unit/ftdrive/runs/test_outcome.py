@@ -83,17 +83,6 @@ def test_the_mass_of_the_sensor_counts(payload_kg: float, sensor_kg: float | Non
     assert [one.code for one in outcome.result.findings] == ["payload_mismatch"] * differs + ["gain_unknown"]
 
 
-@pytest.mark.slow
-def test_a_run_goes_on_with_the_mass_of_the_sensor_as_it_is_known_now(lab: Lab) -> None:
-    lab.arm.set_status(payload_kg=2.8)
-    lab.calibrate()
-    assert payload_notes(lab)
-    lab.operator.shown.clear()
-    lab.cell = replace(lab.cell, sensor=SensorConfig("fake://", mass_kg=1.6))
-    lab.calibrate(resume=lab.run().folder, redo=(4,))
-    assert payload_notes(lab) == []
-
-
 def test_a_controller_that_does_not_report_its_payload_is_not_compared(lab: Lab) -> None:
     lab.arm.set_status(payload_kg=None)
     lab.take_poses()

@@ -14,7 +14,6 @@ from ftdrive.runs.verification import (
     FORMAT,
     VerificationRecord,
     age_and_check,
-    age_in_words,
     fitted_dataset,
     verification_near,
 )
@@ -84,11 +83,6 @@ def test_a_record_survives_its_way_into_a_recording(tmp_path: Path) -> None:
     record = VerificationRecord.load(verify(tmp_path / "a", 1.0, passed=False, change="payload"))
     kept = VerificationRecord.from_dict(json.loads(json.dumps(record.to_dict())))
     assert kept == record._replace(id="")
-
-
-@pytest.mark.parametrize(("hours", "words"), [(0.2, "12 min"), (5, "5 h"), (47.4, "47 h"), (80, "3 d"), (-1, "0 min")])
-def test_ages(hours: float, words: str) -> None:
-    assert age_in_words(timedelta(hours=hours)) == words
 
 
 def test_the_state_of_a_calibration_in_words(tmp_path: Path) -> None:

@@ -2,9 +2,8 @@
 
 import re
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from ftcalib.model import Array, cross
 from ftcalib.routine import PoseRecord, dataset_from, drift_check
 from ftcalib.sampling import Sampling
 from ftdrive.errors import SupervisorGone
-from ftdrive.session.events import Compared, Estimated, Event, Key, Noted, PoseTaken, Question, State, StateChanged
+from ftdrive.session.events import Compared, Estimated, Event, Key, Noted, PoseTaken, Question, StateChanged
 from ftdrive.session.guards import Limits
 from ftdrive.session.hand_guided import HandGuided
 from ftdrive.session.open_session import OpenCell, PoseBook
@@ -235,11 +234,6 @@ class Verification:
         )
 
 
-def guided(cell: Any, person: Any, run: Any, fit: Any, sampling: Sampling, *, listen: bool = False) -> HandGuided:
-    opened = OpenCell(cell, cell, cell.clock, person, Limits())
-    return HandGuided(opened, PoseBook(opened, run, fit, FLOOR), sampling, listen=listen)
-
-
 class Outcome:
     """What a collection leaves."""
 
@@ -250,34 +244,31 @@ class Outcome:
         listen: bool = False,
         keys: dict[float, Key] | None = None,
         earlier: Sequence[PoseRecord] = (),
-        says: Callable[[float], ArmStatus] | None = None,
         fit: Any = None,
         has_keys: bool = True,
         raises: Any = None,
-        **cell: Any,
+        at_commit: Callable[["Outcome"], None] = lambda _: None,
+        **interrupted: Any,
     ) -> None:
+        self.at_commit = at_commit
         self.cell = Cell(dwells)
-        self.cell.says = says or self.cell.says
-        for name, value in cell.items():
+        for name, value in interrupted.items():
             setattr(self.cell, name, value)
         self.person = Person(self.cell, keys or {}, has_keys=has_keys)
         self.fit = fit or Fit()
         self.kept: list[PoseRecord] = []
 
-        def collect() -> None:
-            sampling = Sampling(average_s=AVERAGE_S, attempts=3)
-            guided(self.cell, self.person, self, self.fit, sampling, listen=listen).run(
-                earlier, "the coverage is green"
-            )
-
-        if raises is None:
-            collect()
-        else:
-            with raises:
-                collect()
+        cell: Any = self.cell
+        run: Any = self
+        opened = OpenCell(cell, cell, cell.clock, run.person, Limits())
+        book = PoseBook(opened, run, run.fit, FLOOR)
+        sampling = Sampling(average_s=AVERAGE_S, attempts=3)
+        with raises or nullcontext():
+            HandGuided(opened, book, sampling, listen=listen).run(earlier, "the coverage is green")
 
     def commit(self, record: PoseRecord) -> PoseRecord:
         self.kept.append(record)
+        self.at_commit(self)
         self.person.shown.append(Noted(words=f"committed {record.stop}"))
         return record
 
@@ -349,15 +340,6 @@ def test_a_repeat_is_reported_once_and_left_out(turn_deg: float) -> None:
     assert outcome.person.words().count(f"This orientation is {turn_deg:.0f}° from pose 1") == 1
 
 
-def test_a_repeat_once_the_poses_are_enough_names_the_key_that_finishes() -> None:
-    near = Rotation.from_euler("y", 5.0, degrees=True)
-    outcome = Outcome(dwells(UP, near, DOWN, LEFT, RIGHT, FRONT, BACK, near), keys={40.0: Key.KEEP})
-    repeats = [words for words in outcome.person.words().splitlines() if words.startswith("This orientation is")]
-    left_out = "This orientation is 5° from pose 1 and is left out."
-    assert [words.startswith(left_out) for words in repeats] == [True, True]
-    assert ["Press k" in words for words in repeats] == [False, True]
-
-
 def test_a_quarter_turn_about_gravity_is_no_repeat() -> None:
     assert Outcome(dwells(UP, Rotation.from_euler("z", 90, degrees=True))).stops == [1, 2]
 
@@ -407,13 +389,6 @@ def test_without_keys_it_does_not_end_with_a_pose_that_is_in_doubt() -> None:
     assert "press" not in outcome.person.words()
 
 
-def test_a_run_that_is_continued_without_keys_takes_one_pose_more() -> None:
-    first = Outcome(dwells(*AROUND), has_keys=False)
-    outcome = Outcome(dwells(*TILTED), earlier=first.kept, has_keys=False)
-    assert outcome.stops == [7]
-    assert "ends with the next" in outcome.person.words()
-
-
 def test_redo_replaces_the_newest_pose_where_the_arm_stands_or_goes() -> None:
     there = Outcome(dwells(UP, DOWN, LEFT, seconds=8.0), keys={14.5: Key.REDO})
     assert there.stops == [1, 2, 2, 3]
@@ -440,19 +415,6 @@ def test_keys_pressed_while_a_pose_is_averaged_mean_what_is_shown_then() -> None
     assert paused.stops == [1]
 
 
-@pytest.mark.parametrize("listen", [False, True])
-def test_a_pose_that_is_done_with_is_no_longer_measured_on_the_screen(listen: bool) -> None:
-    shown = Outcome(dwells(UP, DOWN, UP), listen=listen).person.shown
-    after = False
-    for event in shown:
-        if isinstance(event, StateChanged):
-            assert not after or (event.state is State.MOVE and event.words)
-            after = False
-        after |= isinstance(event, PoseTaken) or (isinstance(event, Noted) and "left out" in event.words)
-    words = [event.words for event in shown if isinstance(event, StateChanged) and event.words]
-    assert words == (["the program goes on"] if listen else ["move on to another orientation"]) * 3
-
-
 def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once() -> None:
     outcome = Outcome(dwells(UP, DOWN, LEFT, seconds=6.0), recover=True, unplugged_s=9.5)  # while pose 2 is averaged
     assert outcome.stops == [1, 2, 3]
@@ -461,19 +423,6 @@ def test_a_sensor_that_recovers_is_waited_for_and_its_failure_is_reported_once()
     outcome = Outcome(dwells(UP, DOWN), unplugged_s=8.0, raises=pytest.raises(StreamBroken))
     assert outcome.stops == [1]
     assert "a cable came off" in outcome.person.words()
-
-
-def test_a_sensor_that_comes_back_within_12_s_is_waited_for() -> None:
-    outcome = Outcome(dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=11.7)
-    assert outcome.stops == [1, 2]
-
-
-@pytest.mark.parametrize("away_s", [12.5, 1e9])
-def test_a_sensor_that_does_not_come_back_ends_it(away_s: float) -> None:
-    outcome = Outcome(
-        dwells(UP, DOWN), recover=True, unplugged_s=8.0, away_s=away_s, raises=pytest.raises(StreamBroken)
-    )
-    assert outcome.stops == [1]
 
 
 @pytest.mark.parametrize("listen", [False, True])
@@ -485,14 +434,22 @@ def test_an_arm_that_is_silent_for_a_second_is_waited_for(since_s: float, listen
     assert outcome.person.words().count(words) == 1
 
 
-def test_an_arm_that_is_heard_again_within_12_s_is_waited_for() -> None:
-    assert Outcome(dwells(UP, DOWN), silent_s=(8.0, 19.7)).stops == [1, 2]
-
-
-@pytest.mark.parametrize("again_s", [21.6, np.inf])
-def test_an_arm_that_stays_silent_ends_it(again_s: float) -> None:
-    outcome = Outcome(dwells(UP, DOWN), silent_s=(8.0, again_s), raises=pytest.raises(DeviceTimeout))
-    assert outcome.stops == [1]
+@pytest.mark.parametrize(
+    ("interrupted", "ends"),
+    [
+        ({"recover": True, "unplugged_s": 8.0, "away_s": 11.7}, None),
+        ({"recover": True, "unplugged_s": 8.0, "away_s": 12.5}, StreamBroken),
+        ({"recover": True, "unplugged_s": 8.0, "away_s": 1e9}, StreamBroken),
+        ({"silent_s": (8.0, 19.7)}, None),
+        ({"silent_s": (8.0, 21.6)}, DeviceTimeout),
+        ({"silent_s": (8.0, np.inf)}, DeviceTimeout),
+    ],
+)
+def test_a_device_that_comes_back_within_12_s_is_waited_for(
+    interrupted: dict[str, Any], ends: type[Exception] | None
+) -> None:
+    outcome = Outcome(dwells(UP, DOWN), raises=ends and pytest.raises(ends), **interrupted)
+    assert outcome.stops == ([1] if ends else [1, 2])
 
 
 def trembling(t: Array) -> Array:
@@ -627,26 +584,16 @@ def test_a_sensor_that_is_too_slow_is_refused() -> None:
 
 
 def test_without_an_operator_it_ends_and_what_is_committed_stands() -> None:
-    cell = Cell(dwells(*AROUND))
-    person, kept = Person(cell, {}), list[PoseRecord]()
+    def leave(outcome: Outcome) -> None:
+        outcome.person.gone = "the terminal was closed" if len(outcome.kept) == 2 else None
 
-    def commit(record: PoseRecord) -> PoseRecord:
-        kept.append(record)
-        person.gone = "the terminal was closed" if len(kept) == 2 else None
-        return record
-
-    with pytest.raises(SupervisorGone, match="terminal"):
-        guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")
-    assert len(kept) == 2
+    outcome = Outcome(dwells(*AROUND), at_commit=leave, raises=pytest.raises(SupervisorGone, match="terminal"))
+    assert outcome.stops == [1, 2]
 
 
 def test_a_disk_that_is_full_ends_it() -> None:
-    cell = Cell(dwells(UP))
-    person = Person(cell, {})
-
-    def commit(_: PoseRecord) -> None:
+    def full(_: Outcome) -> None:
         raise OSError("No space left on device")
 
-    with pytest.raises(OSError, match="No space"):
-        guided(cell, person, SimpleNamespace(commit=commit), Fit(), Sampling(average_s=AVERAGE_S)).run((), "")
-    assert not any(isinstance(event, PoseTaken) for event in person.shown)
+    outcome = Outcome(dwells(UP), at_commit=full, raises=pytest.raises(OSError, match="No space"))
+    assert not any(isinstance(event, PoseTaken) for event in outcome.person.shown)

@@ -10,16 +10,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from ftdrive.cell.config import ToolConfig, WorkcellConfig
+from ftdrive.cell.config import ToolConfig
 from ftdrive.checks import computer
 from ftdrive.checks.arm import SLOWEST_SLIDER, check_speed
 from ftdrive.checks.check import Check
 from ftdrive.errors import NotAccepted
 from ftdrive.session import preflight
 from ftdrive.session.events import Checked, Noted
-from ftdrivers.errors import DeviceFault, StreamBroken
+from ftdrivers.errors import StreamBroken
 from ftdrivers.interfaces import ArmState, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
+from tests.unit.ftdrive.session.scenarios import Action, status
 
 
 def refuse(lab: Lab, words: str) -> None:
@@ -29,25 +30,57 @@ def refuse(lab: Lab, words: str) -> None:
     assert lab.operator.asked == []
 
 
-def test_a_workcell_that_was_not_measured_is_refused(lab: Lab) -> None:
-    lab.cell = replace(lab.cell, workcell=WorkcellConfig())
-    refuse(lab, "measured = true")
+def describe(section: str, **different: Any) -> Action:
+    """Return the action that changes a section of the cell's configuration."""
+    return lambda lab: setattr(
+        lab, "cell", replace(lab.cell, **{section: replace(getattr(lab.cell, section), **different)})
+    )
 
 
-@pytest.mark.parametrize(
-    ("different", "words"),
-    [
-        ({"fault": DeviceFault("protective stop", "clear it"), "safety_mode": "protective stop"}, "protective stop"),
-        ({"payload_kg": 0.0}, "no payload is set"),
-        (
-            {"p_flange_payload_m": (0.0, 0.0, -0.15)},
-            r"\(0, 0, -150\) mm",
-        ),
-        ({"p_flange_payload_m": (0.3, 0.0, 0.05)}, r"\(300, 0, 50\) mm"),
-    ],
-)
-def test_a_controller_that_is_not_ready_is_refused(different: dict[str, Any], words: str, lab: Lab) -> None:
-    lab.arm.set_status(**different)
+def forbid_a_pose(lab: Lab) -> None:
+    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]  # this arm only
+
+
+def report_another_flange(lab: Lab) -> None:
+    right = lab.arm.state
+
+    def elsewhere() -> ArmState:
+        state = right()
+        return replace(state, p_base_flange_m=np.add(state.p_base_flange_m, [0, 0, 0.02]))
+
+    lab.arm.state = elsewhere  # type: ignore[method-assign]  # this arm only
+
+
+def read_beyond_the_range(lab: Lab) -> None:
+    facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured")}
+    lab.sensor.identify = lambda: DeviceInfo("fake", "S1", "1", facts)  # type: ignore[method-assign]
+    lab.sensor.push = np.array([0, 0, 25_400.0, 0, 0, 0])
+
+
+REFUSED: dict[str, tuple[Action, str]] = {
+    "a workcell that was not measured": (describe("workcell", measured=False), "measured = true"),
+    "a protective stop": (status("protective stop"), "protective stop"),
+    "no payload": (status(payload_kg=0.0), "no payload is set"),
+    "a payload behind the flange": (status(p_flange_payload_m=(0.0, 0.0, -0.15)), r"\(0, 0, -150\) mm"),
+    "a payload beside the tool": (status(p_flange_payload_m=(0.3, 0.0, 0.05)), r"\(300, 0, 50\) mm"),
+    "a payload that is not that of the tool": (
+        describe("tool", mass_kg=3.0),
+        "payload 1.50 kg .* sensor and tool weigh 3.00 kg",
+    ),
+    "a reading at rest beyond the range": (
+        read_beyond_the_range,
+        "at rest the sensor reads .* in Fz, 50[78].. % of its range",
+    ),
+    "a pose the controller forbids": (forbid_a_pose, "safety limits forbid"),
+    "another model or TCP": (report_another_flange, "check the model and the active TCP"),
+    "a stuck sensor": (lambda lab: setattr(lab.sensor, "stuck", True), "did not change"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_is_not_as_it_should_be_is_refused(what: str, lab: Lab) -> None:
+    arrange, words = REFUSED[what]
+    arrange(lab)
     refuse(lab, words)
 
 
@@ -84,11 +117,6 @@ def test_wrist_3_at_the_end_of_its_range_may_be_outside_it_by_its_joint_noise(ou
         assert preflight.check_cable(cast("preflight.Before", before)).state == state
 
 
-def test_a_payload_that_is_not_that_of_the_tool_is_refused(lab: Lab) -> None:
-    lab.cell = replace(lab.cell, tool=replace(lab.cell.tool, mass_kg=3.0))
-    refuse(lab, "payload 1.50 kg .* sensor and tool weigh 3.00 kg")
-
-
 @pytest.mark.parametrize(
     ("range_N", "range_Nm", "share", "passes"),
     [
@@ -123,13 +151,6 @@ def test_a_sensor_with_an_arbitrary_zero_is_calibrated_within_its_range(
     assert outcome.result.force_bias_N == pytest.approx([1800, 400, 25_400], abs=5)
 
 
-def test_a_reading_at_rest_beyond_the_range_is_refused(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
-    facts = {"range": Fact((50.0,) * 3 + (10.0,) * 3, "configured")}
-    monkeypatch.setattr(lab.sensor, "identify", lambda: DeviceInfo("fake", "S1", "1", facts))
-    lab.sensor.push = np.array([0, 0, 25_400.0, 0, 0, 0])
-    refuse(lab, "at rest the sensor reads .* in Fz, 50[78].. % of its range")
-
-
 def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
     lab.arm.set_status(speed_slider=SLOWEST_SLIDER)
     assert lab.take_poses(dry_run=True) is None
@@ -138,34 +159,11 @@ def test_a_speed_slider_that_doctor_calls_too_low_is_refused(lab: Lab) -> None:
     refuse(lab, "slider: speed slider at 4 %.*raise the speed slider at the pendant")
 
 
-def test_a_pose_the_controller_forbids_is_refused(lab: Lab) -> None:
-    assert lab.take_poses(dry_run=True) is None
-    lab.arm.forbidden = lab.arm.q.round(12)
-    lab.arm.within_safety_limits = lambda q_rad: q_rad[4] < 2.0  # type: ignore[method-assign]  # this arm only
-    refuse(lab, "safety limits forbid")
-
-
-def test_another_model_or_tcp_is_refused(lab: Lab) -> None:
-    right = lab.arm.state
-
-    def elsewhere() -> ArmState:
-        state = right()
-        return replace(state, p_base_flange_m=np.add(state.p_base_flange_m, [0, 0, 0.02]))
-
-    lab.arm.state = elsewhere  # type: ignore[method-assign]  # this arm only
-    refuse(lab, "check the model and the active TCP")
-
-
 def test_another_arm_than_the_one_that_is_meant_is_refused(lab: Lab) -> None:
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="A1"))
     assert lab.take_poses(dry_run=True) is None
     lab.cell = replace(lab.cell, robot=replace(lab.cell.robot, serial="B2"))
     refuse(lab, r"the arm at fake has serial A1, but \[robot\] serial is B2")
-
-
-def test_a_stuck_sensor_is_refused(lab: Lab) -> None:
-    lab.sensor.stuck = True
-    refuse(lab, "did not change")
 
 
 def test_a_sensor_that_stumbles_once_is_opened_again(lab: Lab) -> None:

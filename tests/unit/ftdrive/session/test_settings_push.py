@@ -205,16 +205,16 @@ def test_a_rejected_calibration_is_refused(cell: Cell) -> None:
     [
         ({"program": "playing"}, "another program is active on the controller"),
         ({"remote": False}, "local control"),
-        (
-            {"_status": replace(FakeArm(FakeClock())._status, fault=DeviceFault("protective stop", "clear it"))},
-            "clear it",
-        ),
+        ({"fault": DeviceFault("protective stop", "clear it")}, "clear it"),
         ({"identify": lambda: DeviceInfo("UR5e", "A7", "5.15")}, "A7"),
     ],
 )
 def test_an_arm_that_is_not_ready_is_refused(cell: Cell, arm: dict[str, Any], says: str) -> None:
     for name, value in arm.items():
-        setattr(cell.arm, name, value)
+        if name == "fault":
+            cell.arm.set_status(fault=value)
+        else:
+            setattr(cell.arm, name, value)
     with pytest.raises(NotAccepted, match=says):
         cell.propose()
     assert not cell.arm.sent
@@ -382,23 +382,4 @@ def test_a_damaged_receipt_is_an_error_that_names_it(cell: Cell, change: dict[st
     assert "push.json" in str(error.value)
 
 
-def test_a_run_without_a_receipt_says_so(tmp_path: Path) -> None:
-    with pytest.raises(BadDataset, match="no receipt of a push"):
-        Receipt.load(tmp_path)
-
-
 # ----------------------------------------------------------------------------------------------------------------- text
-
-
-def test_old_new_and_change_stand_beside_one_another(cell: Cell) -> None:
-    lines = proposal_in_lines(cell.propose())
-    assert [line.split() for line in lines[:3]] == [
-        ["controller", "new", "change"],
-        ["mass,", "kg", "0.600", "1.500", "+0.900"],
-        ["centre,", "mm", "(0.0,", "0.0,", "30.0)", "(8.0,", "0.0,", "84.0)", "(+8.0,", "+0.0,", "+54.0)"],
-    ]
-    text = "\n".join(lines)
-    assert "3.50 kg below the rated payload of a UR5e, 5 kg" in text
-    assert "sensor and adapter, 0.3 kg" in text
-    assert "The inertia is kept" in text
-    assert "At the calibration, the payload in the controller was 0.900 kg." in text

@@ -306,10 +306,6 @@ def test_a_recording_that_cannot_be_used_is_one_sentence(name: str) -> None:
         use(Table(frame))
 
 
-def test_there_are_sixty_of_them() -> None:
-    assert len(BROKEN) + len(MOTION) >= 60
-
-
 @pytest.mark.parametrize(
     ("options", "words"), [({"euler": "abd"}, "--euler abd: give rpy, ABC"), ({"rate_Hz": -1.0}, "--rate -1")]
 )
