@@ -1,8 +1,6 @@
 """One trial of row 27: the supervisor of a session leaves, the emulated arm is watched, and the run is resumed."""
 
 import json
-import os
-import pty
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
@@ -14,8 +12,7 @@ from typing import Any, Final, Literal
 from ftdrive.cell.emulated import Station
 from tests.system.command_line import CommandLine, say, wait_until
 
-Kind = Literal["reader killed", "stdout closed", "stdin closed", "terminal closed"]
-KINDS: Final[tuple[Kind, ...]] = ("reader killed", "stdout closed", "stdin closed", "terminal closed")
+Kind = Literal["reader killed", "stdin closed"]
 GONE: Final = 9
 ANSWERS: Final = "yes\nyes\nyes\nMOVE\nyes\n"
 _SLOW: Final = 0.05
@@ -29,7 +26,7 @@ class Seen:
 
     exit_code: int
     said: str
-    """On standard error, where it was open."""
+    """On standard error."""
     moved: bool
     """Whether the arm moved when the supervisor left."""
     rest_s: float | None
@@ -44,14 +41,7 @@ class Supervised:
     """A session whose supervisor leaves as `kind` says."""
 
     def __init__(self, kind: Kind, ftdrive: CommandLine, *arguments: str | Path) -> None:
-        self._kind, self._reader, self._terminal = kind, None, -1
-        if kind == "terminal closed":
-            self._terminal, slave = pty.openpty()
-            how: dict[str, Any] = dict.fromkeys(("stdin", "stdout", "stderr"), slave)
-            self.process = ftdrive.start(*arguments, **how, start_new_session=True)
-            os.close(slave)
-            threading.Thread(target=self._answer, daemon=True).start()
-            return
+        self._reader: subprocess.Popen[bytes] | None = None
         if kind == "reader killed":
             self._reader = subprocess.Popen(["cat"], stdin=subprocess.PIPE, stdout=subprocess.DEVNULL)
             pipe = self._reader.stdin
@@ -60,41 +50,22 @@ class Supervised:
             pipe.close()
         else:
             self.process = ftdrive.start(*arguments, "--json")
-            if kind == "stdin closed":
-                threading.Thread(target=self.process.stdout.read, daemon=True).start()  # type: ignore[union-attr]
+            threading.Thread(target=self.process.stdout.read, daemon=True).start()  # type: ignore[union-attr]
         say(self.process, ANSWERS)
 
-    def _answer(self) -> None:
-        """Answer the questions on the terminal."""
-        said = ""
-        with suppress(OSError):  # closed
-            while True:
-                said += os.read(self._terminal, 4096).decode(errors="replace")
-                for words, answer in (("yes/no]", b"yes\n"), ("Type MOVE", b"MOVE\n")):
-                    if words in said:
-                        said = said.split(words, 1)[1]
-                        os.write(self._terminal, answer)
-
     def leave(self) -> None:
-        """Be gone."""
-        if self._kind == "reader killed":
-            assert self._reader is not None
+        if self._reader is not None:
             self._reader.kill()
             self._reader.wait()
-        elif self._kind == "stdout closed":
-            assert self.process.stdout is not None
-            self.process.stdout.close()
-            self.process.stdout = None
-        elif self._kind == "stdin closed":
+        else:
             assert self.process.stdin is not None
             self.process.stdin.close()
             self.process.stdin = None
-        else:
-            os.close(self._terminal)
 
     def end(self) -> tuple[int, str]:
         """Return exit code and standard error once the session has ended."""
-        said = "" if self.process.stderr is None else self.process.stderr.read()
+        assert self.process.stderr is not None
+        said = self.process.stderr.read()
         return self.process.wait(timeout=60), said
 
 

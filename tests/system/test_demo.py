@@ -31,22 +31,6 @@ def test_the_run_of_a_demo_is_replayed_to_the_same_result(demo: dict[str, Any], 
     assert solved["force_bias_N"] == again["force_bias_N"]
 
 
-def test_the_run_of_a_demo_is_solved_by_another_method(demo: dict[str, Any], ftdrive: CommandLine) -> None:
-    srom = ftdrive.json("solve", demo["run"], "--method", "srom")
-    assert srom["mass_kg"] == pytest.approx(demo["truth"]["mass_kg"], abs=6 * srom["sigma"]["mass_kg"])
-
-
-def test_the_bundle_of_a_demo_is_replayed_and_reported_without_its_run(
-    demo: dict[str, Any], ftdrive: CommandLine
-) -> None:
-    file = ftdrive.json("bundle", demo["run"], "-o", "demo.zip")["file"]
-    again = ftdrive.json("replay", file)
-    assert {key: again[key] for key in ("id", "verdict", "covariance", "residuals")} == {
-        key: demo["result"][key] for key in ("id", "verdict", "covariance", "residuals")
-    }
-    assert ftdrive.json("report", file, "--format", "json")["reproduce"].endswith("demo.zip")
-
-
 @pytest.mark.parametrize("source", ["--simulate", "--replay"])
 def test_the_calibration_of_a_demo_compensates_live(source: str, demo: dict[str, Any], ftdrive: CommandLine) -> None:
     run = Path(demo["run"])

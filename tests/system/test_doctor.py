@@ -133,17 +133,6 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
 
 
 @pytest.mark.slow
-def test_an_arm_that_is_not_there(station: Station, cell: Path, ftdrive: CommandLine) -> None:
-    cell.write_text(cell.read_text().replace(station.cell.robot.host, "no-such-arm.invalid"))
-    outcome = ftdrive.run("doctor", "--config", cell, "--json")
-    assert outcome.returncode == 7
-    checks = checks_of(outcome)
-    assert checks["robot.reachable"]["state"] == "failed"
-    assert "IPv4 address" in checks["robot.reachable"]["fix"]
-    assert checks["sensor.rate"]["state"] != "skipped"
-
-
-@pytest.mark.slow
 def test_a_person_pushes(station: Station, cell: Path, ftdrive: CommandLine) -> None:
     process = ftdrive.start("doctor", "--config", cell, "--push", "--json")
     listen_for(process, "press Enter")

@@ -5,12 +5,11 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ftdrive.fleet.resolve import solve_again, solve_run, solved_path
-from ftdrive.fleet.workers import WorkerDied, Workers, answers, cluster_workers, local_workers
+from ftdrive.fleet.workers import Workers, cluster_workers, local_workers
 from ftdrivers.errors import Unreachable
 from tests.calibrated_runs import calibrated_run
 from tests.dask_cluster import dask_cluster, kill_busiest_worker
@@ -57,21 +56,6 @@ def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Pa
 def solved_on(address: str, runs: list[Path], *, timeout_s: float = 0.1, kill: bool = False) -> list[bytes]:
     with cluster_workers(address, timeout_s=timeout_s) as workers:
         return solved_by(workers, runs, kill=kill)
-
-
-def test_a_killed_worker_loses_no_answer_and_the_call_that_kills_two_is_given_up(tmp_path: Path) -> None:
-    def script(item: Path) -> tuple[Any, str]:
-        """A call that leaves a mark, and kills its process if it is number 3."""
-        mark = f"open({str(tmp_path / item)!r}, 'a').write('x')"
-        kill = "__import__('os').kill(__import__('os').getpid(), 9)"
-        return eval, f"({mark}, {kill if item.name == '3' else repr(item.name.encode())})[1]"
-
-    with local_workers(1) as workers:
-        found = dict(answers(script, map(Path, "0123456789"), workers))
-    assert isinstance(found.pop(Path("3")), WorkerDied)
-    assert found == {Path(name): name.encode() for name in "012456789"}
-    calls = {one.name: len(one.read_text()) for one in tmp_path.iterdir()}
-    assert calls == dict.fromkeys("012456789", 1) | {"3": 2}
 
 
 def test_ctrl_c_keeps_what_is_solved_and_the_command_continues(runs: list[Path], ftdrive: CommandLine) -> None:

@@ -203,13 +203,6 @@ def test_a_robot_that_does_not_answer_is_exit_code_3(station: Station) -> None:
     assert not Path("ftdrive.toml").exists()
 
 
-def test_a_missing_folder_is_an_error_before_the_first_question(tmp_path: Path) -> None:
-    path = tmp_path / "nowhere" / "cell.toml"
-    error = run("--robot", "127.99.99.9", "--sensor", "ati-can://can0", *TOOL, "--yes", "--output", str(path)).exception
-    assert isinstance(error, ConfigError)
-    assert "create it first" in str(error)
-
-
 @pytest.mark.slow
 def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     answers = ["127.99.99.9", station.cell.robot.host, "ati-nonsense://x", serial_port(station)]
@@ -242,14 +235,6 @@ def test_answers_that_cannot_be_used_are_asked_again(station: Station) -> None:
     assert cell.workcell.planes_mm == ((-1, 0, 0, -800),)
     assert cell.workcell.boxes_mm == ((300, 300, 0, 500, 500, 400),)
     assert (cell.sensor.height_mm, cell.sensor.mass_kg) == (33, None)
-
-
-def test_an_error_names_the_option_that_a_script_left_out(station: Station) -> None:
-    outcome = run("--robot", station.cell.robot.host, "--sensor", station.cell.sensor.url, typed="33\n")
-    assert outcome.exception is not None
-    assert exit_code(outcome.exception) == 2
-    assert "--sensor-mass" in str(outcome.exception)
-    assert not Path("ftdrive.toml").exists()
 
 
 def test_the_operator_may_keep_addresses_that_do_not_answer() -> None:

@@ -67,14 +67,6 @@ def test_killed_station_is_a_lost_stream(station: Station, tour: subprocess.Pope
     assert len(ftdrive.poses()) >= 2
 
 
-def test_a_wrong_option_is_reported_before_a_device_opens(ftdrive: CommandLine) -> None:
-    outcome = ftdrive.run(
-        "calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port", "--redo", "3"
-    )
-    assert outcome.returncode == 2, outcome.stderr
-    assert "--resume" in outcome.stderr
-
-
 def test_a_device_that_does_not_answer(ftdrive: CommandLine) -> None:
     outcome = ftdrive.run("calibrate", "--robot", "127.213.7.9", "--sensor", "ati-serial:///dev/no-such-port")
     assert outcome.returncode == 3

@@ -17,16 +17,14 @@ from typing import Any
 
 import pytest
 
-from ftdrive.cell.emulated import REAL_PACE, Station
+from ftdrive.cell.emulated import Station
 from tests.system.attacked_page import SECRET, Attacked, served
-from tests.system.command_line import CommandLine, exit_code_of, say, wait_until
+from tests.system.command_line import CommandLine, exit_code_of, wait_until
 from tests.unit.ftdrive.stream.simulated import calibrated_from
 
 pytest.importorskip("uplot", reason="the extra viz is not installed")
 
 STOP_S, GROWTH_MB, LARGE = 10.0, 50, 45_000_000
-# Until the arm stands, with braking, and an emulated cell on a busy computer.
-STANDS_S = 10.0
 words = re.compile(r"\S+").findall
 # What the controls of that page pass on.
 VALUES = {"tare": "None", "check": "True|False", "axes": "'base'|'tcp'", "name": r"'[^\\]*'"}
@@ -224,14 +222,6 @@ def test_no_message_sets_more_than_the_value_of_a_control(attacked: Attacked) ->
     attacked.is_well()
 
 
-@pytest.mark.parametrize("hook", ["time.sleep(1e6)", "raise RuntimeError('no picture')"])
-def test_stop_works_without_drawing(tmp_path: Path, hook: str) -> None:
-    page = served(tmp_path, hook)
-    time.sleep(0.3)
-    assert stops_s(page) < STOP_S
-    page.process.communicate()
-
-
 # Run by another user: tries the page, and all files about the process, and prints what it gets.
 OTHER_USER = """
 import glob, socket, sys
@@ -284,52 +274,3 @@ def command(name: str, ftdrive: CommandLine, station: Station) -> list[str | Pat
     if name == "calibrate":
         return [name, "--config", ftdrive.connect(station), "--view"]
     return [name, *(("--model", "ur5e", "--tool", "0:200:100", "--minimal") if name == "plan" else ()), "--view"]
-
-
-def started(name: str, ftdrive: CommandLine, station: Station) -> Attacked:
-    """Start a command with a page; a session until its arm moves."""
-    page = Attacked(lambda **how: ftdrive.start(*command(name, ftdrive, station), **how), ftdrive.folder)
-    if name == "calibrate":
-        # the tour takes some minutes, longer than any attack on a busy computer
-        say(page.process, "yes\nyes\nyes\nMOVE\nyes\n")
-        wait_until(lambda: bool(station.control(do="state")["moving"]), page.process)
-    return page
-
-
-def stopped(page: Attacked, station: Station) -> None:
-    """Stop a moving arm in time; the session says who did."""
-    # between two poses it stands while the sensor is averaged
-    wait_until(lambda: bool(station.control(do="state")["moving"]), page.process)
-    assert page.stop_s(lambda: not station.control(do="state")["moving"]) < STANDS_S
-    assert exit_code_of(page.process, page.err) == 130
-    assert "stopped by viewer 0" in page.printed()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["init", "plan", "live", "weigh", "calibrate"])
-def test_each_page_goes_on(ftdrive: CommandLine, name: str) -> None:
-    with Station("can", REAL_PACE) as station, ExitStack() as stack:
-        page = started(name, ftdrive, station)
-        time.sleep(3.0)
-        before_MB, before = page.memory_MB(), page.out.read_text().count("\n")
-        for data in (
-            *[page.head("GET", "/parts", Cookie=page.cookie)] * 200,
-            *[page.unfinished(30_000, 29_999)] * 200,
-            *[page.unfinished(LARGE, LARGE)] * 3,
-        ):
-            stack.enter_context(page.connect(data, receives=4096, timeout_s=2))
-        parts = page.parts()
-        shown = [one for part in parts.values() if part["kind"] == "controls" for one in part["controls"]]
-        for one in fuzzed([control for control in shown if control["name"] != "write"], 2_000):
-            assert status(page.do(one)) in (204, 400, 413)
-        assert page.memory_MB() - before_MB < GROWTH_MB
-        page.is_well()
-        if name == "calibrate":
-            stopped(page, station)
-            return
-        assert page.listens_at() == [("tcp", page.port)]
-        assert {part.partition("/")[0] for part in parts} <= {part.partition("/")[0] for part in page.parts()}
-        page.process.send_signal(signal.SIGINT)
-        exit_code_of(page.process, page.err)
-        readings = [json.loads(line) for line in page.out.read_text().splitlines() if name in ("live", "weigh")]
-        assert len(readings) > before or name != "live"

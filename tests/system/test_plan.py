@@ -1,6 +1,5 @@
 """`ftdrive plan` as a person and as a script calls it."""
 
-import json
 from pathlib import Path
 
 import pytest
@@ -15,20 +14,6 @@ UR5E = ["plan", "--model", "ur5e", "--tool", "0:200:100"]
 
 def run(*arguments: str) -> Result:
     return CliRunner().invoke(cli, arguments)
-
-
-def test_json_holds_the_figures() -> None:
-    outcome = run(*UR5E, "--tip-speed-limit", "none", "--json")
-    assert outcome.exit_code == 0, outcome.output
-    document = json.loads(outcome.stdout)
-    assert document["schema_version"] == 1
-    assert document["poses"] == len(document["steps"]) == 24
-    assert document["certified"] is True
-    assert document["max_move_deg"] <= 90.1
-    assert document["motion_time_s"] <= 54.1
-    assert document["min_clearance_mm"] > 0
-    assert document["ball_m"] == pytest.approx(0.35, abs=0.005)
-    assert document["predicted_sigma"]["mass_kg"] > 0
 
 
 def test_the_table_is_the_answer_and_the_file_is_the_plan(tmp_path: Path) -> None:
@@ -75,21 +60,6 @@ def test_the_plan_says_whether_its_cell_was_measured(
     assert (exported.exit_code == 0) is measured
 
 
-def test_a_plane_with_its_sign_wrong_is_named_at_once() -> None:
-    error = run(*UR5E, "--plane", "0:1:0:-900", "--plane", "0:0:1:300").exception
-    assert error is not None
-    assert exit_code(error) == 2
-    assert "wrong side of the plane [0, 0, 1, 300]" in str(error)
-
-
-def test_the_table_fits_into_80_columns() -> None:
-    lines = run(*UR5E, "--all").stdout.splitlines()
-    start = next(i for i, line in enumerate(lines) if line.startswith("Joint angles of the poses in degrees"))
-    table = lines[start + 1 : lines.index("", start)]
-    assert max(map(len, table)) <= 80
-    assert len({len(line) for line in table[:-2]}) == 1  # headings stand above their numbers
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -97,7 +67,7 @@ def test_the_table_fits_into_80_columns() -> None:
         (["--tool", "200:100:50"], "[200.0, 100.0, 50.0] is not"),
         (["--quick", "--minimal"], "not both"),
         (["--mounting", "sideways"], "mounting"),
-        (["--plane", "0:0:0:1"], ": the normal of"),
+        (["--plane", "0:0:0:1"], "the normal of [0.0, 0.0, 0.0, 1.0] is zero"),
         (["--tip-speed-limit", "-1"], "1 to 250"),
         (["--tip-speed-limit", "fast"], "'fast': give mm/s, such as 250, or none"),
         (["--posture", "45,-100"], "3 numbers"),

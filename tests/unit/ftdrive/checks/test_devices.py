@@ -32,6 +32,7 @@ from ftdrivers.errors import (
 from ftdrivers.interfaces import NOT_REPORTED, ArmStatus, DeviceInfo, Fact, FtSamples, Health
 from ftdrivers.ur.kinematics import MODELS
 from tests.own_kinematics import drawn
+from tests.unit.ftdrive.fake_cell import STATUS as PLAYING
 from tests.unit.ftdrive.fake_cell import Lab
 
 FACTS = {
@@ -71,19 +72,7 @@ def test_what_is_assumed_or_unknown_of_a_sensor_is_a_warning() -> None:
 
 
 TOOL = ToolConfig(cylinders_mm=((0.0, 200.0, 100.0),))
-STATUS = ArmStatus(
-    t_host_ns=0,
-    t_device_s=1.0,
-    robot_mode="running",
-    safety_mode="normal",
-    program="stopped",
-    fault=None,
-    speed_slider=0.5,
-    speed_scaling=1.0,
-    payload_kg=1.2,
-    p_flange_payload_m=(0.0, 0.01, 0.05),
-    tcp_offset=(0.0,) * 6,
-)
+STATUS = replace(PLAYING, program="stopped", speed_slider=0.5, payload_kg=1.2, p_flange_payload_m=(0.0, 0.01, 0.05))
 
 
 def arm_checks(status: ArmStatus, tool: ToolConfig = TOOL, sensor_kg: float | None = None) -> dict[str, Check]:

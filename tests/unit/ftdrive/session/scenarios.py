@@ -42,6 +42,16 @@ def lose_sensor(lab: Lab) -> None:
     lab.sensor.failure = StreamBroken("a cable came off")
 
 
+def end_guards(lab: Lab) -> None:
+    """Let the guards' thread end with the next look, whatever it does."""
+
+    def end() -> None:
+        if lab.guards_look:
+            raise SystemExit
+
+    lab.arm.at_look = end
+
+
 def press_and_release(mode: str = "robot emergency stop") -> Action:
     """Return the action that stops the arm for a tenth of a second, in which the guards look at it."""
 

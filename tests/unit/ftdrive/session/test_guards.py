@@ -28,8 +28,9 @@ from ftdrive.session.guards import (
     arm_lost,
 )
 from ftdrivers.errors import DeviceFault, DeviceTimeout
-from ftdrivers.interfaces import ArmState, ArmStatus
+from ftdrivers.interfaces import ArmState
 from ftdrivers.ur.kinematics import MODELS
+from tests.unit.ftdrive.fake_cell import STATUS
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,6 @@ CERTIFIER = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)]), Scene())
 OWN = Certifier(ArmModel("UR5e", [Cylinder(0.0, 0.2, 0.1)], MODELS["UR5e"]), Scene())
 START = np.radians([45.0, -100, 60, -50, 90, 45])
 GOAL = np.radians([45.0, -100, 60, -140, 45, 90])
-STATUS = ArmStatus(0, 0.0, "running", "normal", "playing", None, 1.0, 1.0, 1.5, (0.0, 0.0, 0.05), (0.0,) * 6)
 WEIGHT = np.array([0.0, 0.0, 12.0, 0.1, 0.0, 0.0])
 
 

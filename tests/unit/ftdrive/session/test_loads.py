@@ -49,7 +49,7 @@ def test_a_load_is_hung_when_the_arm_stands_at_the_first_pose(lab: Lab) -> None:
     lab.calibrate(load=HUNG)
     asked = [question.text for question in lab.operator.asked]
     assert "the weight off" in asked[0]
-    assert "nothing and no one below" in asked[1]
+    assert "Is the space below and beside it free of people" in asked[1]
     assert sum("hang a load of 2 kg at tip now" in text for text in asked) == 1
     assert all(record.swings for record in lab.run().records())
     assert any("repeated while it swings" in event.words for event in lab.operator.of(Noted))

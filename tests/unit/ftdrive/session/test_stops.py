@@ -27,6 +27,7 @@ from tests.unit.ftdrive.session.scenarios import (
     at,
     both,
     cases,
+    end_guards,
     fail,
     lose_sensor,
     press,
@@ -116,16 +117,6 @@ def test_a_fault_on_the_way_stops_the_arm_and_resume_goes_on(fault: str, lab: La
     # The way on was asked for, planned from where the arm stood, and slow.
     assert any("Approach to pose 4" in question.text for question in lab.operator.asked)
     assert lab.arm.moves[4][1] <= np.radians(15) + 1e-9
-
-
-def end_guards(lab: Lab) -> None:
-    """Let the guards' thread end with the next look, whatever it does."""
-
-    def end() -> None:
-        if lab.guards_look:
-            raise SystemExit
-
-    lab.arm.at_look = end
 
 
 def leave(lab: Lab) -> None:

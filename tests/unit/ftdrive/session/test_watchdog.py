@@ -16,6 +16,7 @@ from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout
 from tests.fake_clock import FakeClock
 from tests.unit.ftdrive.fake_cell import FakeArm, FakeSensor, Lab, Scripted, SteppedWatcher
+from tests.unit.ftdrive.session.scenarios import end_guards
 
 
 class Looks(Guard):
@@ -224,21 +225,11 @@ def test_an_emergency_stop_is_seen_within_a_twentieth_of_a_second_while_the_arm_
         assert watcher.safety_stop is not None
 
 
-def end(lab: Lab) -> None:
-    """Let the guards' thread end with the next look, whatever it does."""
-
-    def leave() -> None:
-        if lab.guards_look:
-            raise SystemExit
-
-    lab.arm.at_look = leave
-
-
 @pytest.mark.parametrize("stop", [0, 3])
 def test_nothing_moves_without_a_watchdog(stop: int, lab: Lab) -> None:
     def on_event(event: Event) -> None:
         if isinstance(event, PoseTaken) and event.stop == stop:
-            end(lab)
+            end_guards(lab)
             lab.clock.sleep(0.1)
 
     if stop == 0:
