@@ -29,7 +29,17 @@ from ftdrive.session.events import (
 from ftdrive.words.result import drift_in_words
 from ftdrivers.interfaces import NOT_REPORTED, DeviceInfo, Fact
 from tests.unit.ftdrive.fake_cell import Lab
-from tests.unit.ftdrive.session.scenarios import Case, cases, once, press
+from tests.unit.ftdrive.session.scenarios import Case, at, both, cases, once, press
+
+
+def broken_off(lab: Lab, mode: str = "auto") -> Path:
+    """Begin a run and stop it at its third move."""
+    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
+    with pytest.raises(Declined):
+        lab.take_poses(mode=mode)
+    lab.arm.moves.clear()
+    return lab.run().folder
+
 
 ON_ITS_WAY = {
     "pause holds the arm on its way and goes on": Case(
@@ -110,14 +120,7 @@ def test_redo_takes_the_pose_that_was_shown_when_it_was_pressed(lab: Lab) -> Non
 
 
 def test_a_pose_that_was_to_be_taken_again_and_is_skipped_stays(lab: Lab) -> None:
-    def skip() -> None:
-        if len(lab.arm.moves) == 3 and len(lab.taken()) == 3 and not skipped:
-            skipped.append(True)
-            lab.operator.keys.append(Key.SKIP)
-
-    skipped: list[bool] = []
-    lab.sensor.collecting = skip
-    lab.press((Key.REDO, PoseTaken, 3))
+    at(lab, "taken 3", both(press(Key.REDO), lambda lab: at(lab, "measuring 3", press(Key.SKIP))))
     outcome = lab.calibrate()
     assert lab.taken() == [1, 2, 3, 4, 5, 6, 7]
     assert "pose 3 keeps" in lab.said()
@@ -179,15 +182,12 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
             lab.sensor.push = lab.sensor.push + np.array([0.1, 0, 0, 0, 0, 0])
 
     lab.operator.on_event = drift
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined):
-        lab.take_poses()
-    run = lab.run()
+    run = Run(broken_off(lab))
     lab.operator.shown.clear()
     outcome = lab.calibrate(resume=run.folder)
     assert outcome is not None
     assert outcome.run.folder == run.folder
-    assert [event.stop for event in lab.operator.of(PoseTaken)] == [4, 5, 6, 7]
+    assert [event.stop for event in lab.operator.of(PoseTaken)] == [3, 4, 5, 6, 7]
     estimate = lab.operator.of(Estimated)[-1].values
     assert estimate["force_bias_N"].tolist() == outcome.result.force_bias_N.tolist()  # their times are those on disk
     assert len((run.folder / "events.ndjson").read_text().splitlines()) > len(lab.operator.shown)
@@ -204,50 +204,31 @@ def test_resume_takes_what_is_missing_and_redo_takes_one_again(lab: Lab) -> None
     [pytest.param("step", "auto", True, marks=pytest.mark.slow), ("auto", "step", True), ("auto", "auto", False)],
 )
 def test_a_run_goes_on_in_its_own_mode_or_in_steps(begun: str, asked: str, in_steps: bool, lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined):
-        lab.take_poses(mode=begun)
+    folder = broken_off(lab, mode=begun)
     lab.operator.asked.clear()
-    lab.take_poses(resume=lab.run().folder, mode=asked)
+    lab.take_poses(resume=folder, mode=asked)
     steps = [question.text.split(",")[0] for question in lab.operator.asked if "Enter" in question.text]
-    assert steps == [f"Pose {stop} of 7" for stop in (4, 5, 6, 7) if in_steps]
+    assert steps == [f"Pose {stop} of 7" for stop in (3, 4, 5, 6, 7) if in_steps]
 
 
 def test_a_resumed_run_is_open_with_its_poses_before_anything_is_checked(lab: Lab) -> None:
-    lab.arm.at_move[4] = lambda: lab.operator.keys.append(Key.STOP)
-    lab.operator.answers["resume:"] = ["quit"]
-    with pytest.raises(Declined):
-        lab.take_poses()
-    run = lab.run()
+    folder = broken_off(lab)
     lab.operator.shown.clear()
-    assert lab.take_poses(resume=run.folder, dry_run=True) is None
+    assert lab.take_poses(resume=folder, dry_run=True) is None
     kinds = [type(event) for event in lab.operator.shown]
     assert kinds.count(RunOpened) == 1
     assert kinds.index(RunOpened) < kinds.index(Checked)
     before = lab.operator.shown[: kinds.index(Checked)]
-    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2, 3]
+    assert [event.poses for event in before if isinstance(event, Estimated)] == [1, 2]
 
 
 def test_a_run_is_not_gone_on_with_another_tool(lab: Lab) -> None:
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
-    lab.operator.answers["resume:"] = ["quit"]
-    with pytest.raises(Declined):
-        lab.take_poses()
-    lab.arm.moves.clear()
+    folder = broken_off(lab)
     lab.cell = replace(lab.cell, tool=ToolConfig(cylinders_mm=((0.0, 210.0, 100.0),)))
     for redo in ((), (1,)):
         with pytest.raises(NotAccepted, match="another tool"):
-            lab.take_poses(resume=lab.run().folder, redo=redo)
+            lab.take_poses(resume=folder, redo=redo)
     assert lab.arm.moves == []
-
-
-def broken_off(lab: Lab) -> Path:
-    """Begin a run and stop it at its third move."""
-    lab.arm.at_move[3] = lambda: lab.operator.keys.append(Key.STOP)
-    with pytest.raises(Declined):
-        lab.take_poses()
-    lab.arm.moves.clear()
-    return lab.run().folder
 
 
 def report(
