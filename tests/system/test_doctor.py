@@ -127,7 +127,7 @@ def test_an_unplugged_sensor(station: Station, cell: Path, ftdrive: CommandLine)
     outcome = ftdrive.run("doctor", "--config", cell, "--push", "--all")
     assert outcome.returncode == 7
     assert "the port does not open" in outcome.stdout
-    assert "fix: plug it in" in outcome.stdout
+    assert "fix: plug the adapter in" in outcome.stdout
     assert "✔ remote control" in outcome.stdout
     assert "sensor.identity, permissions.port" in outcome.stderr
 

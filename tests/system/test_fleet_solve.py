@@ -42,7 +42,7 @@ def test_processes_give_the_same_bytes_also_if_one_is_killed(runs: list[Path]) -
 
 
 def test_a_cluster_gives_the_same_bytes_also_if_a_worker_is_killed(runs: list[Path]) -> None:
-    with pytest.raises(Unreachable, match=r"dask://127\.0\.0\.1:1 .*start it"):
+    with pytest.raises(Unreachable, match=r"dask://127\.0\.0\.1:1 .*start the scheduler"):
         solved_on("dask://127.0.0.1:1", runs)
     with dask_cluster() as cluster:
         with pytest.raises(Unreachable, match="no worker; start one: dask worker tcp://"):

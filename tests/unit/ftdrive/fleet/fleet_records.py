@@ -9,7 +9,6 @@ from typing import Any, cast
 import numpy as np
 
 from ftcalib.model import Array
-from ftdrive.fleet.cells import Observed
 from ftdrive.fleet.state import Fleet
 from ftdrive.fleet.status import fleet_state
 from ftdrive.runs.verification import VerificationRecord, newest
@@ -166,7 +165,3 @@ def fleet(
     weighings: Sequence[WeighingDay] = (),
 ) -> Fleet:
     return fleet_state(store(cells, results, checks, weighings), NOW)
-
-
-def observed(cells: Sequence[StoredCell], results: Sequence[StoredResult], checks: Sequence[Any] = ()) -> Observed:
-    return Observed.read(store(cells, results, checks), NOW)
