@@ -111,7 +111,8 @@ class AtiCanNode(CanSensor):
     def _samples(self, _count: int) -> list[CanFrame]:
         return []  # this sensor only answers requests
 
-    def _answer(self, request: CanFrame) -> list[CanFrame]:
+    def answer(self, request: CanFrame) -> list[CanFrame]:
+        """Return the frames that answer a request; none if the frame is no request."""
         opcode = request.identifier & 0xF
         if self.clock.now_s() < self._booted_s:
             return []

@@ -204,7 +204,7 @@ class AtiSerialBox(ModbusSensor):
         self._pacer.start(min(STREAM_HZ, BAUD_RATES[self._registers[BAUD]] / (CHARACTER_BITS * RECORD_BYTES)))
 
     def _samples(self, count: int) -> list[bytes]:
-        records = stream_records(self._gauges(count), error=bool(self.status & 0x8000))
+        records = stream_records(self.gauges(count), error=bool(self.status & 0x8000))
         if self.bad_checksum:
             records[self._random.random(count) < self.bad_checksum, 12] ^= 0x01
         data = records.tobytes()
@@ -215,7 +215,7 @@ class AtiSerialBox(ModbusSensor):
     def _transducer(self) -> Calibration:
         return self.calibrations[min(self.calibrations)]
 
-    def _gauges(self, count: int) -> NDArray[np.int16]:
+    def gauges(self, count: int) -> NDArray[np.int16]:
         """Return gauges (count, 6) with the active gains and offsets, which may not be those of the calibration."""
         calibration = self._transducer
         active = np.array([self._registers[address] for address in range(GAINS, SESSION)], dtype=np.float64)

@@ -228,7 +228,7 @@ class NetFtBox(Device[bytes]):
         self._bias = np.array(self.bias, dtype=float)
         self._booted_s = self.clock.now_s()
         if self.streaming_at_start:
-            self._request(Command.REAL_TIME, 0, self.streaming_at_start)
+            self.request(Command.REAL_TIME, 0, self.streaming_at_start)
 
     def _receive(self) -> None:
         with contextlib.suppress(OSError):  # a client that has ended causes a refused connection
@@ -236,9 +236,10 @@ class NetFtBox(Device[bytes]):
             if len(data) == REQUEST.size and self.rdt_enabled:
                 header, command, count = REQUEST.unpack(data)
                 if header == REQUEST_HEADER:
-                    self._request(command, count, client)
+                    self.request(command, count, client)
 
-    def _request(self, command: int, count: int, client: tuple[str, int]) -> None:
+    def request(self, command: int, count: int, client: tuple[str, int]) -> None:
+        """Carry out a request that a client has sent."""
         match command:
             case Command.STOP:
                 self._pacer.stop()
@@ -254,7 +255,7 @@ class NetFtBox(Device[bytes]):
                 self.status = 0 if self.status == SUMMARY else self.status
             case Command.BIAS:
                 gauges_per_SI = REFERENCE.gauges_per_SI
-                self._bias = gauges_per_SI @ self._measured(1)[0][0] + self._gauge_offset
+                self._bias = gauges_per_SI @ self.measured(1)[0][0] + self._gauge_offset
 
     def _deliver(self, frames: list[bytes]) -> None:
         for datagram in frames:
@@ -268,19 +269,19 @@ class NetFtBox(Device[bytes]):
             count = max(0, min(count, self._left - first))
             self._pacer.made = first + count
         if count:
-            measured, saturated = self._measured(count)
+            measured, saturated = self.measured(count)
             ft = self._ft_start + ((first + np.arange(count)) * (INTERNAL_HZ / self._stream_hz)).astype(np.int64)
             status = np.where(saturated, SATURATED, 0) | self.status
-            records = rdt_records(first + 1, ft, status, self._counts(measured))
+            records = rdt_records(first + 1, ft, status, self.counts(measured))
             self._send(records, last=self._left is not None and first + count >= self._left)
         if self._left is not None and first + count >= self._left:
             self._pacer.stop()
 
-    def _measured(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
+    def measured(self, count: int) -> tuple[Array, NDArray[np.bool_]]:
         """Return wrenches (count, 6) on the transducer, N and N·m, and whether each is at its rating (count,)."""
         return self._readings(count, np.asarray(self.calibration.rating))
 
-    def _counts(self, measured: Array) -> Array:
+    def counts(self, measured: Array) -> Array:
         """Return counts (n, 6) of wrenches on the transducer, after software bias and tool transformation."""
         bias = np.linalg.solve(REFERENCE.gauges_per_SI, self._bias - self._gauge_offset)
         metres, radians = DISTANCE_UNITS[self.distance_unit][1], ANGLE_UNITS[self.angle_unit][1]

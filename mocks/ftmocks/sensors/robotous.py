@@ -274,7 +274,8 @@ class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
     def _boot(self) -> None:
         self.boot()
 
-    def _answer(self, request: CanFrame) -> list[CanFrame]:
+    def answer(self, request: CanFrame) -> list[CanFrame]:
+        """Return the frames that answer a request; none if the frame is no request."""
         if request != CanFrame(self.ids[0], request.data) or len(request.data) != COMMAND_BYTES:
             return []
         return self._frames(self.execute(request.data))

@@ -138,6 +138,10 @@ class Device(ABC, Generic[Frame]):
         if self._threads:
             os.write(self._wake_write, _RESET)
 
+    def power_up(self) -> None:
+        """Supply the device with power, as `start` does, without a wire."""
+        self._power_up()
+
     @abstractmethod
     def _power_up(self) -> None:
         """Set the state after power-up."""

@@ -42,13 +42,14 @@ class ModbusSensor(SerialSensor):
         wait_s = self._last_byte_s + self.frame_gap_s - now_s
         if wait_s > 0:
             return wait_s
-        answer = self._reply(bytes(self._burst))
+        answer = self.reply(bytes(self._burst))
         self._burst.clear()
         if answer:
             self._wire.put([answer])
         return None
 
-    def _reply(self, frame: bytes) -> bytes:
+    def reply(self, frame: bytes) -> bytes:
+        """Return the reply to a frame, or nothing if the frame is damaged or for another device."""
         return modbus.reply(self.address, frame, self._execute)
 
 
@@ -76,7 +77,7 @@ class CanSensor(PtyDevice[CanFrame]):
         """Set the state the sensor has after power-up."""
 
     @abstractmethod
-    def _answer(self, request: CanFrame) -> list[CanFrame]:
+    def answer(self, request: CanFrame) -> list[CanFrame]:
         """Answer to a frame on the bus; nothing when it is no request."""
 
     @abstractmethod
@@ -98,7 +99,7 @@ class CanSensor(PtyDevice[CanFrame]):
         self._answers += answers
         for frame in frames:
             if self._adapter.bitrate == self.bitrate:
-                self._wire.put(self._answer(frame))
+                self._wire.put(self.answer(frame))
             else:
                 self._adapter.bus_error = True
 

@@ -63,14 +63,14 @@ FIRMWARE = "20F#0308 0002"
 def test_answers(options: dict[str, Any], requests: list[str], answers: list[str]) -> None:
     node = AtiCanNode(lambda n: np.tile(WRENCH, (n, 1)), boot_s=0.0, **options)
     frames = [
-        node._answer(CanFrame(int(head, 16), bytes.fromhex(tail))) for head, tail in (r.split("#") for r in requests)
+        node.answer(CanFrame(int(head, 16), bytes.fromhex(tail))) for head, tail in (r.split("#") for r in requests)
     ]
     assert [f"{one.identifier:03X}#{one.data.hex(' ', -2).upper()}" for some in frames for one in some] == answers
 
 
 def test_only_standard_data_frames_are_requests() -> None:
     node = AtiCanNode(lambda n: np.tile(WRENCH, (n, 1)), boot_s=0.0)
-    assert node._answer(CanFrame(0x200, extended=True)) == node._answer(CanFrame(0x200, remote=True)) == []
+    assert node.answer(CanFrame(0x200, extended=True)) == node.answer(CanFrame(0x200, remote=True)) == []
 
 
 def opened_adapter() -> SlcanAdapter:

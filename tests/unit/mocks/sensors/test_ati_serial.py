@@ -20,7 +20,7 @@ V2 = [221, -926, 69, -1086, 2342, 1266]
 @pytest.fixture
 def box() -> Iterator[AtiSerialBox]:
     box = AtiSerialBox(lambda n: np.zeros((n, 6)))
-    box._power_up()
+    box.power_up()
     yield box
     box.stop()
 
@@ -65,7 +65,7 @@ def test_calibration_block_fields_stand_at_their_registers() -> None:
     ],
 )
 def test_documented_requests(box: AtiSerialBox, request_hex: str, reply_hex: str) -> None:
-    assert box._reply(bytes.fromhex(request_hex)) == bytes.fromhex(reply_hex)
+    assert box.reply(bytes.fromhex(request_hex)) == bytes.fromhex(reply_hex)
 
 
 @pytest.mark.parametrize(
@@ -90,21 +90,21 @@ def test_documented_requests(box: AtiSerialBox, request_hex: str, reply_hex: str
 )
 def test_exceptions(box: AtiSerialBox, body: str, code: int) -> None:
     request = bytes.fromhex(body)
-    assert box._reply(with_crc(request)) == with_crc(bytes([0x0A, request[1] | 0x80, code]))
+    assert box.reply(with_crc(request)) == with_crc(bytes([0x0A, request[1] | 0x80, code]))
 
 
 @given(st.binary(max_size=300))
 def test_bytes_with_a_wrong_crc_are_met_with_silence(body: bytes) -> None:
     box = AtiSerialBox(lambda n: np.zeros((n, 6)))
-    box._power_up()
+    box.power_up()
     damaged = bytearray(with_crc(b"\x0a" + body))
     damaged[-1] ^= 1 + zlib.crc32(body) % 255
-    assert box._reply(bytes(damaged)) == b""
+    assert box.reply(bytes(damaged)) == b""
 
 
 def test_other_addresses_are_met_with_silence(box: AtiSerialBox) -> None:
     for address in (0x00, 0x09, 0x0B):
-        assert box._reply(with_crc(bytes([address]) + bytes.fromhex("03 00 1D 00 01"))) == b""
+        assert box.reply(with_crc(bytes([address]) + bytes.fromhex("03 00 1D 00 01"))) == b""
 
 
 V1_WRENCH = [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
@@ -114,15 +114,15 @@ WRITE_OFFSETS = "0A 10 00 06 00 06 0C 80 00 80 00 80 00 80 00 80 00 80 00 75 66"
 
 def made(*, loads_gains: bool = True) -> AtiSerialBox:
     box = AtiSerialBox(lambda n: np.tile(V1_WRENCH, (n, 1)), loads_gains=loads_gains)
-    box._power_up()
+    box.power_up()
     return box
 
 
 def test_gauges_are_right_from_power_up_on_and_after_writing_the_same_gains() -> None:
     box = made()
-    assert box._gauges(1)[0].tolist() == V1
+    assert box.gauges(1)[0].tolist() == V1
     gains = with_crc(bytes.fromhex("0A 03 0C 02 1F 02 2B 02 39 02 43 02 35 02 37"))
-    assert box._reply(with_crc(bytes.fromhex("0A 03 00 00 00 06"))) == gains
+    assert box.reply(with_crc(bytes.fromhex("0A 03 00 00 00 06"))) == gains
     for request in ("0A 6A AA FF 1D", WRITE_GAINS, WRITE_OFFSETS, "0A 6A 18 7F 68"):
-        assert not box._reply(bytes.fromhex(request))[1] & 0x80
-    assert box._gauges(1)[0].tolist() == V1
+        assert not box.reply(bytes.fromhex(request))[1] & 0x80
+    assert box.gauges(1)[0].tolist() == V1

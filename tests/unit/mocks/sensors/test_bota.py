@@ -20,7 +20,7 @@ def test_documented_frame() -> None:
 @pytest.fixture
 def box() -> BotaBox:
     box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), streaming_at_start=True)
-    box._power_up()
+    box.power_up()
     return box
 
 
@@ -32,7 +32,7 @@ def answers(box: BotaBox, written: bytes) -> bytes:
 def test_it_boots_for_three_seconds_then_says_who_it_is_and_streams() -> None:
     real = RealTime()
     box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), serial=471, clock=CellClock(real))
-    box._power_up()
+    box.power_up()
     printed = b""
     for _ in range(300):
         box._work(box.clock.now_s())

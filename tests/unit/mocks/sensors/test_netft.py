@@ -28,12 +28,12 @@ def test_sequence_numbers_wrap_and_counts_are_clipped() -> None:
 @pytest.fixture
 def box() -> NetFtBox:
     box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)))
-    box._power_up()
+    box.power_up()
     return box
 
 
 def sent(box: NetFtBox) -> list[float]:
-    return [float(value) for value in (box._counts(box._measured(1)[0])[0] / 1e6).round(9)]
+    return [float(value) for value in (box.counts(box.measured(1)[0])[0] / 1e6).round(9)]
 
 
 def page(box: NetFtBox, path: str) -> dict[str, str]:
@@ -78,14 +78,14 @@ def test_configuration_page(box: NetFtBox) -> None:
 )
 def test_tool_transformation_as_in_the_library_of_ati(transform: tuple[float, ...], wrench: list[float]) -> None:
     box = NetFtBox(lambda n: np.tile([1, 2, 3, 0.1, 0.2, 0.3], (n, 1)), tool_transform=transform)
-    box._power_up()
+    box.power_up()
     assert sent(box) == pytest.approx(wrench)
 
 
 def test_tool_transformation_in_inches_and_radians() -> None:
     box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)), distance_unit=1, angle_unit=2)
     box.tool_transform = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
-    box._power_up()
+    box.power_up()
     expected = transform_matrix(np.array([0.0254, 0.0508, 0.0762]), np.array([0.1, 0.2, 0.3])) @ WRENCH
     assert sent(box) == pytest.approx(expected.tolist())
     assert page(box, "/netftapi2.xml")["cfgtfx"] == "1.000;2.000;3.000;0.100;0.200;0.300"
@@ -96,7 +96,7 @@ def test_tool_transformation_in_inches_and_radians() -> None:
 def test_the_bias_is_in_gauge_counts_before_the_transformation() -> None:
     bias = [100, -200, 300, -400, 500, -600]
     box = NetFtBox(lambda n: np.tile(WRENCH, (n, 1)), bias=bias, gauge_offset=0, tool_transform=(0, 0, 100, 0, 0, 0))
-    box._power_up()
+    box.power_up()
     fx, fy, fz, tx, ty, tz = np.array(WRENCH) - [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608]
     assert sent(box) == pytest.approx([fx, fy, fz, tx + 0.1 * fy, ty - 0.1 * fx, tz])
     np.testing.assert_allclose(REFERENCE.matrix @ bias / 1e6, [-0.85, 1.476, 6.84, 0.044, -0.0762, 0.1608])
@@ -104,16 +104,16 @@ def test_the_bias_is_in_gauge_counts_before_the_transformation() -> None:
 
 def test_bias_command_and_settings_page(box: NetFtBox) -> None:
     before = sent(box)
-    box._request(Command.BIAS, 0, ("127.0.0.1", 9))
+    box.request(Command.BIAS, 0, ("127.0.0.1", 9))
     assert sent(box) == [0.0] * 6
     assert page(box, "/netftapi2.xml")["setbias"] != "745;17;447;184;-596;-253"
-    box._power_up()
+    box.power_up()
     assert sent(box) == before
     assert box.page("/setting.cgi?" + "&".join(f"setbias{i}=0" for i in range(6))) is not None
     assert page(box, "/netftapi2.xml")["setbias"] == "0;0;0;0;0;0"
     cleared = sent(box)
     assert cleared != before, "the gauges have an offset of their own"
-    box._power_up()
+    box.power_up()
     assert sent(box) == cleared
 
 
@@ -137,11 +137,11 @@ def test_pages_that_are_not_there(box: NetFtBox, path: str) -> None:
 
 def test_saturation_clips_at_the_rating_of_the_transducer(box: NetFtBox) -> None:
     box.measure = lambda n: np.tile([0, 0, -500.0, 0, 0, 0], (n, 1))
-    measured, saturated = box._measured(1)
+    measured, saturated = box.measured(1)
     assert measured[0, 2] == -400
     assert saturated.all()
     box.measure = lambda n: np.tile(WRENCH, (n, 1))
     box.saturated_axis = 3
-    measured, saturated = box._measured(1)
+    measured, saturated = box.measured(1)
     assert measured[0, 3] == 10
     assert saturated.all()

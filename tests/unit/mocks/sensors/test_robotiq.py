@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ftmocks.sensors.robotiq import RobotiqBox, raw_values, stream_frame
-from ftmocks.wires.modbus import reply, with_crc
+from ftmocks.wires.modbus import with_crc
 
 WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
 
@@ -17,11 +17,11 @@ def box() -> RobotiqBox:
 
 
 def ask(box: RobotiqBox, request: str) -> str:
-    return reply(9, bytes.fromhex(request), box._execute).hex(" ").upper()
+    return box.reply(bytes.fromhex(request)).hex(" ").upper()
 
 
 def read(box: RobotiqBox, first: int, count: int) -> tuple[int, ...]:
-    answer = reply(9, with_crc(struct.pack(">BBHH", 9, 3, first, count)), box._execute)
+    answer = box.reply(with_crc(struct.pack(">BBHH", 9, 3, first, count)))
     assert with_crc(answer[:-2]) == answer
     return struct.unpack(f">{count}H", answer[3:-2])
 
@@ -64,13 +64,13 @@ def test_registers(box: RobotiqBox) -> None:
 )
 def test_exceptions(box: RobotiqBox, body: str, code: int) -> None:
     request = bytes.fromhex(body)
-    assert reply(9, with_crc(request), box._execute) == with_crc(bytes([9, request[1] | 0x80, code]))
+    assert box.reply(with_crc(request)) == with_crc(bytes([9, request[1] | 0x80, code]))
 
 
 def test_others_and_damaged_requests_are_met_with_silence(box: RobotiqBox) -> None:
     assert ask(box, "09 03 00 B4 00 06 84 A7") == ""
-    assert reply(9, with_crc(bytes.fromhex("0A 03 00 B4 00 06")), box._execute) == b""
-    assert reply(9, b"\xff" * 50, box._execute) == b""
+    assert box.reply(with_crc(bytes.fromhex("0A 03 00 B4 00 06"))) == b""
+    assert box.reply(b"\xff" * 50) == b""
 
 
 def test_saturation(box: RobotiqBox) -> None:

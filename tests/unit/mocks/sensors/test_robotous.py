@@ -140,13 +140,13 @@ def test_can_node_answers_at_its_identifiers(readings: Readings) -> None:
         CanFrame(0x64, command("0A"), extended=True),
         CanFrame(0x64, command("0A"), remote=True),
     ]
-    assert [node._answer(frame) for frame in strange] == [[]] * 4
+    assert [node.answer(frame) for frame in strange] == [[]] * 4
     sample = b"\x0a" + bytes.fromhex(SAMPLE)[1:]
-    assert node._answer(CanFrame(0x64, command("0A"))) == [CanFrame(1, sample[:8]), CanFrame(2, sample[8:])]
+    assert node.answer(CanFrame(0x64, command("0A"))) == [CanFrame(1, sample[:8]), CanFrame(2, sample[8:])]
     node.execute(command("04 70 71 72"))
     node.boot()
-    assert node._answer(CanFrame(0x64, command("0A"))) == []
-    assert node._answer(CanFrame(0x70, command("0A"))) == [CanFrame(0x71, sample[:8]), CanFrame(0x72, sample[8:])]
+    assert node.answer(CanFrame(0x64, command("0A"))) == []
+    assert node.answer(CanFrame(0x70, command("0A"))) == [CanFrame(0x71, sample[:8]), CanFrame(0x72, sample[8:])]
 
 
 def test_while_streaming_only_stop_and_bias_are_taken(sensor: RobotousSerialBox) -> None:
