@@ -3,7 +3,11 @@
 import contextlib
 import json
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
+from inspect import signature
 from pathlib import Path
+from typing import Any
+from unittest.mock import Mock
 
 import pytest
 from click.testing import CliRunner
@@ -14,19 +18,14 @@ from ftdrive.cell.config import FORMAT, CellConfig, RobotConfig, SensorConfig
 from ftdrive.cell.devices import build_arm
 from ftdrive.commands import doctor
 from ftdrive.errors import ConfigError
-from ftdrivers.ati.can import AtiCanSensor
-from ftdrivers.ati.netft import NetFtSensor
-from ftdrivers.ati.serial import AtiSerialSensor
 from ftdrivers.bota.sensor import BotaSensor
 from ftdrivers.errors import BadUrl
 from ftdrivers.interfaces import Fact
-from ftdrivers.registry import arm_class, in_url, sensor_from_url, split_url
-from ftdrivers.robotiq.sensor import RobotiqFt300
-from ftdrivers.robotous.can import RobotousCan
-from ftdrivers.robotous.sensor import RobotousSerial
+from ftdrivers.registry import Options, arm_class, in_url, sensor_from_url, split_url
+from ftdrivers.sensors import SENSORS
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.sensor import UrWristSensor
+from ftdrivers.wires.serial_port import SerialPort
 
 
 @given(st.text(min_size=1))
@@ -41,72 +40,88 @@ def test_usual_names_stand_in_an_address_as_they_are() -> None:
         assert in_url(path) == path
 
 
-def test_can_addresses() -> None:
-    sensor = sensor_from_url("ati-can://can0?bitrate=500000&base=0x7F&slot=3", sign=-1)
-    assert isinstance(sensor, AtiCanSensor)
-    assert sensor.name == "ATI CAN sensor 0x7F on socketcan can0"
-    assert (sensor._bus._bitrate, sensor._slot, sensor._sign) == (500_000, 3, -1)
-    assert (sensor._unit_codes, sensor._counts_per_unit) == (None, None)
-    sensor = sensor_from_url("ati-can://can0")
-    assert isinstance(sensor, AtiCanSensor)
-    assert (sensor._bus._bitrate, sensor._base, sensor._slot) == (250_000, 0x20, 0)
-    sensor = sensor_from_url("ati-can://can0?units=lbf,N-mm&counts=1000000,2000000")
-    assert isinstance(sensor, AtiCanSensor)
-    assert (sensor._unit_codes, sensor._counts_per_unit) == ((1, 4), (1_000_000, 2_000_000))
-    sensor = sensor_from_url("ati-can:///dev/ttyACM0?interface=slcan")
-    assert isinstance(sensor, AtiCanSensor)
-    assert sensor.name == "ATI CAN sensor 0x20 on slcan /dev/ttyACM0"
+def arguments(url: str) -> dict[str, Any]:
+    """Return the arguments with which the driver is built from an address."""
+    parts = split_url(url)
+    driver = EntryPoint("", SENSORS[parts.scheme].driver, "").load()
+    options = Options(url, parts.query)
+    return dict(driver.from_url.__func__(lambda _, **arguments: arguments, parts.address, options, sign=-1))
 
 
 @pytest.mark.parametrize(
-    ("scheme", "setting"),
+    ("url", "name", "given"),
     [
-        ("ati-serial", (1_250_000, True)),
-        ("robotous-serial", (115_200, False)),
-        ("robotiq-ft300", (19_200, False)),
-        ("bota", (460_800, False)),
+        (
+            "ati-can://can0",
+            "ATI CAN sensor 0x20 on socketcan can0",
+            {"bitrate": 250_000, "base": 0x20, "slot": 0, "unit_codes": None, "counts_per_unit": None},
+        ),
+        (
+            "ati-can://can0?bitrate=500000&base=0x7F&slot=3",
+            "ATI CAN sensor 0x7F on socketcan can0",
+            {"bitrate": 500_000, "base": 0x7F, "slot": 3},
+        ),
+        (
+            "ati-can:///dev/ttyACM0?interface=slcan&units=lbf,N-mm&counts=1000000,2000000",
+            "ATI CAN sensor 0x20 on slcan /dev/ttyACM0",
+            {"interface": "slcan", "unit_codes": (1, 4), "counts_per_unit": (1_000_000, 2_000_000)},
+        ),
+        (
+            "ati-serial:///dev/serial/by-id/usb-FTDI_My%20Box-if00?calibration=2",
+            "ATI serial sensor on /dev/serial/by-id/usb-FTDI_My Box-if00",
+            {"calibration": 2},
+        ),
+        ("robotous-can://can0?rate=500", "Robotous sensor on socketcan can0", {"rate_Hz": 500}),
+        (
+            "robotous-serial:///dev/ttyUSB0?baud=921600&rate=1000",
+            "Robotous sensor on /dev/ttyUSB0",
+            {"baud": 921_600, "rate_Hz": 1000},
+        ),
+        ("robotiq-ft300:///dev/ttyUSB0", "Robotiq FT 300 on /dev/ttyUSB0", {}),
+        ("bota:///dev/ttyUSB0?sinc=512", "Bota sensor on /dev/ttyUSB0", {"baud": None, "sinc": 512}),
+        (
+            "ati-netft://192.168.1.1",
+            "ATI Ethernet sensor at 192.168.1.1",
+            {"onrobot": False, "rdt_port": 49152, "http_port": 80},
+        ),
+        (
+            "ati-netft://192.168.1.1?onrobot=1&rdt_port=65535&http_port=1",
+            "OnRobot Ethernet sensor at 192.168.1.1",
+            {"onrobot": True, "rdt_port": 65535, "http_port": 1},
+        ),
+        (
+            "ur-ft://10.0.0.2?counts_per_N=1&counts_per_Nm=2",
+            "wrist sensor of the arm at 10.0.0.2",
+            {"counts_per_N": 1, "counts_per_Nm": 2},
+        ),
     ],
 )
-def test_a_serial_sensor_has_the_bit_rate_and_parity_of_its_manual(scheme: str, setting: tuple[int, bool]) -> None:
-    port = vars(sensor_from_url(f"{scheme}:///dev/ttyUSB0"))["_port"]
-    assert (port._baud, port._even_parity) == setting
-
-
-def test_ethernet_addresses() -> None:
-    sensor = sensor_from_url("ati-netft://192.168.1.1")
-    assert isinstance(sensor, NetFtSensor)
-    assert (sensor._rdt_port, sensor._http_port) == (49152, 80)
-    sensor = sensor_from_url("ati-netft://192.168.1.1?rdt_port=65535&http_port=1")
-    assert isinstance(sensor, NetFtSensor)
-    assert (sensor._rdt_port, sensor._http_port) == (65535, 1)
-    for query in ("rdt_port=65536", "http_port=65536", "rdt_port=0", "http_port=0"):
-        with pytest.raises(BadUrl, match="allowed are 1 to 65535"):
-            sensor_from_url(f"ati-netft://192.168.1.1?{query}")
-
-
-def test_serial_addresses() -> None:
-    sensor = sensor_from_url("ati-serial:///dev/serial/by-id/usb-FTDI_My%20Box-if00?calibration=2")
-    assert isinstance(sensor, AtiSerialSensor)
-    assert sensor.name == "ATI serial sensor on /dev/serial/by-id/usb-FTDI_My Box-if00"
-    assert sensor._calibration_index == 2
-
-
-@pytest.mark.parametrize(
-    ("url", "kind", "name"),
-    [
-        ("robotous-can://can0?rate=500", RobotousCan, "Robotous sensor on socketcan can0"),
-        ("robotous-serial:///dev/ttyUSB0?baud=921600&rate=1000", RobotousSerial, "Robotous sensor on /dev/ttyUSB0"),
-        ("robotiq-ft300:///dev/ttyUSB0", RobotiqFt300, "Robotiq FT 300 on /dev/ttyUSB0"),
-        ("bota:///dev/ttyUSB0?sinc=512", BotaSensor, "Bota sensor on /dev/ttyUSB0"),
-        ("ati-netft://192.168.1.1", NetFtSensor, "ATI Ethernet sensor at 192.168.1.1"),
-        ("ati-netft://192.168.1.1?onrobot=1", NetFtSensor, "OnRobot Ethernet sensor at 192.168.1.1"),
-        ("ur-ft://10.0.0.2?counts_per_N=1&counts_per_Nm=1", UrWristSensor, "wrist sensor of the arm at 10.0.0.2"),
-    ],
-)
-def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: str) -> None:
+def test_a_driver_gets_the_options_of_its_address(url: str, name: str, given: dict[str, Any]) -> None:
     sensor = sensor_from_url(url, sign=-1)
-    assert isinstance(sensor, kind)
-    assert (sensor.name, sensor._sign) == (name, -1)
+    assert isinstance(sensor, StreamingSensor)
+    assert sensor.name == name
+    assert given.items() | {("sign", -1)} <= arguments(url).items()
+
+
+@pytest.mark.parametrize(
+    ("scheme", "module", "setting"),
+    [
+        ("ati-serial", "ati.serial", (1_250_000, True)),
+        ("robotous-serial", "robotous.sensor", (115_200, False)),
+        ("robotiq-ft300", "robotiq.sensor", (19_200, False)),
+        ("bota", "bota.sensor", (460_800, False)),
+    ],
+)
+def test_a_serial_sensor_has_the_bit_rate_and_parity_of_its_manual(
+    scheme: str, module: str, setting: tuple[int, bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = Mock()
+    monkeypatch.setattr(f"ftdrivers.{module}.SerialPort", port)
+    sensor_from_url(f"{scheme}:///dev/ttyUSB0")
+    first = port.call_args_list[0]
+    call = signature(SerialPort).bind(*first.args, **first.kwargs)
+    call.apply_defaults()
+    assert (call.arguments["baud"], call.arguments["even_parity"]) == setting
 
 
 @pytest.mark.parametrize(
@@ -141,6 +156,10 @@ def test_addresses_of_the_others(url: str, kind: type[StreamingSensor], name: st
         ("ati-can://can0?base", "key=value"),
         ("ati-can://can0?base=1&base=2", "twice"),
         ("ati-serial:///dev/x?calibration=0", "allowed are 1 to 16"),
+        ("ati-netft://x?rdt_port=65536", "allowed are 1 to 65535"),
+        ("ati-netft://x?http_port=65536", "allowed are 1 to 65535"),
+        ("ati-netft://x?rdt_port=0", "allowed are 1 to 65535"),
+        ("ati-netft://x?http_port=0", "allowed are 1 to 65535"),
         ("robotous-can://can0?rate=123", "rate is 123 Hz; choose one of 10, 20"),
         ("robotous-serial:///dev/x?rate=1000", "choose at most 333 Hz"),
         ("robotous-serial:///dev/x?baud=60000", "baud is 60000; choose"),
@@ -254,12 +273,9 @@ def test_another_package_brings_a_sensor_and_an_arm(install: Install) -> None:
         build_arm(CellConfig(RobotConfig("127.0.0.1", driver="acmee"), anything))
 
 
-def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(
-    install: Install, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_doctor_asks_the_arm_of_another_package_only_what_any_arm_knows(install: Install, tmp_path: Path) -> None:
     points = "[ftdrive.sensors]\nacme-usb = acme_arm:Sensor\n[ftdrive.arms]\nacme = acme_arm:Arm\n"
     install("acme_arm", points, ACME)
-    monkeypatch.setattr("ftdrive.checks.arm._CLOCK_S", 0.1)
     path = tmp_path / "ftdrive.toml"
     path.write_text(
         f'format = "{FORMAT}"\n[robot]\nhost = "127.0.0.1"\ndriver = "acme"\n[sensor]\nurl = "acme-usb:///dev/acme0"\n',
