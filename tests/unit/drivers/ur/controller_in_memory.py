@@ -47,9 +47,13 @@ def pose_from_ur(pose: Sequence[float]) -> Pose:
     return Pose(Rotation.from_rotvec(pose[3:]).as_matrix(), np.array(pose[:3]))
 
 
+def nominal_flange(q_rad: Sequence[float]) -> Pose:
+    return forward(MODELS["UR5e"], q_rad)
+
+
 @cache  # most tests move on the same path
-def tcp_pose(*q_and_tcp: float) -> tuple[float, ...]:
-    pose = forward(MODELS["UR5e"], q_and_tcp[:6]) @ pose_from_ur(q_and_tcp[6:])
+def tcp_pose(flange: Callable[[Sequence[float]], Pose], *q_and_tcp: float) -> tuple[float, ...]:
+    pose = flange(q_and_tcp[:6]) @ pose_from_ur(q_and_tcp[6:])
     return (*pose.p_m, *Rotation.from_matrix(pose.R).as_rotvec())
 
 
@@ -67,6 +71,8 @@ class Controller:
         self._began_s: float | None = None
         self.q_rad = [0.1, -1.2, 1.5, -0.7, -1.4, 0.3]
         self.qd_rad_s = [0.0] * 6
+        self.flange: Callable[[Sequence[float]], Pose] = nominal_flange
+        """Its forward kinematics."""
         self.goal_rad: list[float] | None = None
         self.sweeps_until_s = 0.0
         self.swept: tuple[float, ...] = ()
@@ -102,6 +108,8 @@ class Controller:
         self.stood_still_s = 0.0
         """For how long its clock has not run."""
         self.stalled_until_s = self._arrives_s = 0.0
+        self.control: Any = None
+        """The newest control path of an arm."""
         self._sent: deque[bytes] = deque()
         self._operation = 0
         self._services = ServicesInMemory(self)
@@ -144,7 +152,7 @@ class Controller:
             "actual_qd": tuple(self.qd_rad_s),
             "target_q": tuple(self.q_rad),
             "target_qd": (0.0,) * 5 + (moving,),
-            "actual_TCP_pose": tcp_pose(*self.q_rad, *self.tcp_offset),
+            "actual_TCP_pose": tcp_pose(self.flange, *self.q_rad, *self.tcp_offset),
             "robot_mode": (self.robot_mode,),
             "safety_mode": (self.safety_mode,),
             "safety_status_bits": (self.safety_bits,),
@@ -162,7 +170,7 @@ class Controller:
         layout = ">B" + "".join(map(LETTERS.__getitem__, known.values()))
         return struct.pack(layout, 1, *chain.from_iterable(map(sample.__getitem__, known)))
 
-    def run(self, reader: Reader) -> None:
+    def run(self, reader: "ReaderInMemory") -> None:
         """Send a sample every `period_s` to a reader that has nothing else to do."""
 
         def cycle() -> None:
@@ -177,7 +185,7 @@ class Controller:
 
         def receive() -> None:
             if not self.held_back:
-                reader._follow()
+                reader.receive()
                 if self._sent:  # and a caller may look meanwhile
                     self.clock.at(1e-4, receive)
 
@@ -320,6 +328,7 @@ class ControlInMemory(ControlProcess):
         self._asked = 0
         self._hangs = False
         super().__init__(HOST, STOP_RAD_S2, clock=controller.clock, timing=timing)
+        controller.control = self
         assert isinstance(self._process, ProcessInMemory)
         self._process.take = self._take
         controller.clock.at(controller.starts_in_s, self._start)
@@ -401,6 +410,9 @@ class ReaderInMemory(Reader):
     def __init__(self, controller: Controller, model: str | None, timing: UrTiming = STRICT) -> None:
         super().__init__(HOST, model, clock=controller.clock, timing=timing)
         controller.run(self)
+
+    def receive(self) -> None:
+        self._follow()
 
     def _run(self) -> None:
         pass  # a fake clock is for one thread

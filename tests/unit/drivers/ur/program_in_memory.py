@@ -123,12 +123,12 @@ class Link:
         self.cut = False
         """What is sent in either direction is lost."""
         self.failure: Exception | None = None
-        self._sent: deque[tuple[float, ...]] = deque()
+        self.sent: deque[tuple[float, ...]] = deque()
 
     def sample(self) -> None:
         far = self.registers.far
         if not (self.cut or far.silent):
-            self._sent.append((far.t_s, *self.registers.outputs))
+            self.sent.append((far.t_s, *self.registers.outputs))
 
     def read(self, timeout_s: float) -> list[tuple[float, ...]]:
         assert timeout_s <= 0.05
@@ -136,10 +136,10 @@ class Link:
             raise OSError("closed")
         if self.failure or self.registers.far.failure:
             raise self.failure or StreamBroken("closed")
-        if not self._sent:
+        if not self.sent:
             raise TimeoutError
-        samples = [*self._sent]
-        self._sent.clear()
+        samples = [*self.sent]
+        self.sent.clear()
         return samples
 
     def decode(self, samples: Sequence[tuple[float, ...]]) -> Mapping[str, NDArray[Any]]:
@@ -164,6 +164,7 @@ class ScriptInMemory(ScriptControl):
     def __init__(self, link: Link, timing: UrTiming) -> None:
         self.link = link
         super().__init__(HOST, link.registers.far.version, STOP_RAD_S2, clock=link.registers.far.clock, timing=timing)
+        link.registers.far.control = self
         self._stream = stream = self._connect()
 
         def cycle() -> None:
@@ -175,6 +176,9 @@ class ScriptInMemory(ScriptControl):
 
     def _clock_at(self, delay_s: float, action: Callable[[], None]) -> None:
         self.link.registers.far.clock.at(delay_s, action)
+
+    def send_again(self, command: tuple[int, int, tuple[float, ...]]) -> None:
+        self._command = command
 
     @property
     def token(self) -> int:

@@ -16,7 +16,7 @@ from ftdrivers.interfaces import Guard
 from ftdrivers.ur import arm as arm_module
 from ftdrivers.ur import opening
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control import Control, ControlSetting
+from ftdrivers.ur.control import ControlSetting
 from ftdrivers.ur.timing import STRICT, UrTiming
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import (
@@ -37,11 +37,6 @@ def path(request: pytest.FixtureRequest) -> ControlSetting:
     """The control path; both find the controller in memory."""
     setting: ControlSetting = request.param
     return setting
-
-
-def control_of(arm: UrArm) -> Control:
-    assert arm._control is not None
-    return arm._control
 
 
 def move(arm: UrArm, controller: Controller, guard: Guard = no_guard) -> None:
@@ -117,9 +112,8 @@ def test_bad_targets_never_leave_the_house(arm: UrArm, controller: Controller, q
     assert "move" not in controller.did
 
 
-@pytest.mark.parametrize(("setting", "source"), [("auto", "assumed"), ("script", "configured")])
-def test_the_control_path_is_a_fact(arm: UrArm, setting: ControlSetting, source: str) -> None:
-    arm._setting = setting
+@pytest.mark.parametrize(("path", "source"), [("auto", "assumed"), ("script", "configured")], indirect=["path"])
+def test_the_control_path_is_a_fact(arm: UrArm, source: str) -> None:
     assert arm.identify().facts["control"].source == source
 
 
@@ -396,9 +390,10 @@ def test_a_question_to_our_program_has_four_tenths_of_a_second(
 ) -> None:
     controller.control_delay_s = answers_in_s
     begin_s = clock.now_s()
-    assert arm._is_ours(control_of(arm), timeout_s=STRICT.ours_s) == ours
-    assert clock.now_s() - begin_s == pytest.approx(min(answers_in_s, 0.4), abs=1e-6)
-    assert control_of(arm).alive == ours
+    with nullcontext() if ours else pytest.raises(DeviceFault, match="another program"):
+        move(arm, controller)
+    assert ours or 0.4 <= clock.now_s() - begin_s < 0.43
+    assert controller.control.alive == ours
 
 
 def test_another_program_is_found_in_a_move(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
@@ -428,13 +423,13 @@ def test_a_control_path_that_hangs_is_killed(
     with pytest.raises(DeviceTimeout, match=f"within {limit_s} s"):
         move(arm, controller)
     assert limit_s < clock.now_s() - begin_s < limit_s + 0.1
-    assert not control_of(arm).alive
+    assert not controller.control.alive
     assert controller.did[-1] == "dashboard stop"
 
 
 @on_ur_rtde
 def test_a_control_process_that_ends_is_reported_at_once(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    control = control_of(arm)
+    control = controller.control
     assert isinstance(control, ControlInMemory)
     provoke = After(clock, 0.3, control.die)
     with pytest.raises(StreamBroken, match=r"control.* ended \(exit code -11\)"):
@@ -490,14 +485,14 @@ def test_a_safety_stop_is_the_reason_of_an_ended_program(arm: UrArm, controller:
 def test_the_ways_to_stop(
     arm: UrArm, controller: Controller, clock: FakeClock, path: ControlSetting, trouble: dict[str, Any], ways: list[str]
 ) -> None:
-    control_of(arm).call("move", away(controller), 1.0, 3.0)
+    controller.control.call("move", away(controller), 1.0, 3.0)
     setting(controller, **trouble)()
     before, begin_s = len(controller.did), clock.now_s()
     arm.stop()
     if path == "script" and "stopping_works" in trouble:
         ways = ["stop softly", "stop softly", "end our program", "dashboard stop"]  # it is asked to end, too
     assert controller.did[before:] == ways
-    assert control_of(arm).alive == (ways == ["stop softly"])
+    assert controller.control.alive == (ways == ["stop softly"])
     assert clock.now_s() - begin_s < (0.85 if "hanging" in trouble else 0.25)  # 0.5 s, and the braking
 
 
@@ -561,7 +556,7 @@ def test_a_stop_of_old_is_not_the_reason_of_a_fault(arm: UrArm, controller: Cont
 def test_closing_takes_a_second_and_a_half_at_most(
     arm: UrArm, controller: Controller, clock: FakeClock, trouble: dict[str, Any], longest_s: float
 ) -> None:
-    control = control_of(arm)
+    control = controller.control
     setting(controller, **trouble)()
     begin_s = clock.now_s()
     arm.close()

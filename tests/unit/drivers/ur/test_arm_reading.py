@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -97,14 +98,14 @@ def test_a_status_is_at_most_fifty_milliseconds_old(controller: Controller, read
 
 
 @pytest.fixture
-def full_rate(controller: Controller) -> Reader:
+def full_rate(controller: Controller) -> ReaderInMemory:
     """A reader of an e-Series arm."""
     controller.period_s = 0.002
     return ReaderInMemory(controller, "UR5e")
 
 
 def test_a_busy_computer_at_the_full_rate_finds_new_samples(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     """The reader gets a turn now and then, and finds samples without waiting for them."""
     full_rate.look()
@@ -119,7 +120,7 @@ def test_a_busy_computer_at_the_full_rate_finds_new_samples(
 
 @pytest.mark.parametrize("stalled_s", [0.06, 0.19, 5.0])
 def test_what_the_network_has_delayed_is_not_now(
-    controller: Controller, full_rate: Reader, clock: FakeClock, stalled_s: float
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock, stalled_s: float
 ) -> None:
     """The reader waits for each sample, so only the controller's clock shows that it is old."""
     clock.advance(0.7)
@@ -138,7 +139,7 @@ def test_what_the_network_has_delayed_is_not_now(
 
 
 def test_a_clock_that_stood_still_is_trusted_again_after_a_second(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     clock.advance(2.0)
     controller.stood_still_s = 0.4
@@ -150,7 +151,7 @@ def test_a_clock_that_stood_still_is_trusted_again_after_a_second(
 
 @pytest.mark.parametrize("slower", [0.04, -0.05, -9.0])  # simulators; the emulated arm lives ten times faster
 def test_a_clock_of_another_speed_is_not_late(
-    controller: Controller, full_rate: Reader, clock: FakeClock, slower: float
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock, slower: float
 ) -> None:
     begin_s = clock.now_s()
     for _ in range(250):
@@ -321,45 +322,42 @@ def test_a_real_arm_is_read_and_what_contradicts_its_kinematics_is_refused(
     controller: Controller, moved_mm: float, turned_deg: float, sends: Kinematics | None, refused: str | None
 ) -> None:
     controller.kinematics = sends
-    reader = ReaderInMemory(controller, "UR5e")
-    sample = reader.look()
     nudge = pose_from_ur([1e-3 * moved_mm, 0.0, 0.0, 0.0, math.radians(turned_deg), 0.0])
-    flange = forward(MODELS["UR5e"], sample.q_rad) @ nudge
-    if refused is None:
-        reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
-        return
-    with pytest.raises(DeviceFault, match=refused):
-        reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
+    controller.flange = lambda q: forward(MODELS["UR5e"], q) @ nudge
+    reader = ReaderInMemory(controller, "UR5e")
+    with nullcontext() if refused is None else pytest.raises(DeviceFault, match=refused):
+        reader.state(never)
 
 
 @pytest.mark.parametrize("is_a", ["UR3e", "UR5", "UR10e", "UR16e", "UR30"])
 @pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
 def test_an_arm_of_another_model_is_refused(controller: Controller, is_a: str, sends: Kinematics | None) -> None:
     controller.kinematics = sends
+    controller.flange = lambda q: forward(MODELS[is_a], q)
     reader = ReaderInMemory(controller, "UR5e")
-    rng = np.random.default_rng(1)
-    for q in rng.uniform(-3, 3, (5, 6)):
+    for controller.q_rad in np.random.default_rng(1).uniform(-3, 3, (5, 6)).tolist():
         with pytest.raises(DeviceFault, match=f"UR5e: the arm is another model, probably a {is_a}"):
-            reader._check_pose(q, forward(MODELS[is_a], q), np.zeros(6))
+            reader.state(never)
 
 
 @pytest.mark.parametrize("sends", [None, MODELS["UR5e"]])
 def test_a_tcp_that_changes_is_named_after_the_arm_has_fitted(controller: Controller, sends: Kinematics | None) -> None:
     controller.kinematics = sends
     reader = ReaderInMemory(controller, "UR5e")
-    sample = reader.look()
-    flange = forward(MODELS["UR5e"], sample.q_rad)
-    reader._check_pose(sample.q_rad, flange, sample.qd_rad_s)
+    reader.state(never)
+    controller.flange = lambda q: forward(MODELS["UR5e"], q) @ pose_from_ur([0, 0, 0.03, 0, 0, 0])
     with pytest.raises(DeviceFault, match="active TCP changes"):
-        reader._check_pose(sample.q_rad, flange @ pose_from_ur([0, 0, 0.03, 0, 0, 0]), sample.qd_rad_s)
+        reader.state(never)
 
 
 def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> None:
     reader = ReaderInMemory(controller, "UR5e")
-    q, qd = np.array(controller.q_rad), np.full(6, math.radians(20))
-    reader._check_pose(q, forward(MODELS["UR5e"], q + 0.008 * qd), qd)
+    controller.qd_rad_s = [math.radians(20)] * 6
+    controller.flange = lambda q: forward(MODELS["UR5e"], np.array(q) + 0.008 * math.radians(20))
+    reader.state(never)
+    controller.qd_rad_s = [0.0] * 6
     with pytest.raises(DeviceFault, match="TCP"):
-        reader._check_pose(q, forward(MODELS["UR5e"], q + 0.008 * qd), np.zeros(6))
+        reader.state(never)
 
 
 @pytest.mark.parametrize(
@@ -367,19 +365,20 @@ def test_a_moving_arm_may_be_a_control_cycle_behind(controller: Controller) -> N
 )
 def test_every_real_arm_is_nearest_to_its_own_model(controller: Controller, number: str) -> None:
     model, own = real()[number]
+    controller.flange = lambda q: forward(own, q)
     for controller.kinematics in (own, None):
-        reader = ReaderInMemory(controller, None)
-        reader.info = replace(reader.info, model=model)
-        for q in np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 6)):
-            reader._fits = False
-            reader._check_pose(q, forward(own, q), np.zeros(6))
+        for controller.q_rad in np.random.default_rng(2).uniform(-np.pi, np.pi, (20, 6)).tolist():
+            reader = ReaderInMemory(controller, None)
+            reader.info = replace(reader.info, model=model)
+            reader.state(never)
+            reader.close()
 
 
 # ---------------------------------------------------------------------- following
 
 
 def test_a_follower_reads_every_sample_as_flange_poses(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     tcps, joints, pieces = [], [], []
     with full_rate.follow() as follow:
@@ -406,7 +405,7 @@ def test_a_follower_reads_every_sample_as_flange_poses(
 
 
 def test_a_follower_loses_nothing_while_it_is_not_read(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
         controller.held_back = True
@@ -419,7 +418,7 @@ def test_a_follower_loses_nothing_while_it_is_not_read(
 
 
 def test_a_follower_finds_silence_as_quickly_as_a_look(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
         clock.advance(0.01)
@@ -440,7 +439,7 @@ def test_a_follower_finds_silence_as_quickly_as_a_look(
 
 
 def test_the_end_of_the_stream_is_raised_at_a_follower(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
         clock.advance(0.004)
@@ -455,20 +454,20 @@ def test_the_end_of_the_stream_is_raised_at_a_follower(
 
 
 def test_a_follower_of_an_arm_that_was_closed_is_not_left_waiting(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
         clock.advance(0.004)
         full_rate.close()
         controller.failure = OSError("Bad file descriptor")
-        full_rate._follow()
+        full_rate.receive()
         assert len(follow.read(1.0)) == 2
         with pytest.raises(StreamBroken, match="was closed; open it again"):
             follow.read(1.0)
 
 
 def test_poses_without_power_over_the_joints_are_not_read(
-    controller: Controller, full_rate: Reader, clock: FakeClock
+    controller: Controller, full_rate: ReaderInMemory, clock: FakeClock
 ) -> None:
     with full_rate.follow() as follow:
         clock.advance(0.004)

@@ -83,15 +83,16 @@ def test_what_the_library_says_comes_with_a_cure(tmp_path: Path, monkeypatch: py
     child = tmp_path / "child.py"
     child.write_text(
         "import json, sys\n"
-        'print(json.dumps({"id": 0, "value": sys.argv[1:]}), flush=True)\n'
+        'print(json.dumps({"id": 0, "value": None}), flush=True)\n'
         "for line in sys.stdin:\n"
-        '    print(json.dumps({"id": json.loads(line)["id"], "error": "the connection was lost"}), flush=True)\n'
+        '    said = f"the connection was lost after {sys.argv[3]}"\n'
+        '    print(json.dumps({"id": json.loads(line)["id"], "error": said}), flush=True)\n'
     )
     monkeypatch.setattr(control_child, "__file__", str(child))
     control = ControlProcess("10.0.0.1", 2.5, clock=REAL, timing=UrTiming.emulated())
     try:
-        assert control._answer(0, 30.0, lambda: None)[2] == "2.5"  # host, rate, deceleration, limits
-        with pytest.raises(StreamBroken, match="was lost") as error:
+        control.wait_until_ready(lambda: None)
+        with pytest.raises(StreamBroken, match=r"was lost after 2\.5") as error:  # host, rate, deceleration, limits
             control.call("progress")
         assert error.value.fix
     finally:

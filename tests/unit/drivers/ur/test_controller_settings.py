@@ -1,6 +1,7 @@
 """Payload and gravity of the controller: what is sent, what is refused before it is sent, and what is read."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ftdrivers.interfaces import ControllerSettings
 from ftdrivers.ur import controller_settings
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.controller_settings import read_controller_settings
+from ftdrivers.ur.kinematics import MODELS, forward
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import HOST, Controller
 
@@ -43,7 +45,12 @@ def test_a_centre_in_the_flange_is_sent_so_that_it_counts(arm: UrArm, controller
 def test_before_5_10_the_payload_has_no_inertia(
     arm: UrArm, controller: Controller, version: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(arm._reader, "version", version)
+    arm.close()
+    monkeypatch.setattr(Controller, "version", version)
+    controller.kinematics = None
+    controller.flange = partial(forward, MODELS["UR5" if version < (5,) else "UR5e"])
+    arm.open(control=True)
+    controller.did.clear()
     arm.set_payload(1.0, (0, 0, 0.05))
     assert controller.did == ["payload 1 [0.0, 0.0, 0.05]"]
     with pytest.raises(DeviceFault, match="accepts no inertia"):

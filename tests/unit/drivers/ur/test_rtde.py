@@ -289,10 +289,10 @@ def test_a_device_that_does_not_answer() -> None:
 def test_each_reason_for_no_connection_has_its_own_fix(
     error: OSError, fix: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(rtde, "_Connection", refuse)
+    monkeypatch.setattr(socket, "create_connection", refuse)
     with pytest.raises(Unreachable) as raised:
         rtde.Subscription("ur5", OUTPUTS, 125.0, timeout_s=0.5)
     assert fix in raised.value.fix

@@ -14,19 +14,15 @@ from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import ControlSetting
 from ftdrivers.ur.primary import Code, Failed, Note, Stopped
 from ftdrivers.ur.script_control import OUTPUTS, STOPS_ITSELF_S, program_text
+from ftdrivers.ur.timing import STRICT
 from tests.fake_clock import FakeClock
 from tests.unit.drivers.ur.controller_in_memory import CYCLE_S, Controller, MakeArm, away, no_guard
-from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script, ScriptInMemory
+from tests.unit.drivers.ur.program_in_memory import COMMANDS, Script
 
 
 @pytest.fixture
 def path() -> ControlSetting:
     return "script"
-
-
-def control_of(arm: UrArm) -> ScriptInMemory:
-    assert isinstance(arm._control, ScriptInMemory)
-    return arm._control
 
 
 # ---------------------------------------------------------------------- the program
@@ -71,15 +67,16 @@ def test_every_sample_is_answered_with_one_heartbeat(script: Script, clock: Fake
         clock.advance(CYCLE_S)
         beats.append(script.registers.inputs[0])
     assert len(set(beats)) == 20
-    script.link._sent.clear()
+    script.link.sent.clear()
     script.registers.far.silent = True
     before = script.registers.inputs[0]
     clock.advance(0.1)
     assert script.registers.inputs[0] == before
 
 
+@pytest.mark.usefixtures("arm")
 def test_a_repeated_sample_is_no_sign_of_life(
-    arm: UrArm, script: Script, clock: FakeClock, monkeypatch: pytest.MonkeyPatch
+    script: Script, controller: Controller, clock: FakeClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     repeated = script.registers.far.t_s
     monkeypatch.setattr(script.link, "decode", lambda _: script_control_sample(script, repeated))
@@ -87,19 +84,20 @@ def test_a_repeated_sample_is_no_sign_of_life(
     before = script.registers.inputs[0]
     clock.advance(0.3)
     assert script.registers.inputs[0] == before
-    assert not control_of(arm).alive
+    assert not controller.control.alive
 
 
 def script_control_sample(script: Script, t_s: float) -> dict[str, NDArray[np.float64]]:
     return {name: np.array([value]) for name, value in zip(OUTPUTS, (t_s, *script.registers.outputs), strict=True)}
 
 
+@pytest.mark.usefixtures("arm")
 @pytest.mark.parametrize("how", ["suspended", "cut", "killed"])
 @pytest.mark.parametrize("delay_s", [0.3, 0.302, 0.305, 0.307])
 def test_an_arm_without_heartbeat_stops_within_three_tenths_of_a_second(
-    arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str, delay_s: float
+    script: Script, controller: Controller, clock: FakeClock, how: str, delay_s: float
 ) -> None:
-    control = control_of(arm)
+    control = controller.control
     control.call("move", away(controller), 1.0, 3.0)
     clock.advance(delay_s)
     assert controller.goal_rad is not None
@@ -136,7 +134,7 @@ def test_a_lost_link_is_found_as_soon(arm: UrArm, script: Script, controller: Co
 
 
 def test_after_a_suspension_the_reason_is_reported(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    control = control_of(arm)
+    control = controller.control
 
     def suspend() -> None:
         control.suspended = controller.held_back = True
@@ -174,16 +172,16 @@ def test_a_program_of_another_session_ends(script: Script, clock: FakeClock) -> 
     assert script.registers.outputs[1] == -3
 
 
-def test_an_old_command_is_not_carried_out(arm: UrArm, controller: Controller, clock: FakeClock) -> None:
-    control = control_of(arm)
+def test_an_old_command_is_not_carried_out(
+    arm: UrArm, script: Script, controller: Controller, clock: FakeClock
+) -> None:
     arm.move_to(away(controller), timeout_s=5, guard=no_guard)
-    sequence, command, numbers = control._command
+    sequence = round(script.registers.inputs[2])
     before = list(controller.did)
     for old in (sequence, sequence - 1, 0):
-        control._command = (old, 1, (0.0,) * 5 + (1.5, 1.0, 3.0, 0.0, 0.0))
+        controller.control.send_again((old, 1, (0.0,) * 5 + (1.5, 1.0, 3.0, 0.0, 0.0)))
         clock.advance(5 * CYCLE_S)
     assert controller.did == before
-    control._command = (sequence, command, numbers)
 
 
 def test_a_move_paused_by_a_protective_stop_does_not_go_on(
@@ -259,7 +257,7 @@ def test_settings_and_questions_pass_through_the_registers(arm: UrArm, controlle
     ]
     assert arm.within_safety_limits(controller.q_rad)
     assert not arm.within_safety_limits([*controller.q_rad[:5], 3.0])
-    assert control_of(arm).call("tcp_offset") == pytest.approx(controller.tcp_offset)
+    assert controller.control.call("tcp_offset") == pytest.approx(controller.tcp_offset)
 
 
 # ---------------------------------------------------------------------- a sweep
@@ -299,7 +297,7 @@ def test_a_sweep_from_elsewhere_is_rejected(arm: UrArm, controller: Controller) 
 def test_a_sweep_without_heartbeat_stops(
     arm: UrArm, script: Script, controller: Controller, clock: FakeClock, how: str
 ) -> None:
-    control, sweep = control_of(arm), sweep_of(arm)
+    control, sweep = controller.control, sweep_of(arm)
     for k, wave in enumerate(sweep.waves.reshape(-1, 3).tolist()):
         control.call("wave", k, *wave)
     control.call("sweep", list(sweep.centre_rad), sweep.duration_s, sweep.ramp_s)
@@ -314,16 +312,11 @@ def test_a_sweep_without_heartbeat_stops(
     assert script.registers.outputs[1] == -2
 
 
-def test_a_silent_controller_is_lost_after_its_limit_and_not_before(
-    arm: UrArm, script: Script, clock: FakeClock
-) -> None:
-    control = control_of(arm)
-    script.registers.far.silent = True
-    limit_s, step_s, waited_s = control._timing.stale_s, control._clock.poll_s, 0.0
-    assert control._pause(), "it has just been heard"
-    while control._pause():
-        clock.advance(step_s)
-        waited_s += step_s
-        assert waited_s < 2 * limit_s
-    assert waited_s == pytest.approx(limit_s, abs=3 * step_s)
-    assert "the controller sent nothing for" in str(control._failure)
+@pytest.mark.usefixtures("arm")
+def test_a_silent_controller_is_lost_after_its_limit_and_not_before(controller: Controller, clock: FakeClock) -> None:
+    controller.silent = True
+    clock.advance(STRICT.stale_s - 3 * CYCLE_S)
+    assert controller.control.alive
+    clock.advance(3 * CYCLE_S)
+    assert not controller.control.alive
+    assert "the controller sent nothing for" in str(controller.control.end_reason())

@@ -31,7 +31,7 @@ class SubscriptionInMemory:
     version = (5, 15, 0, 1)
 
     def __init__(self, clock: FakeClock) -> None:
-        self._clock = clock
+        self.clock = clock
         self.times: list[float] = []
         self.raw = RAW
         self.missing: list[str] = []
@@ -42,7 +42,7 @@ class SubscriptionInMemory:
         self, host: str, outputs: Mapping[str, str], frequency_Hz: float, *, timeout_s: float, clock: Clock
     ) -> "SubscriptionInMemory":
         assert timeout_s == 2.0
-        assert clock is self._clock
+        assert clock is self.clock
         self.asked.append((host, dict(outputs), frequency_Hz))
         self._ends_s = clock.now_s() + self.ends_after_s
         self._t_s = 100.0
@@ -50,8 +50,8 @@ class SubscriptionInMemory:
 
     def read(self, timeout_s: float) -> list[tuple[float, list[float]]]:
         assert timeout_s <= 0.05
-        self._clock.advance(CYCLE_S)
-        if self._clock.now_s() > self._ends_s:
+        self.clock.advance(CYCLE_S)
+        if self.clock.now_s() > self._ends_s:
             raise ConnectionResetError
         self._t_s = self.times.pop(0) if self.times else self._t_s + CYCLE_S
         return [(self._t_s, self.raw)]
@@ -72,7 +72,7 @@ def controller(monkeypatch: pytest.MonkeyPatch) -> SubscriptionInMemory:
 
 @pytest.fixture
 def sensor(controller: SubscriptionInMemory) -> Iterator[Wrist]:
-    sensor = Wrist(HOST, counts_per_N=200.0, counts_per_Nm=100.0, clock=controller._clock)
+    sensor = Wrist(HOST, counts_per_N=200.0, counts_per_Nm=100.0, clock=controller.clock)
     yield sensor
     sensor.close()
 
@@ -113,10 +113,10 @@ def test_a_clock_that_goes_back_ends_the_stream(controller: SubscriptionInMemory
 def test_lost_connection(controller: SubscriptionInMemory, sensor: Wrist) -> None:
     controller.ends_after_s = 0.1
     sensor.open()
-    begin_s = controller._clock.now_s()
+    begin_s = controller.clock.now_s()
     with pytest.raises(StreamBroken, match="connection was lost"):
         sensor.collect(5.0)
-    assert controller._clock.now_s() - begin_s < 0.12
+    assert controller.clock.now_s() - begin_s < 0.12
 
 
 def test_old_controllers_do_not_report_it(controller: SubscriptionInMemory, sensor: Wrist) -> None:
