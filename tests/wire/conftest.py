@@ -13,8 +13,8 @@ from ftdrivers.clock import Clock
 from ftdrivers.registry import sensor_from_url
 from ftdrivers.streaming.sensor import StreamingSensor
 from ftdrivers.ur.arm import UrArm
-from ftdrivers.ur.control import ControlPath
-from ftdrivers.ur.opening import path_for
+from ftdrivers.ur.control import Control, ControlPath
+from ftdrivers.ur.opening import Opening, path_for
 from ftdrivers.ur.timing import UrTiming
 from tests.cell_time import CellTime
 from tests.ur_rtde import require_ur_rtde
@@ -110,6 +110,20 @@ def control(request: pytest.FixtureRequest) -> ControlPath:
 one_path = pytest.mark.parametrize("control", ["auto"], indirect=True)
 """For tests of what has nothing to do with the control path."""
 on_ur_rtde = pytest.mark.parametrize("control", ["ur-rtde"], indirect=True)
+
+
+@pytest.fixture
+def controls(monkeypatch: pytest.MonkeyPatch) -> list[Control]:
+    """The control paths that arms have opened, the newest last."""
+    opened: list[Control] = []
+    open_control = Opening.open
+
+    def open_and_remember(opening: Opening) -> Control:
+        opened.append(open_control(opening))
+        return opened[-1]
+
+    monkeypatch.setattr(Opening, "open", open_and_remember)
+    return opened
 
 
 @pytest.fixture

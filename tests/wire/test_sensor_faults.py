@@ -5,6 +5,7 @@ with it, also those a failed `collect` drops.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,9 @@ from numpy.typing import NDArray
 
 from ftdrivers.clock import Clock
 from ftdrivers.errors import DeviceError, DeviceTimeout, StreamBroken
-from ftdrivers.follow import Unread
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.streaming.sensor import StreamingSensor
+from ftdrivers.streaming.sensor import NOTHING, StreamingSensor
 from tests.wire.laboratory import STEPS, Laboratory, numbers_in
 from tests.wire.sensor_kinds import KINDS
 
@@ -85,16 +85,15 @@ class Watched:
     blocks: list[FtSamples] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.unread: Unread[FtSamples] = Unread(self.sensor.name, 10**9)
-        with self.sensor._news:
-            self.sensor._taps.append(self.unread)
+        self.stack = ExitStack()  # never left, as the sensor may fail and be opened again
+        self.follow = self.stack.enter_context(self.sensor.follow())
         if self.seconds:
             self.sensor.collect(self.seconds)
 
     def samples(self) -> FtSamples:
-        with self.sensor._news:
-            self.blocks += self.unread.take()
-            return FtSamples.concatenate(self.blocks) if self.blocks else self.sensor._newest
+        with suppress(DeviceError):  # the failure is raised after the samples that came before it
+            self.blocks.append(self.follow.read(0.0))
+        return FtSamples.concatenate(self.blocks or [NOTHING])
 
     def wrong(self) -> int:
         """Count the samples that no sensor has measured."""
@@ -170,6 +169,14 @@ def applies(scheme: str, fault: str) -> bool:
     return packets if fault in {"swap", "foreign"} else not packets if fault in {"corrupt", "byte_slip"} else True
 
 
+def failure_of(sensor: StreamingSensor) -> str:
+    try:
+        sensor.check()
+    except StreamBroken as failure:
+        return str(failure)
+    return ""
+
+
 def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[DeviceError]:
     """Use a sensor for a while as a program would; return its errors."""
     errors: list[DeviceError] = []
@@ -180,7 +187,7 @@ def suffer(sensor: StreamingSensor, clock: Clock, seconds: float) -> list[Device
             sensor.latest(timeout_s=0.1)
         except DeviceError as exc:
             errors.append(exc)
-            if sensor._failure is not None:
+            if any(what.startswith("ended") for _, what in sensor.health().events):
                 break
             clock.sleep(0.02)
     return errors
@@ -284,8 +291,8 @@ def reconnected(emulator: Emulator, before_s: float) -> list[Watched]:
         with pytest.raises(StreamBroken, match="reconnecting"):
             sensor.collect(60.0)
         emulator.plug_in()
-        while (failure := sensor._failure) is not None:  # it gives up by itself
-            assert "reconnecting" in str(failure), emulator.kind.scheme
+        while failure := failure_of(sensor):  # it gives up by itself
+            assert "reconnecting" in failure, emulator.kind.scheme
             emulator.clock.sleep(0.05)
         sensor.collect(0.1)
         health = sensor.health()

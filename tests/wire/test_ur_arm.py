@@ -23,12 +23,11 @@ from scipy.spatial.transform import Rotation
 from ftdrivers.errors import ConnectError, DeviceFault, DeviceTimeout, StreamBroken
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control
-from ftdrivers.ur.control_process import ControlProcess
 from ftdrivers.ur.kinematics import forward, kinematics_of
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, Station, on_ur_rtde, one_path
 from tests.wire.moves import away, no_guard
-from tests.wire.waiting import wait_until
+from tests.wire.waiting import control_process, wait_until
 
 pytestmark = pytest.mark.slow  # every test needs a process of its own
 
@@ -60,9 +59,9 @@ def assert_flange_is_right(arm: UrArm) -> None:
     flange = forward(own, state.q_rad)
     assert np.allclose(state.R_base_flange, flange.R, atol=1e-6)
     assert np.allclose(state.p_base_flange_m, flange.p_m, atol=1e-6)
-    assert arm._reader is not None
-    tcp = Rotation.from_rotvec(arm._reader.look().tcp_pose[3:])
-    assert (tcp.inv() * Rotation.from_matrix(flange.R)).magnitude() > 0.5  # there is something to take off
+    tcp_offset = arm.status().tcp_offset
+    assert tcp_offset is not None
+    assert Rotation.from_rotvec(tcp_offset[3:]).magnitude() > 0.5  # there is something to take off
 
 
 @one_path
@@ -287,11 +286,10 @@ def test_whatever_ends_the_wait_stops_the_arm_and_leaves_it_usable(station: Stat
 
 @pytest.mark.slow
 def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
-    station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
+    station: Station, controls: list[Control], arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     q = away(arm)
-    assert arm._control is not None
-    kind = type(arm._control)
+    kind = type(controls[-1])
     call = kind.call
 
     def interrupted(self: Control, name: str, *args: object, **how: Any) -> object:
@@ -309,10 +307,9 @@ def test_a_second_ctrl_c_does_not_let_the_arm_move_on(
 
 
 @pytest.mark.slow
-def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, arm: UrArm) -> None:
-    assert arm._control is not None
+def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, controls: list[Control], arm: UrArm) -> None:
     q = away(arm)
-    arm._control.call("move", q, SPEED_RAD_S, ACCELERATION_RAD_S2)
+    controls[-1].call("move", q, SPEED_RAD_S, ACCELERATION_RAD_S2)
     station.wait_for(lambda state: state["moving"])
     arm.close()
     state = station.ask("state")
@@ -327,8 +324,7 @@ def test_close_in_the_middle_of_a_move_stops_the_arm(station: Station, arm: UrAr
 @pytest.mark.slow
 @on_ur_rtde
 def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
-    assert isinstance(arm._control, ControlProcess)
-    pid = arm._control._process.pid
+    pid = control_process()
     q = away(arm)
     with pytest.raises(StreamBroken, match="control"):
         arm.move_to(q, timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGKILL)))
@@ -345,8 +341,7 @@ def test_a_control_process_that_is_gone(station: Station, arm: UrArm) -> None:
 def test_a_control_process_that_hangs(station: Station, new_arm: NewArm, caplog: pytest.LogCaptureFixture) -> None:
     arm = new_arm(timing=replace(UrTiming.emulated(), progress_s=2.0))
     arm.open(control=True)
-    assert isinstance(arm._control, ControlProcess)
-    pid = arm._control._process.pid
+    pid = control_process()
     with pytest.raises(DeviceTimeout, match="did not answer"):
         arm.move_to(away(arm), timeout_s=30, guard=Trigger(arm, lambda: os.kill(pid, signal.SIGSTOP)))
     station.wait_for(lambda state: not state["moving"] and state["runtime_state"] == "STOPPED")

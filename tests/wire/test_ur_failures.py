@@ -48,19 +48,21 @@ import pytest
 
 from ftdrivers.clock import REAL
 from ftdrivers.errors import ConnectError, DeviceError, DeviceFault, DeviceTimeout, StreamBroken
+from ftdrivers.ur import opening
 from ftdrivers.ur.arm import UrArm
 from ftdrivers.ur.control import Control, ControlPath
 from ftdrivers.ur.control_process import ControlProcess
-from ftdrivers.ur.opening import Opening
-from ftdrivers.ur.sample import PROGRAM_STOPPED
+from ftdrivers.ur.script_control import ScriptControl
 from ftdrivers.ur.timing import UrTiming
 from tests.wire.conftest import ACCELERATION_RAD_S2, SPEED_RAD_S, TIME_SCALE, Station, on_ur_rtde, one_path
 from tests.wire.moves import STEP_RAD, away, no_guard
+from tests.wire.waiting import control_process
 
 ROOT = Path(__file__).parents[2]
 MOVE_S = 60.0
 EMULATED = replace(UrTiming.emulated(), ours_s=2.0, ours_again_s=2.0, ours_closing_s=2.0, release_s=1.0, braking_s=5.0)
 """Here other clients never answer, brake or let go."""
+CONTROLS: dict[ControlPath, type[Control]] = {"ur-rtde": ControlProcess, "script": ScriptControl}
 slow = pytest.mark.slow
 
 NewArm = Callable[..., UrArm]
@@ -233,9 +235,8 @@ def moves_again(arm: UrArm) -> None:
 
 
 def wait_until_moving(arm: UrArm) -> Callable[[], bool]:
-    assert arm._reader is not None
-    reader, q0 = arm._reader, arm.state().q_rad[5]
-    return lambda: abs(reader.look().q_rad[5] - q0) > 0.1
+    q0 = arm.state().q_rad[5]
+    return lambda: abs(arm.state().q_rad[5] - q0) > 0.1
 
 
 class Once:
@@ -298,15 +299,18 @@ def test_at_rest(station: Station, new_arm: NewArm, event: Event) -> None:
     *("protective-stop", "emergency-stop", "brakes", "rtde-fin", "rtde-silent", "cable", "freeze", "cut"),
     script=("protective-stop", "cable", "cut"),
 )
-def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypatch: pytest.MonkeyPatch) -> None:
-    start = Opening._start
+def test_while_opening(
+    station: Station, new_arm: NewArm, event: Event, control: ControlPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind: Any = CONTROLS[control]
     provoke = Once(lambda: event.do(station))
 
-    def provoking(self: Opening, path: ControlPath) -> Control:
+    def provoking(*args: object, **how: object) -> Control:
         provoke()  # all was well, and the control path is about to start
-        return start(self, path)
+        made: Control = kind(*args, **how)
+        return made
 
-    monkeypatch.setattr(Opening, "_start", provoking)
+    monkeypatch.setattr(opening, kind.__name__, provoking)
     arm = new_arm()
     with pytest.raises(ConnectError, match=event.says):
         arm.open(control=True)
@@ -318,13 +322,12 @@ def test_while_opening(station: Station, new_arm: NewArm, event: Event, monkeypa
     *("protective-stop", "safeguard", "program-pause", "foreign-program", "rtde-fin", "rtde-silent", "cable"),
     script=("protective-stop", "foreign-program", "cable"),
 )
-def test_while_closing(station: Station, new_arm: NewArm, event: Event) -> None:
+def test_while_closing(station: Station, controls: list[Control], new_arm: NewArm, event: Event) -> None:
     arm = opened(new_arm())
-    assert arm._control is not None
     moving = wait_until_moving(arm)
-    arm._control.call("move", away(arm), SPEED_RAD_S, ACCELERATION_RAD_S2)
+    controls[-1].call("move", away(arm), SPEED_RAD_S, ACCELERATION_RAD_S2)
     while not moving():
-        arm._control.call("progress")
+        controls[-1].call("progress")
     event.do(station)
     arm.close()
     if event.reachable and event.name != "foreign-program":
@@ -384,11 +387,12 @@ def test_a_slider_at_zero(station: Station, arm: UrArm) -> None:
 
 
 @slow
-def test_an_end_before_the_goal_is_no_arrival(station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_before_the_goal_is_no_arrival(
+    station: Station, control: ControlPath, arm: UrArm, monkeypatch: pytest.MonkeyPatch
+) -> None:
     where, q = arm.state().q_rad, away(arm)
     station.ask("slider", fraction=0.0)
-    assert arm._control is not None
-    kind = type(arm._control)
+    kind = CONTROLS[control]
     call = kind.call
 
     def hasty(self: Control, name: str, *args: object, **how: Any) -> object:
@@ -458,12 +462,12 @@ def test_a_program_of_another_client_found_before_a_move_is_left_alone(station: 
 
 @slow
 def test_a_program_that_cannot_be_asked_is_ended_by_leaving(
-    station: Station, arm: UrArm, monkeypatch: pytest.MonkeyPatch
+    station: Station, control: ControlPath, arm: UrArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> object:
         raise StreamBroken("the control connection was lost")
 
-    monkeypatch.setattr(type(arm._control), "call", fail)
+    monkeypatch.setattr(CONTROLS[control], "call", fail)
     arm.close()
     assert station.ask("state")["runtime_state"] == "STOPPED"
 
@@ -480,7 +484,7 @@ def test_a_program_of_another_client_is_never_ended_for_a_start(station: Station
         station.wait_for(lambda state: state["runtime_state"] == "PAUSED")
     before = len(station.ask("state")["events"])
     error = refused(station)
-    assert re.search(r"\((PLAYING|PAUSED) .*\) and is not stopped", error.found)
+    assert re.search(r"\((PLAYING|PAUSED) .*\), and is not stopped", error.found)
     assert "stop it at the pendant" in error.fix
     state = station.ask("state", since=before)
     assert not [event for event in state["events"] if event["by"] in ("script port", "program")]
@@ -503,13 +507,14 @@ def test_a_program_that_took_the_place_of_ours_is_not_ended_when_the_arm_is_open
 
 @slow
 @on_ur_rtde
-def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(station: Station, arm: UrArm) -> None:
-    assert isinstance(arm._control, ControlProcess)
-    os.kill(arm._control._process.pid, signal.SIGKILL)  # so that it cannot be asked whose program it runs
-    station.wait_for(lambda _: arm._control is not None and not arm._control.alive)
+def test_what_runs_after_ours_was_seen_to_have_ended_is_not_ours(
+    station: Station, controls: list[Control], arm: UrArm
+) -> None:
+    os.kill(control_process(), signal.SIGKILL)  # so that it cannot be asked whose program it runs
+    station.wait_for(lambda _: not controls[-1].alive)
     station.ask("dashboard-stop")
     # A sample on its way can be from before the stop.
-    station.wait_for(lambda _: arm._reader is not None and arm._reader.look().program_state == PROGRAM_STOPPED)
+    station.wait_for(lambda _: arm.status().program == "stopped")
     arm.open()
     another_takes_over(station)
     with pytest.raises(ConnectError, match="stop it at the pendant"):

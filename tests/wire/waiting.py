@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import serial
 
@@ -14,6 +15,12 @@ def wait_until(condition: Callable[[], object], limit_s: float = LIMIT_S) -> Non
     while not condition():
         assert time.monotonic() < deadline_s, "the condition never came true"
         time.sleep(0.002)
+
+
+def control_process() -> int:
+    """Return the process id of the newest control process of this process."""
+    children = [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
+    return max(pid for pid in children if b"control_child" in Path(f"/proc/{pid}/cmdline").read_bytes())
 
 
 def drain(port: serial.Serial, quiet_s: float = 0.05) -> bytes:
