@@ -45,11 +45,11 @@ class _Wire(Generic[T]):
         self.once: list[T] = []
         """Comes before the next chunk of a stream."""
         self._turns: Iterator[tuple[Any, Any]] = iter(turns)
-        self._arrived: list[T] = []
+        self.arrived: list[T] = []
         self._news = threading.Condition()
-        self._streams = 0
+        self.streams = 0
         if streaming:
-            self._run(streaming)
+            self.stream(streaming)
 
     def __enter__(self) -> Self:
         return self
@@ -62,19 +62,19 @@ class _Wire(Generic[T]):
     def _take(self, sent: T) -> list[tuple[float, T]]:
         """Compare what is sent with the next turn; return what is received, and after how many seconds."""
         self.sent.append(sent)
-        self._streams += 1
+        self.streams += 1
         expected, received = next(self._turns, (None, None))
         if sent != expected:
             self.wrong.append(f"sent {sent!r}, not {expected!r}")
             return []
         if isinstance(received, Stream):
-            self._run(received)
+            self.stream(received)
             received = received.reply
         items = received if isinstance(received, list) else [received] if received else []
         return [(item[0] * 1e-3, item[1]) if isinstance(item, tuple) else (DELAY_S, item) for item in items]
 
     def _arrive(self, after_s: float, what: T) -> None:
-        self.clock.at(after_s, lambda: self._arrived.append(what))
+        self.clock.at(after_s, lambda: self.arrived.append(what))
 
     def _wait_for(self, enough: Callable[[], bool], timeout_s: float) -> None:
         for left_s in self.clock.looks(timeout_s):
@@ -82,9 +82,9 @@ class _Wire(Generic[T]):
                 return
             self.clock.wait(self._news, left_s)
 
-    def _run(self, stream: Stream) -> None:
+    def stream(self, stream: Stream) -> None:
         """Send in step with the clock: what a driver was too late for has piled up."""
-        number, chunks = self._streams, iter(stream.chunks)
+        number, chunks = self.streams, iter(stream.chunks)
         due_s = self.clock.now_s() + DELAY_S
 
         def schedule() -> None:
@@ -93,9 +93,9 @@ class _Wire(Generic[T]):
             self.clock.at(due_s - self.clock.now_s(), send)
 
         def send() -> None:
-            is_on = number == self._streams or not stream.has_end
+            is_on = number == self.streams or not stream.has_end
             if is_on and (chunk := next(chunks, None)):
-                self._arrived += [*self.once, *(chunk if isinstance(chunk, list) else [chunk])]
+                self.arrived += [*self.once, *(chunk if isinstance(chunk, list) else [chunk])]
                 self.once.clear()
                 schedule()
 
@@ -115,16 +115,16 @@ class SerialWire(_Wire[bytes]):
 
     def read(self, size: int) -> bytes:
         self._wait_for(lambda: self.in_waiting >= size, self.timeout)
-        data = b"".join(self._arrived)
-        self._arrived = [data[size:]]
+        data = b"".join(self.arrived)
+        self.arrived = [data[size:]]
         return data[:size]
 
     @property
     def in_waiting(self) -> int:
-        return sum(map(len, self._arrived))
+        return sum(map(len, self.arrived))
 
     def reset_input_buffer(self) -> None:
-        self._arrived.clear()
+        self.arrived.clear()
 
     def set_low_latency_mode(self, _: bool) -> None: ...
 
@@ -148,10 +148,10 @@ class CanWire(_Wire[str]):
             self._arrive(after_s, line)
 
     def recv(self, timeout: float) -> can.Message | None:
-        self._wait_for(lambda: bool(self._arrived), timeout)
-        if not self._arrived:
+        self._wait_for(lambda: bool(self.arrived), timeout)
+        if not self.arrived:
             return None
-        identifier, _, payload = self._arrived.pop(0).partition(" ")
+        identifier, _, payload = self.arrived.pop(0).partition(" ")
         return can.Message(arbitration_id=int(identifier, 16), data=bytes.fromhex(payload), is_extended_id=False)
 
     def shutdown(self) -> None: ...

@@ -1,7 +1,6 @@
 """A recorded wire that is played in memory: what is sent when, which requests may be left out, and what diverges."""
 
 import math
-import os
 import sys
 import threading
 import time
@@ -10,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 import serial
 
-from ftdrivers.transcript import Passage, Player, Transcript, _Terminal
+from ftdrivers.transcript import Passage, Player, Transcript
 from ftdrivers.wires.serial_port import SerialPort, ask_for_marks
 from tests.fake_clock import FakeClock
 
@@ -34,24 +33,27 @@ class Far:
         self.sent.append(data)
 
 
-class Played:
+class Played(Player):
     """A player whose thread takes its turns in the test."""
 
     def __init__(self, transcript: Transcript) -> None:
         self.clock, self.far = FakeClock(), Far()
-        self.player = Player(transcript, self.clock)
-        self.player._far = self.far  # type: ignore[assignment]
-        self.player._t = self.clock.now_s()  # the driver has opened the port
+        super().__init__(transcript, self.clock)
+        self._far = self.far  # type: ignore[assignment]
+        self._t = self.clock.now_s()  # the driver has opened the port
 
     def ask(self, data: bytes) -> None:
-        self.player._asked += data
-        self.player._listen()
+        self._asked += data
+        self._listen()
+
+    def play(self) -> float:
+        return self._play()
 
     def answers(self, after_s: float = 0.0) -> bytes:
         """Let the time pass and return what was sent meanwhile."""
         self.far.sent.clear()
         end_s = self.clock.now_s() + after_s
-        while (wait_s := self.player._play()) < math.inf and self.clock.now_s() + wait_s <= end_s + 1e-9:
+        while (wait_s := self.play()) < math.inf and self.clock.now_s() + wait_s <= end_s + 1e-9:
             assert wait_s > 0
             self.clock.advance(wait_s)
         self.clock.advance(end_s - self.clock.now_s())
@@ -77,8 +79,8 @@ def test_a_request_is_answered_after_the_recorded_time() -> None:
     wire.ask(b"cd")
     assert wire.answers(0.009) == b""
     assert wire.answers(0.002) == b"3"
-    assert wire.player._play() == math.inf
-    assert wire.player.divergence is None
+    assert wire.play() == math.inf
+    assert wire.divergence is None
 
 
 @pytest.mark.parametrize(("early_s", "is_sent"), [(0.04, True), (0.06, False)])
@@ -96,7 +98,7 @@ def test_a_request_may_be_left_out_with_its_answer() -> None:
     wire = Played(DIALOGUE)
     wire.ask(b"cd")
     assert wire.answers(1.0) == b"3"
-    assert wire.player.divergence is None
+    assert wire.divergence is None
 
 
 def test_a_request_without_an_answer_may_be_left_out() -> None:
@@ -110,14 +112,14 @@ def test_two_requests_may_arrive_at_once() -> None:
     wire.ask(b"abcd")
     assert wire.answers(0.02) == b"3"
     wire.ask(b"xy")  # the driver says goodbye, or the recording was broken off
-    assert (wire.player.divergence, bytes(wire.player._asked)) == (None, b"")
+    assert wire.divergence is None
 
 
 def test_a_request_that_was_not_recorded_ends_in_silence_with_a_reason() -> None:
     wire = Played(DIALOGUE)
     wire.ask(b"ab")
     wire.ask(b"ax")
-    assert wire.player.divergence == "the driver sent 61 78, the recording has 63 64"
+    assert wire.divergence == "the driver sent 61 78, the recording has 63 64"
     assert wire.answers(1.0) == b""
     wire.ask(b"cd")
     assert wire.answers(1.0) == b""
@@ -127,20 +129,19 @@ def test_what_comes_unasked_keeps_its_times_and_waits_while_the_driver_is_full()
     wire = Played(recorded((0.1, False, b"1"), (0.2, False, b"2")))
     assert wire.answers(0.11) == b"1"
     wire.far.is_full = True
-    assert wire.player._play() == pytest.approx(0.09)
+    assert wire.play() == pytest.approx(0.09)
     wire.clock.advance(0.1)
     wire.far.sent.clear()
-    assert wire.player._play() == pytest.approx(0.001)  # a look each millisecond
+    assert wire.play() == pytest.approx(0.001)  # a look each millisecond
     assert wire.far.sent == [b"", b"2"]  # the rest first
     wire.far.is_full = False
-    assert wire.player._play() == math.inf
+    assert wire.play() == math.inf
 
 
 def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
     player = Player(recorded((0.0, True, b"ab"), (0.0, False, b"1"), (0.0, True, b"cd"), (0.01, False, b"2")))
     with player as path:
-        thread = player._thread
-        assert thread is not None
+        (thread,) = (thread for thread in threading.enumerate() if thread.name == f"player on {path}")
         with serial.Serial(path, timeout=5.0) as port:
             port.write(b"a")
             port.write(b"b")
@@ -149,7 +150,6 @@ def test_a_driver_is_answered_on_a_pseudo_terminal_until_it_closes_it() -> None:
             assert port.read(1) == b"2"
         thread.join(5.0)
         assert not thread.is_alive()
-    assert player._thread is None
 
 
 def read_through(player: Player, request: bytes, size: int) -> tuple[bytes, list[int]]:
@@ -198,43 +198,33 @@ def test_a_player_that_is_never_opened_ends() -> None:
 
 def test_how_much_is_left() -> None:
     wire = Played(DIALOGUE)
-    assert wire.player.left_s == pytest.approx(0.31)
+    assert wire.left_s == pytest.approx(0.31)
     wire.ask(b"ab")
-    assert wire.player.left_s == pytest.approx(0.26)
+    assert wire.left_s == pytest.approx(0.26)
     wire.answers(0.1)
-    assert wire.player.left_s == pytest.approx(0.06)
+    assert wire.left_s == pytest.approx(0.06)
     wire.ask(b"cd")
     wire.answers(0.1)
-    assert wire.player.left_s == 0
+    assert wire.left_s == 0
 
 
-def test_frames_are_played_by_an_adapter() -> None:
-    frames = recorded((0.0, True, b"t2050\r"), (0.0, False, b"t20520102\r"))
+def test_frames_are_played_by_an_adapter_whose_commands_are_left_out() -> None:
+    more = b"T000001230\rr02A3\rR000000010\r"
+    frames = recorded(
+        *((0.0, True, b"t2050\r"), (0.0, False, b"t20520102\r"), (0.0, True, more), (0.0, False, b"t20520304\r"))
+    )
     with Player(replace(frames, frames=True)) as path, serial.Serial(path, timeout=5.0) as port:
-        port.write(b"C\rS5\rO\rt2050\r")
+        port.write(b"C\rS5\rO\rt2050\rT0000012")
         assert port.read(10) == b"t20520102\r"
+        port.write(b"30\rr02A3\rR000000010\rV\r")
+        assert port.read(10) == b"t20520304\r"
 
 
 def test_what_the_driver_does_not_accept_yet_is_sent_later_and_in_order() -> None:
-    terminal, data = _Terminal(recorded()), bytes(range(256)) * 1000
-    driver = os.open(terminal.open(), os.O_RDWR | os.O_NOCTTY)
-    try:
-        terminal.send(data)
-        assert terminal.is_full
-        read = os.read(driver, 100)
-        terminal.send(b"end")
-        while terminal.is_full:
-            read += os.read(driver, 65536)
-            terminal.send(b"")
-        while not read.endswith(b"end"):
-            read += os.read(driver, 65536)
-        assert read == data + b"end"
-    finally:
-        os.close(driver)
-        terminal.close()
-
-
-def test_commands_to_an_adapter_are_left_out() -> None:
-    terminal = _Terminal(recorded())
-    assert terminal._frames_of(b"C\rS5\rO\rt2050\rT0000012") == b"t2050\r"
-    assert terminal._frames_of(b"30\rr02A3\rR000000010\rV\r") == b"T000001230\rr02A3\rR000000010\r"
+    data = bytes(range(256)) * 1000
+    with (
+        Player(recorded((0.0, True, b"ab"), (0.0, False, data), (0.0, False, b"end"))) as path,
+        serial.Serial(path, timeout=5.0) as port,
+    ):
+        port.write(b"ab")
+        assert port.read(len(data) + 3) == data + b"end"

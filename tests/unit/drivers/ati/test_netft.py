@@ -50,7 +50,7 @@ class Box:
 
     def __init__(self, *records: bytes, deaf: int = 0, page: bytes = PAGE) -> None:
         self.time = CellTime()
-        self._records = list(records)
+        self.records = list(records)
         self._deaf = deaf
         self.heard: list[bytes] = []
         self.asked = asked = list[str]()
@@ -118,11 +118,11 @@ class Box:
                 else:
                     client = who if request == START else None
                     if client and self.mute_and_then:
-                        self._records, self.mute_and_then = self.mute_and_then, []
+                        self.records, self.mute_and_then = self.mute_and_then, []
             except TimeoutError:
                 pass
             if client is not None and not self.mute and not self.mute_and_then:
-                waiting, self._records = self._records, []
+                waiting, self.records = self.records, []
                 number += len(waiting) or 1
                 for datagram in waiting or [record(number)]:
                     self._udp.sendto(datagram, client)
@@ -170,7 +170,7 @@ def test_gaps_are_lost_and_doubled_or_late_datagrams_are_no_samples() -> None:
 )
 def test_a_fault_in_the_stream_is_named(status: int, says: str) -> None:
     with Box() as box, box.sensor() as sensor:
-        box._records = [record(100_000, status)]
+        box.records = [record(100_000, status)]
         with pytest.raises(DeviceFault, match=says):
             sensor.collect(1.0)
 

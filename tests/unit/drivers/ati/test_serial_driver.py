@@ -287,11 +287,10 @@ def test_error_bit_that_comes_later_may_be_harmless_and_the_next_one_not(table: 
     with table.serial(start_up(None, FINE, *harmless, *critical)) as wire, Sensor(wire.clock) as sensor:
         wire.clock.at(0.02, lambda: wire.once.append(RECORD_ERROR))
         seen: list[int] = []
-        while sensor._failure is None:
-            seen.append(int(sensor.latest(timeout_s=0.1).status[0]))
-            wire.clock.advance(0.005)
-        with pytest.raises(DeviceFault, match="EEPROM error"):
-            sensor.check()
+        with pytest.raises(DeviceFault, match="EEPROM error"):  # noqa: PT012
+            while True:
+                seen.append(int(sensor.latest(timeout_s=0.1).status[0]))
+                wire.clock.advance(0.005)
     assert list(dict.fromkeys(seen)) == [0, 0xC000, 0x4000]
 
 
@@ -349,9 +348,9 @@ def test_a_reply_that_this_computer_looks_at_late_is_a_reply(table: Table) -> No
 
         wire.write = starved  # type: ignore[method-assign]
         sensor = Sensor(wire.clock)
-        sensor._connect()
+        sensor.open()
         wire.write = write  # type: ignore[method-assign]
-        sensor._disconnect()
+        sensor.close()
 
 
 def test_lost_start_reply_is_recovered_by_a_jam(table: Table) -> None:

@@ -85,8 +85,8 @@ def test_an_older_sensor_that_does_not_know_the_question_is_configured(table: Ta
 
 def test_boot_text_names_the_sensor(table: Table) -> None:
     wire = table.serial([])
-    wire.clock.at(1.0, lambda: wire._arrived.append(BOOT))
-    wire.clock.at(1.1, lambda: wire._run(stream()))
+    wire.clock.at(1.0, lambda: wire.arrived.append(BOOT))
+    wire.clock.at(1.1, lambda: wire.stream(stream()))
     with wire, Sensor(wire.clock) as sensor:
         info = sensor.identify()
     assert (info.model, info.serial, info.firmware) == ("Bota SensONE T15", "4711", "1.2.3")
@@ -101,13 +101,13 @@ def test_both_usual_baud_rates_are_tried_unless_one_is_given(
     opened = list[int]()
 
     def port(_: str, baud: int, **options: Any) -> Any:
-        wire._arrived.clear()
-        wire._streams += 1  # what was sent before has ended
+        wire.arrived.clear()
+        wire.streams += 1  # what was sent before has ended
         opened.append(baud)
         if baud == bauds[-1]:
-            wire.clock.at(3.5, lambda: wire._run(stream()))
+            wire.clock.at(3.5, lambda: wire.stream(stream()))
         else:
-            wire._run(Stream.of(b"\x80\x00\xf8" * 20, 0.01))
+            wire.stream(Stream.of(b"\x80\x00\xf8" * 20, 0.01))
         return wire(**options)
 
     monkeypatch.setattr("serial.Serial", port)
@@ -150,7 +150,7 @@ def test_a_command_has_a_second_and_is_sent_five_times(table: Table) -> None:
 @pytest.mark.parametrize(("boot_s", "opens"), [(4.8, True), (5.1, False)])
 def test_first_frames_are_waited_for_five_seconds(table: Table, boot_s: float, opens: bool) -> None:
     wire = table.serial([])
-    wire.clock.at(boot_s, lambda: wire._run(stream()))
+    wire.clock.at(boot_s, lambda: wire.stream(stream()))
     sensor = Sensor(wire.clock, baud=460_800)
     if opens:
         sensor.open()

@@ -1,7 +1,9 @@
 """Which halves of a Robotous sensor on CAN are believed to be one sample: none that may be of two."""
 
 import random
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -173,11 +175,25 @@ def test_no_crosswise_pair_while_the_host_keeps_up(loss: float, swaps: float, se
     assert len(got) > 290 or loss + swaps > 0
 
 
+class Listening(RobotousCan):
+    """A sensor whose bus hands over what `look` returns."""
+
+    def __init__(self, look: Callable[[float], tuple[int, bytes] | None], clock: FakeClock) -> None:
+        super().__init__("can0", clock=clock)
+        self._bus = SimpleNamespace(look=look)  # type: ignore[assignment]
+
+    def receive(self) -> list[Any]:
+        return self._receive()
+
+    @property
+    def silence_fix(self) -> str:
+        return self._stale(0.4).fix
+
+
 @pytest.mark.parametrize(("slept_s", "fields"), [(0.0, 1), (0.02, 0)])
-def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int) -> None:
     """The second half that comes twice shows that the first may be foreign: unless it came after a silence."""
     clock = FakeClock()
-    sensor = RobotousCan("can0", clock=clock)
     frames: list[tuple[int, bytes] | None] = [(1, data(1)), (2, data(1)), None, (2, data(1))]
 
     def look(wait_s: float) -> tuple[int, bytes] | None:
@@ -186,21 +202,19 @@ def test_a_silence_the_host_slept_through_is_none(slept_s: float, fields: int, m
             clock.stall(wait_s + slept_s)
         return frame
 
-    monkeypatch.setattr(sensor._bus, "look", look)
-    assert len(sensor._receive()) == fields
+    assert len(Listening(look, clock).receive()) == fields
 
 
-def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_silence_while_halves_come_is_not_the_fault_of_cable_or_supply() -> None:
     clock = FakeClock()
-    sensor = RobotousCan("can0", clock=clock)
-    assert "cable" in sensor._stale(0.4).fix
 
     def look(_: float) -> tuple[int, bytes]:
         clock.stall(0.001)
         return 1, data(1)  # first halves only
 
-    monkeypatch.setattr(sensor._bus, "look", look)
-    assert sensor._receive() == []
-    assert "to be paired" in sensor._stale(0.4).fix
+    sensor = Listening(look, clock)
+    assert "cable" in sensor.silence_fix
+    assert sensor.receive() == []
+    assert "to be paired" in sensor.silence_fix
     clock.stall(0.2)
-    assert "cable" in sensor._stale(0.4).fix
+    assert "cable" in sensor.silence_fix

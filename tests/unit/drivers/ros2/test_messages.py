@@ -17,7 +17,6 @@ from ftdrive.checks.sensor import check_compensated
 from ftdrivers.errors import BadUrl, DeviceError, ProtocolError
 from ftdrivers.interfaces import FtSamples
 from ftdrivers.registry import sensor_from_url
-from ftdrivers.ros2 import poses
 from ftdrivers.ros2.arm import Ros2Arm, pose_reader_of
 from ftdrivers.ros2.middleware import Received
 from ftdrivers.ros2.poses import Chain, Joints, Poses, Transforms
@@ -35,11 +34,20 @@ def urdf(tmp_path: Path) -> Path:
     return path
 
 
-def read_sensor(*messages: Any) -> Any:
-    sensor = Ros2Sensor("/ft")
-    for number, message in enumerate(messages):
-        sensor._queue.put(Received(message, 7, number))
-    return sensor._read_block()
+class Topic(Ros2Sensor):
+    """A sensor that reads when the test says so."""
+
+    def read(self, messages: dict[int, Any]) -> FtSamples:
+        """Return the samples of messages by their numbers."""
+        for number, message in messages.items():
+            self._queue.put(Received(message, 7, number))
+        samples = self._read_block()
+        self._newest = samples.rows(slice(-1, None))
+        return samples
+
+
+def read_sensor(*messages: Any) -> FtSamples:
+    return Topic("/ft").read(dict(enumerate(messages)))
 
 
 def test_a_chain_agrees_with_kinematics_written_apart(urdf: Path) -> None:
@@ -52,8 +60,8 @@ def test_a_chain_agrees_with_kinematics_written_apart(urdf: Path) -> None:
     assert np.allclose(p, expected_p, atol=1e-12)
 
 
-def test_a_urdf_is_not_read_without_end(urdf: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(poses, "_LARGEST", 100)
+def test_a_urdf_is_not_read_without_end(urdf: Path) -> None:
+    urdf.write_text(URDF.replace("</robot>", " " * 16_000_000 + "</robot>"))
     with pytest.raises(BadUrl, match=r"is not a URDF .*: give the file with xacro evaluated"):
         Chain(urdf, "", "flange")
 
@@ -86,18 +94,13 @@ def test_a_sensor_numbers_and_stamps_its_samples() -> None:
 
 
 def test_numbers_that_are_missing_are_lost_messages() -> None:
-    sensor = Ros2Sensor("/ft")
-    for number in (3, 4, 8, 9, 12):
-        sensor._queue.put(Received(wrench(5 + 0.01 * number), 7, number))
-    sensor._read_block()
-    assert sensor._lost == 3 + 2
-    sensor._newest = FtSamples.of([7], [12], np.zeros((1, 6)), t_device_s=[5.12])
-    sensor._queue.put(Received(wrench(5.2), 7, 15))
-    sensor._read_block()
-    assert sensor._lost == 5 + 2
-    sensor._queue.put(Received(wrench(5.3), 7, 3))  # another publisher counts from the beginning
-    sensor._read_block()
-    assert sensor._lost == 7
+    sensor = Topic("/ft")
+    sensor.read({number: wrench(5 + 0.01 * number) for number in (3, 4, 8, 9, 12)})
+    assert sensor.health().lost == 3 + 2
+    sensor.read({15: wrench(5.2)})
+    assert sensor.health().lost == 5 + 2
+    sensor.read({3: wrench(5.3)})  # another publisher counts from the beginning
+    assert sensor.health().lost == 7
 
 
 def _read_tf(*messages: tuple[str, Any]) -> None:

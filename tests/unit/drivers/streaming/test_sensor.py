@@ -31,6 +31,8 @@ class Fed(StreamingSensor):
         self.connect_error: Exception | None = None
         self.disconnect_error: Exception | None = None
         self.connects = self.disconnects = 0
+        self.info = DeviceInfo("fake", "F1", "1.0")
+        self.before_read: Callable[[], object] = lambda: None
         self.first = 1
         self.seq = 0
         self.arrived = threading.Condition()
@@ -41,9 +43,10 @@ class Fed(StreamingSensor):
             raise self.connect_error
         if self.first:
             self.feed.append(self.first)
-        return DeviceInfo("fake", "F1", "1.0")
+        return self.info
 
     def _read_block(self) -> FtSamples:
+        self.before_read()
         with self.arrived:
             for left_s in self._clock.looks(READ_S):
                 if self.feed:
@@ -59,6 +62,14 @@ class Fed(StreamingSensor):
         seq = self.seq + np.arange(item)
         self.seq += item
         return FtSamples.of(self._clock.now_ns(), seq, self.wrench(seq), counts=np.ones((item, 6)))
+
+    @property
+    def readers(self) -> int:
+        return len(self._taps)
+
+    @property
+    def is_awaited(self) -> bool:
+        return bool(self._news._waiters)  # type: ignore[attr-defined]
 
     def wrench(self, seq: NDArray[np.int64]) -> Array:
         return np.arange(1.0, 7.0) + 1e-3 * seq[:, np.newaxis]
@@ -96,6 +107,20 @@ class FakeSensor(InOneThread, Fed):
             self.time.at(period_s, send)
 
         self.time.at(period_s, send)
+
+    def expect_rate(self, nominal_Hz: float) -> None:
+        self._nominal_Hz = nominal_Hz
+
+    def count(self, *, lost: int, malformed: int) -> None:
+        """Count as a driver does since it has connected."""
+        self._lost, self._malformed = lost, malformed
+
+    def take_turn(self) -> None:
+        self._take_turn()
+
+    @property
+    def has_ended(self) -> bool:
+        return self._has_ended
 
     def settle(self) -> None:
         """Let the reader take what it was fed."""
@@ -221,11 +246,10 @@ def test_more_samples_than_a_collect_may_hold_is_an_error() -> None:
             fake.collect(1.0)
 
 
-def test_what_the_device_does_not_report_is_configured(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_device_does_not_report_is_configured() -> None:
     rating = Fact((100.0,) * 6, "device")
     fake = FakeSensor(sign=-1)
-    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": rating}))
-    fake.feed.append(1)
+    fake.info = DeviceInfo("fake", NOT_REPORTED, "1.0", {"range": rating})
     fake.configured = {"serial": Fact("F7", "configured")}
     with fake:
         info = fake.identify()
@@ -234,15 +258,14 @@ def test_what_the_device_does_not_report_is_configured(monkeypatch: pytest.Monke
     assert json.loads(json.dumps(asdict(info)))["facts"]["range"] == {"value": [100.0] * 6, "source": "device"}
 
 
-def test_a_sensor_with_another_serial_number_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sensor_with_another_serial_number_is_refused() -> None:
     fake = FakeSensor()
     fake.configured = {"serial": Fact("F2", "configured")}
     with pytest.raises(ConnectError, match=r"F1.*F2"):
         fake.open()
     assert fake.disconnects == 1
     fake.configured = {"serial": Fact("F1", "configured"), "range": Fact((1.0,) * 6, "configured")}
-    monkeypatch.setattr(fake, "_connect", lambda: DeviceInfo("fake", "F1", "1.0", {"range": Fact(2.0, "device")}))
-    fake.feed.append(1)
+    fake.info = DeviceInfo("fake", "F1", "1.0", {"range": Fact(2.0, "device")})
     with fake:
         assert fake.identify().facts["range"] == Fact((1.0,) * 6, "configured")  # the user knows why
 
@@ -348,7 +371,7 @@ class TestThread:
             threads = [threading.Thread(target=lambda: collected.append(fake.collect(0.1))) for _ in range(2)]
             for thread in threads:
                 thread.start()
-            while len(fake._taps) < 2:
+            while fake.readers < 2:
                 time.sleep(0.001)
             fake.time.advance(0.12)
             for thread in threads:
@@ -378,7 +401,7 @@ class TestThread:
         fake.disconnect_error = OSError("gone")  # and close does not raise it
         with fake:
             consumer.start()
-            while not fake._news._waiters:  # type: ignore[attr-defined]
+            while not fake.is_awaited:
                 time.sleep(0.001)
         consumer.join(30.0)
         assert len(ended) == 1
@@ -444,7 +467,7 @@ def test_few_identical_samples_or_a_short_while_are_not_frozen(sensor: FakeSenso
 def test_how_many_identical_samples_are_enough_depends_on_the_rate(
     sensor: FakeSensor, nominal_Hz: float, enough: int
 ) -> None:
-    sensor._nominal_Hz = nominal_Hz
+    sensor.expect_rate(nominal_Hz)
     frozen = [sensor.block([10 + number], after_s=0.011 * number, wrench=3.0) for number in range(enough)]
     sensor.feed.extend(frozen[:-1])
     sensor.settle()
@@ -533,14 +556,11 @@ class TestAway:
         assert sensor.health().lost >= 11 + 4 + 5
 
     def test_a_stream_that_never_has_to_be_waited_for_is_believed_after_half_a_second(self, sensor: FakeSensor) -> None:
-        read = sensor._read_block
-
-        def busy() -> FtSamples:
+        def send() -> None:
             sensor.feed.append(1)
             sensor.time.ns += 400_000
-            return read()
 
-        sensor._read_block = busy  # type: ignore[method-assign]
+        sensor.before_read = send
         start_s = sensor.time.now_s()
         sensor.time.stall(1.0)
         while sensor.health().received == 1:
@@ -567,9 +587,9 @@ class TestAway:
         def pause() -> None:
             sensor.time.stall(0.35)
             sensor.feed.append(1)
-            sensor._take_turn()
+            sensor.take_turn()
             sensor.feed.append(1)
-            sensor._take_turn()  # what was away is back before the collect has had a look
+            sensor.take_turn()  # what was away is back before the collect has had a look
 
         sensor.time.at(0.1, pause)
         with pytest.raises(DeviceTimeout, match="the reader paused"):
@@ -628,7 +648,7 @@ def test_a_late_block_or_a_slow_reader_is_no_jump() -> None:
 def test_a_rate_off_by_more_than_a_tenth_is_said_once(
     sensor: FakeSensor, nominal_Hz: float, hint: str | None, caplog: pytest.LogCaptureFixture
 ) -> None:
-    sensor._nominal_Hz = nominal_Hz
+    sensor.expect_rate(nominal_Hz)
     sensor.feed.extend(sensor.block([5 + number], after_s=0.005 * number) for number in range(1, 801))
     sensor.settle()
     health = sensor.health()
@@ -641,7 +661,7 @@ def test_a_rate_off_by_more_than_a_tenth_is_said_once(
 
 
 def test_a_rate_that_is_right_again_is_said_and_so_is_the_next_wrong_one(sensor: FakeSensor) -> None:
-    sensor._nominal_Hz = 200.0
+    sensor.expect_rate(200.0)
     t_s, seq = 0.0, 5
     for rate_Hz in (100.0, 200.0, 100.0):
         for _ in range(round(4.5 * rate_Hz)):
@@ -707,7 +727,7 @@ class TestRecover:
         sensor.feed.append(StreamBroken("gone", "plug it in"))
         ended: list[bool] = []
         for t_s in (9.9, 10.6):
-            sensor.time.at(t_s, lambda: ended.append(sensor._has_ended))
+            sensor.time.at(t_s, lambda: ended.append(sensor.has_ended))
         sensor.time.advance(11.0)
         assert ended == [False, True]
         with pytest.raises(StreamBroken, match=rf"^gone, not reconnected within 10 s \(.*{said}.*\)") as caught:
@@ -732,8 +752,8 @@ class TestRecover:
         def interrupt() -> None:
             sensor.feed.clear()
             sensor.feed.append(StreamBroken("gone"))
-            sensor._take_turn()
-            sensor._take_turn()
+            sensor.take_turn()
+            sensor.take_turn()
 
         sensor.time.at(0.05, interrupt)
         with pytest.raises(StreamBroken, match="came back"):
@@ -749,11 +769,11 @@ class TestRecover:
         assert sensor.health().reconnects == 1
 
     def test_what_was_lost_and_damaged_before_stays_counted(self, sensor: FakeSensor) -> None:
-        sensor._lost, sensor._malformed = 3, 2  # as a driver counts them since it has connected
+        sensor.count(lost=3, malformed=2)
         sensor.feed.append(StreamBroken("gone"))
         sensor.settle()
         assert sensor.health().reconnects == 1
-        sensor._lost, sensor._malformed = 10, 20
+        sensor.count(lost=10, malformed=20)
         assert (sensor.health().lost, sensor.health().malformed) == (13, 22)
 
     def test_a_fault_found_while_connecting_again_is_final(self, sensor: FakeSensor) -> None:
@@ -765,7 +785,7 @@ class TestRecover:
         assert sensor.connects == 2
 
     def test_numbers_go_on(self, sensor: FakeSensor) -> None:
-        sensor._nominal_Hz = 1000.0
+        sensor.expect_rate(1000.0)
         sensor.feed.append(sensor.block([40]))
         sensor.settle()
         before = sensor.latest(timeout_s=0.0)
@@ -776,8 +796,8 @@ class TestRecover:
         missed = round(int(after.t_host_ns[0] - before.t_host_ns[0]) / 1e6)
         assert after.seq[0] - before.seq[0] - 1 == sensor.health().lost == missed > 99
 
-    def test_another_device_is_not_the_same_stream(self, sensor: FakeSensor, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(sensor, "_connect", lambda: DeviceInfo("fake", "F2", "1.0"))
+    def test_another_device_is_not_the_same_stream(self, sensor: FakeSensor) -> None:
+        sensor.info, sensor.first = DeviceInfo("fake", "F2", "1.0"), 0
         sensor.feed.append(StreamBroken("gone"))
         sensor.settle()
         assert failure_of(sensor) is ConnectError
@@ -833,7 +853,7 @@ class TestFollow:
                 first, second = one.read(0.0).seq.tolist(), other.read(0.0).seq.tolist()
             assert first[-len(second) :] == second
             assert 0 < len(second) < len(first)
-        assert not sensor._taps
+        assert not sensor.readers
 
     def test_a_lost_sample_is_a_gap_in_the_numbers(self, sensor: FakeSensor) -> None:
         sensor.feed.extend([sensor.block([5, 6]), sensor.block([9])])
@@ -877,7 +897,6 @@ class TestFollow:
             for _ in range(2):
                 with pytest.raises(StreamBroken, match=r"20 samples .* limit is 10; read more often"):
                     idle.read(0.0)
-            assert not idle.read.__self__._read.args[0]._items  # type: ignore[attr-defined]
 
     def test_an_old_follower_does_not_read_a_stream_that_was_opened_again(self, sensor: FakeSensor) -> None:
         with sensor.follow() as follow:
@@ -890,7 +909,7 @@ class TestFollow:
 
     def test_a_follower_outlives_a_reconnection(self) -> None:
         with FakeSensor(recover=True) as fake, fake.follow() as follow:
-            fake._nominal_Hz = 1000.0
+            fake.expect_rate(1000.0)
             fake.connect_error = ConnectError("not plugged in")
             fake.feed.extend([1, StreamBroken("gone")])
             seen: list[int] = []
