@@ -29,10 +29,9 @@ def test_a_file_above_the_limit_is_not_read(tmp_path: Path, monkeypatch: pytest.
         read_file(path)
 
 
-def test_a_line_without_an_end_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(files, "_LONGEST_LINE", 8)
+def test_a_line_without_an_end_is_not_read_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
-    path.write_bytes(b"one\n123456\nthree" + bytes(100))
+    path.write_bytes(b"one\n123456\nthree" + bytes(16_000_000))
     with files.open_file(path) as file:
         lines = files.read_lines(file, BadDataset, 10)
         assert [next(lines), file.tell(), next(lines)] == [b"one\n", 4, b"123456\n"]

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from ftcalib.likelihood import explanation
 from ftcalib.likelihood.descent import Kept, agreeing_poses, fewest_kept
-from ftcalib.likelihood.explanation import Explanation, _are_gaussian, _criterion, _limit, _membership, _stand_out
+from ftcalib.likelihood.explanation import _are_gaussian, _criterion, _limit, _membership, _stand_out
 from ftcalib.likelihood.session import SessionData, inverses
 from ftcalib.likelihood.variance_components import FORCE, Component, Point, channel_component, point
 from ftcalib.model import Array
@@ -133,14 +133,14 @@ def smooth_tour(n: int, *, measured: bool = True, bumped: int = 0) -> SessionDat
 
 @pytest.mark.parametrize("measured", [True, False])
 def test_some_of_many_poses_show_errors_that_have_a_structure(measured: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    searched = list[int]()
+    searched, some = list[int](), SessionData.some
 
-    def counted(own: SessionData, *arguments: Any) -> Explanation:
-        searched.append(own.n)
-        return improve(own, *arguments)
+    def counted(own: SessionData, *arguments: Any) -> SessionData:
+        chosen = some(own, *arguments)
+        searched.append(chosen.n)
+        return chosen
 
-    improve = explanation._improve
-    monkeypatch.setattr(explanation, "_improve", counted)
+    monkeypatch.setattr(SessionData, "some", counted)
     own = smooth_tour(1200, measured=measured, bumped=3)
     found, minima, _ = explanation.explain(own)
     assert set(searched) == {explanation.SEARCHED}

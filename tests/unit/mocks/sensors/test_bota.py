@@ -17,43 +17,54 @@ def test_documented_frame() -> None:
     assert stream_frame(0, WRENCH, 1_000_000, 25.5) == bytes.fromhex(FRAME)
 
 
+class Box(BotaBox):
+    """An emulator whose wire the test reads."""
+
+    def ask(self, written: bytes) -> bytes:
+        self._received(written)
+        return b"".join(self._wire.due(self.clock.now_s()))
+
+    def turn(self) -> None:
+        self._work(self.clock.now_s())
+
+    def frame(self) -> tuple[int, list[float]]:
+        """Return status and values of a frame."""
+        status, *values = struct.unpack("<H6f", self._samples(1)[0][1:27])
+        return status, values
+
+
 @pytest.fixture
-def box() -> BotaBox:
-    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), streaming_at_start=True)
+def box() -> Box:
+    box = Box(lambda n: np.tile(WRENCH, (n, 1)), streaming_at_start=True)
     box.power_up()
     return box
 
 
-def answers(box: BotaBox, written: bytes) -> bytes:
-    box._received(written)
-    return b"".join(box._wire.due(box.clock.now_s()))
-
-
 def test_it_boots_for_three_seconds_then_says_who_it_is_and_streams() -> None:
     real = RealTime()
-    box = BotaBox(lambda n: np.tile(WRENCH, (n, 1)), serial=471, clock=CellClock(real))
+    box = Box(lambda n: np.tile(WRENCH, (n, 1)), serial=471, clock=CellClock(real))
     box.power_up()
     printed = b""
     for _ in range(300):
-        box._work(box.clock.now_s())
-        printed += answers(box, b"C")
+        box.turn()
+        printed += box.ask(b"C")
         assert not box.streaming
         real.pass_s(0.01)
     assert printed == b"c,0,1,0,4\r\n"
-    box._work(box.clock.now_s())
-    assert answers(box, b"") == banner(471)
+    box.turn()
+    assert box.ask(b"") == banner(471)
     assert box.streaming
     assert banner(471) == b"App Init\r\nname: SensONE\r\nS/N: 471\r\nFW version: 1.2.0\r\n"
 
 
-def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
+def test_overrange_and_uncalibrated_bits(box: Box) -> None:
     box.measure = lambda n: np.tile([0, 0, -1300.0, 0, 0, 0], (n, 1))
-    status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
+    status, values = box.frame()
     assert status == 0x0002
     assert values[2] == -1200
     box.measure = lambda n: np.tile(WRENCH, (n, 1))
     box.calibrated, box.saturated_axis = False, 4
-    status, *values = struct.unpack("<H6f", box._samples(1)[0][1:27])
+    status, values = box.frame()
     assert status == 0x000A
     assert values[4] == 15
 
@@ -69,10 +80,10 @@ def test_overrange_and_uncalibrated_bits(box: BotaBox) -> None:
         (b"cccccccccccccccccc", b"r,1,c,0\r\n"),
     ],
 )
-def test_configuration_answers(box: BotaBox, written: bytes, answered: bytes) -> None:
-    assert answers(box, b"garbage C") == b"r,0,C,0\r\n"
-    assert answers(box, written) == answered
-    assert answers(box, b"C") == b"r,0,C,0\r\n", "and nothing else"
+def test_configuration_answers(box: Box, written: bytes, answered: bytes) -> None:
+    assert box.ask(b"garbage C") == b"r,0,C,0\r\n"
+    assert box.ask(written) == answered
+    assert box.ask(b"C") == b"r,0,C,0\r\n", "and nothing else"
 
 
 @pytest.mark.parametrize(("sinc", "rate_hz"), [(2048, 25), (512, 100), (256, 200), (128, 400), (64, 800)])
@@ -80,8 +91,8 @@ def test_sampling_time_follows_the_filter(sinc: int, rate_hz: float) -> None:
     assert 1 / BotaBox(lambda n: np.zeros((n, 6)), sinc_length=sinc).sample_s == pytest.approx(rate_hz, rel=1e-3)
 
 
-def test_serial_number_in_configuration_mode(box: BotaBox) -> None:
-    assert answers(box, b"p?") == b"", "it streams"
-    assert answers(box, b"C") == b"r,0,C,0\r\n"
-    assert answers(box, b"p") == b""
-    assert answers(box, b"?") == b"p,0,12345,1,0,SensONE\r\nr,0,p,0\r\n"
+def test_serial_number_in_configuration_mode(box: Box) -> None:
+    assert box.ask(b"p?") == b"", "it streams"
+    assert box.ask(b"C") == b"r,0,C,0\r\n"
+    assert box.ask(b"p") == b""
+    assert box.ask(b"?") == b"p,0,12345,1,0,SensONE\r\nr,0,p,0\r\n"

@@ -11,9 +11,14 @@ from ftmocks.wires.modbus import with_crc
 WRENCH = np.array([12.34, -5.67, 100, 0.15, -0.025, 1])
 
 
+class Box(RobotiqBox):
+    def frame(self) -> bytes:
+        return self._samples(1)[0]
+
+
 @pytest.fixture
-def box() -> RobotiqBox:
-    return RobotiqBox(lambda n: np.tile(WRENCH, (n, 1)))
+def box() -> Box:
+    return Box(lambda n: np.tile(WRENCH, (n, 1)))
 
 
 def ask(box: RobotiqBox, request: str) -> str:
@@ -73,8 +78,8 @@ def test_others_and_damaged_requests_are_met_with_silence(box: RobotiqBox) -> No
     assert box.reply(b"\xff" * 50) == b""
 
 
-def test_saturation(box: RobotiqBox) -> None:
+def test_saturation(box: Box) -> None:
     box.measure = lambda n: np.tile([500.0, -500, 0, 0, 0, 0], (n, 1))
     box.saturated_axis = 5
     assert read(box, 180, 6) == (0x7FFF, 0x8000, 0, 0, 0, 0x7FFF)
-    assert box._samples(1)[0][2:14] == bytes.fromhex("FF7F 0080 0000 0000 0000 FF7F")
+    assert box.frame()[2:14] == bytes.fromhex("FF7F 0080 0000 0000 0000 FF7F")

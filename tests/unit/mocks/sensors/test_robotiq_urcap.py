@@ -62,13 +62,18 @@ class Slow(socket.socket):
         return len(sent)
 
 
+class Box(RobotiqUrcap):
+    def deliver(self, client: socket.socket, count: int) -> None:
+        self._clients.setdefault(client, b"")
+        self._deliver([TEXT] * count)
+
+
 @pytest.mark.parametrize("room", [0, 1, 30, len(TEXT), len(TEXT) + 5])
 def test_a_client_that_does_not_read_loses_whole_readings(room: int) -> None:
-    box = RobotiqUrcap(lambda n: np.tile(WRENCH, (n, 1)))
+    box = Box(lambda n: np.tile(WRENCH, (n, 1)))
     with Slow(room) as client:
-        box._clients[client] = b""
-        box._deliver([TEXT] * 5)
+        box.deliver(client, 5)
         client.room = 1000
-        box._deliver([TEXT] * 2)
+        box.deliver(client, 2)
         assert client.data == TEXT * (client.data.count(b"(")), "no reading is broken"
         assert client.data.endswith(2 * TEXT)

@@ -74,6 +74,20 @@ def corrupted(frame: bytes, seed: int, byte_slip: float) -> bytes:
     return wire.due(CLOCK.now_s() + LATER)[0]
 
 
+class Box(AtiSerialBox):
+    """An emulator whose client asks for marks."""
+
+    def _client_wants_marks(self) -> bool:
+        return True
+
+    def send(self, burst: bytes) -> int:
+        return self._send(burst, RECORD_BYTES)
+
+    def finish(self) -> None:
+        while self._unsent or self._begun:
+            self._finish_record()
+
+
 @given(
     st.lists(
         st.tuples(st.integers(1, 3), st.integers(0, 12) | st.none(), st.sampled_from([0xFF, 0x00])),
@@ -89,7 +103,7 @@ def test_a_full_terminal_drops_whole_records_and_breaks_no_mark(
     bursts: list[tuple[int, int | None, int]], room: list[int]
 ) -> None:
     """Bursts of numbered records, each with a wrong byte or none, into a terminal with so much room at each write."""
-    box = AtiSerialBox(lambda n: np.zeros((n, 6)))
+    box = Box(lambda n: np.zeros((n, 6)))
     wire, rooms = bytearray(), iter(room)
 
     def write(_master: int, data: bytes) -> int:
@@ -103,15 +117,13 @@ def test_a_full_terminal_drops_whole_records_and_breaks_no_mark(
     dropped = 0
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("ftmocks.wires.pty.os.write", write)
-        patch.setattr(box, "_client_wants_marks", lambda: True)
         for count, at, filler in bursts:
             data = b"".join(bytes([filler] * 12 + [len(sent) + i]) for i in range(count))
             burst = data if at is None else WrongParity(data, at)
             characters = unmarked(marked(burst))
             sent += [characters[i : i + RECORD_BYTES] for i in range(0, len(data), RECORD_BYTES)]
-            dropped += box._send(burst, RECORD_BYTES)
-        while box._unsent or box._begun:
-            box._finish_record()
+            dropped += box.send(burst)
+        box.finish()
     characters = unmarked(bytes(wire))
     arrived = [characters[i : i + RECORD_BYTES] for i in range(0, len(characters), RECORD_BYTES)]
     assert len(arrived) == len(sent) - dropped
