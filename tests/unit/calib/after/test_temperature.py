@@ -8,7 +8,7 @@ import pytest
 from scipy.linalg import null_space
 from scipy.stats import f, multivariate_normal
 
-from ftcalib.after.series import _SHARES, BiasTemperature, bias_temperature
+from ftcalib.after.series import BiasTemperature, bias_temperature
 from ftcalib.after.state import with_bias_change
 from ftcalib.model import BIASES, Array
 from ftcalib.sensor_matrix import Response
@@ -17,6 +17,9 @@ from tests.unit.ftdrive.stream.simulated import calibrated
 ONES = np.repeat([1.0, 0.03], 3)
 SLOPE = 0.1 * ONES
 NOISE = 0.02 * ONES
+
+SHARES = np.array([0.0, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5])
+"""Standard deviations that are tried, relative to the spread of the residuals."""
 
 
 def fitted(seed: int, slope: Array, n: int = 12, scatter: float = 0.1, walk: float = 0.3) -> BiasTemperature:
@@ -71,7 +74,7 @@ def test_scatter_and_walk_are_averaged_by_their_likelihood() -> None:
         left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
         spread = np.sqrt(np.mean(left**2))
         weights, slopes, variances, misses = [], [], [], []
-        for scatter, walk in product(_SHARES * spread, repeat=2):
+        for scatter, walk in product(SHARES * spread, repeat=2):
             V = np.diag(np.mean(sigma[:, :3] ** 2, axis=1) + scatter**2) + walk**2 * np.minimum.outer(since, since)
             W = np.linalg.inv(V)
             C = np.linalg.inv(X.T @ W @ X)

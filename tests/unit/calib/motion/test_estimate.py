@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, skew
 from ftcalib.motion.estimate import (
-    _SIZES,
     TOUCH_N,
     TOUCH_NM,
     _first_kept,
@@ -177,13 +176,25 @@ def test_a_step_is_that_of_generalised_least_squares(posed: Posed, off: tuple[st
     )
 
 
-@pytest.mark.parametrize("name", _SIZES)
-def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(posed: Posed, name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "tried"),
+    [
+        ("gain", (1.6e-3, 1.6e-2)),
+        ("cross_talk", (1.7e-3, 6e-2)),
+        ("walk_N", (1.4e-3, 6.5e-2)),
+        ("walk_Nm", (2.8e-5, 1.3e-3)),
+        *((f"{kind}_N", (1.6e-4, 0.63)) for kind in ("slow", "cable", "load")),
+        *((f"{kind}_Nm", (6e-6, 2e-2)) for kind in ("slow", "cable", "load")),
+        *((f"{kind}_rad", (1.6e-6, 6e-3)) for kind in ("yielding", "rotation")),
+    ],
+)
+def test_the_likelihood_of_a_size_is_that_of_the_whole_solution(
+    posed: Posed, name: str, tried: tuple[float, float]
+) -> None:
     problem, load, effects = posed
     sums = problem.sums(load, effects, WHITE, all_kept(problem.rows), np.zeros(len(problem.rows), np.intp))
     sizes = {"cross_talk": 3e-3, "walk_N": 0.05, "slow_Nm": 2e-3, "rotation_rad": 1e-3, "cable_N": 0.02}
-    tried = _SIZES[name][[2, -3]]
-    found = problem.criteria(name, tried, sizes, sums, load, effects)
+    found = problem.criteria(name, np.array(tried), sizes, sums, load, effects)
     at_zero = problem.solve({**sizes, name: 0.0}, sums, load, effects).criterion
     expected = [problem.solve({**sizes, name: size}, sums, load, effects).criterion - at_zero for size in tried]
     np.testing.assert_allclose(found, expected, atol=1e-3)
