@@ -414,6 +414,14 @@ class ReaderInMemory(Reader):
     def receive(self) -> None:
         self._follow()
 
+    @property
+    def newest_t_s(self) -> float:
+        return self._t_device_s
+
+    @property
+    def n_followers(self) -> int:
+        return len(self._followers)
+
     def _run(self) -> None:
         pass  # a fake clock is for one thread
 

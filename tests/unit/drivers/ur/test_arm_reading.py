@@ -128,7 +128,7 @@ def test_what_the_network_has_delayed_is_not_now(
     late: list[float] = []
     while clock.now_s() < controller.stalled_until_s + 0.3:
         clock.advance(0.001)
-        t_s = full_rate._t_device_s
+        t_s = full_rate.newest_t_s
         late.append(controller.t_s - t_s)
         try:
             status = full_rate.status()
@@ -401,7 +401,7 @@ def test_a_follower_reads_every_sample_as_flange_poses(
     nominal = [forward(MODELS["UR5e"], q) for q in joints]
     np.testing.assert_allclose(states.R_base_flange, [pose.R for pose in nominal], atol=1e-9)
     np.testing.assert_allclose(states.p_base_flange_m, [pose.p_m for pose in nominal], atol=1e-9)
-    assert not full_rate._followers
+    assert full_rate.n_followers == 0
 
 
 def test_a_follower_loses_nothing_while_it_is_not_read(
