@@ -16,12 +16,12 @@ ROOT = Path(__file__).parents[2]
 PACKAGES = ("calib", "drivers", "ftdrive")
 
 CEILINGS = {
-    "product lines": 70524,
+    "product lines": 70504,
     "files": 308,
     "dataclasses": 229,
     "public functions and classes": 1414,
     "import statements inside functions": 108,
-    "test lines": 81508,
+    "test lines": 75611,
 }
 ROOMS = {
     "a: calibrate, to the first move": 70,
