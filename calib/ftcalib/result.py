@@ -134,7 +134,7 @@ class CalibrationResult(Displayed, Calibrated):
     covariance: Array
     """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench in the sensor frame, with `response` and mean bias, without drift."""
+    """(n, 6) measured minus predicted wrench, N and N·m, sensor axes, with `response` and mean bias, without drift."""
     chi2: float
     """Weighted sum of squared residuals of the used poses with the measured noise alone, without drift and
     `components`; with the noise from the residuals if it was not measured."""
@@ -163,7 +163,7 @@ class CalibrationResult(Displayed, Calibrated):
     drift: DriftResult | None = None
     """Drift of the bias; None if no drift was found, or if `drift="none"`."""
     mean_bias: Array | None = None
-    """(6,) mean of the bias over the session; None without drift, or in a file of an earlier format."""
+    """(6,) mean of the bias over the session, N and N·m; None without drift, or in a file of an earlier format."""
     response: Response | None = None
     """Gain and cross-talk of the sensor; None if not found, or if the method does not estimate them."""
     gain_sigma: float = 0.0

@@ -332,7 +332,7 @@ def _orientations(rows: MotionRows) -> Array:
 
 
 def _static_wrench(rows: MotionRows, best: MotionFit, weight_N: float) -> Array:
-    """Return the wrench (n, 6) that the sensor would read at rest in the orientation of each row.
+    """Return the wrench (n, 6), N and N·m, that the sensor would read at rest in the orientation of each row.
 
     If the fit is poor, the inertial wrench is that of the best linear function, whatever the axes and signs.
     """

@@ -186,7 +186,6 @@ def _device_info(document: Mapping[str, Any]) -> DeviceInfo:
 
 
 def _frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
-    """Build a frame from the result of `WrenchFrame.to_dict`."""
     about: Any = values["about"]
     return WrenchFrame(values["axes"], tuple(about) if isinstance(about, list) else about)
 

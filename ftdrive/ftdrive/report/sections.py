@@ -395,11 +395,12 @@ def tour(facts: Facts) -> Section:
         return Section("tour", title, text, (), tables)
     text += plan["why"]
     if "sweep" in plan:
-        text.append(f"Proven clear along the whole curve, nearest {plan['min_clearance_mm']:.0f} mm.")
+        text.append(f"Proven clear along the whole curve, clearance at least {plan['min_clearance_mm']:.0f} mm.")
         return Section("tour", title, text, (), tables)
+    proven = "all" if plan["certified"] else "NOT all"
     text.append(
         f"{plan['poses']} poses, {plan['motion_time_s']:.0f} s of motion, no move above {plan['max_move_deg']:.0f}°, "
-        f"{'all' if plan['certified'] else 'NOT all'} proven clear, nearest {plan['min_clearance_mm']:.0f} mm."
+        f"{proven} proven clear, clearance at least {plan['min_clearance_mm']:.0f} mm."
     )
     rows, larger = [], []
     obtained = facts["result"]["sigma"] | facts["result"]["predicted_error"]

@@ -75,7 +75,7 @@ class FaultyWire(Generic[Frame]):
         self._clock = clock
         self._random = random.Random(seed)
         self.foreign: Callable[[random.Random], Frame] | None = None
-        """Returns a frame of another node."""
+        """Function that returns a frame of another node on the bus."""
         self._outbox: deque[tuple[float, Frame]] = deque()
         self._held: list[Frame] = []
 
