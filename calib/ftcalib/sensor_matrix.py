@@ -254,12 +254,12 @@ def sensor_error_columns(tool: Parameters, known: Response, p: Parameters, R_bas
 
 
 def _products(A: Array, v: Array, sigma: Array) -> Array:
-    """Return the derivative (n, 3, 9) of A E v by the entries of E, times their sigma (3, 3), for vectors v (n, 3)."""
+    """Return the derivative (n, 3, 9) of A E v with respect to E, times the sigmas (3, 3), for vectors v (n, 3)."""
     return np.asarray(np.einsum("ri,nj,ij->nrij", A, v, sigma).reshape(len(v), 3, 9))
 
 
 _ENTRIES = np.eye(36).reshape(36, 6, 6)
-"""(36, 6, 6) derivative of the error matrix E by its entries, row by row."""
+"""(36, 6, 6) derivative of the error matrix E with respect to its entries, row by row."""
 
 
 def ranges(lever_m: float) -> Array:

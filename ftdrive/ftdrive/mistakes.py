@@ -114,9 +114,9 @@ def _runs_in(folder: Path) -> Iterator[Path]:
 
 
 def other_command(group: click.Group, arguments: Sequence[str], about: str = "") -> str:
-    """Return the commands that accept the first misplaced file of a line; empty if there is none.
+    """Return the commands that accept the first file that this command does not accept; empty if there is none.
 
-    If the error is `about` something, only files named there are considered.
+    With the error message `about`, only files that it names are considered.
     """
     for number, place, name, command in _unmatched_arguments(group, arguments):
         path, kind = Path(name), kind_of(Path(name))

@@ -298,7 +298,7 @@ class Station:
         }
 
     def _content(self) -> dict[str, Any]:
-        """Return the truth of the cell, or the recording, whose truth is unknown."""
+        """Return the true parameters of the emulated cell, or what recording it plays; then they are unknown."""
         recording = self._recording
         if recording is None:
             return {"truth": self.world.truth.to_json(), "imperfections": asdict(self.world.imperfections)}

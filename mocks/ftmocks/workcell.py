@@ -23,7 +23,7 @@ STRING_MM = 250.0
 SWING_DEG = 2.0
 """Swing of a load that an operator has hung, degrees."""
 GRIPPED_M = 0.06
-"""Edge length of a load in the gripper, a cube."""
+"""Edge length of the cubic load in the gripper, m."""
 NO_NUMBER: Array = np.full(6, np.nan)
 
 
@@ -84,7 +84,7 @@ class Workcell:
         if "joint" in request:
             joint = int(request["joint"])
             if not 1 <= joint <= 6:
-                raise ValueError(f"joint {joint} is not 1 to 6")
+                raise ValueError(f"the joint must be 1 to 6, not {joint}")
             beyond_rad = float(np.radians(request["beyond_deg"]))
             cable = Cable(_numbers(request["force_N_deg"], 3), point_m, joint=joint - 1, beyond_rad=beyond_rad)
         else:

@@ -12,7 +12,7 @@ from tests.system.command_line import CommandLine, end_of, listen_for
 @pytest.mark.slow
 def test_ctrl_c_ends_the_server(ftdrive: CommandLine) -> None:
     process = ftdrive.start("fleet", "serve", "--metrics", "127.0.0.1:0")
-    said = listen_for(process, "Ctrl-C ends.")
+    said = listen_for(process, "Press Ctrl-C to stop.")
     process.send_signal(signal.SIGINT)
     ended, more = end_of(process)
     assert ended == 130, more

@@ -16,7 +16,7 @@ from tests.unit.ftdrive.servers.fake_stream import Client
 @pytest.mark.slow
 def test_a_viewer_sees_no_force_on_a_free_tool(ftdrive: CommandLine) -> None:
     process = ftdrive.start("stream", "--simulate", "--sensor", "emulated://serial", "--port", "0", "--axes", "base")
-    printed = listen_for(process, "Ctrl-C ends.")
+    printed = listen_for(process, "Press Ctrl-C to stop.")
     (port,) = set(re.findall(r"ws://127\.0\.0\.1:(\d+)", printed))
     store = get_typestore(Stores.ROS2_HUMBLE)
     force_N = {}

@@ -41,7 +41,7 @@ TIED = 1.3
 # Wrenches of a weight in other poses: force residual from which poses are suspected, and from which they are taken for
 # other poses rather than inaccurate ones, as shares of the weight; largest radial share of the residual.
 OFF_POSES, OTHER_POSES, OF_A_WEIGHT = 0.015, 0.15, 0.1
-# Largest angle between a constant force and down for a weight in base axes.
+# A force that is constant in base axes counts as a weight within this angle of straight down.
 IN_BASE_RAD = np.deg2rad(10.0)
 # Largest relative variation of a constant force.
 STEADY = 0.05

@@ -105,8 +105,8 @@ class Estimate(Calibrated):
     ) -> Self:
         """Return the estimates of another method, for poses with independent noise `wrench_cov` (n, 6, 6).
 
-        `measured` tells measured noise from noise estimated from the residuals. `free` (15, m) is the identity unless
-        the method assumes mounting or gravity.
+        `measured` is true if the noise was measured, and false if it was estimated from the residuals. The columns of
+        `free` (15, m) span the estimated parameters; it is the identity unless the method assumes mounting or gravity.
         """
         r = np.asarray(wrench - predict(parameters, R_base_flange))[..., None]
         chi2 = float(weights @ np.sum(r * np.linalg.solve(wrench_cov, r), axis=(1, 2)))

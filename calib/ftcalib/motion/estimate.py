@@ -47,7 +47,7 @@ _WORTH = 4.0
 # Initial standard deviations of components.
 _ROUGH: Mapping[str, float] = {"gain": 0.02, "cross_talk": 0.02}
 _SAME_RAD = 0.2
-# Length of the moving average of the variance, rows, and weight of the whole state as a prior, rows.
+# Window of the moving average of the variance, and weight of the mean variance of the state as a prior, both in rows.
 _AROUND, _PRIOR_ROWS = 3, 1.0
 # Largest number of steps of the fit with a prior, and the change of its cost at which the fit has converged.
 _PRIOR_STEPS, _SETTLED = 20, 1e-4
@@ -224,7 +224,7 @@ def _join(
     """
 
     def fitted(kept: Sequence[int]) -> tuple[MovingLoad, Array, Solution]:
-        """Return load, effects and solution; `kept` as in `CellPrior.rows`."""
+        """Fit with the prior. Return the load, its other effects and the solution; `kept` is as in `CellPrior.rows`."""
         (load, effects), before = start, np.inf
         for _ in range(_PRIOR_STEPS):
             sums = problem.sums(load, effects, *weighed)

@@ -59,7 +59,7 @@ from ftcalib.motion.model import (
 )
 from ftcalib.motion.samples import Motion, MotionRows
 
-# Prior of a tool, one sigma: radius of gyration, sensor height, and delay in addition to that of the rows.
+# Prior sigmas of a tool: radius of gyration, height of the sensor, and delay that the rows are not yet corrected for.
 GYRATION_M, HEIGHT_M, DELAY_S = 0.15, 0.3, 0.3
 # Interval and largest number of the knots of the bias.
 KNOT_S, _MOST_KNOTS = 5.0, 25

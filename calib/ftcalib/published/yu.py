@@ -262,7 +262,7 @@ def _likely_members(R_base_flange: Array, most: int = 12) -> Iterator[Array]:
 def _common_rotation(R_base_flange: Array, seed: Array) -> Array:
     """Return Y estimated from all poses in the group of `seed`: the smallest of 24 equivalent rotations."""
     Y = seed
-    for tolerance_rad in (4 * TOLERANCE_RAD, 2 * TOLERANCE_RAD, _RECOGNISED_RAD):  # `seed` itself deviates at first
+    for tolerance_rad in (4 * TOLERANCE_RAD, 2 * TOLERANCE_RAD, _RECOGNISED_RAD):  # `seed` may deviate more
         number = _Match(R_base_flange, Y, tolerance_rad).number
         near = number >= 0
         if near.any():

@@ -158,7 +158,7 @@ def _main() -> None:
     serve(calls, requests, reply, unwatched_s)
     with suppress(Exception):
         calls.quit()
-    os._exit(0)  # the regular exit of the library takes 0.5 s and may crash
+    os._exit(0)  # the normal shutdown of the library takes 0.5 s and may crash
 
 
 def serve(calls: Calls, requests: "SimpleQueue[str | None]", reply: Callable[..., None], unwatched_s: float) -> None:

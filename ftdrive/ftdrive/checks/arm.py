@@ -181,7 +181,7 @@ def check_link(arm: RobotArm, clock: Clock, *, usual_s: float, gap_s: float) -> 
         if median_s < usual_s and np.quantile(took_s, 0.9) < gap_s:
             return Check(name, "ok", found)
     limit = f"allowed: median {1e3 * usual_s:.0f} ms, 90 % within {1e3 * gap_s:.0f} ms"
-    return Check(name, "failed", f"{found} ({limit})", "use a cable, and reduce the load of this computer and network")
+    return Check(name, "failed", f"{found} ({limit})", "use a network cable, and reduce the load on this computer")
 
 
 def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:

@@ -189,10 +189,10 @@ def _check_access(port: Path) -> Check:
     except (ImportError, KeyError):
         group = "dialout"
     if info.st_mode & stat.S_IRGRP and info.st_mode & stat.S_IWGRP and group != "root":
-        fix = f"sudo usermod -aG {group} $USER    (then log out and in again)"
+        fix = f"sudo usermod -aG {group} $USER    (then log out and back in)"
     else:
         install = _udev_command(Path(os.path.realpath(port)).name)
-        fix = f"{install}    (then log out and in again; until it is unplugged: sudo chmod a+rw {port})"
+        fix = f"{install}    (then log out and back in; for access until it is unplugged: sudo chmod a+rw {port})"
     return Check("permissions.port", "failed", f"{port} is not readable and writable", fix)
 
 

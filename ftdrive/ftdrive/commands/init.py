@@ -97,7 +97,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
         else:
             from ftdrive.view.init_page import InitPage
 
-            messages.print(f"Fill in the form there. Ctrl-C ends; the answers are kept in {draft}.")
+            messages.print(f"Fill in the form there. Press Ctrl-C to stop; the answers are kept in {draft}.")
             form = InitPage(page, described, draft, output.name, say)
             form.run()
         cell = described.cell()

@@ -189,6 +189,6 @@ def plan_command(
         command = " ".join(["ftdrive calibrate", *(option for option, given in same.items() if given)])
         messages.print_next(f"{command}   (asks before anything moves)")
     if page is not None:
-        messages.print("Ctrl-C ends.")
+        messages.print("Press Ctrl-C to stop.")
         with suppress(KeyboardInterrupt):
             PlanPage(page, made, certifier).play(Event())

@@ -74,7 +74,7 @@ def record(
     with ExitStack() as stack:
         stream = source.open(stack, frame, track, stages)
         recorder = Recorder(paths, stream.info, stream.cell.to_dict(), duration_s=duration_s, count=count)
-        messages.print(f" Recording, {frame}. Ctrl-C ends.")
+        messages.print(f" Recording, {frame}. Press Ctrl-C to stop.")
         try:
             with working("Recording") as recorder.show:
                 for _ in pump(stream, [recorder], until=lambda: recorder.is_complete, patience_s=0.0):

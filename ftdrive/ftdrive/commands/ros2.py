@@ -37,7 +37,7 @@ def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> 
 
     The topics are ~/wrench_raw, ~/wrench, ~/contact, ~/status and /diagnostics, the services ~/tare and ~/undo_tare.
     `ros2 param describe` explains each parameter. While a device sends no samples or the calibration does not fit, no
-    wrench is published and /diagnostics gives the reason. The arm is only read, never moved. Ctrl-C ends.
+    wrench is published and /diagnostics gives the reason. The arm is only read, never moved. Press Ctrl-C to stop.
     """
     ros2_module("rclpy")  # a missing package raises here, before any work
     from ftdrive.servers.ros2 import Ros2Node  # this imports rclpy
@@ -50,7 +50,7 @@ def ros2(source: SourceOptions, frame: WrenchFrame, ros_args: Sequence[str]) -> 
             calibration = calibration if given else source.calibration()
             messages.print(
                 f"Node {node.name} publishes {node.name}/wrench in {node.parameters.frame}, at most "
-                f"{node.fixed.rate:g} Hz, {'reliable' if node.fixed.reliable else 'best effort'}. Ctrl-C ends."
+                f"{node.fixed.rate:g} Hz, {'reliable' if node.fixed.reliable else 'best effort'}. Press Ctrl-C to stop."
             )
             node.serve(lambda: source.stream(cell, calibration, node.parameters.tool))
     except KeyboardInterrupt:

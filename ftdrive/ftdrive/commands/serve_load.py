@@ -24,7 +24,7 @@ def serve_load(source: SourceOptions, frame: WrenchFrame, track: Tracking, first
 
     Any program may run. It writes requests to two output registers and reads input registers, with the functions of
     `ftdrive export urscript`. Nothing else is sent, and the arm is never moved. With --track, the program also gets the
-    tracked bias. Ctrl-C ends.
+    tracked bias. Press Ctrl-C to stop.
     """
     doubles = len(doubles_of(track))
     last = LAST_REGISTER + 1 - max(len(INTEGERS), doubles)

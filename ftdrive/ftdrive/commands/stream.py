@@ -47,7 +47,7 @@ def stream(
 
     Foxglove, Lichtblick and PlotJuggler from 3.16 connect to a WebSocket server. They receive every sample, poses,
     joint angles, frames, arrows and events. Programs can tare and change frame and stages. In a browser, only pages of
-    Foxglove and Lichtblick are accepted. The arm is only read, never moved. Ctrl-C ends.
+    Foxglove and Lichtblick are accepted. The arm is only read, never moved. Press Ctrl-C to stop.
     """
     udp_address = None if udp is None else host_and_port("--udp", udp, "127.0.0.1:9870")
     with ExitStack() as stack:
@@ -75,4 +75,4 @@ def _introduce(source: Stream, server: FoxgloveServer, host: str, udp: tuple[str
             f"Unprotected: a program on any computer that reaches port {server.port} can read the stream, tare it and "
             "change its frame and stages. There is no password and no encryption."
         )
-    messages.print("Ctrl-C ends.")
+    messages.print("Press Ctrl-C to stop.")

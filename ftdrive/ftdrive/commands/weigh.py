@@ -58,7 +58,7 @@ def weigh_command(
 
     One pose gives the mass, and the centre of mass except along gravity, each with one sigma, and the smallest mass
     that differs from zero. Contacts, cables and moving parts are reported and not weighed. With --moving, the load is
-    weighed while the arm carries it, with its complete centre of mass. The arm is only read, never moved. Ctrl-C ends.
+    weighed while the arm carries it, with its complete centre of mass. The arm is only read. Press Ctrl-C to stop.
     """
     if moving and (zero or poses > 1):
         raise ConfigError("--moving tracks the bias and needs only one pose: leave out --zero and --poses")

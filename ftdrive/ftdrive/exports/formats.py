@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 Property = Literal["tilt", "rotation", "response"]
 Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
-# Largest accepted force error of a target that cannot express everything, N.
+# Largest accepted force error, N, of an export format that cannot represent the whole calibration.
 MAX_FORCE_ERROR_N: Final = 0.1
 # From mc_rtc/constants.h. The force must be right, so the mass for this gravity differs by up to 0.3 %.
 MC_RTC_G_M_S2: Final = 9.80665

@@ -97,7 +97,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
     yield "  joint = joint + 1"
     yield "end"
     yield ""
-    yield "# To the first pose: slow, and not proven clear."
+    yield "# Move to the first pose: slow, and not proven clear."
     yield f"movej({first}, a={APPROACH_RAD_S2:.6f}, v={APPROACH_RAD_S:.6f})"
     for i, step in enumerate((*steps, steps[0]), start=1):
         if i > 1:
@@ -110,7 +110,7 @@ def _body(plan: Plan, dwell_s: float) -> Iterator[str]:
 
 
 def _warnings(model: str, *, is_nominal: bool) -> Iterator[str]:
-    yield "This is no safety function. Real cables, fixtures and people are not in the plan."
+    yield "This is not a safety function. The plan does not consider real cables, fixtures and people."
     yield f"Run it on a {model} with exactly this tool and mounting; in another cell the moves are not proven clear."
     if not is_nominal:
         yield "It is proven with the measured kinematics of one arm: on another one distances are up to 20 mm smaller."

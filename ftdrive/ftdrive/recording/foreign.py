@@ -177,7 +177,7 @@ def _choose_topic(reader: "AnyReader", kind: str, topic: str | None, option: str
         others = ", ".join(sorted({f"{one.topic} ({one.msgtype})" for one in reader.connections}))
         if of_kind:
             raise ConfigError(f"the bag has {len(of_kind)} topics of {kind}, {', '.join(of_kind)}: give {option}")
-        raise ConfigError(f"the bag has no topic of {kind}, but {others}: give {option} or another bag")
+        raise ConfigError(f"the bag has no topic of {kind}, only {others}: give {option} or another bag")
     return topic or of_kind[0]
 
 

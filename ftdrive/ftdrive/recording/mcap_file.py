@@ -282,7 +282,7 @@ def read_mcap(path: Path, columns: Collection[str]) -> Generator[Piece, None, st
     size = path.stat().st_size
     with open_file(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise BadRecording("the first bytes are not those of MCAP")
+            raise BadRecording("the file does not begin as an MCAP file")
         try:
             for opcode, data in _data_section(file):
                 if opcode == _ATTACHMENT:

@@ -195,7 +195,7 @@ class Recorder(Sink):
             status = self._stream.status()
             values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
             delay_ms = with_sigma(1e3 * status.delay_s, 1e3 * status.delay_sigma_s)
-            text = f"delay of the wrench after the pose: {delay_ms} ms (1 sigma)"
+            text = f"delay of the wrench relative to the pose: {delay_ms} ms (± is 1 sigma)"
             self._events.append(StreamEvent(self.last_ns, "delay", text, values))
         self._flush()
         if self._files:

@@ -86,7 +86,7 @@ class SolveOptions:
     """(3,) declared up direction in base, which replaces that of the mounting in a run."""
     as_published: bool = False
     earlier: CalibrationResult | None = None
-    """Result with the mounting, base and gain for a new tool."""
+    """Earlier result, from which a new tool takes mounting, gravity direction and gain."""
     pair: tuple[Path, Path] | None = None
     """Files of wrench and orientation, which together are a recording in motion."""
     point_mass: bool = False
@@ -290,7 +290,7 @@ class RecordedData:
     records: Sequence[PoseRecord] = ()
     """Records of a run; empty for other sources."""
     earlier: CalibrationResult | None = None
-    """Result with the mounting, base and gain for a new tool."""
+    """Earlier result, from which a new tool takes mounting, gravity direction and gain."""
 
     def solve(
         self,

@@ -72,9 +72,9 @@ class _SafetyQuestions:
 
     def ask(self, way_rad: Array, *, assumed: bool) -> None:
         """Ask all questions before the arm moves along `way_rad` (k, 6); with `assumed`, `--yes` may answer."""
-        room = "" if self._plan.arm_rests else ", and the space of the whole arm, which moves too,"
+        room = "" if self._plan.arm_rests else ", and the space around the whole arm, which moves too,"
         if arm_moves(way_rad):
-            room = f", and the space of the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
+            room = f", and the space around the whole arm, which moves in the approach ({turns_in_words(way_rad)}),"
         for text in (
             *(() if self._load is None else self._load.questions),
             "Is the tool free: no contact, no workpiece, no fluid, cables slack? Is the base bolted?",

@@ -52,7 +52,7 @@ class Before:
     """Approach to the first remaining pose."""
     runs: Path
     known: bool
-    """Whether this arm has completed the plan before, so that its controller has accepted every move."""
+    """Whether this arm has completed the plan before, which means that its controller has accepted every move."""
     quiet: FtSamples
     """Samples of the resting sensor over `LISTEN_S`."""
     resumed: bool
@@ -277,7 +277,7 @@ def run_checks(before: Before, rows: Sequence[SessionCheck]) -> None:
 
 @contextmanager
 def awake() -> Iterator[str]:
-    """Keep the computer from going to sleep if systemd can (row 18); yields a note for the operator."""
+    """Keep the computer from going to sleep if systemd supports it (hazard 18); yield a note for the operator."""
     asleep = "this computer may go to sleep: disable sleep during the session"
     tool = shutil.which("systemd-inhibit") if sys.platform == "linux" else None
     if tool is None:

@@ -166,7 +166,7 @@ class Tour:
         speed_rad_s = self._own_speed(index)
         if speed_rad_s is None:
             drives = ", and moves along it if --yes may confirm it" if self._drive.trusted and self._options.yes else ""
-            return f"Enter plans the approach and shows it{drives}, {joints}, {largest}"
+            return f"Enter plans and shows the approach{drives} ({joints}, {largest})"
         return f"Enter moves {joints}, {largest}, at {np.degrees(speed_rad_s):.0f} °/s"
 
     def _turn(self, key: Key) -> None:

@@ -61,9 +61,10 @@ def samples_in_reading(rate_Hz: float) -> int:
 
 
 class MotionTracker:
-    """State of motion at each sample, from the mean poses of readings; rest begins after 0.5 s without motion.
+    """Classify each sample as at rest or in motion, from poses averaged over each reading of the sensor.
 
-    If the position of the sensor is unknown (NaN), the centre of mass is taken relative to the flange.
+    Rest begins after 0.5 s without motion. The motion includes that of the centre of mass of the tool. If the position
+    of the sensor is unknown (NaN), its origin is taken to be that of the flange.
     """
 
     def __init__(self, rate_Hz: float, mass_kg: float, parameters: Parameters, p_flange_sensor_m: Array) -> None:

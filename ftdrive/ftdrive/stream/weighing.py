@@ -418,7 +418,7 @@ class Weighing(Sink):
     def given_up(self, shown: ScaleState) -> CannotWeigh:
         """Return the error for a single weighing that did not succeed within `PATIENCE_S`."""
         code = shown.refusal or "samples"
-        # faults are kept already
+        # faults have been kept when they occurred
         if code not in _FAULTS:
             self._keep({"refused": code})
         return CannotWeigh(code, shown.weight)

@@ -39,7 +39,7 @@ class Interview:
         self._addresses: dict[str, str] = {}
 
     def take_draft(self, *, asked: bool) -> None:
-        """Use the answers of a draft; if `asked`, only after confirmation."""
+        """Use the answers saved in a draft; if `asked`, only after the user confirms."""
         if self._draft is None or not self._draft.exists():
             return
         when = saved_at(self._draft)

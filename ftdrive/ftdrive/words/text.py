@@ -16,7 +16,7 @@ COMMANDS: Final[Mapping[str, str]] = {
     "doctor": "Check robot, sensor and computer. Moves nothing.",
     "devices": "List serial ports and CAN interfaces.",
     "solve": "Solve a recorded run, a dataset or a CSV file.",
-    "report": "Report a calibration in one file: verdict, findings, figures.",
+    "report": "Write a report of a calibration: verdict, findings, figures.",
     "live": "Show the raw and the compensated wrench.",
     "weigh": "Weigh what the gripper holds, in half a second.",
     "loads": "Check the sensor by a known weight, or correct its matrix by several.",

@@ -246,7 +246,7 @@ class Servo:
         return sum(command.seconds for command in self._commands) - self._into_s
 
     def command(self, command: Command) -> None:
-        """Continue to a target.
+        """Add the next target of a continuous motion.
 
         Raises
         ------
@@ -384,7 +384,7 @@ class Arm:
         self.speed_fraction = 1.0
         """Speed slider, 0 to 1."""
         self.pushed_rad = ZERO6
-        """Deflection of the joints from their set-points by a push of the operator, rad."""
+        """Deflection of the joints from their set-points when the operator pushes the arm, rad."""
         self.scaling = 1.0
         """Fraction of the speed that the trajectory limiter allows, 0 to 1."""
         self.paused = False

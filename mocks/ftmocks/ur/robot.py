@@ -499,7 +499,7 @@ class Robot:
             reader = self._program if self.runtime == Runtime.PLAYING else None
             listening = reader is not None and reader.reads_registers
             if not listening and command not in (0, STOP_SCRIPT, self.inputs.get(name)):
-                why = f"no control script reads it: {self.runtime.name} {self.program_name}"
+                why = f"no control script reads commands (state {self.runtime.name}, program {self.program_name})"
                 self.note("rtde", f"command {command}", accepted=False, why=why)
 
     def input_int(self, index: int) -> int:

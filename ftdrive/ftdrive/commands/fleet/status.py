@@ -90,7 +90,7 @@ def fleet_serve(address: str, url: str | None) -> None:
     """Serve the state of all cells to Prometheus, and as a page.
 
     The store is read every 60 s. If reading fails, the last state stays, with its age. Alert rules and a dashboard for
-    Grafana come with ftdrive: their folder is printed. Nothing moves. Ctrl-C ends.
+    Grafana come with ftdrive: their folder is printed. Nothing moves. Press Ctrl-C to stop.
     """
     host, port = host_and_port("--metrics", address, f"127.0.0.1:{PORT}", lowest=0)
     found = open_store(url)
@@ -102,7 +102,7 @@ def fleet_serve(address: str, url: str | None) -> None:
                 f"Unprotected: any computer that reaches port {metrics.port} can read the state of all cells."
             )
         messages.print(f"Alert rules and a dashboard are in {MONITORING}")
-        messages.print("Ctrl-C ends.")
+        messages.print("Press Ctrl-C to stop.")
         serve_status(partial(fleet_state, found), metrics.update, REAL, say=messages.print)
 
 

@@ -180,11 +180,11 @@ def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     return point, np.sqrt(dot(difference, difference))
 
 
-# Rounding of the edges of the housings at the joints. With it, the clearance of a UR3e to itself on the constant tour
+# Radius of the rounded edges of the joint housings. With it, the smallest self-clearance of a UR3e on the constant tour
 # is 22 mm; that of the convex hulls of its meshes is 27 mm.
 HUB_ROUNDING_M = 0.020
 
-# Rounding of the edges of the housing at the end of the forearm.
+# Radius of the rounded edges of the housing at the end of the forearm.
 FOREARM_END_ROUNDING_M = 0.010
 
 
