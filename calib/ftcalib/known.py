@@ -233,7 +233,7 @@ class Setup:
     """Standard deviation per axis of the arm's orientation, deg; 0.06 is assumed if not declared, as for an arm with
     its own factory kinematics. 0 declares an exact arm with rigid mounts."""
     sensor_has_arbitrary_zero: bool = False
-    """Whether the zero of the sensor is arbitrary, so that a large bias is no sign of a mistake."""
+    """Whether the zero of the sensor is arbitrary, so that a large bias is not a sign of a mistake."""
 
     def __post_init__(self) -> None:
         if self.up_in_base is not None:

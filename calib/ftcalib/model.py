@@ -189,7 +189,7 @@ def predict(parameters: Parameters, R_base_flange: Rotations) -> Array:
 
 
 def jacobian(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Return the derivative of `predict` by the error vector of `Parameters.moved`.
+    """Return the derivative of `predict` with respect to the error vector of `Parameters.moved`.
 
     With R = s_eR, A = e_bR, g = A F_b and u = R g:  dF = -R [g]x delta + R A dF_b + dF0,
     dT = [P]x (dF - dF0) - [u]x dP + dT0.

@@ -398,7 +398,7 @@ class CalibrationResult(Displayed, Calibrated):
         mass_kg, sigma_kg = self.weighed_kg
         noise_kg = self.parameters.weight_sigma_N(self.covariance) / self.g_m_s2
         excess, sigma = self.mass_kg / mass_kg - 1, float(np.hypot(sigma_kg, noise_kg)) / mass_kg
-        # A larger excess is no gain error, but another tool or a wrong unit, which the verdict reports.
+        # A larger excess is not a gain error, but another tool or a wrong unit, which the verdict reports.
         return (excess, sigma) if abs(excess) <= _CONTRADICTS * np.hypot(sensor.sigma[0, 0], sigma) else None
 
     @property

@@ -85,7 +85,7 @@ LEAST_COMMON_GAIN = 0.002
 
 
 def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Return the derivative (..., 6, 11) of the wrench by the coefficients of gain and cross-talk."""
+    """Return the derivative (..., 6, 11) of the wrench with respect to the coefficients of gain and cross-talk."""
     u = gravity_wrench(parameters, R_base_flange)[..., :3]
     T = np.zeros((*u.shape[:-1], 6, SIZE))
     T[..., :3, :5] = np.einsum("kij,...j->...ik", GAIN, u)

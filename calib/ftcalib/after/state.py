@@ -221,7 +221,7 @@ def _directions(p: Parameters, blocks: Sequence[Block]) -> Array:
 
 
 def _kept_derivative(old: Parameters, new: Parameters, blocks: Sequence[Block], size: int) -> Array:
-    """Return the derivative (size, size) of the new errors by the errors of kept parameters."""
+    """Return the derivative (size, size) of the new errors with respect to the errors of kept parameters."""
     kept = np.eye(size)
     if "mounting" in blocks:
         kept[:3, :3] = 0.0

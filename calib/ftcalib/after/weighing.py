@@ -231,7 +231,7 @@ class _LoadFit:
     S: Array
     """(6n, 6n) covariance of the readings."""
     H: Array
-    """(6n, 4) derivative of the readings by `x`."""
+    """(6n, 4) derivative of the readings with respect to `x`."""
     near: Array
     """(3, 4) prior of the centre of mass, in standard deviations."""
     misfit: Array
@@ -272,7 +272,7 @@ def _unit_readings(u: Array) -> Array:
 def _by_sensor(by_reading: Array, mass_kg: float, contact: ContactResponse, held: Array) -> Array:
     """Return the covariance (4, 4) of an estimate due to errors of the sensor, for held wrenches (n, 6).
 
-    `by_reading` (4, 6n) is the derivative of the estimate by the readings.
+    `by_reading` (4, 6n) is the derivative of the estimate with respect to the readings.
     """
     by_entry = by_reading @ contact.error_columns(held).reshape(held.size, -1)
     # In the worst case nonlinear errors are equal in all poses.

@@ -162,7 +162,7 @@ def _likeliest_change(parameters: Parameters, R: Array, wrench: Array, scale: Ar
     ramp = np.linspace(-1, 1, n)[:, None, None] * np.eye(6)
     J = np.concatenate([jacobian(parameters, R), response_columns(parameters, R)], axis=2)
     residuals = wrench - predict(parameters, R)
-    # The misfit without a change is that with a linear drift, because a steady drift is no change.
+    # The misfit without a change is that with a linear drift, because a steady drift is not a change.
     without = min(_least(J, residuals, scale)[0], _least(np.concatenate([J, ramp], axis=2), residuals, scale)[0])
     small = bool((_axis_rms(residuals) < SMALL * _axis_rms(gravity_wrench(parameters, R))).all())
     changes = []
@@ -369,7 +369,7 @@ def _least(J: Array, residuals: Array, scale: Array) -> tuple[float, Array]:
 
 
 def _change_columns(p: Parameters, R: Array) -> Array:
-    """Return the derivative (n, 6, 16) of the wrench by the parameters that may change.
+    """Return the derivative (n, 6, 16) of the wrench with respect to the parameters that may change.
 
     They are a rotation of the sensor, both biases, weight, centre of mass, and a rotation of sensor and tool together.
     """

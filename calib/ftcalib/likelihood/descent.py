@@ -48,7 +48,7 @@ def coefficients(p: Parameters) -> Array:
 
 
 def coefficients_derivative(p: Parameters) -> Array:
-    """Return the derivative (15, 6, 10) of Theta by the error vector of `Parameters.moved`."""
+    """Return the derivative (15, 6, 10) of Theta with respect to the error vector of `Parameters.moved`."""
     R, b = p.R_flange_sensor.T, p.gravity_force_base_N
     T = _CONSTANT.copy()
     T[0:3, :3, :9] = ((R @ _CROSS)[:, :, None, :] * b[:, None]).reshape(3, 3, 9)

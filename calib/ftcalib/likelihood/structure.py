@@ -21,7 +21,7 @@ MOST_POSES = 1000
 
 
 def structure_columns(parameters: Parameters, R_base_flange: Array, middle: Array) -> dict[str, Array]:
-    """Return the derivatives (n, 6, k) of the wrench by the coefficients of each kind.
+    """Return the derivatives (n, 6, k) of the wrench with respect to the coefficients of each kind.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def error_with_other_joints(parameters: Parameters, orientation_rad: float) -> A
 
 
 def _load_response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Return the derivative (n, 6, 54) of the wrench by the coefficients of a nonlinear response.
+    """Return the derivative (n, 6, 54) of the wrench with respect to the coefficients of a nonlinear response.
 
     Each channel has squares, products and third powers of the components of the force. In the torque they are scaled by
     the lever of the centre of mass, or by that of cross-talk if it is longer.

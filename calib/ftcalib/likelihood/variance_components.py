@@ -105,13 +105,13 @@ class Linearised:
     """Estimation problem, linearised at given parameters."""
 
     J: Array
-    """(n, 6, m) derivative of the wrench by the free parameters."""
+    """(n, 6, m) derivative of the wrench with respect to the free parameters."""
     r: Array
     """(n, 6) residuals at the point of linearisation, N and N·m."""
     prior: tuple[Array, Array]
     """Information matrix (m, m) and right-hand side (m,) of the priors."""
     turn: Array
-    """(n, 6, 3) derivative of the wrench by the orientation of each pose."""
+    """(n, 6, 3) derivative of the wrench with respect to the orientation of each pose."""
     D: Array
     """(n, 6, 6) measured noise covariance of each pose, or a lower bound if the noise is unknown."""
     time: Array
@@ -121,7 +121,7 @@ class Linearised:
     slope: bool
     """Whether a linear drift of unknown size is part of the model."""
     effects: Mapping[str, Array]
-    """(n, 6, k) derivative by the coefficients of each kind of `EFFECTS`."""
+    """(n, 6, k) derivative with respect to the coefficients of each kind of `EFFECTS`."""
     lever: float = 0.0
     """Distance of the centre of mass from the sensor origin, in units of `RANGE_LEVER_M`."""
     least: Mapping[str, float] = field(default_factory=dict)
@@ -131,7 +131,7 @@ class Linearised:
 
     @cached_property
     def X(self) -> Array:
-        """(n, 6, M) derivatives by parameters, slopes and effects; the last column holds the residuals."""
+        """(n, 6, M) derivatives with respect to parameters, slopes and effects; the last column holds the residuals."""
         time = centre(self.time, self.origin)
         slopes = np.broadcast_to(time[:, None, None] * np.eye(6), (len(time), 6, 6))
         return np.concatenate([self.J, slopes, *self.effects.values(), self.r[..., None]], axis=2)

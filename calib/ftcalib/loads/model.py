@@ -113,7 +113,7 @@ class Linear:
     """Model linearised at its present values; one list entry per run."""
 
     J: list[Array]
-    """(6n, k) derivatives of the readings by all unknowns."""
+    """(6n, k) derivatives of the readings with respect to all unknowns."""
     residual: list[Array]
     """(6n,) readings minus model."""
     noise: list[Mapping[str, Array]]
@@ -131,7 +131,7 @@ class Evaluated:
     cost: float
     """-2 log marginal likelihood up to a constant, including the priors of the sizes."""
     gradient: Array
-    """Derivative of the cost by the logarithms of the sizes."""
+    """Derivative of the cost with respect to the logarithms of the sizes."""
     step: Array
     """(k,) step of all unknowns."""
     covariance: Array
@@ -277,7 +277,7 @@ class LoadModel:
         return sum(earlier.load is not None for earlier in self.runs[:run])
 
     def columns_of(self, mistake: Mistake, run: int, J: Array, readout: Array) -> Array:
-        """Return the derivative (n, 6, m) of the readings of a run by the free quantities of a mistake."""
+        """Return the derivative (n, 6, m) of the readings of a run with respect to the free quantities of a mistake."""
         kind, n = mistake.kind, len(J)
         if kind == "tool_mass":
             return np.asarray(J[..., self.at["tool"]][..., :1])
@@ -344,7 +344,7 @@ def sizes_of(logarithms: Array) -> dict[str, float]:
 
 
 def _known_load_columns(mass_kg: float, place_m: Array, u: Array) -> Array:
-    """Return the derivative (n, 6, 4) of the wrench by mass and position of a load, in flange axes."""
+    """Return the derivative (n, 6, 4) of the wrench with respect to mass and position of a load, in flange axes."""
     columns = np.zeros((len(u), 6, 4))
     columns[:, :3, 0], columns[:, 3:, 0], columns[:, 3:, 1:] = u, cross(place_m, u), -mass_kg * skew(u)
     return columns

@@ -141,7 +141,7 @@ def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
 
 
 def turn_columns(load: MovingLoad, motion: Motion) -> Array:
-    """Return the derivative (n, 6, 3) of the wrench by a small rotation of gravity about the flange axes.
+    """Return the derivative (n, 6, 3) of the wrench with respect to a small rotation of gravity about the flange axes.
 
     An error of a joint angle rotates the pose and its acceleration together, so the acceleration in flange axes stays.
     """
@@ -198,7 +198,7 @@ class SmoothFunctions:
 
 
 def motion_jacobian(load: MovingLoad, motion: Motion, rate: Motion) -> Array:
-    """Return the derivative (n, 6, 34) of the wrench by the error vector of `MovingLoad.moved`.
+    """Return the derivative (n, 6, 34) of the wrench with respect to the error vector of `MovingLoad.moved`.
 
     `motion` is the motion after the delay of the load was applied, and `rate` its rate of change.
     """

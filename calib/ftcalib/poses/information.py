@@ -225,7 +225,7 @@ class _Variance:
 
 
 def _weight_and_tilt_rows(guess: Guess) -> Array:
-    """Return the derivatives (3, 15) of weight, alpha and beta by the error coordinates."""
+    """Return the derivatives (3, 15) of weight, alpha and beta with respect to the error coordinates."""
     F_b = guess.parameters.gravity_force_base_N
     turn = skew(F_b / guess.weight_N**2)  # of a small rotation of F_b: cross(F_b, dF_b) / weight²
     alpha, beta = guess.tilt_alpha_rad, guess.tilt_beta_rad

@@ -78,7 +78,7 @@ _DOUBTFUL_N, _DOUBTFUL_SIGMAS = 0.2, 3.0
 _USUAL_WALK_N, _WALK_KNOWN_S = 1.0, 1800.0
 # Drift allowed at a tare, one sigma, N.
 _TARED_N = 0.5
-# For the contact test, the uncertainty of the bias grows no longer than this, because a long contact is no drift.
+# For the contact test, the uncertainty of the bias grows no longer than this, because a long contact is not a drift.
 _CONTACT_S = 30.0
 # A drift is reported if it exceeds this many sigmas.
 _WARNED_SIGMAS = 5.0

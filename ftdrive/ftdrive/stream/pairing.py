@@ -321,7 +321,7 @@ class Pairing:
             count = samples.t_device_s
         elif counts:
             count = samples.seq.astype(np.float64)
-        else:  # polled: the time of receipt is the time
+        else:  # a polled sensor: the time of receipt is the time of the sample
             count = np.asarray(samples.t_host_ns * 1e-9)
         if self._sensor is None:
             self._sensor = SampleClock(1 / self._rate_Hz, RATE_TOLERANCE) if counts and not has_clock else SampleClock()

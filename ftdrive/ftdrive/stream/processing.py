@@ -402,7 +402,7 @@ class Processor:
     def restart(self, *, elsewhere: bool = False) -> None:
         """Discard the samples before an interruption; noise, tares and drift remain.
 
-        With `elsewhere` the next sample is at another position of a recording, which is no gap.
+        With `elsewhere` the next sample is at another position of a recording, which is not a gap.
         """
         with self._lock:
             if self._monitor is not None:

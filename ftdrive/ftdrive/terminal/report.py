@@ -122,7 +122,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
-    """Print Yu's Table III; `known` tells whether errors of weight and centre refer to an emulated truth."""
+    """Print Yu's Table III; `known` is true if the errors of weight and centre are those from an emulated cell."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)

@@ -112,7 +112,7 @@ class AtiCanNode(CanSensor):
         return []  # this sensor only answers requests
 
     def answer(self, request: CanFrame) -> list[CanFrame]:
-        """Return the frames that answer a request; none if the frame is no request."""
+        """Return the frames that answer a request; none if the frame is not a request."""
         opcode = request.identifier & 0xF
         if self.clock.now_s() < self._booted_s:
             return []

@@ -238,7 +238,7 @@ class Sensor:
     def saturate(self, axis: int | None) -> None:
         """Let an axis, or a gauge if the sensor sends gauges, read the end of its range; None ends the saturation."""
         if axis is not None and not 0 <= axis < 6:
-            raise ValueError(f"axis {axis} is not 0 to 5")
+            raise ValueError(f"the axis must be 0 to 5, not {axis}")
         self.emulator.saturated_axis = axis
 
     def stop(self) -> None:

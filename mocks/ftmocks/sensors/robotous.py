@@ -275,7 +275,7 @@ class RobotousCanNode(RobotousSensor[CanFrame], CanSensor):
         self.boot()
 
     def answer(self, request: CanFrame) -> list[CanFrame]:
-        """Return the frames that answer a request; none if the frame is no request."""
+        """Return the frames that answer a request; none if the frame is not a request."""
         if request != CanFrame(self.ids[0], request.data) or len(request.data) != COMMAND_BYTES:
             return []
         return self._frames(self.execute(request.data))

@@ -43,7 +43,7 @@ def take_request(buffer: bytearray) -> Request | None:
         case [method, path, "HTTP/1.0" | "HTTP/1.1" as version]:
             pass
         case _:
-            raise HttpError(f"{first[:80]!r} is no request line")
+            raise HttpError(f"{first[:80]!r} is not a request line")
     length = headers.get("content-length", "0")
     if not length.isdecimal() or "transfer-encoding" in headers:
         raise HttpError("a body needs a Content-Length")

@@ -124,7 +124,7 @@ class Operator:
         robot, up = self._robot, vector3(request["up"])
         length = math.hypot(*up)
         if not 0.0 < length < math.inf:
-            raise ValueError(f"up {request['up']} is no direction")
+            raise ValueError(f"up {request['up']} is not a direction")
         if robot.runtime != Runtime.STOPPED:
             raise ValueError(f"the installation cannot be changed: the program is {robot.runtime.name}")
         robot.target_gravity_m_s2 = vector3([INSTALLED_G_M_S2 * part / length for part in up])
@@ -133,7 +133,7 @@ class Operator:
     def _push_joint(self, request: Request) -> None:
         joint, off_rad = int(request["joint"]), math.radians(request["off_deg"])
         if not (1 <= joint <= 6 and math.isfinite(off_rad)):
-            raise ValueError(f"joint {joint} is not 1 to 6, or {off_rad} rad is no angle")
+            raise ValueError(f"the joint is {joint} and the angle {off_rad} rad: give 1 to 6, and a finite angle")
         pushed = [0.0] * 6
         pushed[joint - 1] = off_rad
         self._robot.arm.pushed_rad = vector6(pushed) if off_rad else ZERO6
@@ -157,7 +157,7 @@ class Operator:
     def _rest_s(self, request: Request) -> float:
         rest_s = float(request.get("rest_s", usual_rest_s(self._robot)))
         if not 0.0 < rest_s < math.inf:
-            raise ValueError(f"rest_s {rest_s} is no positive time")
+            raise ValueError(f"rest_s {rest_s} is not a positive time")
         return rest_s
 
     def _swing(self, request: Request) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class CanSensor(PtyDevice[CanFrame]):
 
     @abstractmethod
     def answer(self, request: CanFrame) -> list[CanFrame]:
-        """Answer to a frame on the bus; nothing when it is no request."""
+        """Answer to a frame on the bus; nothing when it is not a request."""
 
     @abstractmethod
     def _foreign_frame(self, rng: random.Random) -> CanFrame:

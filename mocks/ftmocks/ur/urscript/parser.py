@@ -78,7 +78,7 @@ def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, li
     Raises
     ------
     UrscriptSyntaxError
-        When the text is no program, or uses a name that is not known.
+        When the text is not a program, or uses a name that is not known.
     """
     try:
         return _Parser(text, built_in).program(name)

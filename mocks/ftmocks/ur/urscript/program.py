@@ -65,7 +65,7 @@ class Program(ControllerProgram):
     Raises
     ------
     UrscriptSyntaxError
-        When the text is no program.
+        When the text is not a program.
     """
 
     def __init__(self, robot: Robot, name: str, text: str) -> None:

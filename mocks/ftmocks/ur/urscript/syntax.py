@@ -14,7 +14,7 @@ from ftmocks.ur.controller_program import Place
 
 
 class UrscriptSyntaxError(Exception):
-    """The text is no program.
+    """The text is not a program.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ def pow(_program: object, base: Value, exponent: Value) -> float:
 def length(_program: object, v: Value) -> int:
     """Return the number of elements of a list or text."""
     if not isinstance(v, list | str):
-        raise ScriptError(f"length: {text_of(v)} is no list")
+        raise ScriptError(f"length: {text_of(v)} is not a list")
     return len(v)
 
 

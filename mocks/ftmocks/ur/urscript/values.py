@@ -84,7 +84,7 @@ def element(whole: Value, index: Value) -> Value:
 
 
 def single(value: Value) -> Value:
-    """Take an element of a list, which is no list itself; a pose is."""
+    """Take an element of a list, which is not a list itself; a pose is."""
     if type(value) is list:
         raise ScriptError(f"a list of lists is not emulated: {text_of(value)}")
     return value
