@@ -67,7 +67,7 @@ def test_case_8_and_its_table_come_from_one_run(lab: Lab) -> None:
     printed = CliRunner().invoke(cli, ["solve", folder, "--method", "carlson-eigen", "--as-published"])
     assert "method carlson-eigen as published" in printed.stdout
     incomplete = CliRunner().invoke(cli, ["solve", folder, "--table-iii"]).exception
-    assert "lacks poses" in str(incomplete)
+    assert "poses of Table III are missing" in str(incomplete)
 
 
 def test_the_test_set_is_a_bundle_or_a_table_of_either_orientation(lab: Lab, tmp_path: Path) -> None:
