@@ -1,4 +1,4 @@
-"""Solver of the calibration from poses and wrenches. It needs numpy and scipy, and accesses no device.
+"""Solver for calibrations from poses and wrenches. It needs numpy and scipy and accesses no device.
 
 Names are imported at their first use, so that `import ftcalib.errors` needs neither numpy nor scipy.
 """

@@ -1,4 +1,4 @@
-"""Errors of a calibration: over orientations, at the tip of the tool, and compared with a known truth."""
+"""Errors of a calibration: over orientations, at the tip of the tool, and relative to known true values."""
 
 from collections.abc import Mapping
 from typing import Any, Final
@@ -18,12 +18,12 @@ CONTACT_N: Final = 100.0
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
 # Step of the grid of elevation and azimuth.
 _STEP_DEG = 10
-# Number of rotations of the tool about its axis, at each direction of the axis.
+# Number of rotations of the tool about its axis for each direction of the axis.
 _TURNS = 12
 
 
 def error_map(result: CalibrationResult) -> dict[str, Any]:
-    """Return the standard deviation of a compensated free tool as a function of the direction of the tool axis.
+    """Return the sigma of the compensated wrench of a free tool as a function of the direction of the tool axis.
 
     `elevation_deg` (n,) and `azimuth_deg` (m,) give the direction of flange z in base axes. `force_N` and `torque_Nm`
     contain `map` (n, m), the largest error over rotations about the tool axis, `largest`, `rms` over all orientations,

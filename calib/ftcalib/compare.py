@@ -91,7 +91,7 @@ def compare(  # noqa: PLR0913 - one argument for each known quantity
     test: CalibrationDataset | None = None,
     truth: Parameters | None = None,
 ) -> list[MethodResult]:
-    """Return the results of all methods; a method that fails on these data has a reason instead.
+    """Return the results of all methods; for a method that fails on these data, the result holds the reason.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Compensation: subtract weight and bias, one sample in about a microsecond, a recording at memory bandwidth.
+"""Compensation subtracts weight and bias: one sample in about a microsecond, a recording at memory bandwidth.
 
 For given parameters the expected wrench is affine in the nine entries of R_base_flange, so the contact wrench is
 
@@ -42,7 +42,7 @@ class Compensator:
     Attributes
     ----------
     matrix : array, shape (6, 9)
-        Derivative of the wrench by the entries of R_base_flange, N and N·m.
+        Derivative of the wrench with respect to the entries of R_base_flange, N and N·m.
     offset : array, shape (6,)
         Bias, N and N·m.
     decoder : array, shape (6, 6), or None

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 MOST_LINES: Final = 10
 # Number of notes that the text always shows; a notebook shows all notes.
 _LEAST_NOTES = 2
-# Longest text of a field, characters; longer ones are cut.
+# Longest text of a field, in characters; longer text is cut.
 _LONGEST = 60
 # Colours that are readable on white and on black pages.
 _COLOURS: Final = {"good": "#2e8b57", "usable": "#b8860b", "rejected": "#d9534f"}
@@ -70,7 +70,7 @@ class Summary(NamedTuple):
 class Displayed:
     """Base of objects that print as a short summary and show a table in a notebook.
 
-    A dataclass that inherits from it needs ``repr=False``. The summary lists its fields, of arrays the shape.
+    A dataclass that inherits from this class needs ``repr=False``. The summary lists its fields, arrays by their shape.
     """
 
     __slots__ = ()

@@ -1,4 +1,4 @@
-"""Writing and reading of files: written completely or not at all, never overwritten, with a format name.
+"""Reading and writing of files, which are written completely or not at all, never overwritten, and state their format.
 
 A JSON file has a `checksum`, which reveals damage and edits.
 """
@@ -17,7 +17,7 @@ from typing import Any, Final, TypeAlias
 JSON: TypeAlias = Any
 # Largest file that is read as a whole: 200,000 poses with covariances.
 MOST_BYTES: Final = 200_000_000
-# Longest line of a file that is read line by line: a thousand times a calibration.
+# Longest line of a file that is read line by line: a thousand times the size of a calibration.
 _LONGEST_LINE: Final = 16_000_000
 
 
@@ -97,7 +97,7 @@ def _numbered_paths(path: Path) -> Iterator[Path]:
 
 
 def open_file(path: str | Path) -> BufferedReader:
-    """Open a file for reading; raise `OSError` also for a pipe or a device, whose reading may never end."""
+    """Open a file for reading; raise `OSError` also for a pipe or a device, from which reading may never end."""
     path = Path(path)
     mode = path.stat().st_mode
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):  # for a folder, `open` raises a clear error

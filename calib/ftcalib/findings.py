@@ -135,7 +135,7 @@ def ordered(findings: Iterable[Finding]) -> tuple[Finding, ...]:
 
 
 def folded(findings: Iterable[Finding]) -> list[Finding]:
-    """Return ordered findings without the consequences of a cause, which gets the worst severity among them."""
+    """Return ordered findings without the consequences of a cause; the cause gets the worst severity among them."""
     findings, worse = list(findings), [*_VERDICTS].index
     for causes, consequences in _EXPLAINS:
         cause = next((each for each in findings if each.code in causes), None)
@@ -221,7 +221,7 @@ def _format_orders(orders: Sequence[str]) -> str:
 
 
 def _format_scale(unit_N: Sequence[float] | None) -> str:
-    """Return a sentence with the size of the unit of force by a known mass, and its sigma, both in N."""
+    """Return a sentence with the size of the unit of force according to a known mass, and its sigma, both in N."""
     if not unit_N:
         return ""
     unit, sigma = (to_place_of(value, unit_N[1]) for value in unit_N)
@@ -500,7 +500,7 @@ CODES: Final[Mapping[str, Code]] = {
     "earlier_cell": Code(_NOTE, "mounting, base and gain are taken from {parent}, with their sigmas"),
     "together": Code(_NOTE, "{n_runs} runs were combined, each with its own bias; the result has the last bias"),
     "updated": Code(_NOTE, "{kind} updated from {n_poses} poses, with the verdict of {parent}"),
-    # Hints about single poses, beside the result
+    # Hints about single poses, shown beside the result
     "pose_turned": Code(_NOTE, "{pose:poses} turned by {turn_deg:.2f} while it was averaged", "repeat it"),
     "pose_unsteady": Code(_NOTE, "{pose:poses} was not steady while it was averaged",
         "look for what swings or touches, and repeat it"),
@@ -518,8 +518,8 @@ CODES: Final[Mapping[str, Code]] = {
 }
 # fmt: on
 
-# Consequences of causes: of wrong units or another reference point of the torques, and of mistakes in the data or
-# changes during the session, which spoil the fit.
+# Codes that may be mere consequences: of wrong units or another reference point of the torques, and of mistakes in the
+# data or changes during the session, which spoil the fit.
 _OF_UNITS: Final = frozenset((
     "weight_compensated", "weight_implausible", "com_too_far", "com_too_near", "com_outside_tool", "tool_mass_mismatch",
 ))  # fmt: skip

@@ -35,7 +35,7 @@ class Known:
     R_tolerance_rad: float = 0.0
     """Tolerance of each rotation angle of the mounting, rad; with `yaw_only` of the two tilts."""
     yaw_only: bool = False
-    """Whether the sensor is mounted flat, so that only its rotation about the flange z axis is unknown."""
+    """Whether the sensor is mounted flat, so only its rotation about the flange z axis is unknown."""
     gravity_direction_base: ArrayLike | None = None
     """(3,) direction of gravity in base axes, of any length: (0, 0, -1) for a level robot."""
     direction_tolerance_rad: float = 0.0
@@ -64,7 +64,7 @@ class Known:
 
 
 class Constraints:
-    """Known values in the form of the solver: free directions, and pseudo-measurements divided by their tolerance."""
+    """Known values as the solver needs them: free directions, and pseudo-measurements divided by their tolerance."""
 
     def __init__(self, known: Known, g_m_s2: float) -> None:
         self.R = None if known.R_flange_sensor is None else np.asarray(known.R_flange_sensor)
@@ -233,7 +233,7 @@ class Setup:
     """Standard deviation per axis of the arm's orientation, deg; 0.06 is assumed if not declared, as for an arm with
     its own factory kinematics. 0 declares an exact arm with rigid mounts."""
     sensor_has_arbitrary_zero: bool = False
-    """Whether the zero of the sensor is arbitrary, so that a large bias is not a sign of a mistake."""
+    """Whether the zero of the sensor is arbitrary. A large bias is then not a sign of a mistake."""
 
     def __post_init__(self) -> None:
         if self.up_in_base is not None:
@@ -276,5 +276,5 @@ class Setup:
         return np.asarray(up / np.linalg.norm(up))
 
 
-# A cell of which nothing is declared.
+# Description of a cell about which nothing is declared.
 NOTHING: Final = Setup()

@@ -88,7 +88,7 @@ class Parameters(Displayed):
     def weight_sigma_N(self, covariance: Array) -> float:
         """Return one standard deviation of the weight, N, from the covariance (15, 15) of the parameters."""
         variance = float(self.down @ covariance[3:6, 3:6] @ self.down)
-        return float(np.sqrt(max(variance, 0.0)))  # rounding may make it negative if the weight is exactly known
+        return float(np.sqrt(max(variance, 0.0)))  # a rounded variance may be negative if the weight is exactly known
 
     @property
     def down(self) -> Array:
@@ -288,7 +288,7 @@ def read_only(value: ArrayLike) -> Array:
 
 
 def keep_finite(record: object, whose: str, **shapes: tuple[int, ...]) -> None:
-    """Replace arrays of a frozen record by read-only copies; raise `ValueError` if not finite or of another shape."""
+    """Replace arrays of a frozen record by read-only copies; raise `ValueError` for a wrong shape or NaN."""
     for name, shape in shapes.items():
         value = read_only(getattr(record, name))
         if value.shape != shape or not np.isfinite(value).all():

@@ -134,7 +134,7 @@ class CalibrationResult(Displayed, Calibrated):
     covariance: Array
     """(15, 15) covariance of the error coordinates `PARAMETER_NAMES`, from the noise and the `components`."""
     residuals: Array
-    """(n, 6) measured minus predicted wrench, N and N·m, sensor axes, with `response` and mean bias, without drift."""
+    """(n, 6) measured minus predicted wrench, N and N·m, sensor axes; predicted with `response` and the mean bias."""
     chi2: float
     """Weighted sum of squared residuals of the used poses with the measured noise alone, without drift and
     `components`; with the noise from the residuals if it was not measured."""
@@ -339,7 +339,7 @@ class CalibrationResult(Displayed, Calibrated):
     def sigma(self) -> Mapping[str, Array | float]:
         """Standard deviation of every quantity by its name, from `tool_covariance`.
 
-        That of `R_flange_sensor` is (3,) in rad about the flange axes.
+        The sigma of `R_flange_sensor` is (3,), in rad about the flange axes.
         """
         covariance = self.tool_covariance
         std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -367,7 +367,7 @@ class CalibrationResult(Displayed, Calibrated):
             As measured, N and N·m, in the sensor frame.
         R_base_flange : array, shape (3, 3) or (n, 3, 3), or Rotation
         response : bool
-            Whether to apply gain and cross-talk of the sensor to the weight. False: as programs that lack them.
+            Whether to apply gain and cross-talk of the sensor to the weight. False: as in programs without them.
 
         Returns
         -------
@@ -608,7 +608,7 @@ def _weight_and_tilt_sigma(F_b: Array, cov: Array) -> tuple[float, float, float]
     out = np.array([x, 0.0, z]) / h if h > 0 else np.array([1.0, 0.0, 0.0])  # away from the base y axis
     gradients = np.array([F_b / weight, (h * np.array([0.0, 1.0, 0.0]) - y * out) / weight**2])
     variance = np.einsum("ki,ij,kj->k", gradients, cov, gradients)
-    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # rounding may make it negative
+    weight_sigma, alpha = np.sqrt(np.maximum(variance, 0.0)).tolist()  # a rounded variance may be negative
     along_beta = np.array([z, 0.0, -x])
     beta = float(np.sqrt(max(along_beta @ cov @ along_beta, 0.0))) / h**2 if h > 0 else float("inf")
     return weight_sigma, min(alpha, float(np.pi)), min(beta, float(np.pi))

@@ -120,7 +120,7 @@ class PoseRecord:
     clock_offset_ns: int = 0
     """Offset from the host clock to the clock of the run, ns; a run may span a restart of the computer."""
     swings: bool = False
-    """Whether a weight hangs on a string, so that its swing is removed from the mean."""
+    """Whether a weight hangs on a string. Its swing is then removed from the mean."""
     mean: PoseMean = field(init=False)
     """Mean wrench and the covariance of the mean."""
 

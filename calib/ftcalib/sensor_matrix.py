@@ -94,7 +94,7 @@ def response_columns(parameters: Parameters, R_base_flange: Array) -> Array:
 
 
 def sensor_columns(parameters: Parameters, R_base_flange: Array) -> dict[str, Array]:
-    """Return the derivatives of the wrench by the coefficients of "gain" (..., 6, 5) and "cross_talk" (..., 6, 6)."""
+    """Return the derivatives of the wrench for the coefficients "gain" (..., 6, 5) and "cross_talk" (..., 6, 6)."""
     columns = response_columns(parameters, R_base_flange)
     return {"gain": columns[..., : len(GAIN)], "cross_talk": columns[..., len(GAIN) :]}
 
@@ -185,7 +185,7 @@ class Calibrated:
         return None if self.response is None else Response(self.response.coefficients, covariance)
 
     def jacobian(self, R_base_flange: Array, parameters: Parameters | None = None) -> Array:
-        """Return the derivative (..., 6, 15 or 26) of the wrench by the coordinates of `joint_covariance`."""
+        """Return the derivative (..., 6, 15 or 26) of the wrench with respect to the axes of `joint_covariance`."""
         p = self.parameters if parameters is None else parameters
         J = jacobian(p, R_base_flange)
         return J if self.response is None else np.concatenate([J, response_columns(p, R_base_flange)], axis=-1)
@@ -270,7 +270,7 @@ def ranges(lever_m: float) -> Array:
 def own_variances(gain_sigma: float, lever_m: float = RANGE_LEVER_M) -> Array:
     """Return the variances (36,) of the entries of E of a usual sensor, without the gain common to all axes.
 
-    `gain_sigma` is that of the diagonal, including the common part; `lever_m` is torque range over force range.
+    `gain_sigma` is the sigma of the diagonal, with the common part; `lever_m` is torque range over force range.
     """
     F = ranges(lever_m)
     share = np.where(np.eye(6) > 0, np.sqrt(1 - COMMON_SHARE), CROSS_TALK_SHARE)
@@ -295,7 +295,7 @@ def _mounting_turn(E: Array, p: Array) -> Array:
 
 
 def shown_by(p: Array) -> Array:
-    """Return the derivative (11, 36) of the gain and cross-talk seen with a tool at p, by the entries of E."""
+    """Return the derivative (11, 36) of gain and cross-talk seen with a tool at p, with respect to the entries of E."""
     force, torque = _gain_at(_ENTRIES, p)
     torque = torque - skew(p) @ skew(_mounting_turn(_ENTRIES, p))
     parts = [
@@ -346,7 +346,7 @@ class SensorMatrix(Displayed):
         ----------
         gain_sigma : float
             Standard deviation of the diagonal entries. Half of the variance is common to all axes, because calibration
-            masses, ageing and temperature affect all of them. The others have half of it, relative to the ranges.
+            masses, ageing and temperature affect all of them. The others have half this sigma, relative to the ranges.
         source : {"assumed", "data sheet"}
         """
         covariance = np.diag(np.concatenate([np.full(3, np.pi**2), own_variances(gain_sigma, lever_m)]))
@@ -521,7 +521,7 @@ class ContactResponse:
         return contact if self.decoder is None else np.asarray(contact @ self.decoder.T)
 
     def error_columns(self, wrench: Array) -> Array:
-        """Return the derivative (..., 6, 39) of decoded wrenches (..., 6) by the coordinates of `error_covariance`."""
+        """Return the derivative (..., 6, 39) of decoded wrenches with respect to the errors in `error_covariance`."""
         turns = -np.kron(np.eye(2), skew(np.eye(3)))
         effects = np.concatenate([turns, _ENTRIES])
         if self.decoder is not None:
@@ -600,6 +600,6 @@ def _hidden_covariance(parameters: Parameters, mean: Array, C: Array) -> Array:
 
 
 def _common_gain(p: Array) -> Array:
-    """Return the derivative (1, 36) of the gain common to all axes, for a tool at p, by the entries of E."""
+    """Return the derivative (1, 36) of the gain common to all axes of a tool at p with respect to the entries of E."""
     force, _ = _gain_at(_ENTRIES, p)
     return np.asarray(np.trace(force, axis1=1, axis2=2)[None] / 3)

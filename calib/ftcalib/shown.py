@@ -49,7 +49,7 @@ class ShownEstimate(NamedTuple):
     sigma: Array
     """(k,) standard deviations in SI units."""
     is_known: NDArray[np.bool_]
-    """(k,) whether a value was exactly known, so that its sigma is only a rounding error."""
+    """(k,) whether a value was exactly known. Its sigma is then only a rounding error."""
 
     @property
     def axes(self) -> Sequence[str]:

@@ -1,4 +1,4 @@
-"""Solve a dataset for a calibration."""
+"""Calibration from a dataset of static poses."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -76,11 +76,11 @@ def solve(
     known : Known, optional
         Known mounting, direction of gravity and mass. Published methods use the values that they need as exactly known:
         Carlson's methods gravity, "vougioukas" the mounting (default: axes of sensor and flange agree) and the
-        direction of gravity (default: the up direction of `setup`), "wang" the mounting, "yang" that but its yaw.
+        direction of gravity (default: the up direction of `setup`), "wang" the mounting, "yang" the same without yaw.
     g_m_s2 : float
         Acceleration of gravity; the mass is the weight divided by it.
     setup : Setup
-        Description of the cell, for the verdict. Methods that need gravity use its up direction; a known one sets it.
+        Description of the cell, for the verdict. Methods that need gravity use its up direction, by default the known.
     provenance : mapping, optional
         Stored with the result, together with the hash of the dataset. Must be valid JSON.
     as_published : bool
@@ -427,7 +427,7 @@ def _simulated_covariance(estimator: Estimator, truth: Parameters, R_base_flange
     """Return the mean square error (15, 15) of a closed-form method around `truth`, from simulated noise.
 
     Linear propagation fails, because the cube roots of SROM have no derivative at a zero component of the gravity
-    force. The seed is fixed, so that the same data give the same result.
+    force. The seed is fixed, so the same data always give the same result.
     """
     rng = np.random.default_rng(20210)
     L = np.linalg.cholesky(wrench_cov)

@@ -110,7 +110,7 @@ class CellPrior:
                 left, freedom, new = refit(kept)
             except NotObservable:
                 continue
-            # The difference is tested, because chi2 over all readings can hide a significant rotation.
+            # The difference of chi2 is tested, because chi2 over all readings can hide a significant rotation.
             fits = not freedom or chi2_sf(freedom, left) >= FALSE_ALARMS
             if fits and chi2_sf(dof - freedom, chi2 - left) < FALSE_ALARMS:
                 turned = float(angle_between(old.R_flange_sensor, new.R_flange_sensor))

@@ -352,7 +352,7 @@ class BiasTemperature:
 
 
 def spans_temperature(temperature_C: Array, fewest: int) -> bool:
-    """Whether there are at least `fewest` runs, over at least 3 K, so that a dependence can be estimated."""
+    """Whether a dependence can be estimated: from at least `fewest` runs, over at least 3 K."""
     return len(temperature_C) >= fewest and bool(np.ptp(temperature_C) >= _LEAST_K)
 
 

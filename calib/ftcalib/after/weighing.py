@@ -164,7 +164,7 @@ def weigh_load(  # noqa: PLR0913 - readings, noise and prior knowledge
     Raises
     ------
     BadDataset
-        Inconsistent shapes, or a tool without weight, so that the direction of gravity is unknown.
+        Inconsistent shapes, or a tool without weight, for which the direction of gravity is unknown.
     """
     n = len(wrench)
     R_base_flange = require_finite("R_base_flange", R_base_flange, (n, 3, 3))

@@ -26,7 +26,7 @@ Orientation = Literal["R_base_flange", "R_flange_base"]
 
 # Largest accepted value in N, N·m or their squares, so that powers of it do not overflow.
 LARGEST = 1e9
-# Smallest accepted variance, N² or (N·m)², for a sigma of 1 nN. Smaller ones would cost all digits in products.
+# Smallest accepted variance, N² or (N·m)², for a sigma of 1 nN. Products of smaller ones would lose all digits.
 _LEAST_VARIANCE = 1e-18
 _MATRIX_COLUMNS = ("r11", "r12", "r13", "r21", "r22", "r23", "r31", "r32", "r33")
 
@@ -131,7 +131,7 @@ class CalibrationDataset(Displayed):
         )
 
     def __len__(self) -> int:
-        """Count the poses."""
+        """Return the number of poses."""
         return len(self.wrench)
 
     def _summary(self) -> Summary:

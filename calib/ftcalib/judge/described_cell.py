@@ -29,7 +29,7 @@ OTHER_MOUNTING_DEG: Final = 10.0
 LEAN_DEG: Final = 0.2
 # Tolerance of the described cylinders, for cables and screws.
 COM_MARGIN_M = 0.01
-# A centre of mass farther outside the tool is wrong; closer, the description may be wrong.
+# A centre of mass farther outside the tool than this is wrong. If it is closer, the description may be wrong.
 SURELY_OUTSIDE_M = 0.1
 # Wrong units are suspected if the centre of mass is outside the tool and farther from the sensor than this.
 FAR_COM_M = 0.1
@@ -245,7 +245,7 @@ def _outside_m(parameters: Parameters, covariance: Array, setup: Setup) -> float
     """Return the significant distance of the centre of mass outside the described cylinders; negative inside.
 
     A body's centre of mass lies in its convex hull. The distance from the hull is the maximum over all directions of
-    the extent of the point minus that of the hull, less a multiple of sigma. Unknown heights count as any.
+    the extent of the point minus that of the hull, less a multiple of sigma. An unknown height may be any.
     """
     height_m = setup.sensor_height_m
     lowest_m, highest_m = (0.0, max(row[1] for row in setup.cylinders_m)) if height_m is None else (height_m,) * 2

@@ -234,7 +234,7 @@ def _readings(R: Array, wrench: Array, written: str) -> Iterator[_Reading]:
 def _euler_orders(R: Array, wrench: Array, read_as: Any) -> Iterator[_Reading]:
     """Yield orientations from the same angles about x, y and z in the other orders.
 
-    Programs write the middle angle within 90°. If it is beyond in another order, the equivalent angles are used.
+    Programs write the middle angle within 90°. If it is larger in another order, the equivalent angles are used.
     """
     extrinsic: Any = read_as if read_as.islower() else read_as[::-1].lower()
     with warnings.catch_warnings():  # gimbal lock: one of the angles is arbitrary

@@ -30,7 +30,7 @@ TORQUE_UNITS_NM = {
     "kgf·m": 9.80665,
     "kN·m": 1e3,
 }
-# The simplest mistake first.
+# Pairs of wrong units of force and torque, the simplest mistake first.
 UNITS = (
     *(("N", "N·mm"), ("N", "lbf·in"), ("lbf", "N·m"), ("kgf", "N·m"), ("gf", "N·m"), ("mN", "N·m"), ("kN", "N·m")),
     *(("lbf", "lbf·in"), ("lbf", "lbf·ft"), ("kgf", "kgf·cm"), ("kgf", "kgf·m"), ("mN", "N·mm"), ("kN", "kN·m")),

@@ -308,7 +308,7 @@ def _linear_start(statistics: Statistics, R_flange_sensor: Array) -> Parameters:
 # Outliers: poses in which the tool was bumped or touched, or something slipped.
 #
 # Graduated non-convexity with the Geman-McClure cost (Yang, Antonante, Tzoumas, Carlone 2020) starts from every minimum
-# of the least-squares cost, then a least-squares fit of the other poses. The lowest truncated cost is chosen.
+# of the least-squares cost. A least-squares fit of the other poses follows. The lowest truncated cost is chosen.
 
 Kept = NDArray[np.bool_]
 
@@ -316,7 +316,7 @@ Kept = NDArray[np.bool_]
 FALSE_REJECTION = 1e-3
 # Squared Mahalanobis distance beyond which a pose is rejected: 22.5.
 FARTHEST = float(chi2_isf(6, FALSE_REJECTION))
-# With fewer poses an outlier cannot be told from good poses.
+# With fewer poses an outlier cannot be distinguished from good poses.
 FEWEST_TO_REJECT_FROM = 8
 ANNEALING = 1.6
 

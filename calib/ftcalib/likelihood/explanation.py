@@ -397,7 +397,7 @@ def _with_expected_noise(session: SessionData, e: Explanation) -> Explanation:
 
 
 def _is_quiet(session: SessionData, best: Minimum) -> bool:
-    """Whether the measured noise explains the residuals, so that no component or outlier would be found."""
+    """Whether the measured noise explains the residuals, which means that no component or outlier would be found."""
     always, candidates = session.always(), [*session.candidates(), *session.structure()]
     if not session.measured or always or session.drift == "linear":
         return False

@@ -86,7 +86,7 @@ class Estimate(Calibrated):
     response: Response | None = None
     """Gain and cross-talk of the sensor as best linear prediction; None if they were not found."""
     may_bend: bool = False
-    """Whether the data show weakly a nonlinear response, which this fit treats as noise."""
+    """Whether the data weakly show a nonlinear response, which this fit treats as noise."""
 
     @classmethod
     def independent(  # noqa: PLR0913 - what an estimate rests on
@@ -377,7 +377,7 @@ def _fit_of(session: SessionData, e: Explanation, minima: list[Minimum], static_
         Z = block_diag(Z, np.eye(SIZE))
         covariance = (Z @ C @ Z.T)[:15, :15]
         response = Response(x[-SIZE:], Z @ C @ Z.T) if x[-SIZE:].any() else None
-    # In the order of the components, because a sum over a set would depend on the process in its last digit.
+    # The order of the components is used, because the last digit of a sum over a set may differ between processes.
     if hidden := [c for c in found if c in UNCOMPENSATED]:
         lag, square = np.zeros((session.n, 6)), np.zeros((session.n, 6, 6))
         for c in hidden:

@@ -14,8 +14,8 @@ from ftcalib.model import Array, skew
 
 # Rows per matrix product: 0.4 MB, so that a chunk stays in the cache.
 _CHUNK = 4096
-# In 16000 problems 24 starts missed a minimum in 93, 60 starts in 8, and 120 starts in 2, where neither was the best
-# minimum or from usable poses.
+# In 16000 problems 24 starts missed a minimum in 93, 60 starts in 8, and 120 starts in 2. Neither of these two was the
+# best minimum or from usable poses.
 _STARTS = 120
 # A curvature below this share of the variation of the cost is zero: the poses do not determine that direction.
 _FLAT = 1e-6
@@ -170,7 +170,7 @@ def certificate(Q: Array, R: Array) -> float:
     gamma. The largest gamma is the solution of a semidefinite program of 21 variables, by a primal-dual interior-point
     method (the direction of Helmberg, Rendl, Vanderbei and Wolkowicz 1996). The bound is the smallest eigenvalue of
     that matrix minus a margin for rounding. It is valid even if the method stops early, so the gap can be too large,
-    but never too small. It was such a sum in all of 8000 simulated calibrations, but not for 4 of 6000 random Q.
+    but never too small. The relaxation was exact in all of 8000 simulated calibrations, but not for 4 of 6000 random Q.
     """
     if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
         raise ValueError(f"the certificate needs a 3x3 rotation matrix, not {R.tolist()}")

@@ -124,7 +124,7 @@ class SessionData:
 
     def is_exact(self, p: Parameters) -> bool:
         """Whether the residuals are only rounding errors or, if the noise is unknown, below the sensor's resolution."""
-        first_poses, all_poses = slice(1000), slice(None)  # the first poses decide nearly always
+        first_poses, all_poses = slice(1000), slice(None)  # the first poses usually decide
         return self._fits_exactly(p, first_poses) and self._fits_exactly(p, all_poses)
 
     def _fits_exactly(self, p: Parameters, poses: slice) -> bool:

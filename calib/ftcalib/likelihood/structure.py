@@ -152,7 +152,7 @@ FEW = 1000
 
 
 def hysteresis_columns(parameters: Parameters, R_base_flange: Array) -> Array:
-    """Return the derivative (n, 6, 12) of the wrench by the shares, and by the shares of the step to the first pose.
+    """Return the wrench's derivative (n, 6, 12) with respect to the shares, and those of the step to the first pose.
 
     The poses are in the order of measurement. With more than 1000 poses only the first 6 columns are returned.
     """

@@ -256,9 +256,9 @@ class Point:
         Parameters
         ----------
         J : array, shape (n, 6, m)
-            Derivative by the free parameters in the orientations of the prediction.
+            Derivative with respect to the free parameters in the orientations of the prediction.
         effects : mapping
-            Derivatives by the coefficients of effects in these orientations.
+            Derivatives with respect to the coefficients of effects in these orientations.
         """
         X, modelled = np.zeros((*J.shape[:2], self.problem.X.shape[2] - 1)), np.zeros(self.problem.X.shape[2] - 1)
         X[..., : J.shape[2]] = J
@@ -385,7 +385,7 @@ def noise_of(problem: Linearised, components: Sequence[Component], theta: Array)
 
 
 def score(problem: Linearised, at: Point, components: Sequence[Component], theta: Array) -> tuple[Array, Array]:
-    """Return the score (k,), the derivative of the restricted log-likelihood by the log variances, and the information.
+    """Return the score (k,), the gradient of the restricted log-likelihood in the log variances, and the information.
 
     The average information is (k, k). The score of other components is the derivative at variance zero times `theta`.
     """

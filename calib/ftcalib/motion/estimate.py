@@ -31,7 +31,7 @@ from ftcalib.motion.model import (
 from ftcalib.motion.problem import DELAY_S, EXPECTED, GYRATION_M, HEIGHT_M, NEVER, RIDGE, ROUGH_ROWS, Problem, Solution
 from ftcalib.motion.samples import MotionRows
 
-# Squared Mahalanobis distance from which a row is in contact.
+# Squared Mahalanobis distance above which a row is taken for contact.
 _CONTACT = float(chi2_isf(6, 1e-7))
 # Smallest force or torque residual of a row in contact, in a motion with a contact guard.
 TOUCH_N, TOUCH_NM = 2.0, 0.2
@@ -138,7 +138,7 @@ def fit_motion(
         reverses, are not taken for contact: only rows with residuals above `TOUCH_N` or `TOUCH_NM` are, and the noise
         of each row is estimated from its neighbours.
     zeroed_s : array, shape (k,)
-        Times at which the sensor was zeroed; the rows are nearly free of these steps. The bias of the load is the last.
+        Times at which the sensor was zeroed. The rows are nearly free of these steps; the bias of `load` is the last.
     """
     problem = Problem(rows, known, g_m_s2, point_mass=point_mass, zeroed_s=zeroed_s)
     # Forces alone allow several mountings: the robust fit of forces and torques with the smallest residuals is chosen.
@@ -294,7 +294,7 @@ class FreeFit:
     load: MovingLoad
     error: PoseError
     covariance: Array
-    """(37, 37) of the errors of `MovingLoad.moved`, scale and lateral offset, with the effect of smooth errors."""
+    """(37, 37) covariance of the errors of `MovingLoad.moved`, scale and lateral offset, including smooth errors."""
     residual: Array
     """(2,) standard deviation of the force and torque residuals, from their median, N and N·m."""
 
@@ -402,7 +402,7 @@ def _choose_sizes(
             continue
         worth, slow = -_WORTH, name.replace("walk", "slow")
         of_sizes = values(name, **{slow: 0.0})
-        if name != slow:  # slow noise looks like a walk
+        if name != slow:  # slow noise looks like a random walk
             worth = min(worth, float(values(slow, **{name: 0.0}).min()))
         best = int(np.argmin(of_sizes))
         chosen[name] = float(tried[best]) if of_sizes[best] < worth else 0.0

@@ -40,7 +40,7 @@ _CLOCK_SHARE: Final = 0.03
 _ASIDE_M: Final = 0.01
 # The signs of channels are certain if scale and moment are this many sigmas above 0.
 _SIGNED: Final = 3.0
-# A clock scale that deviates by this share, but only by this many sigmas, limits a result if alone, uncorrected.
+# A clock scale off by this share, but only by this many sigmas, is not corrected. If found alone, it limits a result.
 _DOUBTFUL_SIGMAS, _DOUBTFUL_SHARE = 4.5, 0.15
 # Largest plausible distance between the axes of sensor and flange.
 _FAR_ASIDE_M: Final = 0.03

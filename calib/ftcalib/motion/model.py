@@ -114,7 +114,7 @@ class PoseError:
 
     @staticmethod
     def jacobian(load: MovingLoad, motion: Motion) -> Array:
-        """Return the derivative (n, 6, 3) of the wrench by `scale` and `aside_m`, for the motion with the error."""
+        """Return the derivative (n, 6, 3) of the wrench in `scale` and `aside_m`, for the motion with the error."""
         static, Omega = load.static, motion.Omega_rad2_s2
         moved = np.concatenate([motion.acceleration_m_s2[:, :, None], Omega[:, :, :2]], axis=2)
         dU = -load.mass_kg * static.R_flange_sensor.T @ moved
@@ -143,7 +143,7 @@ def wrench_of(load: MovingLoad, motion: Motion, *, bias: bool = True) -> Array:
 def turn_columns(load: MovingLoad, motion: Motion) -> Array:
     """Return the derivative (n, 6, 3) of the wrench with respect to a small rotation of gravity about the flange axes.
 
-    An error of a joint angle rotates the pose and its acceleration together, so the acceleration in flange axes stays.
+    An error of a joint angle rotates pose and acceleration together, so the acceleration in flange axes is unchanged.
     """
     static = load.static
     dU = static.R_flange_sensor.T @ skew(static.gravity_force_base_N @ motion.R_base_flange)
@@ -151,7 +151,7 @@ def turn_columns(load: MovingLoad, motion: Motion) -> Array:
 
 
 def lever_columns(load: MovingLoad, motion: Motion) -> Array:
-    """Return the derivative (n, 6, 3) of the inertial wrench by a shift of the centre of mass, in sensor axes.
+    """Return the derivative (n, 6, 3) of the inertial wrench with respect to the centre of mass, in sensor axes.
 
     Antisymmetric cross-talk shifts the centre of mass seen in the torques of the weight, not that of inertial forces.
     """

@@ -17,9 +17,9 @@ The wrench of row i at time t_i in orientation R_i is, with h of `ftcalib.motion
            lever     antisymmetric cross-talk (3): it shifts the centre of mass seen in the torques, not in the forces
 
 Gain and cross-talk in x have priors of the same kind; inertia, height and delay have the priors of a usual tool. With
-J the derivative of all y by v = (x, beta, u), r = y - prediction, W the inverse covariance of the noise, and P(s) the
-precision of the priors for the standard deviations s of the components, a step and its covariance are (Henderson,
-Biometrics 31, 1975)
+J the derivative of all y with respect to v = (x, beta, u), r = y - prediction, W the inverse covariance of the noise,
+and P(s) the precision of the priors for the standard deviations s of the components, a step and its covariance are
+(Henderson, Biometrics 31, 1975)
 
     H = J' W J + P(s),    b = J' W r - P(s) v,    step = H^-1 b,    cov = H^-1
 
@@ -119,10 +119,10 @@ class Problem:
         self.basis = block_diag(np.kron(courses, np.eye(6)), np.eye(self.others))
 
     def _group(self) -> tuple[dict[str, tuple[NDArray[np.intp], Array]], int]:
-        """Return for each component its indices in (load, effects) and its precision at size 1; also the other effects.
+        """Return each component's indices in (load, effects) and precision at size 1; also the number of other effects.
 
         The effects are the values of the bias (without the last knot), then the others: slow noise, rotations, cable
-        and lever. The second result is the number of the others.
+        and lever. The second result is the number of these other effects.
         """
         distance = self.slow_knots[1] - self.slow_knots[0]
         lags = np.abs(np.subtract.outer(self.slow_knots, self.slow_knots))
@@ -168,7 +168,7 @@ class Problem:
         return wrench_of(load, rows.motion.earlier(load.delay_s, rows.rate))
 
     def smooth_columns(self, load: MovingLoad, motion: Motion) -> Array:
-        """Return the derivative (n, 6, k) of the wrench by the effects rotation and yielding, shift, cable and load."""
+        """Return the wrench's derivative (n, 6, k) for the effects rotation and yielding, shift, cable and load."""
         R = nearest_rotation(motion.R_base_flange)
         turned = turn_columns(load, motion) @ self.turns(load, R)
         moved = _REACH_M * lever_columns(load, motion)
@@ -195,7 +195,7 @@ class Problem:
         return np.asarray(smooth - constant @ share)
 
     def columns(self, load: MovingLoad, rows: MotionRows) -> tuple[Array, Array]:
-        """Return the derivatives of the wrench by the load (n, 6, 34), and by the effects other than the bias."""
+        """Return the wrench's derivatives with respect to the load (n, 6, 34) and to all effects except the bias."""
         motion = rows.motion.earlier(load.delay_s, rows.rate)
         J, slow = motion_jacobian(load, motion, rows.rate), _on_channels(_hats(self.slow_knots, rows.t_s))
         return J, np.concatenate([slow, self.smooth_columns(load, motion), lever_columns(load, motion)], axis=2)

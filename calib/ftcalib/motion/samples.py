@@ -32,7 +32,7 @@ GAP_S = 0.06
 
 # Longer gaps are rejected: the times belong to two recordings, or are wrong.
 LONGEST_GAP_S = 86400.0
-# A longer typical step between samples suggests one of these units; the second number is its longest step, s.
+# A longer typical step, s, suggests times in one of these units. The number is the longest step for that unit.
 LONGEST_STEP_S = 0.25
 _TIME_UNITS = (("ms", 300.0), ("µs", 3e5), ("ns", np.inf))
 # Largest time, s: the number of 10 ms intervals must fit in 64 bits.
@@ -59,7 +59,7 @@ _FAR_NS, _FASTEST_SLEW = 2e8, 0.9
 # If this many successive buckets are later than the line by more than this, and by similar amounts, the line is
 # discarded: samples were lost without being counted.
 _STEP_BUCKETS, _STEP_NS = 8, 5e6
-# A device whose count deviates from the line by more has restarted.
+# A device whose count deviates from the line by more than this time has restarted.
 _LOST_S = 1.0
 # Number of parts of a recording; of each part only the least delayed sample is used.
 _PARTS = 200

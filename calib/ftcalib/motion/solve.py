@@ -63,7 +63,7 @@ SLOW_RAD_S = 0.15
 # Residual, as a share of the change of the wrench, below which the clocks agree; and the share of the residual that
 # must remain for another clock rate to be accepted.
 _FOLLOWS, _OTHER_RATE = 0.03, 0.5
-# Smallest difference of clock rates that is corrected; ratios that are tried, relative to the ratio of the durations.
+# Smallest difference of clock rates that is corrected, and the trial ratios relative to the ratio of the durations.
 _SAME_RATE, _RATIOS = 3e-3, 1 + np.linspace(-0.06, 0.06, 49)
 # Interpolation error from which poses are too coarse for their motion; then only rows slower than this are used.
 _COARSE_RAD, _REST_RAD_S = 8e-3, 0.02
@@ -77,7 +77,7 @@ WRONG_HEIGHT_M = 3e-3
 MOSTLY = 0.5
 # Residual, as a share of the change of the force, from which wrench and poses do not belong together.
 _UNEXPLAINED = 0.3
-# Beginnings of the names of components that are smooth functions of the pose.
+# Prefixes of the names of components that are smooth functions of the pose.
 _SMOOTH = ("load", "cable", "rotation", "yielding")
 
 
@@ -115,7 +115,7 @@ def solve_motion(  # noqa: PLR0913 - one for each thing that may be known
     height_m : float, optional
         Configured height of the sensor origin above the flange face, which is compared with the estimate.
     setup : Setup
-        The described cell, for the verdict.
+        Description of the cell, for the verdict.
     provenance : mapping, optional
         Stored with the result. Must be valid JSON.
 
@@ -410,7 +410,7 @@ def _motion_findings(
 
 
 def _without_zeroing(wrench: Stream, poses: Stream) -> tuple[tuple[Stream, Stream], Array]:
-    """Return both streams with the bias of the end throughout, and the times at which the sensor was zeroed."""
+    """Return both streams with the final bias throughout, and the times at which the sensor was zeroed."""
     at_s, seen = find_zeroings(wrench)
     if len(at_s):
         steps = fit_bias_steps(motion_rows(wrench, poses), at_s)

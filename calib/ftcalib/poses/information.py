@@ -34,7 +34,7 @@ TOOL_DOWN_R_base_flange = np.diag([1.0, -1.0, -1.0])
 
 # Numbers of the tetrahedral subgroup of the paper's 24 orientations: as accurate per pose as all 24, for every tool.
 T12 = (1, 2, 5, 6, 11, 12, 15, 16, 17, 18, 21, 22)
-# Nearly the best six of the 24 with a unique solution; second-basin gap 0.28.
+# Six of the 24 orientations, nearly the best six with a unique solution; second-basin gap 0.28.
 SUBSET_6 = (9, 10, 16, 19, 21, 22)
 
 
@@ -114,7 +114,7 @@ class Prediction:
     cond_u1: float
     """Condition number of gravity directions with a constant, for LROM: at best 1.7, fair above 8, poor above 25."""
     second_basin_gap: float
-    """See `second_basin`."""
+    """Gap to the second solution, from `second_basin`."""
 
 
 def special(numbers: Sequence[int]) -> Array:
@@ -176,7 +176,7 @@ def predicted_sigma(R_base_flange: Array, guess: Guess) -> Prediction:
 def prediction_weights(R_base_flange: Array, guess: Guess) -> tuple[Array, Array]:
     """Return matrices (15, 15) whose scalar product with a covariance is the mean square error over orientations.
 
-    For force in sigma_force_N², for torque in sigma_torque_Nm². The covariance is in the units of `Guess.scale`.
+    The error is in sigma_force_N² for force, in sigma_torque_Nm² for torque; the covariance in units of `Guess.scale`.
     """
     J = whitened_jacobian(R_base_flange, guess)
     force, torque = (np.einsum("nki,nkj->ij", rows, rows) / len(J) for rows in (J[:, :3], J[:, 3:]))

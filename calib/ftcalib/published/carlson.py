@@ -3,7 +3,7 @@
 F. Bagge Carlson, "On the Calibration of Force/Torque Sensors in Robotics", 2019, sections 2 (`relaxation` on) and 3.
 
 In the paper's letters `A_i = R_TF^RB = R_base_flange[i].T`, `X = R_TF^S = R_flange_sensor`, `g = gravity_force_base_N`
-(including the mass), so that at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks
+(including the mass), so at every pose `X f_i = A_i g` (eq. 13), stacked `F vec(X) = D g` (eq. 17). vec stacks
 columns: `vec(X) = R_flange_sensor.T.ravel()`. Without noise all methods find the same solution. With noise they do so
 (section 4.2) only if the forces are distributed isotropically. Prefer `polynomial`, which is least squares.
 
@@ -100,9 +100,9 @@ def eigen(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     vec(X) is the eigenvector of `K = F^+ D D^+ F` with the largest eigenvalue, which is 1 without noise. That is the
     smallest principal angle between the ranges of F and D, the form computed here. It minimises `|F r - D g| / |F r|`.
     The noise in the denominator makes it inconsistent if the forces do not point equally in all directions: with 8
-    orientations within 40 deg, each 2000 times at a signal-to-noise ratio of 10, R remains wrong by 3.5 deg where
+    orientations within 40 deg, each 2000 times at a signal-to-noise ratio of 10, R remains wrong by 3.5 deg, where
     `nullspace` has 0.3 deg. With random orientations instead (tool axis within 40 deg, any turn of the wrist) both
-    decrease alike: 1.7, 0.5 and 0.1 deg with 100, 1,000 and 16,000 poses. (With the bias as columns `[D, I]` instead of
+    errors fall: 1.7, 0.5 and 0.1 deg with 100, 1,000 and 16,000 poses. (With the bias as columns `[D, I]` instead of
     centring, a bias as large as the weight is in that denominator too, and R remains wrong by 30 deg.)
 
     Corrections: the eigenvector is that of the largest eigenvalue (appendix B takes the first, which Julia from 1.2 on
@@ -134,7 +134,7 @@ def nullspace(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
 
     The sum of squares over all pairwise differences is exactly n times `|(I - D D^+) F r|^2`, so the least singular
     vector of `(I - D D^+) F` is the published solution (eqs. 22-26) without its n^2 blocks. With bias it is the LROM of
-    Yu et al. Consistent for isotropic noise.
+    Yu et al. The estimate is consistent for isotropic noise.
 
     Parameters
     ----------
@@ -161,8 +161,8 @@ def iterative(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     Corrections: a matrix with negative determinant is negated before the projection. As printed, the
     limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
     with the negation, in all. With few poses there are still false fixed points: from a random gravity, without
-    noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) end there. From the gravity of
-    theorem 1, which is taken here, 1 % with 5 poses and none with more.
+    noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) converge to one of them. From the
+    gravity of theorem 1, which is the start here, it is 1 % with 5 poses and none with more.
 
     Parameters
     ----------
@@ -267,7 +267,7 @@ def _least_singular_vector(eliminated: Array, kept: Array) -> Array:
 
 # --- observability ---
 # The checks use the forces `A_i g` of the fitted gravity, because noise increases the singular values of measured
-# forces, so that degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise in
+# forces, so degenerate pose sets would pass. One kind still passes: if all poses tilt the tool equally, noise in
 # the fitted direction hides it. Only a comparison with the second solution, as in `polynomial`, detects this.
 
 
@@ -319,7 +319,7 @@ def _require_single_null_vector(eq: ForceEquations, gravity: Array) -> None:
 
 
 def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
-    """Raise `NotObservable` unless the Jacobian by rotation and gravity, scaled by 1 rad and weight, has full rank."""
+    """Raise `NotObservable` unless the Jacobian for rotation and gravity, scaled by 1 rad and weight, has full rank."""
     weight = float(np.linalg.norm(gravity))
     J = np.concatenate([skew(eq.A @ gravity), weight * eq.A], axis=2).reshape(-1, 6)
     missing = 6 - spanned_dimensions(J, len(eq.A) ** 0.5 * weight)
@@ -335,7 +335,7 @@ def _require_locally_unique(eq: ForceEquations, gravity: Array) -> None:
 # Letters and the two forms, without and with bias, are the same as above. A bias has the same effect on the form
 # without bias (Cayley transform: 22 deg if the bias is as large as the weight).
 #
-# Gravity must be known exactly: with the base tilted by 2 deg more than assumed, the result is wrong, unwarned.
+# Gravity must be known exactly: with the base tilted by 2 deg more than assumed, the result is wrong without a warning.
 
 
 def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Array, *, bias: bool) -> ForceFit:
@@ -344,7 +344,7 @@ def relaxation(R_base_flange: Array, force_N: Array, gravity_direction_base: Arr
     The linear unknown is the matrix `X / weight`, nine free numbers, with `(X / weight) f_i = A_i d`. (Eq. 3 calls it
     mR; it is (1/m) R_TF^S, and R_TF^S is the inverse of the R_S^TF of eq. 1.) The noise of the regressor f shrinks it
     by a symmetric factor, which the projection on SO(3) removes; the weight is then the least-squares one given X.
-    Consistent, but not efficient if the tool cannot be turned in all directions.
+    The estimate is consistent, but not efficient if the tool cannot be turned in all directions.
 
     Parameters
     ----------
@@ -377,8 +377,8 @@ def cayley(
     """Return the rotation by the Cayley transform, for known direction of gravity and weight (eqs. 6-11).
 
     The transform fails for rotations by 180 deg and is poor near them, so it is applied after each of four turns of
-    the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept. An error of the weight goes into
-    the rotation: 10 % leave |dR|_F^2 at 1e-5 however small the noise. `relaxation` needs no weight.
+    the flange axes (by 0, and by 180 deg about x, y and z) and the best fit is kept. An error of the weight affects the
+    rotation: an error of 10 % leaves |dR|_F^2 at 1e-5 however small the noise is. `relaxation` needs no weight.
 
     Parameters
     ----------

@@ -108,8 +108,8 @@ def yang(R_base_flange: Array, force_N: Array, *, R_flange_sensor: Array) -> For
     """Return weight, tilt of the base, force bias and yaw of the sensor, for a mounting known up to the yaw.
 
     Source: X. Yang, F. Li, R. Gao, R. Song, Y. Li, "Force perception of industrial robot based on multi-parameter
-    coupled model", 2019. Given the yaw about flange z, the problem is that of `wang`, so what is left is a quadratic
-    form in its cosine and sine. Its stationary points are the roots of a quartic, which gives the minimum exactly.
+    coupled model", 2019. Given the yaw about flange z, the problem is that of `wang`, so the cost is a quadratic form
+    in cosine and sine of the yaw. Its stationary points are the roots of a quartic, which gives the minimum exactly.
     Centre of mass and torque bias follow from the torques, as in eqs 43-45 of Yu.
 
     Parameters

@@ -1,4 +1,4 @@
-"""The closed-form methods of Yu, Shi, Lou 2021: SROM (24 special orientations), LROM (any), and both mixed.
+"""The closed-form methods of Yu, Shi, Lou 2021: SROM (24 special orientations), LROM (any), and a mix of both.
 
 Source: "Bias Estimation and Gravity Compensation for Wrist-Mounted Force/Torque Sensor", eqs 14-48. In this module
 A (n, 3, 3) is the paper's e_bR, base to flange, which is `R_base_flange` transposed, and the estimated R is s_eR,
