@@ -27,7 +27,7 @@ class Waitable(Protocol):
 class Clock(ABC):
     """A monotonic clock and the ways to wait on it. Every method may be called from any thread.
 
-    All differences between a real and an emulated cell are limits and methods of this class, so that a driver need not
+    All differences between a real and an emulated cell are limits and methods of this class, so a driver need not
     know which clock it uses.
     """
 
@@ -81,7 +81,7 @@ class Clock(ABC):
         return nullcontext()
 
     def held(self) -> AbstractContextManager[object]:
-        """Mark a block in which the time of an emulated cell stops, so that its devices send nothing."""
+        """Mark a block in which the time of an emulated cell stops and its devices send nothing."""
         return nullcontext()
 
     def hear(self, look: Callable[[float], Heard | None], silence_s: float) -> Heard | None:
@@ -126,7 +126,7 @@ REAL = _RealClock()
 class Follower(threading.Thread):
     """A daemon thread that calls `work` in a `keeping_up` block of `clock`.
 
-    `start` returns as soon as the time of an emulated cell waits for the thread, so that no limit expires before. It
+    `start` returns as soon as the time of an emulated cell waits for the thread, so no limit expires earlier. It
     raises the exceptions of `Clock.keeping_up`.
     """
 

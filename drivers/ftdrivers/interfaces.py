@@ -129,7 +129,7 @@ class FtSamples(Columns):
     t_device_s: Array
     """(n,) time on the device's own clock, s; NaN if it has none. Its epoch differs from that of host time."""
     seq: NDArray[np.int64]
-    """(n,) sequence number. Every sample that the device sent or was polled for has one, so that gaps are visible."""
+    """(n,) sequence number. Every sample that the device sent or was polled for has one, which makes gaps visible."""
     counts: NDArray[np.int32]
     """(n, k) raw counts of the device; k = 0 if the device reports physical units."""
     wrench: Array
@@ -281,7 +281,7 @@ class ControllerSettings:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """Result of a check that only one driver has, because only its device has what is checked."""
+    """Result of a check that only one driver offers, because only its device has the checked property."""
 
     name: str
     """Name of the check, such as "registers"."""
@@ -304,7 +304,7 @@ class _Device(ABC):
         """Return model, serial number and firmware, as read when the device was opened."""
 
     def diagnose(self) -> list[Diagnosis]:
-        """Run the checks that only this driver has, such as the ports of a controller. They only read.
+        """Run the checks that only this driver has, such as the ports of a controller. These checks only read.
 
         The default returns an empty list.
         """
@@ -519,7 +519,7 @@ class ReadOnlyArm(RobotArm):
         """Do nothing."""
 
     def status(self) -> ArmStatus:
-        """Return a status in which every value is not reported."""
+        """Return a status in which no value is reported."""
         state = self.state()
         unknown = NOT_REPORTED, NOT_REPORTED, "stopped"
         return ArmStatus(state.t_host_ns, state.t_device_s, *unknown, None, 1.0, 1.0, None, None, None)

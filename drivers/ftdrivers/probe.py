@@ -18,11 +18,11 @@ from ftdrivers.wires.serial_port import SerialPort, SerialProbe
 
 _LISTEN_LINE_S = 0.25
 _REPLY_S = 0.25
-# A Bota that restarts when its port is opened prints its baud rate at 230400 baud; its maker waits 2 s for it.
+# A Bota that restarts when its port is opened prints its baud rate at 230400 baud; its vendor waits 2 s for this text.
 _BOOT_S = 2.5
 # A port that is closed for a shorter time may not restart the sensor.
 _CLOSED_S = 0.1
-# Ten samples of the slowest Robotous, and about the period of the slowest usual heartbeat.
+# Listening time on a bus: ten samples of the slowest Robotous, and about the period of the slowest usual heartbeat.
 _LISTEN_BUS_S = 1.0
 
 

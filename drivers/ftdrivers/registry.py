@@ -38,7 +38,7 @@ _EXAMPLES = (
 
 
 class Options:
-    """The options of one address. It records which options a driver has read, so that others can be rejected."""
+    """The options of one address. It records which options a driver has read, to reject all others."""
 
     def __init__(self, url: str, query: str) -> None:
         self._url = url

@@ -1,7 +1,7 @@
 """A sweep: a smooth motion of the three wrist joints that begins and ends in one posture.
 
 Each wrist joint moves by a windowed sum of sines: ``q(t) = centre + w(t) sum(amplitude sin(frequency t + phase))``.
-The ramps of the window ``w`` are quintic polynomials, so that speed and acceleration are zero at both ends.
+The ramps of the window ``w`` are quintic polynomials, so speed and acceleration are zero at both ends.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,7 +27,7 @@ class Sweep:
     Parameters
     ----------
     centre_rad : sequence of float
-        (6,) posture at the begin and at the end.
+        (6,) posture at the beginning and at the end.
     amplitude_rad, frequency_rad_s, phase_rad : array_like, shape (3, 2)
         Amplitude, angular frequency and phase of each sine of wrists 1 to 3.
     duration_s, ramp_s : float
@@ -123,7 +123,7 @@ class Sweep:
 
 
 def _window(x: Array, derivative: int) -> Array:
-    """Return the rising ramp of the window at x (n,) from 0 to 1, or its derivative by x, which is 0 outside."""
+    """Return the window's rising ramp at x (n,) from 0 to 1, or a derivative with respect to x, which is 0 outside."""
     polynomial = np.polynomial.Polynomial((0.0, 0.0, 0.0, 10.0, -15.0, 6.0))
     value = np.asarray(polynomial.deriv(derivative)(x) if derivative else polynomial(x))
     return value if derivative == 0 else np.where(x < 1.0, value, 0.0)

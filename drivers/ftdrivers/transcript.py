@@ -307,7 +307,7 @@ def _checked_end(line: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _time_ns(line: Mapping[str, Any]) -> int:
-    float(line["t_ns"])  # beyond its range times cannot be distinguished
+    float(line["t_ns"])  # beyond the range of a float, times cannot be distinguished
     return int(line["t_ns"])
 
 
@@ -326,7 +326,7 @@ def _replaced(module: ModuleType, name: str, other: object) -> Iterator[None]:
 def recording(writer: Writer) -> Iterator[None]:
     """Record the bytes of all serial ports and CAN buses opened in the `with` block.
 
-    The ports keep the settings of the driver, so that the recording does not affect the device.
+    The ports keep the settings of the driver, so the recording does not affect the device.
     """
     # Bytes are recorded inside pyserial: a pseudo-terminal in between would hide parity and latency settings from the
     # device.

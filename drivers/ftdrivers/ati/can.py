@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 
 _TRANSACTION_S = 0.1
 _ATTEMPTS = 3
-# Time-out of a poll, which takes 1 to 3 ms. It is short, so that one lost frame does not make the stream stale.
+# Time-out of a poll, which takes 1 to 3 ms. It is short, so one lost frame does not make the stream stale.
 _POLL_S = 0.05
 # Number of frames that are still read after the time-out: on a busy computer the process is late, not the reply.
 _LATE_FRAMES = 32
@@ -248,7 +248,7 @@ class AtiCanSensor(StreamingSensor):
 
     def _judge(self, reading: codec.GaugeReading) -> None:
         """Raise `DeviceFault` if a reading is unusable; log other status bits once."""
-        # Bits 0, 8, 14 and 15 are no faults: a healthy unit on a shared bus had bit 14 set.
+        # Bits 0, 8, 14 and 15 are not faults: a healthy unit on a shared bus had bit 14 set.
         status = reading.status
         if status & codec.CRITICAL:
             raise DeviceFault(f"{self.name}: status {describe_status(status, codec.STATUS_BITS)}", UNUSABLE)

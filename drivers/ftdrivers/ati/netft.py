@@ -46,7 +46,7 @@ _QUEUE = 16_384
 _ONROBOT_COUNTS = (10_000, 100_000)
 _DISTANCES_M = {"in": 0.0254, "ft": 0.3048, "mm": 0.001, "cm": 0.01, "m": 1.0}
 
-# pynetft ends the stream for any other status, so that the Axia's warning of a gauge near its limit is a fault too.
+# pynetft ends the stream for any other status, so the Axia's warning of a gauge near its limit is a fault too.
 MONITOR_LATCHED = 0x80010000
 """Status after a monitored threshold was crossed. The data are valid."""
 
@@ -157,7 +157,7 @@ class NetFtSensor(StreamingSensor):
 
     `counts` are the six values as sent, `seq` is the RDT sequence number, `t_device_s` is NaN: records carry no time.
     `wrench` is in the axes and about the origin of the transducer: the driver undoes the tool transformation. The
-    device subtracts its software bias. Both are facts, so that a change is rejected after a reconnection. Nominal rate
+    device subtracts its software bias. Both are facts, so a change is rejected after a reconnection. Nominal rate
     and range are known if the configuration page contains them. Any status except a latched monitor condition raises
     `DeviceFault`.
 
@@ -218,11 +218,11 @@ class NetFtSensor(StreamingSensor):
             sensor_host=self._host,
             rdt_port=self._rdt_port,
             http_port=self._http_port,
-            receive_timeout=_NEVER_S,  # in real time; silence is judged here
+            receive_timeout=_NEVER_S,  # in real time; this driver judges silences
             configuration_connect_timeout=self._http_s,
             configuration_timeout=self._http_s,
             deliver_samples_with_error_status=True,  # the status word names the fault
-            # A doubled or late datagram ends a stream that fails at once. So it may recover, but not before we noticed.
+            # Without reconnecting, a duplicate or late datagram ends a stream. This driver notices any failure first.
             recovery_policy=pynetft.RecoveryPolicy.RECONNECT,
             reconnect_initial_delay=_NEVER_S,
             reconnect_max_delay=_NEVER_S,

@@ -34,7 +34,7 @@ _READ_S = 0.02
 _REPLY_S = 0.1
 _SILENCE_S = 0.2
 # Bytes for which one read waits, 4 ms of stream. Larger batches need less CPU but delay the guards. The records of a
-# batch share one time stamp, because evenly spread stamps would pretend a precision that they do not have.
+# batch share one time stamp, because evenly spread stamps would suggest a precision that they do not have.
 _BATCH_BYTES = 28 * modbus.RECORD_SIZE
 # If the error bit is set but the status word is clear, a byte was damaged. Three times in a row it is a fault.
 _MAX_RESTARTS = 3
@@ -138,7 +138,7 @@ class AtiSerialSensor(StreamingSensor):
         if suspect:
             keep &= ~flagged
         elif keep.any() and not flagged.any():
-            self._status &= ~modbus.ANY_ERROR  # the error has ended, so that another one is logged again
+            self._status &= ~modbus.ANY_ERROR  # the error has ended, so another one is logged again
         gauges = records.gauges[:settled][keep]
         seq = self._seq + 1 + np.flatnonzero(keep)
         if self._last_good_ns is not None and len(gauges):

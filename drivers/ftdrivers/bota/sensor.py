@@ -47,7 +47,7 @@ _CLOCK = 1 << 32
 class BotaSensor(StreamingSensor):
     """A Bota SensONE or Rokubi with the serial interface of 37-byte frames.
 
-    `t_device_s` is the time on the sensor's clock. `seq` counts its sample periods, so that gaps are visible. `counts`
+    `t_device_s` is the time on the sensor's clock. `seq` counts its sample periods, so gaps are visible. `counts`
     are empty, because the sensor sends N and N·m. Overrange, invalid and uncalibrated samples raise `DeviceFault`.
 
     Parameters

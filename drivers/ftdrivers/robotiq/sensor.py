@@ -153,7 +153,7 @@ _BAUD = 19_200
 _REPLY_S = 0.2
 # Silence after which a stream has stopped, and the time-out for it, s.
 _SILENCE_S, _STOP_S = 0.05, 1.0
-# Rates around 62.5 Hz: an FTDI adapter whose latency timer is 16 ms delivers so often.
+# Rates around 62.5 Hz, at which an FTDI adapter with a latency timer of 16 ms delivers data.
 _LATENT_RATE_Hz = (55.0, 70.0)
 
 
@@ -162,7 +162,7 @@ class RobotiqFt300(StreamingSensor):
 
     `counts` are the six raw values (0.01 N and 0.001 N·m). `t_device_s` is NaN and `status` is 0, because the sensor
     reports neither. A value at the end of its 16 bits raises `DeviceFault`. Frames carry no number: `seq` counts
-    received frames, including damaged ones, so that a lost frame is only visible in the rate.
+    received frames, including damaged ones, so a lost frame is only visible in the rate.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Sensors and arms of any make by ROS 2 topics, and the way to rclpy."""
+"""Sensors and arms of any make that publish on ROS 2 topics, and access to rclpy."""

@@ -31,7 +31,7 @@ _SPEED_NS: Final = 100_000_000
 # Lever with which a translation is converted to an angle.
 _LEVER_M: Final = 1.0
 _MOST_UNREAD: Final = 1_000_000
-# If stamps go back by more, s, they were given by another clock.
+# Stamps that go back by more than this, s, were given by another clock.
 _BACK_S: Final = 0.5
 
 

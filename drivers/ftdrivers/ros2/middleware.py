@@ -17,13 +17,13 @@ from ftdrivers.errors import ConnectError, NoRos2, ProtocolError
 from ftdrivers.installation import install_command
 from ftdrivers.interfaces import Diagnosis
 
-# Variables that name the user's profiles of Fast DDS; it also reads DEFAULT_FASTDDS_PROFILES.xml where it starts.
+# Variables that name the user's profiles of Fast DDS. It also reads DEFAULT_FASTDDS_PROFILES.xml in the current folder.
 _PROFILES: Final = {"FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"}
 
 
 def ros2_module(name: str) -> Any:
     """Import a module of ROS 2, such as "rclpy" or "geometry_msgs.msg". Raises `NoRos2`."""
-    # The wheels start each Python again to set LD_LIBRARY_PATH (30 ms), and have no tf2_msgs: tf needs a sourced ROS.
+    # The ROS wheels restart Python to set LD_LIBRARY_PATH (30 ms). They lack tf2_msgs, so tf needs a sourced ROS.
     try:
         return importlib.import_module(name)
     except ImportError as error:
@@ -35,8 +35,8 @@ def ros2_module(name: str) -> Any:
 
 
 def _stay_on_loopback() -> None:
-    """Have Fast DDS bind its ports to loopback where ROS is configured for this computer alone."""
-    # The range of discovery by itself leaves them open on all interfaces. A profile of the user goes first.
+    """Make Fast DDS bind its ports to loopback if ROS is configured for this computer only."""
+    # The discovery range alone leaves the ports open on all interfaces. A profile of the user takes precedence.
     if os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") != "LOCALHOST" or _PROFILES & os.environ.keys():
         return
     if not Path("DEFAULT_FASTDDS_PROFILES.xml").exists():
@@ -44,14 +44,14 @@ def _stay_on_loopback() -> None:
 
 
 class Node:
-    """A node of ROS 2 with a context of its own; callbacks run in its thread between `spin` and `close`.
+    """A ROS 2 node with a context of its own; callbacks run in the thread of the node between `spin` and `close`.
 
     Parameters
     ----------
     name : str
-        Arguments may give another one.
+        Name of the node, which `arguments` may replace.
     arguments : sequence of str
-        After and with ``--ros-args``: remapping, parameters, namespace.
+        ROS arguments, beginning with ``--ros-args``: remapping, parameters, namespace.
 
     Raises
     ------
@@ -65,9 +65,9 @@ class Node:
         _stay_on_loopback()
         self.context = rclpy.Context()
         try:
-            rclpy.init(args=["ftdrive", *arguments], context=self.context)  # of a context: no signal handlers
+            rclpy.init(args=["ftdrive", *arguments], context=self.context)  # own context: no signal handlers
             self.node = rclpy.create_node(name, context=self.context)
-        except Exception as error:  # rclpy raises its own, some of them private
+        except Exception as error:  # rclpy raises its own exceptions, some of them private
             with suppress(Exception):
                 self.context.try_shutdown()
             first = next(iter(str(error).splitlines()), "")
@@ -79,12 +79,12 @@ class Node:
         self._failure: Exception | None = None
 
     def spin(self) -> None:
-        """Begin to call the callbacks."""
+        """Start calling the callbacks."""
         self._thread = Thread(target=self._spin, name=f"ROS 2 of {self.node.get_name()}", daemon=True)
         self._thread.start()
 
     def spin_once(self, timeout_s: float) -> None:
-        """Call one callback, if one is due within `timeout_s`; before `spin`."""
+        """Call one callback if one is due within `timeout_s`. Use this method only before `spin`."""
         self._executor.spin_once(timeout_sec=timeout_s)
 
     def _spin(self) -> None:
@@ -96,7 +96,7 @@ class Node:
             self._failure = error
 
     def check(self) -> None:
-        """Raise what a callback has raised, because no callback is called since."""
+        """Raise the exception of a callback, after which no further callback is called."""
         if self._failure is not None:
             raise self._failure
 
@@ -111,25 +111,25 @@ class Node:
 
 
 DISCOVERY_S: Final = 3.0
-"""Until the publishers of a topic are known."""
+"""Time-out until the publishers of a topic are known, s."""
 _SAME_CLOCK_MS: Final = 2.0
-# A stamp that is older by the clock of this computer was given by another clock.
+# A stamp that is older than this by the clock of this computer was given by another clock.
 _LONGEST_WAY_MS: Final = 30.0
-# Until a second publisher is known too.
+# Time until a second publisher is known too.
 _OTHERS_S: Final = 0.5
-# Between two looks whether another node publishes too.
+# Interval between two checks whether another node publishes too.
 _LOOK_S: Final = 1.0
 _UNNAMED: Final = "NAME_UNKNOWN"
 _UNNUMBERED: Final = (1 << 64) - 1
 
 
 class Received(NamedTuple):
-    """A message with what is known of its way."""
+    """A message with information about its transmission."""
 
     message: Any
     t_host_ns: int
     number: int
-    """The number of the publisher, so that lost messages are gaps; counted here where the middleware gives none."""
+    """Sequence number of the publisher, where lost messages are gaps; counted here if the middleware gives none."""
 
 
 def subscribe(
@@ -142,7 +142,7 @@ def subscribe(
     ros : Node
     topic : str
     kind : str
-        Such as "geometry_msgs/msg/WrenchStamped".
+        Message type, such as "geometry_msgs/msg/WrenchStamped".
     reliable : bool
         Request reliable delivery, which the publisher must offer.
 
@@ -154,9 +154,9 @@ def subscribe(
     Raises
     ------
     ConnectError
-        No node publishes the topic, its type is another one, or it offers best effort alone.
+        No node publishes the topic, it has another type, or the publisher only offers best effort.
     ProtocolError
-        Two nodes publish it.
+        Two nodes publish the topic.
     """
     package, _, name = kind.partition("/msg/")
     message_type = getattr(ros2_module(f"{package}.msg"), name)
@@ -178,7 +178,7 @@ def subscribe(
 
 
 def subscribe_to_tf(ros: Node, topic: str, on_message: Callable[[Received], None], clock: Clock) -> None:
-    """Receive /tf or /tf_static, which many nodes publish. Raises `NoRos2` where tf2_msgs is missing."""
+    """Receive /tf or /tf_static, which many nodes publish. Raises `NoRos2` if tf2_msgs is missing."""
     qos = ros2_module("rclpy.qos")
     is_static = topic == "/tf_static"
     profile = qos.QoSProfile(
@@ -233,14 +233,14 @@ def _publisher(ros: Node, topic: str, kind: str, clock: Clock, *, reliable: bool
 
 
 class OnePublisher:
-    """Looks again and again whether another node publishes a topic too; some are discovered after seconds."""
+    """Checks repeatedly whether another node publishes a topic too; some nodes are discovered after seconds."""
 
     def __init__(self, ros: Node, topic: str, clock: Clock) -> None:
         self._ros, self._topic, self._clock = ros, topic, clock
         self._looked_s = -math.inf
 
     def check(self, *, in_order: bool = True) -> None:
-        """Raise `ProtocolError` if there is another; stamps that are not in order are a reason to look at once."""
+        """Raise `ProtocolError` if there is another publisher; stamps out of order are a reason to check at once."""
         if in_order and self._clock.now_s() - self._looked_s < _LOOK_S:
             return
         self._looked_s = self._clock.now_s()
@@ -259,7 +259,7 @@ def _names(publishers: Sequence[Any]) -> list[str]:
 
 
 def stamp_ns(header: Any, topic: str) -> int:
-    """Return the time of a header in nanoseconds. Raises `ProtocolError` for one that was not set."""
+    """Return the time of a header in nanoseconds. Raises `ProtocolError` if it was not set."""
     t_ns = int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
     if t_ns <= 0:
         raise ProtocolError(

@@ -166,7 +166,7 @@ class Poses:
         yield StampedPose(stamp_ns(message.header, topic), *pose)
 
     def missing(self) -> str:
-        """Return that no message arrived."""
+        """Return the reason: no message arrived."""
         return f"no message of {next(iter(self.topics))} arrived"
 
 

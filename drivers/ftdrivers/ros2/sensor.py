@@ -28,7 +28,7 @@ _WAIT_S = 0.05
 class Ros2Sensor(StreamingSensor):
     """A sensor whose wrench is published as WrenchStamped.
 
-    `t_device_s` is the stamp of the header. `seq` is the sequence number of the publisher's middleware, so that lost
+    `t_device_s` is the stamp of the header. `seq` is the sequence number of the publisher's middleware, where lost
     messages are gaps. `counts` are empty and `status` is 0. There is no nominal rate.
 
     Parameters

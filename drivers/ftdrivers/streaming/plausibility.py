@@ -16,7 +16,7 @@ _FROZEN_S = 0.2
 # with 0.3 steps of 1e-5. A sensor is frozen if all samples of 0.2 s are identical, at least 20 and at most 50 of them.
 # Reason: docs/decisions/sensors.md, 38.
 _FROZEN_SAMPLES = (20, 50)
-# Largest amount, s, by which the device's clock may gain on ours between two blocks. A late block only makes it lose.
+# Largest time, s, by which the device's clock may gain on ours between two blocks. A late block makes it lose time.
 _CLOCK_JUMP_S = 0.5
 # The device's clock may run slower than ours by this fraction. Samples of a slower clock are treated as late.
 _CLOCK_DRIFT = 0.02

@@ -47,7 +47,7 @@ class StreamLimits:
     settle_s: float = 0.05
     """Time for which an adapter may deliver buffered samples after a pause."""
     waited_s: float = 0.001
-    """A read that takes longer had to wait for a new sample, so that the buffer is empty."""
+    """A read that takes longer had to wait for a new sample, which means that the buffer is empty."""
     discard_s: float = 0.5
     """Time-out for emptying the buffer after a pause."""
     recover_s: float = 10.0
@@ -123,7 +123,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._max_unread_samples = max_unread_samples
         self.recover = recover
         self.configured: dict[str, Fact] = {}
-        """Facts `serial` and `range` of the user; they may be set before `open`. A device that reports another serial
+        """Facts `serial` and `range` from the user; they may be set before `open`. A device that reports another serial
         number is rejected. The range replaces the one that the device reports."""
         # A subclass that knows the rate of its device sets this in `_connect`.
         self._nominal_Hz = math.nan
@@ -217,7 +217,7 @@ class StreamingSensor(ForceTorqueSensor):
     def collect(self, duration_s: float) -> FtSamples:
         """Return every sample received within `duration_s` seconds from this call, see `ForceTorqueSensor`.
 
-        The call returns when the first sample after the end arrives, so that no sample before the end is missed.
+        The call returns when the first sample after the end arrives, so no sample before the end is missed.
         """
         if not duration_s > 0:
             raise ValueError(f"a duration of {duration_s} s collects nothing; give a positive one")
@@ -353,7 +353,7 @@ class StreamingSensor(ForceTorqueSensor):
         self._is_late = False
 
     def _start_reader(self) -> None:
-        # `open` continues after the thread has started to keep up, so that no time-out expires before.
+        # `open` continues after the thread has started to keep up, so no time-out expires earlier.
         self._thread = Follower(self._clock, self._run, f"reader of {self.name}")
         self._thread.start()
 

@@ -65,7 +65,7 @@ class Calls:
         self._before = 0
         self._unwatched = False
         self.moving = False
-        """Whether the arm moves, so that the parent has to call `progress` regularly."""
+        """Whether the arm moves. The parent then has to call `progress` regularly."""
 
     def move(self, q_rad: list[float], speed_rad_s: float, acceleration_rad_s2: float) -> bool:
         """Start a move; return whether the controller accepted it."""

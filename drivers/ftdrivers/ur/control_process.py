@@ -110,7 +110,7 @@ class ControlProcess(Control):
                 if "error" in reply:
                     fix = (
                         "check the robot and the cable, then open the arm again" if to else ""
-                    )  # `UrArm` adds the fix to an empty one
+                    )  # `UrArm` fills in an empty fix
                     raise StreamBroken(f"ur_rtde reports: {reply['error']}", fix)
                 return reply["value"]
             if ended:

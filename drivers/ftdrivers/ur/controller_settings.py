@@ -36,7 +36,7 @@ _G_M_S2: Final = (8.0, 12.0)
 
 def read_controller_settings(host: str, *, timeout_s: float, clock: Clock) -> ControllerSettings:
     """Read the settings once. Raises `ConnectError`, `DeviceTimeout`, `StreamBroken` or `ProtocolError`."""
-    # Over a connection of its own: the type of target_gravity stands in no source, and one wrong type ends a
+    # The connection is separate, because no source states the type of target_gravity, and a wrong type ends the
     # connection.
     stream = Subscription(host, OUTPUTS, _RATE_HZ, timeout_s=timeout_s, clock=clock)
     try:
@@ -73,7 +73,7 @@ def checked_payload(
             f"inertia_kg_m2 is {inertia}; give Ixx, Iyy, Izz, Ixy, Ixz, Iyz up to {_LARGEST_INERTIA_KG_M2:g} kg·m²."
         )
     if not any(com):
-        com[0] = 1e-9  # the control script keeps the old centre where all three are exactly zero
+        com[0] = 1e-9  # the control script keeps the old centre if all three are exactly zero
     return mass, com, inertia
 
 

@@ -121,7 +121,7 @@ class Reader:
         self._changed = threading.Condition()
         # `t_host_ns` of the newest sample for a state or a status, and the sample.
         self._live: tuple[int, bytes] | None = None
-        # Number of samples after it.
+        # Number of samples after `_live`.
         self._since_live = 0
         # Times of the last read, of the last read with a sample, and of the read with `_live`.
         self._turn_s = self._read_s = self._live_s = clock.awake_s()

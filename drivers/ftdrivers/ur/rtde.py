@@ -420,7 +420,7 @@ class ProgramRegisters:
         try:
             with self._lock:
                 # One package is processed in one cycle of the controller. The IO client of ur_rtde writes one package
-                # per register, so that a program could read half of an answer.
+                # per register, so a program could read half of an answer.
                 self._link.write([*integers, *doubles])
         except OSError as error:
             raise StreamBroken(f"the registers cannot be written ({error})", "check robot and cable") from error

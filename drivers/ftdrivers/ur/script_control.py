@@ -58,7 +58,7 @@ COMMANDS: Final = MappingProxyType(
     }
 )
 """Codes of the commands, by the names of `control_child.Calls`, which has no sweep."""
-# A command is executed once, if its sequence number is higher than the last one. No motion can therefore start late.
+# A command is executed once, if its sequence number is higher than the last one. Therefore no motion can start late.
 MOVING: Final = ("move", "sweep")
 """Commands that start a motion."""
 _MOVING: Final = 2
@@ -103,7 +103,7 @@ def without_comments(text: str) -> str:
 def program_text(token: int, version: Sequence[int], stop_rad_s2: float) -> str:
     """Return the control program for one session on a controller of this version; stops decelerate by `stop_rad_s2`."""
     # set_target_payload exists since 5.10, and also sets the inertia.
-    # The token stands in the text of the program: one that starts late finds another token, or no heartbeat, and
+    # The program text contains the token. A program that starts late finds another token, or no heartbeat, and
     # ends.
     com, inertia = (", ".join(f"ft_number({k})" for k in numbers) for numbers in (range(1, 4), range(4, 10)))
     payload = f"set_payload(ft_number(0), [{com}])"
@@ -120,7 +120,7 @@ log = logging.getLogger(__name__)
 
 # In 400 trials the arm began to decelerate at most 0.23 s after the last heartbeat.
 STOPS_ITSELF_S: Final = 0.3
-"""Longest time from the last heartbeat to the begin of the deceleration, s: 0.2 s and the cycles of both ends."""
+"""Longest time from the last heartbeat to the start of the deceleration, s: 0.2 s and the cycles of both ends."""
 _RATE_HZ: Final = 125.0
 _LOOK_OUT_S: Final = 0.05
 _LARGEST: Final = 2**31 - 1

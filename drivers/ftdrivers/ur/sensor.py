@@ -1,7 +1,7 @@
 """The force/torque sensor in the wrist of an e-Series arm.
 
 The controller reports two wrenches. `actual_TCP_force` is in base axes at the active TCP. The controller subtracts the
-configured payload and the reading at the last zeroing from it, which cannot be undone, so that it is useless for a
+configured payload and the reading at the last zeroing from it, which cannot be undone, so it is useless for a
 gravity calibration. `ft_raw_wrench` (PolyScope 5.9 and later) is in flange axes, neither compensated nor zeroed.
 Universal Robots documents neither its unit nor its reference point. Therefore this driver reads `ft_raw_wrench`, and
 requires a scale that the user has measured with a known weight. Its zero is arbitrary: recordings have zeros of about
@@ -33,7 +33,7 @@ class UrWristSensor(StreamingSensor):
 
     The wrench is `ft_raw_wrench` divided by the given scale, in flange axes; the flange is assumed as reference point.
     `counts` are empty, because the controller sends floating-point numbers. `t_device_s` is the controller's time and
-    `seq` counts its cycles of 2 ms, so that gaps are visible. `status` is 0, because the controller reports none.
+    `seq` counts its cycles of 2 ms, so gaps are visible. `status` is 0, because the controller reports none.
 
     Parameters
     ----------

@@ -45,9 +45,9 @@ class UrTiming:
     ours_s: float = 0.4
     """Time-out for the answer of the control program, which takes two control cycles at most."""
     ours_again_s: float = 1.0
-    """The same time-out when the arm is reopened."""
+    """Value of `ours_s` when the arm is reopened."""
     ours_closing_s: float = 0.3
-    """The same time-out when the arm is closed."""
+    """Value of `ours_s` when the arm is closed."""
     quit_s: float = 0.7
     """Time-out for ending the control program and its process when the arm is closed."""
     braking_s: float = 0.5
@@ -55,7 +55,7 @@ class UrTiming:
     stop_s: float = 0.4
     """Time-out of a stop through the dashboard server, which takes 0.02 s. Then it continues in the background."""
     stop_silent_s: float = 0.15
-    """The same time-out if no sample has arrived for `stale_s`."""
+    """Value of `stop_s` if no sample has arrived for `stale_s`."""
     reach_s: float = 1.5
     """Time for which the attempt in the background tries to connect, enough for one retransmission of TCP."""
     unwatched_s: float = 0.5
@@ -94,7 +94,7 @@ STRICT: Final = UrTiming()
 class Patience:
     """Waits in turns until `limit_s` has passed. A turn in which this process was suspended adds two turns at most.
 
-    A suspended process receives nothing, so that the silence does not show that the other side is dead.
+    A suspended process receives nothing, so the silence does not show that the other side is dead.
     """
 
     def __init__(self, clock: Clock, limit_s: float) -> None:

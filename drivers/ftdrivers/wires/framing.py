@@ -35,7 +35,7 @@ def _crc(data: bytes, table: tuple[int, ...]) -> int:
 class Deframer:
     """Divides a byte stream into intact frames and numbers them.
 
-    After a false header the search continues at the next byte, so that the next true frame is found. Dropped bytes are
+    After a false header the search continues at the next byte, so the next true frame is found. Dropped bytes are
     counted as damaged frames, at least one per interruption. Bytes before the first frame are not counted, because
     reading often starts in the middle of a stream.
 
@@ -107,7 +107,7 @@ class Deframer:
 
 
 def is_stream(deframer: Callable[[], Deframer]) -> Callable[[bytes], bool]:
-    """Return a function that tells whether bytes contain at least five intact frames, enough to identify a stream."""
+    """Return a function that checks whether bytes contain at least five intact frames, enough to identify a stream."""
     return lambda data: len(deframer().feed(data)) >= 5
 
 

@@ -2,7 +2,7 @@
 
 Ref: POSIX.1-2024, Base Definitions, 11.2.2 Input Modes. With INPCK and PARMRK set and IGNPAR clear, a byte X received
 with wrong parity or framing is delivered as FF 00 X, and a valid FF as FF FF. pyserial clears both flags whenever it
-configures a port, so that damaged bytes are then delivered unmarked.
+configures a port, so damaged bytes are then delivered unmarked.
 """
 
 import contextlib
