@@ -189,7 +189,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main() -> int:
-    """Run what the command line asks for and return the exit code."""
+    """Run the command that the command line requests and return the exit code."""
     parser = _parser()
     options = parser.parse_args()
     try:

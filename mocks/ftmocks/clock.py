@@ -115,7 +115,7 @@ class CellClock:
                 del self._own[thread]
 
     def close(self) -> None:
-        """End the clock, so that clients detect the end of the station. Idempotent."""
+        """End the clock, which shows clients that the station has ended. Idempotent."""
         self._end()
 
     def _move_on(self) -> int:
@@ -129,7 +129,7 @@ class CellClock:
 
     def _slots(self, real_ns: int) -> list[int]:
         """Return the times up to which the owners of slots have followed, except those that are no longer awaited."""
-        # The time for which this process itself was suspended is not counted against the others.
+        # The time for which this process itself was suspended is not counted against other processes.
         elapsed_ns = min(real_ns - self._looked_ns, round(SUSPECT_S * 1e9))
         self._looked_ns = real_ns
         slots = self._page[_HEAD:].tolist()

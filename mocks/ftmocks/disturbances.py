@@ -58,7 +58,7 @@ class Ramp:
     p_sensor_m
         (3,) point of the tool in sensor coordinates.
     start_s, seconds
-        Begin of the change on the cell's clock, and its duration.
+        Start of the change on the cell's clock, and duration of the change.
     """
 
     before_N: Array

@@ -1,7 +1,7 @@
 """Calibrated kinematics of one arm: drawn from a seed, or read from a file.
 
 An arm is drawn as a chain of transforms with small deviations, and converted to the Denavit-Hartenberg parameters that
-the controller reports. The axes of joints 2, 3 and 4 are nearly parallel, so that their common normals are far away:
+the controller reports. The axes of joints 2, 3 and 4 are nearly parallel, so their common normals are far away:
 the offsets d of these joints may be hundreds of metres long, and cancel each other.
 
 Source: Universal Robots ROS 2 driver, package ur_calibration (README and calibration_consumer), which describes the
@@ -71,7 +71,7 @@ def link_frames(chain: Chain) -> list[Array]:
 def to_dh(model: str, frames: list[Array]) -> Dh:
     """Convert the frames of a chain to Denavit-Hartenberg parameters. No two successive axes may be parallel.
 
-    Each step starts from the frame that results from the rounded parameters before it, so that rounding errors do not
+    Each step starts from the frame that results from the rounded parameters before it, so rounding errors do not
     grow with d.
     """
     rows, X = [], np.eye(4)

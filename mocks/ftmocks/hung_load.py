@@ -64,7 +64,7 @@ class HungLoad:
 
     @property
     def swing_deg(self) -> float:
-        """Angle between the string and the vertical, rad."""
+        """Angle between the string and the vertical, degrees."""
         along = float(self._string @ self._down)
         return math.degrees(math.atan2(float(np.linalg.norm(self._string - along * self._down)), along))
 

@@ -1,23 +1,23 @@
 """Imperfections of a real arm and its sensors: vibration, noise, delay, friction. Their sizes are settings.
 
 Sources: sizes and spectrum of the ripple are those of a recording of an LBR with .93 kg on an ATI Gamma, which turns
-at .78 rad/s. It has 1.4, .6 and .4 N rms on x, y and z, at rest no more than the noise. Its 40, 80 and 120 Hz move with
+at .78 rad/s. It has 1.4, .6 and .4 N rms on x, y and z, at rest only noise. Its peaks at 40, 80 and 120 Hz move with
 the speed, as ``sin(k N q)`` does with the gear ratio N and k = 2, 4, 6. Less than 3 % of the power lie below 3 Hz, and
 the torques are those of a force at the centre of mass. Wrists of Universal Robots ring at 8 to 20 Hz for .3 s after a
 stop. Their joint angles have 1e-5 to 3e-5 rad of noise, and their joints follow some ms behind the set-point. Friction
-of wrist 3 adds .15 N·m to the z torque of the built-in sensor. The raw zero of that of a UR5e drifts by 7 N in z within
-10 minutes after a start, fastest at first.
+of wrist 3 adds .15 N·m to the z torque of the built-in sensor. In a UR5e its raw zero drifts by 7 N in z within 10
+minutes after a start, fastest at first.
 
 Chosen here, where the sources are silent:
 
 * The gear ratio is 101. The shares of k = 2, 4, 6 in the power are 60, 30 and 10 %.
 * The ripple is an acceleration of the tool along the axes of the sensor, whatever the tool's mass. It has its full size
-  however many joints turn, in shares of their speed. That of a joint fades below .3 rad/s of this joint with the square
-  of its speed, as the acceleration of an error in the position of a gear does.
-* Each joint rings behind its encoder, as a mass on a spring that follows the joint. The seed draws the frequency.
+  however many joints turn, shared according to their speeds. Below .3 rad/s, the ripple of a joint decreases with the
+  square of its speed, as does the acceleration due to a position error of a gear.
+* Each joint rings behind its encoder, as a mass on a spring that follows the joint. The seed determines the frequency.
 * The noise of joint angles is white, also at rest; joint speeds have none.
 * The sensor's delay is that of its filter, 3 ms. The wires of the emulated cell add their own delay and jitter.
-* Friction opposes the turn. The drift is exponential with a time constant of 3 minutes; it moves no torque. With
+* Friction opposes the turn. The drift is exponential with a time constant of 3 minutes and affects no torque. With
   this sensor, an arm starts with its station. Other arms were started long ago, unless `wrist_drift_N` is set.
 * The ripple does not shake the sensor's own mass.
 """
@@ -61,7 +61,7 @@ class Imperfections:
     joint_noise_rad
         Standard deviation of the joint angles that the controller reports.
     wrench_delay_s
-        Time between measuring and sending of a sample, in addition to the delay of the link.
+        Time between measuring and sending a sample, in addition to the delay of the link.
     wrist_friction_Nm
         Friction of wrist 3 in the readings of the built-in sensor.
     wrist_drift_N

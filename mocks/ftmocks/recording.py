@@ -38,7 +38,7 @@ class Recording:
     Raises
     ------
     ValueError
-        There are less than two rows, a value is not finite, or the time does not increase.
+        There are fewer than two rows, a value is not finite, or the time does not increase.
     """
 
     def __init__(self, t_s: Array, wrench: Array, q_rad: Array) -> None:

@@ -48,7 +48,7 @@ SENSOR_MASS_KG = 0.25
 """Default mass of a sensor with its adapter."""
 
 START_SCATTER_DEG = 5.0
-"""Largest random offset of the wrist at the start, so that the arm has to move to the first pose."""
+"""Largest random offset of the wrist at the start, which makes the arm move to the first pose."""
 
 
 VECTORS = {
@@ -59,7 +59,7 @@ VECTORS = {
     "force_drift": "force_drift_N_min",
     "torque_drift": "torque_drift_Nm_min",
 }
-"""Names of the vectors of the truth by option."""
+"""Option names of the true vectors of the cell."""
 
 
 def truth_from(options: Namespace) -> Truth:
@@ -298,7 +298,7 @@ class Station:
         }
 
     def _content(self) -> dict[str, Any]:
-        """Return the true parameters of the emulated cell, or what recording it plays; then they are unknown."""
+        """Return the true parameters of the emulated cell, or the recording that it plays, with unknown parameters."""
         recording = self._recording
         if recording is None:
             return {"truth": self.world.truth.to_json(), "imperfections": asdict(self.world.imperfections)}
@@ -362,7 +362,7 @@ class Station:
         self.robot.note("network", "delay", why=json.dumps(given))
 
     def _play(self, recording: Recording, request: dict[str, Any]) -> dict[str, Any]:
-        """Continue the recording at another time, at another pace."""
+        """Continue the recording at another time and at another pace."""
         now_s = self._clock.now_s()
         at_s = float(request.get("at_s", recording.at_s(now_s)))
         recording.play(now_s, at_s, float(request.get("pace", recording.pace)))

@@ -43,7 +43,7 @@ def _zero3() -> Array:
 
 @dataclass(frozen=True)
 class Truth:
-    """True quantities of the cell, in SI units and rad. Names have the axes; noise is that of one reading."""
+    """True quantities of the cell, in SI units and rad. Names state the axes; noise is that of one reading."""
 
     mass_kg: float
     p_sensor_com_m: Array
@@ -194,7 +194,7 @@ class Cycle(NamedTuple):
 class World:
     """The current state of the cell. The emulated arm moves it; emulated sensors call `measure` from their threads.
 
-    A change replaces a value as a whole, so that other threads read a consistent state.
+    A change replaces a value as a whole, so other threads read a consistent state.
 
     Parameters
     ----------
@@ -463,7 +463,7 @@ class World:
             self.touch(name, contact)
 
     def shift_payload(self, mass_kg: float | None, p_sensor_com_m: Array | None) -> None:
-        """Change the true payload, as if a part was lost, added or has slipped."""
+        """Change the true payload, as if a part had been lost or added, or had slipped."""
         if mass_kg is not None:
             self.truth = replace(self.truth, mass_kg=mass_kg)
         if p_sensor_com_m is not None:

@@ -21,7 +21,7 @@ from ftmocks.wires.slcan import CanFrame
 from ftmocks.wires.stream import CanSensor
 
 EMPTY_SLOT_STATUS = 0x8040  # bad active calibration, any error
-NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; a superfluous byte is tolerated
+NO_ARGUMENT, ONE_ARGUMENT = (0, 1), (1,)  # accepted data lengths; an additional byte is tolerated
 REQUEST_DLC = {
     0x0: NO_ARGUMENT,
     0x2: ONE_ARGUMENT,
@@ -39,42 +39,42 @@ DIAGNOSTIC_ADC = {0: 0x07FF, 2: 0x0A3C, 3: 0x09C4, 4: 0x0800, 5: 0x0003}
 
 
 def sg_payloads(status: int, gauges: NDArray[np.int16]) -> list[bytes]:
-    """Answer to "read SG data": status and the even gauges, then the odd gauges."""
+    """Return the answer to "read SG data": status and the even gauges, then the odd gauges."""
     even_odd = gauges[WIRE_ORDER].tolist()
     return [struct.pack(">H3h", status, *even_odd[:3]), struct.pack(">3h", *even_odd[3:])]
 
 
 def matrix_row_payloads(row: Array) -> list[bytes]:
-    """Answer to "read matrix row": three pairs of float32."""
+    """Return the answer to "read matrix row": three pairs of float32."""
     return [struct.pack(">2f", *row[i : i + 2]) for i in (0, 2, 4)]
 
 
 @dataclass(eq=False, kw_only=True)
 class AtiCanNode(CanSensor):
-    """The sensor's CAN node and the adapter a client opens.
+    """The sensor's CAN node and the adapter that a client opens.
 
-    `base` and `bitrate` show what is in force.
+    `base` and `bitrate` show the active values.
 
     Parameters
     ----------
     base, bitrate
         Base identifier (7 bits) and bit rate; a client at another bit rate gets no answer.
     calibrations
-        What each slot 0 to 15 holds; a slot not named is empty.
+        Calibration in each slot, 0 to 15. Slots that are not named are empty.
     serial
         At most 8 ASCII characters, padded with NUL.
     firmware
-        Major, minor, build. Older than 3.7 knows no counts and units, older than 3.8 no diagnostics.
+        Major, minor, build. Versions before 3.7 do not report counts and units; before 3.8, no diagnostics.
     status
-        Status bits sent as they are, besides those of an empty slot.
+        Status bits that are sent unchanged, in addition to those of an empty slot.
     gauge_offset
-        (6,) or scalar, added to every gauge, in counts.
+        (6,) or scalar offset that is added to the gauges, in counts.
     boot_s
         Silence after a reset.
     reset_applies_settings
         Whether a reset counts as power-up for a new base identifier and bit rate.
     wrong_echo
-        Slot number echoed in place of the selected one.
+        Slot number that is echoed instead of the selected one.
     """
 
     base: int = 0x20
@@ -163,7 +163,7 @@ class AtiCanNode(CanSensor):
         return gauges
 
     def _foreign_frame(self, rng: random.Random) -> CanFrame:
-        """Another node's frame: a standard identifier that is not ours, or an extended one that looks like ours."""
+        """Return another node's frame: with a foreign standard identifier, or an extended one that looks like ours."""
         data = rng.randbytes(rng.randrange(9))
         if rng.random() < 0.5:
             return CanFrame((self.base << 4) + rng.randrange(16), data, extended=True)

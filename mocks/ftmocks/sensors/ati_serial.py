@@ -13,7 +13,7 @@ Does not model: baud mismatch (a pty has no speed), parity of what the client se
 writing calibrations to storage, the power-up time.
 
 Chosen here, because the sources leave it open: an empty calibration slot reads zeros. The 23 registers between two
-slots do not exist. A read of more than 64 registers is exception 3.
+slots do not exist. A read of more than 64 registers is answered with exception 3.
 """
 
 import struct
@@ -40,7 +40,7 @@ STREAM_HZ = 7000.0
 RECORD_BYTES = 13
 CHARACTER_BITS = 11
 JAM_BYTES = 14
-JAM_PAUSE_S = 0.050  # a longer pause and the jam counts from the start again
+JAM_PAUSE_S = 0.050  # after a longer pause, the jamming sequence must start again
 MAX_READ = 64
 
 GAINS, OFFSETS, SESSION, STATUS, BAUD_STORE, BAUD = 0x0000, 0x0006, 0x000C, 0x001D, 0x001E, 0x001F

@@ -94,7 +94,7 @@ class BotaBox(SerialSensor):
     status
         Status bits in addition to those that follow from readings and configuration.
     streaming_at_start
-        Whether the sensor has its own supply and streams, so that it does not restart when a client opens the port.
+        Whether the sensor has its own supply and streams, so it does not restart when a client opens the port.
     boot_s
         Time from the opening of the port, or a restart, to the end of the banner and the first sample.
     """

@@ -16,8 +16,8 @@ pages, DHCP, rounding to gauge counts, and that a real box answers only a few HT
 
 Chosen here, because the sources leave it open: a new request of samples replaces the running one and its address.
 "One-shot" sends its count of samples, one for count 0, at the set rate. A reading at its rating in the axes of the
-transducer sets the summary and saturation bits. A datagram that is no request is ignored. A bias set over HTTP survives
-a power failure, one by RDT does not.
+transducer sets the summary and saturation bits. Other datagrams are ignored. A bias set over HTTP survives
+a power failure, a bias set by RDT does not.
 """
 
 import contextlib

@@ -5,7 +5,7 @@ Ref: Robotiq FT 300 instruction manual, section "Control" (registers, data strea
 Does not model: parity and baud mismatch, accelerometer readings (they report gravity along the sensor's z axis).
 
 Chosen here, because the sources leave it open: requests during a stream are not answered. Only 50 bytes FF in a row end
-the stream. A register that does not exist is exception 2. Only register 410 can be written: 0x0200 starts the stream,
+the stream. Access to a missing register gives exception 2. Only register 410 can be written: 0x0200 starts the stream,
 any other value has no effect. The stream has neither status nor overload.
 """
 

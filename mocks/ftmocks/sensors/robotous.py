@@ -1,14 +1,14 @@
 """An emulated Robotous RFT force/torque sensor: one device, on a CAN bus or on a UART.
 
 Ref: Robotous RFT series installation and operation manual, revision 1.7 (commands, data field, CAN and UART packets).
-Revision 1.8 as transcribed in ItsLP18/robotous-ft-pipeline (divisors of each model, rates a baud rate allows, overload
+Revision 1.8 as transcribed in ItsLP18/robotous-ft-pipeline (divisors of each model, rates of each baud rate, overload
 from 120 % of the rated load). In revision 1.7 the divisors of RFT64-6A01 were (50, 2000).
 
 Does not model: the low-pass filter (its type and code are stored and reported), storage wear, line speed.
 
 Chosen here, because the manual leaves it open: an unknown command or a damaged packet gets no answer. A setting of the
 other wire is answered as unsupported, and a rate the line does not allow as out of range. If the line becomes slower
-later, it sends what it carries. A reading at the end of the int16 range also sets the overload bit of its axis. The
+later, it limits the rate. A reading at the end of the int16 range also sets the overload bit of its axis. The
 overload counters count the beginnings of overloads up to 255. CAN identifiers and the baud rate need a reboot; `reset`
 is one. All other settings survive it, except bias and streaming. The rated loads are those of the data sheets for
 RFT40-SA01 and RFT60-HA01, and those of RFT60-HA01 for the others.

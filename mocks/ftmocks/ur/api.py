@@ -10,7 +10,7 @@ Chosen here, where the sources are silent:
   other methods by 405.
 * A program from port 30001 is paused, resumed and stopped like one of PolyScope. ``stop`` without a program succeeds.
   ``play`` and ``resume`` are answered by 500 when there is nothing to play or resume, and ``pause`` when none plays.
-* Answers come at once, also to ``POWER_ON``, which takes its time on a controller.
+* Answers are sent at once, also to ``POWER_ON``, which takes a while on a real controller.
 * A safeguard stop is reported as ``PROTECTIVE_STOP``, recovery as ``REDUCED`` and a violation as ``FAULT``, because the
   API names five modes only.
 

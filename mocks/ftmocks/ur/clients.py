@@ -185,7 +185,7 @@ class DashboardClient(Client):
 
     @property
     def trusted(self) -> bool:
-        """Whether the pendant has been in remote control since this client connected. Otherwise it can only query."""
+        """Whether the pendant was in remote control since this client connected. Other clients can only query."""
         return self._opened_remote and self._switches == self.robot.remote_switches
 
     def on_bytes(self, buffer: bytearray) -> None:

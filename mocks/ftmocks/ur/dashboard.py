@@ -127,7 +127,7 @@ def answer(robot: Robot, line: str, *, by: str = "dashboard", trusted: bool = Tr
     by
         Source of the command, for the event log.
     trusted
-        Whether this connection may command: the pendant was in remote control since it was opened.
+        Whether this connection may send commands: the pendant was in remote control since the connection was opened.
     """
     command = line.strip()
     verb = command.lower()

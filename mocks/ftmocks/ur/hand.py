@@ -1,6 +1,6 @@
 """An operator who turns the sensor to many orientations, by hand or with a program on the pendant.
 
-Only the wrist turns. The operator holds the arm above the sensor, so that the sensor does not measure the hand. A tool
+Only the wrist turns. The operator holds the arm above the sensor, so the sensor does not measure the hand. A tool
 with a hanging load is only tilted, and the operator waits longer until the load is at rest.
 """
 

@@ -1,7 +1,7 @@
 """Motion of the arm: paths of motion commands, and an arm that follows them.
 
 A path is a function of *path time*, which is scaled by the speed slider and stops while the program is paused. If the
-arm moves when a motion starts, it is first brought to rest, so that position and velocity never jump.
+arm moves when a motion starts, it is first brought to rest, so position and velocity never jump.
 
 Chosen here, where the script manual is silent: `Servo` is a spring of stiffness `gain` (1/s²), with a damping for which
 the set-point lags a target of constant velocity by `lookahead_time`. The speed slider does not act on it. A target that
@@ -52,7 +52,7 @@ class MotionError(ValueError):
 
 
 class CannotFollow(Exception):
-    """The arm cannot follow the path, so that the safety system stops it."""
+    """The arm cannot follow the path, and the safety system stops the arm."""
 
 
 class Trapezoid:
@@ -337,7 +337,7 @@ class Following(NamedTuple):
     qd
         Joint speeds in that cycle, rad/s; the joints lag the set-point by ``lag_s * qd``.
     off_rad
-        Deflection of the joints by a push.
+        Deflection of the joints when the operator pushes the arm.
     """
 
     lag_s: float

@@ -10,8 +10,8 @@ Source: Universal Robots, "Remote Control via TCP/IP" (client interfaces) and th
 (Pharmaceutical Bioinformatics, Uppsala): timestamps, sources, wording, which sub-packages come once. A maintainer of
 the client library on local control (issue 459 of the ROS driver): connections end when the pendant is switched to
 local control; one opened in local control can only read, also later; a program sent there is answered by the error
-C210 and not executed. Commands that are no programs: the client library's primary client. The packages of the greeting
-behind the version: logs of port 30002 in the README of Shawn-Armstrong/URSim_Demo (5.13), and in published clients of
+C210 and not executed. Commands other than programs: the client library's primary client. The packages of the greeting
+after the version: logs of port 30002 in the README of Shawn-Armstrong/URSim_Demo (5.13), and in published clients of
 a UR5 with 3.10 and of an e-Series arm with 5.12.
 
 Chosen here, where the sources are silent:

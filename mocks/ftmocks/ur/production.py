@@ -3,7 +3,7 @@
 The file has one JSON object per line with the state from its time on: ``t_host_ns`` on the cell's clock, ``event``,
 whether the tool is in ``contact``, ``part_kg``, ``bias`` (6,) with its drift, and ``truth`` of tool and part together,
 as in the first line of the station. Events are start, contact, grasp, release, slip, free and end. Readings are later
-by the delay of the sensor.
+than these times by the delay of the sensor.
 
 Between the sites, the wrist turns at random. A part is pressed against its support before it is grasped or released,
 and the support then carries its weight. The tool is in contact for about a third of the time.
@@ -38,10 +38,10 @@ SPEED_RAD_S, ACCELERATION_RAD_S2 = (0.8, 1.6), 2.5
 SPEED_M_S, ACCELERATION_M_S2 = 0.15, 1.0
 PRESS_N, PRESS_S = (4.0, 20.0), (0.8, 2.0)
 RISE_S = 0.04
-"""Duration of the begin and the end of a contact."""
+"""Duration of the rise and of the fall of a contact force."""
 GRASP_S = 0.2
 PART_M = 0.04
-"""Edge length of a part, a cube."""
+"""Edge length of a cubic part."""
 NO_PART = Body(0.0, np.zeros(3), np.zeros((3, 3)))
 
 Cycles = Generator[None, None, None]

@@ -146,7 +146,7 @@ class Robot:
     popup: str | None = None
     """Text of the popup that a program shows, until the operator closes it."""
     popup_answer: bool | float | str | None = None
-    """What the operator entered in the last popup."""
+    """Value that the operator entered in the last popup."""
 
     def __init__(self, world: World, settings: RobotSettings, arm: Arm | None = None) -> None:
         self.world = world

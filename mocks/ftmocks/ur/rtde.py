@@ -44,7 +44,7 @@ def take_packages(buffer: bytearray) -> Iterator[tuple[int, bytes]]:
     Raises
     ------
     RtdeError
-        The size in a header is smaller than the header, so that the next package cannot be found.
+        The size in a header is smaller than the header, so the next package cannot be found.
     """
     while len(buffer) >= _HEADER.size:
         size, kind = _HEADER.unpack_from(buffer)

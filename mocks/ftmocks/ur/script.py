@@ -250,7 +250,7 @@ class ControlScript(ControllerProgram):
 
     def _protective_stop(self) -> Steps:
         self._robot.protective_stop("requested by the program")
-        yield  # the program is paused here, so that the end of the command is not reported
+        yield  # the program is paused here, so the end of the command is not reported
 
     def _solve(self, qnear: Vector6) -> Vector6 | None:
         X_base_flange = matrix_of(self._vector(0)) @ inverse_matrix(self._robot.X_flange_tcp)

@@ -1,6 +1,6 @@
 """The TCP ports of the controller on one loopback address, and its control cycles.
 
-A single thread runs the control cycles and waits for the sockets in between, so that no lock is needed.
+A single thread runs the control cycles and waits for the sockets in between, so no lock is needed.
 """
 
 import select

@@ -25,7 +25,7 @@ TOLERANCE = 1e-3
 
 
 class Swing:
-    """A path on which each joint oscillates, beginning and ending at rest at one end of the oscillation.
+    """A path on which each joint oscillates. It begins and ends at rest, at one end of the oscillation.
 
     Parameters
     ----------

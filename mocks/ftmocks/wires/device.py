@@ -134,7 +134,7 @@ class Device(ABC, Generic[Frame]):
         self.unplug()
 
     def reset(self) -> None:
-        """Interrupt the supply of the device for a moment, so that it restarts on the same wire."""
+        """Interrupt the supply of the device for a moment, which restarts it on the same wire."""
         if self._threads:
             os.write(self._wake_write, _RESET)
 

@@ -11,7 +11,7 @@ LONGEST_FRAME = 256
 
 
 class ModbusError(Exception):
-    """A request answered with an exception code."""
+    """A request that is answered with an exception code."""
 
     def __init__(self, code: int) -> None:
         super().__init__(f"Modbus exception {code}")
@@ -19,7 +19,7 @@ class ModbusError(Exception):
 
 
 def crc16(data: bytes) -> bytes:
-    """CRC-16/MODBUS as it goes on the wire, low byte first."""
+    """Return the CRC-16/MODBUS as sent on the wire, low byte first."""
     crc = 0xFFFF
     for byte in data:
         crc ^= byte
@@ -34,12 +34,12 @@ def with_crc(body: bytes) -> bytes:
 
 
 def reply(address: int, frame: bytes, execute: Callable[[int, bytes], bytes]) -> bytes:
-    """Answer to one frame; nothing when it is damaged or for another device.
+    """Return the answer to one frame; nothing if the frame is damaged or for another device.
 
     Parameters
     ----------
     execute
-        Takes the function code and the data of a request, returns the data of the reply or raises `ModbusError`.
+        Takes the function code and the data of a request; returns the data of the reply or raises `ModbusError`.
     """
     if len(frame) < 4 or len(frame) > LONGEST_FRAME or frame[0] != address or crc16(frame[:-2]) != frame[-2:]:
         return b""
@@ -51,7 +51,7 @@ def reply(address: int, frame: bytes, execute: Callable[[int, bytes], bytes]) ->
 
 
 def read_registers(data: bytes, registers: Mapping[int, int], max_count: int) -> bytes:
-    """Data of the reply to a read of registers, all of which must exist."""
+    """Return the data of the reply to a read of registers, all of which must exist."""
     if len(data) != 4:
         raise ModbusError(ILLEGAL_VALUE)
     first, count = struct.unpack(">2H", data)
@@ -64,7 +64,7 @@ def read_registers(data: bytes, registers: Mapping[int, int], max_count: int) ->
 
 
 def written_registers(data: bytes) -> dict[int, int]:
-    """Addresses and values of a write of several registers."""
+    """Return the addresses and values in a request that writes several registers."""
     if len(data) < 5:
         raise ModbusError(ILLEGAL_VALUE)
     first, count, size = struct.unpack(">2HB", data[:5])

@@ -1,9 +1,9 @@
 """A sensor behind a pseudo-terminal, which answers and streams through a faulty wire.
 
-Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end. A
-device with `sees_openings` leaves it to the client: while nothing has the port open, the master is hung up.
+Ref: pty(7), termios(3). The slave end stays open here, or the master would read EIO when a client closes its end. With
+`sees_openings` only the client opens the slave end: while no client has it open, the master is hung up.
 
-A pty has no parity. Where the line has, a client requests marks with INPCK and PARMRK, as on a real port. The emulator
+A pty has no parity. If the line has it, a client requests marks with INPCK and PARMRK, as on a real port. The emulator
 then clears PARMRK, or the kernel would double the marks. While INPCK is set, the emulator does all marking. Bytes in
 the terminal while the client changes its flags arrive in either form.
 
@@ -30,30 +30,30 @@ from ftmocks.wires.uart import marked
 class PtyDevice(Device[Frame]):
     """Base of the emulated serial and CAN sensors: opening, unplugging, reading, and writing that never blocks.
 
-    `dropped_frames` counts those the terminal had no room for, because the client does not read.
+    `dropped_frames` counts the frames for which the terminal had no room, because the client does not read.
     """
 
-    has_parity = False  # of the line: whether wrong parity can be marked
-    sees_openings = False  # whether the device can ask `_is_open`, which then is right within 5 ms
+    has_parity = False  # whether the line has parity, so wrong parity can be marked
+    sees_openings = False  # whether the device can use `_is_open`, which is then correct within 5 ms
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.dropped_frames = 0
         self._slave = -1
         self._unsent = b""
-        self._begun = b""  # the rest of a mark that left in part
+        self._begun = b""  # the rest of a mark that was sent in part
 
     def start(self) -> str:
         """Power the device up behind a new pseudo-terminal.
 
         Returns
         -------
-        Path a client opens, for example ``/dev/pts/3``.
+        Path that a client opens, for example ``/dev/pts/3``.
         """
         self._require_stopped()
         self._file, self._slave = os.openpty()
         tty.setraw(self._file)
-        tty.setraw(self._slave)  # else the terminal echoes the device's own bytes back to it
+        tty.setraw(self._slave)  # otherwise the terminal echoes the device's own bytes
         os.set_blocking(self._file, False)
         self._unsent = self._begun = b""
         path = os.ttyname(self._slave)
@@ -65,7 +65,7 @@ class PtyDevice(Device[Frame]):
 
     @property
     def _is_open(self) -> bool:
-        """Whether a client has the port open; True for a device that cannot see it."""
+        """Whether a client has the port open; True for a device that cannot detect this."""
         if not self.sees_openings or self._file < 0:
             return True
         poll = select.poll()
@@ -78,15 +78,15 @@ class PtyDevice(Device[Frame]):
 
     @abstractmethod
     def _received(self, data: bytes) -> None:
-        """Take what the client wrote, in whatever pieces it arrives."""
+        """Process the bytes that the client wrote, in pieces of any size."""
 
     @abstractmethod
     def _samples(self, count: int) -> list[Frame]:
-        """Return the frames of that many samples of the stream."""
+        """Return the frames of the next `count` samples of the stream."""
 
     @abstractmethod
     def _encode(self, frames: list[Frame]) -> bytes:
-        """Return what the client reads of these frames, and what else the adapter has for it."""
+        """Return the bytes of these frames as the client reads them, and other bytes that the adapter sends."""
 
     def _receive(self) -> None:
         data = b""
@@ -108,18 +108,18 @@ class PtyDevice(Device[Frame]):
             os.close(self._slave)
 
     def _send(self, data: bytes, record_bytes: int) -> int:
-        """Write without blocking; when the client does not read, drop whole records and keep none.
+        """Write without blocking; if the client does not read, drop whole records and keep none.
 
         Parameters
         ----------
         data
             Whole records; the first may lack bytes at its start.
         record_bytes
-            Length of a record: a record whose first bytes left is finished before the next one.
+            Length of a record. A record whose first bytes were sent is completed before the next one.
 
         Returns
         -------
-        Number of records dropped.
+        Number of dropped records.
         """
         self._finish_record()
         rest = data if self._unsent else data[self._write(data) :]
@@ -138,14 +138,14 @@ class PtyDevice(Device[Frame]):
             self._unsent = self._unsent[self._write(self._unsent) :]
 
     def _fall_silent(self) -> None:
-        """End the stream and forget what is on its way, a record that left in part too."""
+        """End the stream and discard all bytes in transit, including a record that was sent in part."""
         self._pacer.stop()
         self._wire.clear()
         self._unsent = b""
 
     def _write(self, data: bytes) -> int:
-        """Write without blocking; return how many bytes are gone, with one whose mark left in part."""
-        # The flags are read before every write: while PARMRK is on, the kernel would double what is marked here.
+        """Write without blocking; return the number of bytes sent, including one whose mark was sent in part."""
+        # The flags are read before every write: while PARMRK is on, the kernel would double the marks made here.
         form: Callable[[bytes], bytes] = marked if self.has_parity and self._client_wants_marks() else bytes
         wire = self._begun + form(data)
         try:
@@ -164,8 +164,8 @@ class PtyDevice(Device[Frame]):
         return sent
 
     def _client_wants_marks(self) -> bool:
-        """Whether wrong parity must be marked; the kernel marks nothing any more when this returns True."""
-        attributes = termios.tcgetattr(self._file)  # the client's: both ends have the same
+        """Whether wrong parity must be marked. After True is returned, the kernel no longer marks anything."""
+        attributes = termios.tcgetattr(self._file)  # those of the client, because both ends have the same
         flags = attributes[0]
         if flags & (termios.INPCK | termios.IGNPAR) != termios.INPCK:
             return False

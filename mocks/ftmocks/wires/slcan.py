@@ -37,7 +37,7 @@ class CanFrame(NamedTuple):
 
 
 class SlcanAdapter:
-    """The adapter's state machine: lines in, answers and bus frames out; no I/O."""
+    """The adapter's state machine, which converts lines to answers and bus frames, without I/O."""
 
     def __init__(self) -> None:
         self.bitrate: int | None = None
@@ -47,7 +47,7 @@ class SlcanAdapter:
         self._line = bytearray()
 
     def feed(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
-        """Take bytes from the host; return the answers for it and the frames it puts on the bus."""
+        """Process bytes from the host; return the answers to the host and the frames that it sends on the bus."""
         answers = bytearray()
         frames: list[CanFrame] = []
         *complete, rest = (self._line + data).split(b"\r")
@@ -58,11 +58,11 @@ class SlcanAdapter:
                 frames.append(frame)
         self._line = rest[
             : _LONGEST_LINE + 1
-        ]  # too long stays too long: it is refused at its CR, and memory is bounded
+        ]  # a line that is too long is refused at its CR; its rest is dropped to save memory
         return bytes(answers), frames
 
     def line(self, frame: CanFrame) -> bytes:
-        """Return the line that reports a frame seen on the bus; nothing while the channel is closed."""
+        """Return the line that reports a frame on the bus; nothing while the channel is closed."""
         if not self.is_open:
             return b""
         head = f"T{frame.identifier:08X}" if frame.extended else f"t{frame.identifier:03X}"

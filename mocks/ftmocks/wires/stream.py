@@ -1,4 +1,4 @@
-"""The sorts of pseudo-terminal sensors: on a serial line, there with Modbus too, and on a CAN bus behind an adapter."""
+"""Kinds of sensors on a pseudo-terminal: on a serial line, with or without Modbus, and on a CAN bus with an adapter."""
 
 import random
 from abc import abstractmethod
@@ -17,7 +17,7 @@ class SerialSensor(PtyDevice[bytes]):
 
 
 class ModbusSensor(SerialSensor):
-    """A sensor that answers Modbus RTU, where a pause ends a request; while it streams, it answers nothing."""
+    """A sensor with Modbus RTU, where a pause ends a request. While it streams, it does not answer requests."""
 
     address = 0
     frame_gap_s = 0.0
@@ -25,7 +25,7 @@ class ModbusSensor(SerialSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._burst = bytearray()
-        """What came since the last pause; no more than shows that it is too long for a frame."""
+        """Bytes since the last pause; only as many as show that they are too long for a frame."""
         self._last_byte_s = 0.0
 
     @abstractmethod
@@ -36,7 +36,7 @@ class ModbusSensor(SerialSensor):
         self._burst += data[: modbus.LONGEST_FRAME + 1 - len(self._burst)]
 
     def _work(self, now_s: float) -> float | None:
-        """Answer what came before a pause; return the seconds until the pause is long enough."""
+        """Answer the bytes that arrived before a pause; return the time until the pause is long enough, s."""
         if self.streaming or not self._burst:
             return None
         wait_s = self._last_byte_s + self.frame_gap_s - now_s
@@ -55,12 +55,12 @@ class ModbusSensor(SerialSensor):
 
 @dataclass(eq=False)
 class CanSensor(PtyDevice[CanFrame]):
-    """A sensor on a CAN bus, and the adapter a client opens.
+    """A sensor on a CAN bus, and the adapter that a client opens.
 
     Parameters
     ----------
     bitrate
-        Of the sensor; a client at another one gets no answer.
+        Bit rate of the sensor; a client at another bit rate gets no answer.
     """
 
     _: KW_ONLY
@@ -74,15 +74,15 @@ class CanSensor(PtyDevice[CanFrame]):
 
     @abstractmethod
     def _boot(self) -> None:
-        """Set the state the sensor has after power-up."""
+        """Set the state of the sensor after power-up."""
 
     @abstractmethod
     def answer(self, request: CanFrame) -> list[CanFrame]:
-        """Answer to a frame on the bus; nothing when it is not a request."""
+        """Return the answer to a frame on the bus; nothing if the frame is not a request."""
 
     @abstractmethod
     def _foreign_frame(self, rng: random.Random) -> CanFrame:
-        """Another node's frame, which a hasty client could take for the sensor's."""
+        """Return another node's frame, which a careless client could take for a frame of the sensor."""
 
     def _power_up(self) -> None:
         self._adapter = SlcanAdapter()

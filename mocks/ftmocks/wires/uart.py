@@ -9,20 +9,20 @@ from typing import Self, SupportsIndex, overload
 
 
 class WrongParity(bytes):
-    """Bytes of which one arrives with wrong parity; a slice keeps this property.
+    """Bytes of which one arrives with wrong parity. A slice keeps this property.
 
     Parameters
     ----------
     data
-        As read by a receiver that does not check.
+        The bytes as read by a receiver that does not check parity.
     at
-        Index of that byte.
+        Index of the byte with wrong parity.
     """
 
     at: int
 
     def __new__(cls, data: bytes, at: int) -> Self:
-        """Make the bytes."""
+        """Create the bytes."""
         self = super().__new__(cls, data)
         self.at = at
         return self
@@ -41,7 +41,7 @@ class WrongParity(bytes):
 
 
 def marked(data: bytes) -> bytes:
-    r"""Bytes as a client with INPCK and PARMRK reads them: \377 twice, and \377 \0 before one of wrong parity."""
+    r"""Return bytes as a client with INPCK and PARMRK reads them: \377 doubled, and \377 \0 before wrong parity."""
     if isinstance(data, WrongParity):
         return marked(data[: data.at]) + bytes([0xFF, 0, data[data.at]]) + marked(data[data.at + 1 :])
     return data.replace(b"\xff", b"\xff\xff")

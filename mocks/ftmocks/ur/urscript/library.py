@@ -1,7 +1,7 @@
 """The functions of URScript that PolyScope and the programs for this emulator use.
 
 Source: Universal Robots, "The URScript Programming Language", modules motion, internals, urmath, interfaces and
-ioconfiguration. The Python signature of each function, behind the program, is its signature in URScript. Programs that
+ioconfiguration. The Python signature of each function, after the program, is its signature in URScript. Programs that
 PolyScope saved: docs/reference/urscript-constructs.md.
 
 Chosen here:
@@ -32,10 +32,10 @@ from ftmocks.ur.urscript.threads import Halt
 from ftmocks.ur.urscript.values import Pose, Value, joints, number, numbers, text_of, truth, whole_number
 
 Cycles = Generator[None, None, None]
-"""Takes as many control cycles as it yields."""
+"""A function that takes one control cycle for each value that it yields."""
 
 LOOKAHEAD_S, GAIN = (0.03, 0.2), (100, 2000)
-"""What servoj accepts."""
+"""Smallest and largest values that servoj accepts."""
 LAST_REGISTER, LAST_BIT_REGISTER = 47, 127
 DIGITAL: dict[str, Sequence[int]] = {
     "standard_": range(8),
@@ -78,9 +78,9 @@ _WITHOUT_EFFECT = {
 }
 """Functions that this emulator accepts and ignores, with their parameters."""
 CONTACT_N = 10.0
-"""From which force on `tool_contact` reports a contact."""
+"""Smallest force for which `tool_contact` reports a contact, N."""
 RAMP_SHARE = 0.2
-"""Share of its time in which a move with a given time speeds up, and again slows down."""
+"""Share of the time of a timed move in which it accelerates, and in which it decelerates."""
 
 
 class Caller(Protocol):
@@ -92,10 +92,10 @@ class Caller(Protocol):
 
     @property
     def owner(self) -> str:
-        """Name of the thread that calls: only one thread at a time may move the arm."""
+        """Name of the calling thread: only one thread at a time may move the arm."""
 
     def begin_cycle(self) -> None:
-        """Let the thread that calls compute as much as in a cycle."""
+        """Let the calling thread compute as much as in a new cycle."""
 
 
 def movej(program: Caller, q: Value, a: Value = 1.4, v: Value = 1.05, t: Value = 0, r: Value = 0) -> Cycles:
@@ -125,14 +125,14 @@ def movel(program: Caller, pose: Value, a: Value = 1.2, v: Value = 0.25, t: Valu
 
 
 def movep(program: Caller, pose: Value, a: Value = 1.2, v: Value = 0.25, r: Value = 0) -> Cycles:
-    """Move the TCP at constant speed, here as `movel`."""
+    """Move the TCP at constant speed, emulated like `movel`."""
     yield from movel(program, pose, a, v, 0, r)
 
 
 def movec(
     program: Caller, pose_via: Value, pose_to: Value, a: Value = 1.2, v: Value = 0.25, r: Value = 0, mode: Value = 0
 ) -> Cycles:
-    """Move the TCP to the end of an arc of a circle, here along a straight line."""
+    """Move the TCP to the end of a circular arc, emulated by a straight line."""
     urmath.matrix(pose_via, "movec: pose_via")
     whole_number(mode, "movec: mode", 0, 1)
     yield from movel(program, pose_to, a, v, 0, r)
@@ -187,7 +187,7 @@ def servoj(
         servo = robot.arm.servo(Command(goal, seconds, lookahead_s, stiffness), program.owner)
     except CannotFollow as error:
         robot.protective_stop(str(error))
-        yield  # the program is paused from here on
+        yield  # the program stays paused here
         return
     cycle_s = robot.period_s * robot.settings.time_scale
     while servo.ahead_s > cycle_s - 1e-9:
@@ -196,14 +196,14 @@ def servoj(
 
 
 def stopj(program: Caller, a: Value) -> Cycles:
-    """Slow down the joints."""
+    """Decelerate the joints to rest."""
     arm, owner = program.robot.arm, program.owner
     arm.stop_joints(number(a, "stopj: a"), owner)
     yield from arm.until_finished(owner)
 
 
 def stopl(program: Caller, a: Value, aRot: Value = 0) -> Cycles:
-    """Slow down the tool."""
+    """Decelerate the tool to rest."""
     arm, owner = program.robot.arm, program.owner
     number(aRot, "stopl: aRot")
     arm.stop_tool(number(a, "stopl: a"), owner)
@@ -211,19 +211,19 @@ def stopl(program: Caller, a: Value, aRot: Value = 0) -> Cycles:
 
 
 def sync(_program: Caller) -> Cycles:
-    """Use up the rest of this cycle."""
+    """Wait for the end of this cycle."""
     yield
 
 
 def sleep(program: Caller, t: Value) -> Cycles:
-    """Wait in the time of the arm."""
+    """Wait for `t` seconds of the arm's time."""
     robot = program.robot
     for _ in range(math.ceil(number(t, "sleep: t") / (robot.period_s * robot.settings.time_scale) - 1e-9)):
         yield
 
 
 def textmsg(program: Caller, s1: Value, s2: Value = "") -> None:
-    """Write into the log of the pendant."""
+    """Write a message to the log of the pendant."""
     program.robot.note("program", "textmsg", why=text_of(s1) + text_of(s2))
 
 
@@ -235,7 +235,7 @@ def popup(
     error: Value = False,
     blocking: Value = False,
 ) -> Cycles:
-    """Show a message; a blocking one holds this thread until the operator closes it."""
+    """Show a message. A blocking message holds this thread until the operator closes it."""
     robot = program.robot
     robot.popup = text = text_of(s)
     robot.note("program", "popup", why=text, title=title, warning=warning, error=error, blocking=blocking)
@@ -244,7 +244,7 @@ def popup(
 
 
 def _requests() -> Iterator[tuple[str, Callable[[Caller, Value], Generator[None, None, Value]]]]:
-    """Yield the functions that ask the operator for a value: they end with the popup; no answer ends the program."""
+    """Yield the functions that ask the operator for a value and wait for it; no answer ends the program."""
     for name, kind in {"boolean": bool, "float": float, "integer": int, "string": str}.items():
 
         def request(program: Caller, message: Value, kind: type = kind) -> Generator[None, None, Value]:
@@ -263,7 +263,7 @@ def get_actual_joint_positions(program: Caller) -> list[float]:
 
 
 def get_actual_joint_positions_history(program: Caller, steps: Value = 0) -> list[float]:
-    """Return the joint angles of some cycles ago, rad, here those of now."""
+    """Return the joint angles of some cycles ago, rad; the emulator returns the present ones."""
     whole_number(steps, "get_actual_joint_positions_history: steps", 0, 2**31 - 1)
     return get_actual_joint_positions(program)
 
@@ -294,7 +294,7 @@ def get_tcp_force(program: Caller) -> list[float]:
 
 
 def force(program: Caller) -> float:
-    """Return the size of the force at the TCP, N."""
+    """Return the norm of the force at the TCP, N."""
     return math.hypot(*program.robot.tcp_wrench()[:3])
 
 
@@ -346,7 +346,7 @@ def get_tcp_offset(program: Caller) -> Pose:
 
 
 def set_tcp(program: Caller, pose: Value, tcp_name: Value = "") -> None:
-    """Set the active TCP in the flange frame; a name only shows on the pendant."""
+    """Set the active TCP in the flange frame. Its name is only shown on the pendant."""
     if not isinstance(tcp_name, str):
         raise ScriptError(f"set_tcp: tcp_name must be a text, not {text_of(tcp_name)}")
     urmath.matrix(pose, "set_tcp: pose")
@@ -359,12 +359,12 @@ def get_steptime(program: Caller) -> float:
 
 
 def is_steady(program: Caller) -> bool:
-    """Return whether the arm has stood still for half a second."""
+    """Return whether the arm has been at rest for half a second."""
     return program.robot.steady
 
 
 def is_within_safety_limits(program: Caller, q: Value) -> bool:
-    """Return whether the arm may stand at joint angles."""
+    """Return whether the arm may be at the joint angles `q`."""
     robot = program.robot
     return robot.limits.allow(joints(q, "is_within_safety_limits: q"), robot.X_flange_tcp)
 
@@ -397,12 +397,12 @@ def set_target_payload(program: Caller, m: Value, cog: Value, inertia: Value = N
 
 
 def set_gravity(program: Caller, d: Value) -> None:
-    """Set the acceleration away from the earth that the controller assumes, m/s², base axes."""
+    """Set the upward acceleration that the controller assumes for gravity, m/s², base axes."""
     program.robot.target_gravity_m_s2 = vector3(numbers(d, "set_gravity: d", 3))
 
 
 def zero_ftsensor(program: Caller) -> None:
-    """Take the present wrench as zero."""
+    """Use the present wrench as zero."""
     program.robot.zero_ft()
 
 
@@ -472,7 +472,7 @@ def _digital_signals() -> Iterator[tuple[str, Callable[..., Any]]]:
 
 
 def get_standard_analog_in(_program: Caller, n: Value) -> float:
-    """Return the level of an analog input, to which nothing is wired."""
+    """Return the level of an analog input, to which nothing is connected."""
     whole_number(n, "the number of an analog input", 0, 3)
     return 0.0
 
@@ -489,7 +489,7 @@ def set_standard_analog_out(program: Caller, n: Value, f: Value) -> None:
 
 
 class _WithoutEffect:
-    """A function of which only the arguments are checked; a question mark marks one that may be left out."""
+    """A function that only checks its arguments; a question mark marks an optional argument."""
 
     def __init__(self, parameters: str) -> None:
         self.__signature__ = Signature(
@@ -545,7 +545,7 @@ _SINCE = {
     "set_tool_output_mode": {3: _NEVER},
     "tool_contact": {3: _NEVER, 5: 4},
 }
-"""First minor version of each major one that knows a function."""
+"""First minor version with a function, by major version."""
 
 
 def functions(polyscope: tuple[int, int, int]) -> Mapping[str, Built_in]:

@@ -3,7 +3,7 @@
 Source: Universal Robots, "The URScript Programming Language", chapter 1; the external control program of the client
 library of Universal Robots for line breaks in a statement.
 
-Chosen here: one statement a line, as the manual shows programs. Operators bind as in Python, ``xor`` between ``or`` and
+Chosen here: one statement per line, as in the manual. Operators have Python's precedence, ``xor`` between ``or`` and
 ``and``. A name is known when the program assigns it anywhere, or defines a function of that name anywhere.
 
 The parser rejects what a published report says that a controller rejects. Where another source contradicts the report,
@@ -42,14 +42,14 @@ from ftmocks.ur.urscript.syntax import (
 from ftmocks.ur.urscript.types import check_types
 
 _LEVELS = (("or",), ("xor",), ("and",), ("not",), ("==", "!=", "<", ">", "<=", ">="), ("+", "-"), ("*", "/", "%"))
-"""Operators, from the weakest."""
+"""Operators in ascending order of precedence."""
 _COMPARISONS, _ARITHMETIC = _LEVELS[4], _LEVELS[5:]
 _ALONE = ("break", "continue", "halt", "pass", "enter_critical", "exit_critical")
 _WITH_VALUE = ("kill", "join")
 _RESERVED = {"def", "thread", "sec", "if", "elif", "else", "while", "end", "return", "run", "local", "global", "and"}
 _NOT_EMULATED = ("switch", "assert")
 LONGEST_NAME = 31
-"""Of a program, as the client library of Universal Robots cuts it for the sake of older controllers."""
+"""Longest name of a program; Universal Robots' client library cuts names to this length for older controllers."""
 _RESERVED |= {"or", "xor", "not", "True", "False", "switch", "case", "assert", "None", "in", *_ALONE, *_WITH_VALUE}
 
 
@@ -62,13 +62,13 @@ class _Names:
     valued: set[str] = field(default_factory=set)
     loops: int = 0
     blocks: int = 0
-    """How many loops, and how many blocks of any kind, surround the present statement."""
+    """Numbers of loops, and of blocks of any kind, around the present statement."""
 
 
 def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, list[str]]:
-    """Parse one program: a ``def`` without parameters, or bare statements, which become a program called `name`.
+    """Parse one program: a ``def`` without parameters, or single statements, which become a program called `name`.
 
-    Return it with the doubts about it: what a controller is reported to reject, although other sources contradict.
+    Return the program and its doubts: constructs that controllers are reported to reject, although sources differ.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def parse(text: str, name: str, built_in: Collection[str]) -> tuple[Function, li
     Raises
     ------
     UrscriptSyntaxError
-        When the text is not a program, or uses a name that is not known.
+        The text is not a program, or uses an unknown name.
     """
     try:
         return _Parser(text, built_in).program(name)
@@ -122,7 +122,7 @@ class _Parser:
             self._take()
 
     def _fail(self, what: str) -> NoReturn:
-        """Raise the error at the next word, which may stand in a later line."""
+        """Raise the error at the next word, which may be in a later line."""
         found = "the end of the line" if self._next.kind == "newline" else repr(self._next.text)
         self._skip_newlines()
         raise syntax_error(self._text, self._next.place, f"{what}, found {found}")
@@ -167,7 +167,7 @@ class _Parser:
         self._doubts.append(f"URScript, line {place.line}: {sentence}")
 
     def _other_doubts(self, name: str) -> Iterator[str]:
-        """Yield the doubts that need the whole program."""
+        """Yield the doubts that can only be found in the whole program."""
         hidden = self._main.own - self._globals
         for names in self._functions:
             for used, place in {used: place for used, place in reversed(names.free) if used not in names.own}.items():
@@ -200,7 +200,7 @@ class _Parser:
         return Function(name, tuple(parameters), body, is_thread, functions)
 
     def _block(self, functions: dict[str, Function], ends: tuple[str, ...]) -> Block:
-        """Take statements up to one of the words in `ends`, or up to the end of the text when there are none."""
+        """Parse statements up to one of the words in `ends`, or to the end of the text if `ends` is empty."""
         statements: list[Statement] = []
         while not self._is(*ends):
             if self._next.kind == "end":

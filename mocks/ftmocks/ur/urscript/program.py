@@ -9,15 +9,15 @@ Chosen here, where the manual is silent:
 
 * The main program runs first in a cycle, then the threads in the order of their start. A thread runs in the cycle in
   which it is started.
-* ``kill`` takes the arm from a thread that moves it, and so does the end of the thread. The arm then slows down by
-  itself, and a ``stopj`` in the same cycle replaces that. A motion command while another thread moves the arm is a
-  run-time error.
-* A critical section changes nothing, because a thread is never interrupted before it waits. It does not hold others
-  while it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
+* ``kill`` releases the arm from a thread that moves it, and so does the end of the thread. The arm then decelerates by
+  itself, and a ``stopj`` in the same cycle replaces this deceleration. A motion command while another thread moves the
+  arm is a run-time error.
+* A critical section has no effect, because a thread is never interrupted before it waits. Others are not held while
+  it waits: the external control program of the client library moves the arm in one, and is stopped meanwhile.
 * Everything ends with the main program. ``return`` ends a thread, whatever its value is.
 * A condition must be True or False. A variable keeps its type, of which all numbers have one, and a list its length.
   What a function returns keeps its type: see docs/reference/urscript-constructs.md for the reports.
-* A thread that computes for ever in one cycle is a run-time error. The manual lets it go on in the next cycle, and
+* A thread that never stops computing in one cycle is a run-time error. The manual continues it in the next cycle, and
   warns of a lost connection to the controller.
 """
 
@@ -56,16 +56,16 @@ class Program(ControllerProgram):
     Parameters
     ----------
     robot
-        The controller it runs on.
+        The controller on which the program runs.
     name
-        As the dashboard shows it.
+        Name of the program, as the dashboard shows it.
     text
-        Its URScript.
+        Text of the program in URScript.
 
     Raises
     ------
     UrscriptSyntaxError
-        When the text is not a program.
+        The text is not a program.
     """
 
     def __init__(self, robot: Robot, name: str, text: str) -> None:
@@ -87,27 +87,27 @@ class Program(ControllerProgram):
 
     @property
     def owner(self) -> str:
-        """Name of the thread that runs now: only one thread at a time may move the arm."""
+        """Name of the running thread: only one thread at a time may move the arm."""
         return self._current.name
 
     @property
     def place(self) -> Place:
-        """Where the thread that runs now is in the text."""
+        """Position of the running thread in the text."""
         return self._current.place
 
     def begin_cycle(self) -> None:
-        """Let the thread that runs now compute as much as in a cycle."""
+        """Let the running thread compute as much as in a new cycle."""
         self._left = STATEMENTS_PER_CYCLE
 
     def step(self) -> bool:
-        """Run one control cycle; return False when the program has ended.
+        """Run one control cycle; return False if the program has ended.
 
         Raises
         ------
         ScriptError, MotionError
-            When the program stops with a run-time error.
+            The program stops with a run-time error.
         """
-        for thread in self._threads:  # a thread started in this cycle runs in it
+        for thread in self._threads:  # a thread that was started in this cycle also runs in it
             self._current = thread
             self.begin_cycle()
             try:

@@ -19,11 +19,11 @@ class UrscriptSyntaxError(Exception):
     Parameters
     ----------
     place
-        Where the controller reports it.
+        Position at which the controller reports the error.
     sentence
-        What is wrong, in words.
+        Description of the error.
     report
-        The controller's text.
+        Text that the controller reports.
     """
 
     def __init__(self, place: Place, sentence: str, report: str) -> None:
@@ -72,7 +72,7 @@ class Item:
 
 @dataclass(frozen=True)
 class Call:
-    """A function and its arguments, by place and by name; with `runs`, the start of a thread."""
+    """A call of a function with positional and named arguments; with `runs`, the start of a thread."""
 
     place: Place
     name: str
@@ -122,7 +122,7 @@ class While:
 
 @dataclass(frozen=True)
 class Keyword:
-    """A statement of one word, and what follows it: ``return``, ``kill``, ``join``, ``break``, ``halt``, …."""
+    """A statement of one keyword and its value, if any: ``return``, ``kill``, ``join``, ``break``, ``halt``, …."""
 
     place: Place
     word: str
@@ -135,7 +135,7 @@ Block = tuple[Statement, ...]
 
 @dataclass(frozen=True)
 class Function:
-    """``def`` or ``thread``: its parameters, what it does, and the functions inside."""
+    """``def`` or ``thread``: its parameters, its statements, and the functions inside."""
 
     name: str
     parameters: tuple[tuple[str, Expression | None], ...]
@@ -161,7 +161,7 @@ _TOKEN = re.compile(
 
 
 _CONTINUED_BY = {"and", "or", "xor", "not", "=", "==", "!=", "<", ">", "<=", ">=", "+", "-", "*", "/", "%"}
-"""Words behind which a statement goes on in the next line."""
+"""Words after which a statement continues in the next line."""
 
 
 def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
@@ -171,15 +171,15 @@ def syntax_error(text: str, place: Place, sentence: str) -> UrscriptSyntaxError:
 
 
 def tokens_of(text: str) -> Iterator[Token]:
-    """Yield the words of a program, without blanks, comments and program labels, and ``end`` behind the last.
+    """Yield the words of a program, without blanks, comments and program labels, and ``end`` after the last word.
 
     A program label is ``$ 2 "text" "noBreak"``: the node of the pendant's program to which the next lines belong, and
-    in some versions where a step ends. A line break inside brackets, or behind an operator, is a blank.
+    in some versions where a step ends. A line break inside brackets, or after an operator, is a blank.
 
     Raises
     ------
     UrscriptSyntaxError
-        When a character belongs to no word, or a word is not emulated.
+        A character belongs to no word, or a word is not emulated.
     """
     at, line, line_start, depth = 0, 1, 0, 0
     goes_on = False

@@ -1,4 +1,4 @@
-"""The threads of a URScript program, what they see, and how they leave a block."""
+"""The threads of a URScript program, the names that they see, and exceptions that leave a block."""
 
 from collections.abc import Generator
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from ftmocks.ur.urscript.syntax import Function
 from ftmocks.ur.urscript.values import Value
 
 Run = Generator[None, None, Value]
-"""What is being computed; each `next()` is one control cycle."""
+"""A running computation; each `next()` is one control cycle."""
 
 
 class Halt(Exception):
@@ -16,14 +16,14 @@ class Halt(Exception):
 
 
 class Leave(Exception):
-    """A statement that leaves the block it is in: break, continue, return."""
+    """A statement that leaves its block: break, continue, return."""
 
     def __init__(self, word: str, value: Value = None) -> None:
         self.word, self.value = word, value
 
 
 class Thread:
-    """A thread of a program: its name for the arm, how far it is, and the place in the text."""
+    """A thread of a program: its name as owner of the arm, its computation, and its position in the text."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -32,7 +32,7 @@ class Thread:
 
     @property
     def is_done(self) -> bool:
-        """Whether it has ended or was killed."""
+        """Whether the thread has ended or was killed."""
         return self.steps is None
 
     def step(self) -> None:
@@ -44,7 +44,7 @@ class Thread:
             self.steps = None
 
     def kill(self) -> None:
-        """End it; an arm that it moves slows down by itself."""
+        """End the thread; an arm that it moves decelerates by itself."""
         steps, self.steps = self.steps, None
         if steps is not None:
             steps.close()
@@ -52,7 +52,7 @@ class Thread:
 
 @dataclass
 class Scope:
-    """Where a statement runs: the thread, the variables of its own function, and the functions it sees."""
+    """Scope of a statement: its thread, the variables of its function, and the functions that it can call."""
 
     thread: Thread
     function: Function

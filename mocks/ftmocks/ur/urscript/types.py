@@ -1,6 +1,6 @@
-"""Types of URScript that can be read off the text: a variable keeps its type, and so does what a function returns.
+"""Types of URScript that the text shows: variables keep their type, and so do the values that a function returns.
 
-What is not known before the program runs is checked when it runs. The same rules, and who reports them:
+Types that the text does not show are checked when the program runs. These rules and their sources:
 docs/reference/urscript-constructs.md.
 """
 
@@ -34,7 +34,7 @@ def check_types(main: Function) -> None:
     Raises
     ------
     UrscriptSyntaxError
-        At the second type.
+        A second type occurs; the error is at its position.
     """
     everywhere = {
         name for function in _functions(main) for _, scope, name, _ in _assignments(function) if scope == "global"
@@ -77,7 +77,7 @@ def _error(place: Place, sentence: str, name: str) -> UrscriptSyntaxError:
 
 
 def _assignments(function: Function) -> Iterator[tuple[Place, str, str, str | None]]:
-    """Yield place, qualifier, name and type of the values that variables of a function get."""
+    """Yield place, qualifier, name and type of the values that are assigned to variables of a function."""
     for statement in _statements(function.body):
         if isinstance(statement, Assignment) and statement.index is None:
             yield statement.place, statement.scope, statement.name, type_of(statement.value)
@@ -94,7 +94,7 @@ def _statements(block: Block) -> Iterator[Statement]:
 
 
 def type_of(expression: Expression) -> str | None:
-    """Return the type of the value where the text shows it, in the words of Python."""
+    """Return the type of the value as the name of a Python type; None if the text does not show the type."""
     match expression:
         case Literal():
             return type(expression.value).__name__

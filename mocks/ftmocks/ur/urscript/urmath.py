@@ -30,7 +30,7 @@ _OF_A_NUMBER: dict[str, Callable[[float], float]] = {
 
 
 def functions_of_a_number() -> Iterator[tuple[str, Callable[..., float]]]:
-    """Yield name and function of what takes one number `f`; angles are in radians."""
+    """Yield the names and the functions of one number `f`; angles are in radians."""
     for name, apply in _OF_A_NUMBER.items():
 
         def called(_program: object, f: Value, name: str = name, apply: Callable[[float], float] = apply) -> float:
@@ -45,7 +45,7 @@ def atan2(_program: object, x: Value, y: Value) -> float:
 
 
 def pow(_program: object, base: Value, exponent: Value) -> float:
-    """Return a power."""
+    """Return `base` to the power of `exponent`."""
     return math.pow(number(base, "pow: base"), number(exponent, "pow: exponent"))
 
 
@@ -62,7 +62,7 @@ def norm(_program: object, a: Value) -> float:
 
 
 def normalize(program: object, v: Value) -> list[float]:
-    """Return the list of the same direction with length 1."""
+    """Return a list with the same direction and norm 1."""
     size = norm(program, v)
     if not (isinstance(v, list) and size):
         raise ScriptError(f"normalize: {text_of(v)} has no direction")
@@ -77,7 +77,7 @@ def matrix(value: Value, what: str) -> Array:
 
 
 def pose_trans(_program: object, p_from: Value, p_from_to: Value) -> Pose:
-    """Return the second pose, which is given in the frame of the first, in the frame of the first's base."""
+    """Return the second pose, given in the frame of the first pose, in the frame in which the first pose is given."""
     return Pose(pose_of(matrix(p_from, "pose_trans: p_from") @ matrix(p_from_to, "pose_trans: p_from_to")))
 
 
@@ -87,13 +87,13 @@ def pose_inv(_program: object, p_from: Value) -> Pose:
 
 
 def pose_add(_program: object, p_1: Value, p_2: Value) -> Pose:
-    """Add positions, and apply the second rotation behind the first."""
+    """Add the positions, and multiply the first rotation by the second."""
     X_1, X_2 = matrix(p_1, "pose_add: p_1"), matrix(p_2, "pose_add: p_2")
     return Pose([*(X_1[:3, 3] + X_2[:3, 3]).tolist(), *rotvec(X_1[:3, :3] @ X_2[:3, :3]).tolist()])
 
 
 def pose_sub(_program: object, p_to: Value, p_from: Value) -> Pose:
-    """Return what must be added to the second pose to reach the first."""
+    """Return the pose that must be added to the second pose to give the first."""
     X_to, X_from = matrix(p_to, "pose_sub: p_to"), matrix(p_from, "pose_sub: p_from")
     return Pose([*(X_to[:3, 3] - X_from[:3, 3]).tolist(), *rotvec(X_from[:3, :3].T @ X_to[:3, :3]).tolist()])
 

@@ -1,8 +1,8 @@
-"""The values of URScript: numbers, truth values, texts, lists and poses; what operators do with them.
+"""The values of URScript (numbers, truth values, texts, lists and poses), and its operators.
 
 Source: Universal Robots, "The URScript Programming Language", chapter 1.
 
-Chosen here: a division of whole numbers is not rounded, ``%`` has the sign of its left side.
+Chosen here: a division of whole numbers is not rounded; ``%`` has the sign of its left operand.
 
 Does not model: arithmetic on lists and poses.
 """
@@ -38,7 +38,7 @@ class Pose(list[Value]):
 
 
 def text_of(value: Value) -> str:
-    """Write a value as in a message on the pendant."""
+    """Return a value as text, as in a message on the pendant."""
     if isinstance(value, list):
         return ("p" if isinstance(value, Pose) else "") + "[" + ", ".join(map(text_of, value)) + "]"
     return "nothing" if value is None else str(value)
@@ -50,7 +50,7 @@ def is_number(value: Value) -> bool:
 
 
 def number(value: Value, what: str) -> float:
-    """Take a finite number."""
+    """Return a value that must be a finite number."""
     if not is_number(value) or not math.isfinite(value):
         raise ScriptError(f"{what} must be a number, not {text_of(value)}")
     found: float = value
@@ -58,21 +58,21 @@ def number(value: Value, what: str) -> float:
 
 
 def whole_number(value: Value, what: str, low: int, high: int) -> int:
-    """Take an integer from `low` to `high`."""
+    """Return a value that must be an integer from `low` to `high`."""
     if type(value) is not int or not low <= value <= high:
         raise ScriptError(f"{what} must be a whole number from {low} to {high}, not {text_of(value)}")
     return int(value)
 
 
 def numbers(value: Value, what: str, count: int) -> list[float]:
-    """Take a list of `count` numbers."""
+    """Return a value that must be a list of `count` numbers."""
     if type(value) is not list or len(value) != count:
         raise ScriptError(f"{what} must be a list of {count} numbers, not {text_of(value)}")
     return [number(item, what) for item in value]
 
 
 def joints(value: Value, what: str) -> Vector6:
-    """Take six joint angles, rad."""
+    """Return a value that must be six joint angles, rad."""
     return vector6(numbers(value, what, 6))
 
 
@@ -84,14 +84,14 @@ def element(whole: Value, index: Value) -> Value:
 
 
 def single(value: Value) -> Value:
-    """Take an element of a list, which is not a list itself; a pose is."""
+    """Return a value that may be an element of a list: a pose may, a list may not."""
     if type(value) is list:
         raise ScriptError(f"a list of lists is not emulated: {text_of(value)}")
     return value
 
 
 def truth(value: Value) -> bool:
-    """Take a truth value."""
+    """Return a value that must be a truth value."""
     if not isinstance(value, bool):
         raise ScriptError(f"a condition must be True or False, not {text_of(value)}")
     return value
@@ -103,7 +103,7 @@ def combined(sign: str, a: Value, b: Value) -> Value:
     Raises
     ------
     ScriptError
-        When the operator does not apply to these values.
+        The operator does not apply to these values.
     """
     if sign in ("==", "!="):
         same_kind = (type(a) is bool) == (type(b) is bool)
@@ -119,5 +119,5 @@ def combined(sign: str, a: Value, b: Value) -> Value:
 
 
 def negative(value: Value) -> Value:
-    """Apply the minus sign in front of a value."""
+    """Return a value with reversed sign."""
     return combined("*", -1, value)
