@@ -14,7 +14,7 @@ from ftcalib.shown import values_of
 _USUAL_TIP_MM: Final = 200.0
 CONTACT_N: Final = 100.0
 """Contact force for which a sigma is reported, N."""
-# Orientations over which the error of a calibration is averaged if the truth is known.
+# Orientations over which the error of a calibration is averaged if the true values are known.
 _RANDOM = Rotation.random(1000, rng=0).as_matrix()
 # Step of the grid of elevation and azimuth.
 _STEP_DEG = 10
@@ -84,7 +84,7 @@ def force_sigma_at_tip(result: CalibrationResult, force_N: Array | float = CONTA
 def errors_in_sigma(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, Array]:
     """Return the errors of the estimates, each divided by its standard deviation.
 
-    The error of the mounting is the rotation vector from truth to estimate, about the flange axes, of at most 180°.
+    The error of the mounting is the rotation vector from true to estimated mounting, in flange axes, at most 180°.
     """
     errors = {}
     for _, _, _, key, values, sigma, _ in result.estimates:
@@ -107,7 +107,7 @@ def _free_tool_wrench(truth: Mapping[str, Any], R_base_flange: Array) -> Array:
         "ji,nkj,k->ni", np.asarray(truth["R_flange_sensor"]), R_base_flange, np.asarray(truth["gravity_force_base_N"])
     )
     load = np.hstack([weight, np.cross(truth["p_sensor_com_m"], weight)])
-    # Cells of version 0.1.0 and earlier have a perfect sensor.
+    # Emulated cells of version 0.1.0 and earlier have a perfect sensor.
     load = load + load @ np.array(truth.get("sensor_error", np.zeros((6, 6)))).T
     return np.asarray(load + np.hstack([truth["force_bias_N"], truth["torque_bias_Nm"]]))
 

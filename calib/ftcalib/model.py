@@ -288,7 +288,7 @@ def read_only(value: ArrayLike) -> Array:
 
 
 def keep_finite(record: object, whose: str, **shapes: tuple[int, ...]) -> None:
-    """Replace arrays of a frozen record by read-only copies; raise `ValueError` for a wrong shape or NaN."""
+    """Replace arrays of a frozen record by read-only copies; raise `ValueError` for a wrong shape, NaN or inf."""
     for name, shape in shapes.items():
         value = read_only(getattr(record, name))
         if value.shape != shape or not np.isfinite(value).all():

@@ -251,7 +251,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def n_poses(self) -> int:
-        """Number of poses, rejected ones included."""
+        """Number of poses, including rejected ones."""
         return len(self.residuals)
 
     @property
@@ -261,7 +261,7 @@ class CalibrationResult(Displayed, Calibrated):
 
     @property
     def rejected_poses(self) -> tuple[int, ...]:
-        """Rows, counted from 1, that were rejected."""
+        """Rows of the rejected poses, counted from 1."""
         return () if self.weights is None else tuple(int(i) + 1 for i in np.flatnonzero(self.weights == 0))
 
     @property
@@ -458,10 +458,10 @@ class CalibrationResult(Displayed, Calibrated):
     def likely_error(self, where: Literal["next_use", "workspace", "hour"] = "next_use") -> Array:
         """Return the rms error (2,) of compensating a free tool at the next use, N and N·m.
 
-        If the measured noise explains the residuals, it is `predicted_error`. Otherwise it is the leave-one-out error,
+        If the measured noise explains the residuals, the error is `predicted_error`, otherwise the leave-one-out error,
         which applies to orientations like those of the tour. In both cases the drift of the bias in the minute after
-        the last pose is added. For a recording in motion it is the error of load and smooth errors at rest in the
-        recorded orientations. "workspace": over all orientations; "hour": with an hour of drift, NaN without a drift.
+        the last pose is added. For a recording in motion, load and smooth errors at rest in the recorded orientations
+        give the error. "workspace": over all orientations; "hour": with an hour of drift, NaN without a drift.
         """
         if not self.quality:
             return np.array(self.predicted_error()) if where != "hour" else np.full(2, np.nan)

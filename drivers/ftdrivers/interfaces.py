@@ -184,7 +184,7 @@ class Health:
     nominal_rate_Hz: float = math.nan
     """Rate that the device reports or its manual states, Hz; NaN if unknown."""
     events: tuple[tuple[int, str], ...] = ()
-    """Pairs of `t_host_ns` and a phrase: interruption, reconnection, pause of the reader, late samples, begin and end
+    """Pairs of `t_host_ns` and a phrase: interruption, reconnection, pause of the reader, late samples, start and end
     of a wrong rate. A recording stores them."""
 
 

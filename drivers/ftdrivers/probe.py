@@ -20,7 +20,7 @@ _LISTEN_LINE_S = 0.25
 _REPLY_S = 0.25
 # A Bota that restarts when its port is opened prints its baud rate at 230400 baud; its vendor waits 2 s for this text.
 _BOOT_S = 2.5
-# A port that is closed for a shorter time may not restart the sensor.
+# A port that is closed for a shorter time than this may not restart the sensor.
 _CLOSED_S = 0.1
 # Listening time on a bus: ten samples of the slowest Robotous, and about the period of the slowest usual heartbeat.
 _LISTEN_BUS_S = 1.0

@@ -7,7 +7,7 @@ from typing import Literal
 
 @dataclass(frozen=True, slots=True)
 class SensorKind:
-    """One kind of sensor: what is known before its driver is imported."""
+    """One kind of sensor: the properties that are known before its driver is imported."""
 
     driver: str
     """Module and class of the driver. The class has `from_url`, on CAN also `probe`; on a serial port the module has

@@ -63,7 +63,7 @@ VECTORS = {
 
 
 def truth_from(options: Namespace) -> Truth:
-    """Draw the truth from the seed, then replace the quantities that are given on the command line."""
+    """Draw the true quantities from the seed, then replace those that are given on the command line."""
     truth = Truth.drawn(options.seed, options.mount)
     if options.sensor == WRIST:
         truth = truth.with_wrist_sensor(options.seed)

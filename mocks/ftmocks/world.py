@@ -1,4 +1,4 @@
-"""The truth of a robot cell: arm, gravity, payload, mounting of the sensor, bias and noise.
+"""The true state of a robot cell: arm, gravity, payload, mounting of the sensor, bias and noise.
 
 Every quantity that a calibration estimates is drawn or set in this module only. A wrench is exerted *on the sensor* by
 its load and by contacts, about the sensor origin, force first. A sensor whose z axis points down reads ``+m g`` on z.
@@ -27,7 +27,7 @@ MOUNTS_RAD = {"floor": 0.0, "wall": math.pi / 2, "ceiling": math.pi}
 AHEAD_S = 0.02
 """Time without a control cycle after which the arm stands still, s."""
 BURST_GAP_S = 0.001
-"""Largest gap between two bursts for which the truth at the end of the first one is used again, s."""
+"""Largest gap between two bursts for which the true wrench at the end of the first burst is used again, s."""
 REMEMBERED = 16
 """Number of control cycles whose motion is stored, because a sensor may be later than the controller."""
 WRIST_BIAS_N, WRIST_BIAS_SPREAD = (1800.0, 400.0, 25400.0), 0.1
@@ -137,14 +137,14 @@ class Truth:
         return np.asarray(self.R_flange_sensor.T @ (p_flange_m - self.p_flange_sensor_m))
 
     def holding(self, part: Body) -> "Truth":
-        """Return the truth of the cell with a part in the gripper."""
+        """Return the true quantities of the cell with a part in the gripper."""
         own_m2 = self.gyration_m2
         tool = Body(self.mass_kg, self.p_sensor_com_m, np.zeros((3, 3)) if own_m2 is None else own_m2)
         mass_kg, com_m, gyration_m2 = tool.joined(part)
         return replace(self, mass_kg=mass_kg, p_sensor_com_m=com_m, gyration_m2=None if own_m2 is None else gyration_m2)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the truth as numbers and row-major lists."""
+        """Return the true quantities as numbers and row-major lists."""
         return {
             "mass_kg": self.mass_kg,
             "weight_N": self.weight_N,
@@ -230,7 +230,7 @@ class World:
         self.contacts: dict[str, Contact] = {}
         """Contacts of the tool by name."""
         self.drifts: tuple[SensorDrift, ...] = ()
-        """Drifts of the bias in addition to the drift of the truth."""
+        """Drifts of the bias in addition to the drift in `truth`."""
         self.hung: HungLoad | None = None
         """The load on a string, which is also one of the contacts."""
         self.wrist_error: Callable[[], Array] | None = None
@@ -388,7 +388,7 @@ class World:
         Parameters
         ----------
         t_s
-            (n,) times on the cell's clock, near the current time. The truth without ripple is computed at both ends of
+            (n,) times on the cell's clock, near the current time. The wrench without ripple is computed at both ends of
             a burst and interpolated linearly.
         """
         override = self._override
@@ -457,7 +457,7 @@ class World:
         return lever_m, X[:3, 3] + lever_m
 
     def change_load(self, truth: Truth, name: str, contact: Contact) -> None:
-        """Set truth and contact together: a grasped part is still supported by the table on which it lies."""
+        """Set true quantities and a contact together: the table on which a grasped part lies still supports it."""
         with self._lock:
             self.truth = truth
             self.touch(name, contact)

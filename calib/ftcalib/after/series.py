@@ -14,7 +14,7 @@ from ftcalib.model import Array, Parameters, read_only
 
 # A standard deviation below this share of the largest is a rounding error: the value was exactly known.
 _KNOWN = 1e-9
-# A smaller eigenvalue of a correlation matrix is a rounding error.
+# An eigenvalue of a correlation matrix below this limit is a rounding error.
 _SINGULAR = 1e-10
 # Smallest significant difference along a direction that both calibrations take as exactly known.
 _ROUNDING_SIGMAS = 1e-3
@@ -133,7 +133,7 @@ FEWEST = 6
 SIGNIFICANT = 1e-5
 # Shortest duration of a drift; a more recent change may be a step.
 LEAST_DAYS = 7.0
-# If the series begins later after the calibration, the error of the calibration no longer constrains c.
+# If the series begins more than this after the calibration, the error of the calibration no longer constrains c.
 _NEAR_DAYS = 14.0
 # Smallest difference of chi2 by which a step fits better than an onset: odds of 20 to 1.
 CLEARLY = 6.0

@@ -310,7 +310,7 @@ def _covariance_problem(C: Array) -> str | None:
 _TRUSTED_SAMPLES = 100.0
 # Ratio of median to mean of the variance of six Gaussian values: the median of chi-square(5), divided by 5.
 _MEDIAN_SCATTER = 0.8702920382191053
-# A pose whose variances scatter more, relative to their degrees of freedom, keeps its own shape; 1 % do by chance.
+# A pose whose variances scatter more than this, relative to their degrees of freedom, keeps its shape; 1 % by chance.
 _UNLIKE = 3.0
 
 

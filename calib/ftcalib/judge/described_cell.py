@@ -21,9 +21,9 @@ from ftcalib.rounding import to_place_of
 # Tolerated distance of a centre of mass on the robot's side of the sensor origin, where adapter plates may be.
 INSIDE_M = 0.01
 REVERSED_TILT_DEG = 135.0
-# Tilt from which the robot must be mounted on a wall.
+# Tilt above which the robot must be mounted on a wall.
 HANGING_DEG = 60.0
-# Largest angle of a lean; a larger one is another mounting.
+# Largest angle of a lean; a larger angle means another mounting.
 OTHER_MOUNTING_DEG: Final = 10.0
 # Smallest lean that is reported: about the accuracy of an arm's orientation.
 LEAN_DEG: Final = 0.2
@@ -33,7 +33,7 @@ COM_MARGIN_M = 0.01
 SURELY_OUTSIDE_M = 0.1
 # Wrong units are suspected if the centre of mass is outside the tool and farther from the sensor than this.
 FAR_COM_M = 0.1
-# A smaller share of the described mass is the rest of a compensated weight, not a tool.
+# A mass below this share of the described mass is the rest of a compensated weight, not a tool.
 NO_TOOL_SHARE = 0.1
 # Tolerance of a described tool mass: the larger of this mass and this share.
 TOOL_KG, TOOL_SHARE = 0.1, 0.3

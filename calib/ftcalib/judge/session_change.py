@@ -37,7 +37,7 @@ from ftcalib.model import (
 )
 from ftcalib.sensor_matrix import response_columns
 
-# With fewer poses a change cannot be separated from the 15 parameters.
+# With fewer poses than this, a change cannot be separated from the 15 parameters.
 FEWEST_POSES = 10
 # Smallest number of poses before and after a change.
 FEWEST_ON_A_SIDE = 3
@@ -45,7 +45,7 @@ FEWEST_ON_A_SIDE = 3
 MOST_POSES, OF_MANY = 300, 150
 # A change is fitted only if it reduces the mean square misfit below this share.
 CLEARLY = 0.9
-# With smaller residuals, as a share of the weight, a change is treated as linear.
+# With residuals smaller than this share of the weight, a change is treated as linear.
 SMALL = 0.01
 # Required gain in twice the log-likelihood, in addition to log(6 n) for each parameter of the change.
 MARGIN = 10.0

@@ -146,7 +146,7 @@ def wrench_gram(R_base_flange: Array, wrench: Array, reference: Array) -> Array:
 
 
 MAX_STEPS = 100
-# A descent whose last step is smaller, in standard deviations of the noise, counts as converged.
+# A descent whose last step is smaller than this, in standard deviations of the noise, counts as converged.
 SMALL_STEP = 1e-4
 MOST_MINIMA = 6
 SAME_ROTATION_RAD = np.deg2rad(1.0)
@@ -316,7 +316,7 @@ Kept = NDArray[np.bool_]
 FALSE_REJECTION = 1e-3
 # Squared Mahalanobis distance beyond which a pose is rejected: 22.5.
 FARTHEST = float(chi2_isf(6, FALSE_REJECTION))
-# With fewer poses an outlier cannot be distinguished from good poses.
+# With fewer poses than this, an outlier cannot be distinguished from good poses.
 FEWEST_TO_REJECT_FROM = 8
 ANNEALING = 1.6
 

@@ -275,11 +275,11 @@ def _with_all(problem: Linearised, best: Point, waiting: Sequence[Component]) ->
     return point(problem, [*best.components, *chosen], np.append(best.theta, variances))
 
 
-# With more poses, single poses are examined only if chi2 or `drift` requires it.
+# With more poses than this, single poses are examined only if chi2 or `drift` requires it.
 MANY_POSES = 20_000
 # Size of the subset of more than 1000 poses in which walks and structured errors are searched.
 SEARCHED = 300
-# With fewer poses the distribution of the Mahalanobis distances is not tested.
+# With fewer poses than this, the distribution of the Mahalanobis distances is not tested.
 POSES_FOR_THE_SHAPE = 500
 # P-value of chi2 below which components are searched.
 SUSPICIOUS = 0.01

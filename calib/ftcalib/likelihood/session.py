@@ -44,17 +44,17 @@ Drift = Literal["auto", "none", "linear", "random-walk"]
 RANK_TOLERANCE = 1e-9
 # Usual ratio of torque noise to force noise.
 LEVER_M = 0.025
-# With fewer poses the ratio of torque noise to force noise is assumed.
+# With fewer poses than this, the ratio of torque noise to force noise is assumed.
 FEW_POSES = 6
-# With fewer poses gain and cross-talk are not separated from noise.
+# With fewer poses than this, gain and cross-talk are not separated from noise.
 FEW_POSES_FOR_RESPONSE = 7
-# With fewer poses the variances of gain and cross-talk are at least those of usual sensors.
+# With fewer poses than this, the variances of gain and cross-talk are at least those of usual sensors.
 FEW_POSES_FOR_GAIN = 12
-# With fewer poses drift is not separated from noise that was not measured.
+# With fewer poses than this, drift is not separated from noise that was not measured.
 FEW_POSES_WITHOUT_NOISE = 12
-# With fewer poses hysteresis is not separated from gain and noise.
+# With fewer poses than this, hysteresis is not separated from gain and noise.
 FEW_POSES_FOR_HYSTERESIS = 12
-# With fewer poses the axes of a group share one drift.
+# With fewer poses than this, the axes of a group share one drift.
 POSES_FOR_EACH_AXIS = 50
 # Largest residuals of a fit to data without noise, in units of the rounding error.
 EXACT = 100

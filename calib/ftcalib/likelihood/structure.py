@@ -16,7 +16,7 @@ import numpy as np
 from ftcalib.known import RANGE_LEVER_M
 from ftcalib.model import Array, Parameters, gravity_wrench, jacobian, skew
 
-# With more poses only the kinds found in a subset are modelled, to save memory and time.
+# With more poses than this, only the kinds found in a subset are modelled, to save memory and time.
 MOST_POSES = 1000
 
 
@@ -147,7 +147,7 @@ def _of_each_channel(basis: Array) -> Array:
 # The six shares, one for each axis, have one variance. The step to the first pose is unknown, so a usual step is
 # assumed for it. The compensation does not model steps, so hysteresis is part of the noise of a reading.
 
-# With more poses the unknown step to the first pose is negligible.
+# With more poses than this, the unknown step to the first pose is negligible.
 FEW = 1000
 
 

@@ -56,7 +56,7 @@ LARGEST = {
     "kinematics": float(np.deg2rad(1.0)) ** 2,
     "load": 0.05**2,
 }
-# With fewer poses the covariance of the estimates includes the uncertainty of the variances.
+# With fewer poses than this, the covariance of the estimates includes the uncertainty of the variances.
 POSES_THAT_SHOW_THE_NOISE = 1000
 _AXES = ("fx_N", "fy_N", "fz_N", "tx_Nm", "ty_Nm", "tz_Nm")
 

@@ -90,7 +90,7 @@ ROUGH_ROWS = 600
 _RESPONDING = np.r_[0:15, GAINS.start : SIZE]
 # Number of rows summed at once.
 _CHUNK = 1000
-# With more rows the fit absorbs a negligible part of the noise.
+# With more rows than this, the fit absorbs a negligible part of the noise.
 _MANY = 1000
 
 

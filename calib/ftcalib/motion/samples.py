@@ -40,7 +40,7 @@ LATEST_S = 1e11
 
 # (11, 3) value and first two derivatives of a quartic fitted to 110 ms of poses; the response is flat over the band.
 _FIT = np.linalg.pinv(np.vander(MEAN_S * np.arange(-5, 6), 5, increasing=True))[:3].T * [1.0, 1.0, 2.0]
-# A mean with a smaller total weight of samples is discarded.
+# A mean with a smaller total weight of samples than this is discarded.
 _LEAST_WEIGHT = 1e-3
 # Number of rows filtered at once.
 _CHUNK = 600

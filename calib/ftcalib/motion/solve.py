@@ -52,7 +52,7 @@ from ftcalib.sensor_matrix import Calibrated, Response
 LEAST_S = 5.0
 # Largest delay that is searched.
 FARTHEST_S = 1.5
-# A longer delay is reported as a clock error.
+# A longer delay than this is reported as a clock error.
 OFFSET_S = 0.1
 # Largest residual delay at which scale and signs of the motion are reliable.
 ALIGNED_S = 0.02

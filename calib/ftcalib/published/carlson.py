@@ -159,7 +159,7 @@ def iterative(R_base_flange: Array, force_N: Array, *, bias: bool) -> ForceFit:
     until the rotation converges, instead of 6 times as in appendix B.
 
     Corrections: a matrix with negative determinant is negated before the projection. As printed, the
-    limit is the truth in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
+    limit is correct in only 39 % (start at R = I) or 52 % (random gravity) of cases with 100 random orientations;
     with the negation, in all. With few poses there are still false fixed points: from a random gravity, without
     noise, 37, 12, 3 and 0.3 % of cases with 5, 8, 12 and 24 random poses (and bias) converge to one of them. From the
     gravity of theorem 1, which is the start here, it is 1 % with 5 poses and none with more.

@@ -51,7 +51,7 @@ STATES_HZ: Final = 125.0
 _MOST_UNREAD: Final = 1_000_000
 Received = tuple[int, list[bytes]]
 """`t_host_ns` of one read, and its samples."""
-# After a longer time between two turns, the reader was suspended or got no CPU time.
+# If more than this time passes between two turns, the reader was suspended or got no CPU time.
 _PAUSE_S: Final = 0.1
 # The first output, which follows the number of the recipe.
 _TIMESTAMP: Final = struct.Struct(">xd")

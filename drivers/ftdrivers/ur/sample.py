@@ -129,7 +129,7 @@ class Sample:
 
     @classmethod
     def of(cls, t_host_ns: int, outputs: Mapping[str, NDArray[Any]]) -> Self:
-        """Build the last of n samples from outputs by their names. Those of `OPTIONAL` may be missing."""
+        """Build the last of n samples from outputs by their names. The outputs in `OPTIONAL` may be missing."""
         last: dict[str, Any] = {name: column[-1].tolist() for name, column in outputs.items()}
 
         def vector(name: str) -> tuple[float, ...]:

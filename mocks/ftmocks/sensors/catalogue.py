@@ -92,7 +92,7 @@ def _model(name: str) -> robotous.Model:
 FT300_BIAS_SCALE = (3.3, 1.2)
 """One at rest reads (-20.7, 22.0, -48.7) N and (-0.10, 1.17, -0.32) N·m: ros-industrial-attic/robotiq, request 215."""
 NETFT_BIAS_SCALE = (1.1, 2.1)
-"""A real one has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
+"""A real sensor has a bias of (15.4, -12.2, -1.7) N and (-1.2, -2.1, 0.05) N·m: philip-long/FoamCutting_kukalwr."""
 
 KINDS = {
     "can": Kind(

@@ -1,4 +1,4 @@
-"""A production program on the pendant, which picks, places and touches repeatedly, and records the truth.
+"""A production program on the pendant, which picks, places and touches repeatedly, and records the true state.
 
 The file has one JSON object per line with the state from its time on: ``t_host_ns`` on the cell's clock, ``event``,
 whether the tool is in ``contact``, ``part_kg``, ``bias`` (6,) with its drift, and ``truth`` of tool and part together,
@@ -54,7 +54,7 @@ class Job:
     Parameters
     ----------
     file
-        Path of the file with the truth; None for no file.
+        Path of the file with the true states; None for no file.
     seed
         Seed of parts, forces, times and rotations.
     parts_kg

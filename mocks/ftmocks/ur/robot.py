@@ -182,7 +182,7 @@ class Robot:
         self.output_doubles = [0.0] * 48
         self.signals = Signals()
         self.events: list[Event] = []
-        """Event log: accepted and refused commands, program, safety, begin and end of motion. The newest is last."""
+        """Event log: accepted and refused commands, program, safety, start and end of motion. The newest is last."""
         self.hand: Iterator[None] | None = None
         """The operator who guides the arm by hand. Each `next` is one control cycle."""
         self._remote_control = True

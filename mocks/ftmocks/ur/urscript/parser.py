@@ -4,7 +4,7 @@ Source: Universal Robots, "The URScript Programming Language", chapter 1; the ex
 library of Universal Robots for line breaks in a statement.
 
 Chosen here: one statement per line, as in the manual. Operators have Python's precedence, ``xor`` between ``or`` and
-``and``. A name is known when the program assigns it anywhere, or defines a function of that name anywhere.
+``and``. A name is known if the program assigns it anywhere, or defines a function of that name anywhere.
 
 The parser rejects what a published report says that a controller rejects. Where another source contradicts the report,
 it accepts the text and records a doubt. The list with its sources: docs/reference/urscript-constructs.md.
