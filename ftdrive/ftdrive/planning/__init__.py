@@ -1,1 +1,1 @@
-"""Plans of how the arm takes the sensor through its poses: reached, clear of itself and of the cell, and priced."""
+"""Planning of the motion through the poses: reachable poses, moves proven clear, durations and predicted accuracy."""

@@ -21,13 +21,13 @@ from ftdrivers.ur.kinematics import Array
 
 # If no approach is proven clear, the operator must jog every joint to within this angle of the first pose.
 NEAR_RAD = float(np.radians(30))
-# Largest distance of via poses from the range between start and end. Joint 6 needs no detour.
+# Largest distance of via poses from the joint range between start and end. Joint 6 needs no detour.
 ROOM_RAD = np.radians([120.0, 90.0, 100.0, 120.0, 120.0, 0.0])
 # An arm within this angle of the first pose needs no approach.
 AT_RAD = 1e-3
 NODES = 240
 NEIGHBOURS = 16
-# Largest number of rounds of proofs, about 1 s in all.
+# Largest number of rounds of proofs, which take about 1 s in all.
 ROUNDS = 80
 
 

@@ -66,7 +66,7 @@ def speed_of_leading_joint(arm: ArmModel, start_rad: Array, end_rad: Array, spee
 def durations_s(arm: ArmModel, q_rad: Array, speeds: Speeds) -> Array:
     """Return the durations (n, n) of straight moves between joint vectors (n, 6), for the comparison of tours, s.
 
-    The tips are evaluated only at both ends and the middle of a move, so that their true speed may be slightly higher.
+    The tips are evaluated only at both ends and the middle of a move, so their true speed may be slightly higher.
     """
     turn = np.abs(q_rad[:, None] - q_rad).max(axis=2)
     speed = np.full(turn.shape, speeds.joint_rad_s)

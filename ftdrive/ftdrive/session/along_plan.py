@@ -226,12 +226,12 @@ class AlongPlan:
         watcher = Watcher(cell, rows, on_trip)
         questions = _SafetyQuestions(before)
         recheck = partial(self._recheck, questions)
-        with watcher:  # it also sees an emergency stop during a question
+        with watcher:  # the watcher also sees an emergency stop during a question
             if options.questions and self.todo:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? You hang it when the arm stands at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # other approaches are new
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # an approach of the arm is new
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)

@@ -1,7 +1,7 @@
-"""Motion of the arm between the poses of a plan: certified moves only; after an error STOP, then HOLD.
+"""Motion of the arm between the poses of a plan, by certified moves only. After an error the arm stops and holds.
 
 The arm moves along the plan from one pose to the next or back, or along an approach that is planned from its present
-posture, shown and confirmed. `GuardedCell` recovers from a stop: it finds the cause, and whether the cause is gone.
+posture, shown and confirmed. `GuardedCell` recovers from a stop: it finds the cause, and checks whether it is gone.
 """
 
 import logging
@@ -36,7 +36,7 @@ SLOW: Final = Speeds.first_run()
 AT_RAD: Final = float(np.radians(0.5))
 # An approach that comes closer than this to a skipped posture is reported as passing it.
 _NEAR_RAD: Final = float(np.radians(10))
-# How long the guards watch the resting arm before it moves on after a stop.
+# Time for which the guards watch the resting arm before it moves on after a stop.
 _LOOK_AGAIN_S: Final = 0.4
 _FIRST_WORD: Final = "MOVE"
 
@@ -108,18 +108,18 @@ class Progress:
         self.standing, self.stood_at = False, None
 
     def arrive(self, index: int, *, driven_from: int | None = None) -> None:
-        """Note that the arm stands at a pose; `driven_from` is the index of the pose where its planned move began."""
+        """Note that the arm stands at a pose; `driven_from` is the index of the pose where the planned move began."""
         self.stood_at, self.standing = index, True
         if driven_from is not None:
             self.driven.add(driven_from)
 
     def redo(self, stop: int) -> None:
-        """Put a stop that was taken before at the front of the remaining ones."""
+        """Put a stop that was already taken at the front of the remaining stops."""
         self.todo.insert(0, stop)
         self.skipped.discard(self.index(stop))
 
     def skip(self) -> list[int]:
-        """Leave out the next pose and a return to it; return the skipped stops."""
+        """Leave out the next pose and any return to it; return the skipped stops."""
         index = self.index(self.todo[0])
         dropped = [stop for stop in self.todo if self.index(stop) == index]
         self.todo = [stop for stop in self.todo if stop not in dropped]
@@ -143,7 +143,7 @@ class GuardedCell:
     """A cell under control with its guards, and the recovery from a stop.
 
     The guard `contact` must accept the new zero of a reopened sensor; the guard `load` judges every sample of a pose.
-    `recheck` repeats the checks, and with True also the safety questions; it raises if the arm may not go on.
+    `recheck` repeats the checks, and if called with True also the safety questions; it raises if the arm may not go on.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class GuardedCell:
         return self._cause
 
     def require_answers(self) -> None:
-        """Raise the last stop of row 11, however short, unless the safety questions were answered after it."""
+        """Raise the last emergency or safeguard stop unless the safety questions were answered after it."""
         self.watcher.look_aside()
         stop = self.watcher.safety_stop
         if stop is not None and stop is not self._answered:
@@ -188,7 +188,7 @@ class GuardedCell:
             self.cell.arm.open(control=True)
         except DeviceError:
             with suppress(DeviceError):
-                self.cell.arm.open()  # a connection shows an emergency stop that was pressed meanwhile
+                self.cell.arm.open()  # a new connection shows an emergency stop that was pressed meanwhile
             raise
         try:
             self.cell.sensor.check()
@@ -199,7 +199,7 @@ class GuardedCell:
             self._contact.forget()
             self._sensor_events = SensorEvents(self.cell.sensor, self.cell.journal.show)
         stop = self.watcher.safety_stop
-        if stop is not None and stop not in {self._answered, self._cause}:  # pressed while the arm was already held
+        if stop is not None and stop not in {self._answered, self._cause}:  # a stop while the arm already held
             self._cause = stop
             self.cell.journal.show(GuardTripped(hazard=stop.hazard, words=str(stop)))
         elif unseen:
@@ -278,7 +278,7 @@ class Drive:
     def obey_keys(self) -> None:
         """Obey the pressed keys: r refers to the pose taken last, s to the pose in progress, as on the screen.
 
-        Every key stops a moving arm; its effect follows after the stop. Keys are read before the screen shows another
+        Every key stops a moving arm and takes effect after the stop. Keys are read before the screen shows another
         pose.
         """
         while (key := self.journal.pressed()) is not None:
@@ -291,7 +291,7 @@ class Drive:
                 self.note(note)
 
     def approach(self, index: int, stop: int, *, back: bool = False) -> bool:
-        """Move the arm from its posture to a pose along moves outside the plan; return False if it is there already.
+        """Move the arm from its posture to a pose by moves outside the plan; return False if the arm is already there.
 
         These moves are proven clear, shown and confirmed separately.
         """
@@ -380,7 +380,7 @@ class Drive:
             )
 
     def between_looks(self) -> None:
-        """Raise the trip of a guard, or the effect of a pressed key."""
+        """Raise the trip of a guard, or the exception for a pressed key."""
         self.watcher.check()
         self.obey_keys()
 

@@ -46,7 +46,7 @@ class Hazard(IntEnum):
     WRONG_PLAN = 25
     DISK_FULL = 26
     SUPERVISOR_GONE = 27
-    """No operator, and no program that supervises the session instead, follows it any more."""
+    """Neither an operator nor a supervising program follows the session any more."""
 
 
 SCHEMA_VERSION = 1
@@ -70,7 +70,7 @@ class State(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Event:
-    """Base of all events."""
+    """Base class of all events."""
 
     t_utc: str = field(default_factory=lambda: datetime.now(UTC).isoformat())
 
@@ -224,7 +224,7 @@ class Compared(Event):
     light: str
     """Whether the poses suffice: "green" or "amber"."""
     hint: str = ""
-    """What to do if the pose is too near to one of the calibration; else empty."""
+    """What to do if the pose is too near to a pose of the calibration; else empty."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -319,7 +319,7 @@ class Operator(Protocol):
         """Show an event; return at once. Raises `SupervisorGone` if the operator cannot see the event."""
 
     def ask(self, question: Question) -> str:
-        """Return one of the answers of a question; raises `Declined` or `SupervisorGone` if no operator can answer."""
+        """Return one of the answers to a question; raises `Declined` or `SupervisorGone` if no operator can answer."""
 
     def absence(self) -> str | None:
         """Return why no operator follows, such as a closed terminal; None if one does. Callable from any thread."""

@@ -1,6 +1,6 @@
 """Guards that watch the arm while the program controls it; `watchdog.py` runs them in a thread.
 
-Each guard covers rows of the hazard table in docs/reference/hazards.md, which also names the test of each row. It
+Each guard covers rows of the hazard table in docs/reference/hazards.md, which also names the test of each row. A guard
 judges one `Seen` and raises `Tripped`. No guard is a safety function: safety is the task of the robot's safety system
 and of the user's risk assessment.
 """
@@ -62,7 +62,7 @@ class Limits:
     sensor_age_holding_s: float = 0.5
     """Largest time without a new sample while the arm moves and while it stands."""
     frozen_samples_s: float = 0.2
-    """Largest time during which all samples may be equal."""
+    """Largest time for which all samples may be equal."""
     saturation: float = SATURATION
     """Largest allowed share of the sensor's range."""
     contact_N: float = 8.0
@@ -71,7 +71,7 @@ class Limits:
     """The contact limit is the larger of these values and of this number of standard deviations of the noise."""
     unknown_N: float = 15.0
     unknown_Nm: float = 1.5
-    """Added to twice the weight of the heaviest tool while the running fit is not reliable yet."""
+    """Added to twice the weight of the heaviest tool until the running fit is reliable."""
     low_pass_Hz: float = 20.0
     skew_s: float = 0.03
     """Largest time between a wrench and the pose of the arm with which it is compared."""
@@ -171,7 +171,7 @@ class SupervisorGuard(Guard):
 
     def look(self, seen: Seen) -> None:
         """Trip if the operator is absent."""
-        del seen  # the operator is not part of it
+        del seen  # a look does not show the operator
         if why := self.absence():
             raise Tripped(Hazard.SUPERVISOR_GONE, SupervisorGone(why))
 

@@ -114,7 +114,7 @@ class SessionOptions:
 class Journal:
     """Shows and records every event, one at a time, from any thread; asks the operator.
 
-    With `yes` it answers a question by its assumed answer; the operator answers questions without one.
+    With `yes` the journal gives the assumed answer to a question; the operator answers questions that have none.
     """
 
     def __init__(self, operator: Operator, *, yes: bool = False) -> None:
@@ -126,7 +126,7 @@ class Journal:
         self._absence_recorded = False
 
     def keep_in(self, run: Run) -> None:
-        """Record events in this run from now on, beginning with those shown before."""
+        """Record all events in this run, including those already shown."""
         with self._lock:
             self._run = run
             for event in self._early:
@@ -189,9 +189,9 @@ class Journal:
             raise
 
     def ask(self, question: Question) -> str:
-        """Ask, and record the answer and its author. Raises `SupervisorGone`, even if `--yes` would answer."""
+        """Ask a question; record the answer and who gave it. Raises `SupervisorGone`, even if `--yes` would answer."""
         assumed = question.assumed if self._yes else None
-        with self.recording_absence():  # the guards do not record it, because the arm stands
+        with self.recording_absence():  # the guards record no absence while the arm stands
             self.require_operator()
             try:
                 answer = self._operator.ask(question) if assumed is None else assumed
@@ -289,7 +289,7 @@ class Task(Protocol):
 
     @property
     def goal(self) -> str:
-        """Condition under which hand-guided poses suffice, as half a sentence."""
+        """Condition under which hand-guided poses suffice, as a clause without a full stop."""
 
     def plan(self, certifier: Certifier, q_rad: Array, poses: int) -> Plan:
         """Return a plan that starts near joint angles (6,). Raises `PlanRefused`."""

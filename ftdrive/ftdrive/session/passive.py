@@ -46,10 +46,10 @@ def record_passively(
     """Record the free tool in motion until two consecutive fits are good, the operator presses q, or time is up.
 
     Each second of data is on disk before the next. Each fit is shown with its sigmas and with the missing motion. The
-    fits run in a thread of `fits`, so that a lost device is noticed at once. It raises a `DeviceError`; the recording
+    fits run in a thread of `fits`, so a lost device is noticed at once and raises `DeviceError`; the recording
     so far is in the run. Raises `Declined` if the operator ends the recording in the first seconds.
     """
-    # Every sample is kept, not sums alone, so that the run can be solved again and contact judged anew.
+    # Every sample is kept, not only sums, so that the run can be solved again with a new search for contact.
     cell.note(f"Recording for at most {seconds:.0f} s; nothing is commanded. Keep the tool free for part of the time.")
     cell.journal.keep_in(run)
     executor = fits or ThreadPoolExecutor(1)

@@ -33,7 +33,7 @@ from ftdrivers.clock import Clock
 from ftdrivers.interfaces import FtSamples, RobotArm
 
 LISTEN_S: Final = 2.0
-# Step between points checked against the safety limits: about 10 ms each; between two points the arm deviates from
+# Step between points checked against the safety limits, about 10 ms per point. Between two points the arm deviates from
 # their chord by at most 1 mm.
 _EDGE_RAD: Final = float(np.radians(5))
 # A plan is made for rounded joint angles, and the joint angles of a resting arm have noise of about 2e-5 rad.
@@ -128,7 +128,7 @@ def check_total_payload(before: Before) -> Check:
 
 
 def check_session_link(before: Before) -> Check:
-    """Check the response time of the arm; longer is allowed if a program must request the TCP."""
+    """Check the response time of the arm; a longer time is allowed if a program must request the TCP."""
     arm, limits = before.cell.arm, before.cell.limits
     asked_s = limits.link_asked_s if arm.status().tcp_offset is None else 0.0
     usual_s = limits.link_usual_s + asked_s

@@ -106,7 +106,7 @@ def short_calibration(operator: AbstractContextManager[Operator], sensor: str | 
 
 def station_of(calibration: CalibrationResult, sensor: str | None = None) -> Station:
     """Return the emulated cell of a calibration, not started; `sensor` replaces its sensor."""
-    # A stream pairs samples and poses by the controller's clock, so the cell runs at real pace.
+    # A stream pairs samples and poses by the controller's clock, so the cell runs in real time.
     return Station.of(calibration.provenance.get("station"), sensor, REAL_PACE)
 
 
@@ -119,7 +119,7 @@ def put_on(station: Station, load: Load) -> None:
         place = list(load.p_flange_mm)
         station.control(do="hang", mass_kg=load.mass_kg, at_mm=place, string_mm=1e3 * STRING_M)
     else:
-        # About the middle between the fingers; the solver does not know this position.
+        # About midway between the fingers; the solver does not know this position.
         p_load_m = np.array([0.0, 0.0, TOOL_MM[1] / 1e3 - truth["p_flange_sensor_m"][2]])
         com_m = (truth["mass_kg"] * np.array(truth["p_sensor_com_m"]) + load.mass_kg * p_load_m) / mass_kg
         station.control(do="payload-shift", mass_kg=mass_kg, p_sensor_com_m=com_m.tolist())
@@ -166,7 +166,7 @@ def rehearse_loads(
 def contact_errors(result: CalibrationResult, truth: Mapping[str, Any]) -> dict[str, float]:
     """Return the RMS force error of a contact of 100 N at the tip, N: as read, decoded, and the predicted sigma.
 
-    The mean is over random directions. The reading is computed from the truth, not with the model of the solver.
+    The mean is over random directions. The reading comes from the true parameters, not from the solver's model.
     """
     directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
     force = CONTACT_N * directions / np.linalg.norm(directions, axis=1, keepdims=True)

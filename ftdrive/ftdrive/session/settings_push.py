@@ -40,9 +40,9 @@ WORDS: Final = {"payload": "PUSH", "gravity": "GRAVITY"}
 
 _STILL_S: Final = 5.0
 _LISTEN_S: Final = 1.0
-# Number of attempts at a steady reading: a steady one fails the test about once in a hundred times.
+# Number of attempts at a steady reading; a steady reading fails the test about once in a hundred times.
 _LISTENS: Final = 3
-# Largest allowed difference between a value and its reading back, which has the same 64 bits.
+# Largest allowed difference between a value sent and the value read back, which both have 64 bits.
 _TOLERANCE: Final = 1e-6
 
 # Asks for the word of a setting, such as "payload"; raises `Declined` if it is not typed.
@@ -224,7 +224,7 @@ def _contact_wrench(arm: RobotArm, sensor: ForceTorqueSensor, result: Calibratio
 
 def _gravity_to_set(result: CalibrationResult, lean: Lean, old: ControllerSettings) -> tuple[float, ...] | None:
     """Return the gravity to set, with the magnitude that the controller uses; None if its direction agrees."""
-    # Without a report of the controller's gravity, a change could be neither read back nor restored.
+    # Without a report of the controller's gravity, a change could neither be read back nor be restored.
     if old.up_base_m_s2 is None:
         raise NotAccepted(
             f"the controller does not report its gravity, so a change could not be read back; the base {lean}, "
@@ -266,7 +266,7 @@ def send(
     DeviceError
         The arm failed. If a setting may have been sent, there is a receipt.
     """
-    # The settings are read back after the program has ended, because only then they are known to remain.
+    # The settings are read back after the program has ended, because only then are they known to remain.
     disk = computer.check_disk(folder)
     if disk.state == "failed":
         raise NotAccepted(f"no receipt can be written: {disk.found}. Copy the run to another folder; nothing was sent")
@@ -321,7 +321,7 @@ def _set(arm: RobotArm, new: ControllerSettings, guard: Guard) -> None:
 
 
 def _differences(sent: ControllerSettings, read_back: ControllerSettings | None) -> list[str]:
-    """Return the names of the settings that the controller reports with another value than was sent."""
+    """Return the names of the settings that the controller reports with a value other than the one sent."""
     back = read_back or ControllerSettings()
     pairs = {
         "mass": (sent.mass_kg, back.mass_kg),

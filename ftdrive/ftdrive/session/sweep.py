@@ -21,7 +21,7 @@ from ftdrive.session.open_session import OpenSession
 from ftdrive.session.preflight import Before
 from ftdrivers.sweep import Sweep
 
-# Rest that is recorded before the sweep and after it, s.
+# Duration of the rest that is recorded before and after the sweep, s.
 REST_S: Final = 2.0
 # Time between two points of the curve that the guards use, s.
 CURVE_S: Final = 0.01
@@ -45,7 +45,7 @@ _UNSURE_N: Final = 2.5
 
 
 def take_sweep(session: OpenSession) -> Run | None:
-    """Record the free tool along a wrist curve about the present posture; return the run, None after a dry run."""
+    """Record the free tool along a wrist curve about the present posture; return the run, or None after a dry run."""
     task, options = session.task, session.options
     along = AlongPlan(session, lambda certifier, q_rad: sweep_for(task.cell, certifier, q_rad, options.seconds))
     driven, sweep = _choose_speed(along.before, slow=options.real and not along.before.known)
@@ -166,7 +166,7 @@ class FreeToolPrediction(Guard):
 
     def look(self, seen: Seen) -> None:
         """Add the readings older than `BEHIND_S` to the fit."""
-        # A push that grows over several seconds still enters the fit in part.
+        # A push that grows over several seconds still partly enters the fit.
         if seen.motion.curve_rad is not None:
             self._moving_s += seen.dt_s
         if seen.sample == self._sample:
@@ -206,7 +206,7 @@ def on_script_path(cell: CellConfig) -> CellConfig:
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return plan and curve, slowed down by the speed slider as it is now. Raises `NotAccepted` if it is too low."""
+    """Return plan and curve, slowed down by the present speed slider. Raises `NotAccepted` if it is too low."""
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(

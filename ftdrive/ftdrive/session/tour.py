@@ -28,12 +28,12 @@ from ftdrive.session.preflight import LISTEN_S, Before
 # Target sigma of one average; 24 poses then give a sigma of the force bias of 0.02 N.
 _TARGET_N, _TARGET_NM = 0.057, 0.0035
 # Factor on the averaging time for a new tool: its four poses then have the information of eight.
-# Drift acts for twice the time, but four long poses are as accurate as six, with two moves less.
+# Drift acts for twice the time, but four long poses are as accurate as six, with two moves fewer.
 _TOOL_AVERAGES: Final = 2.0
 
 
 def take_tour(session: OpenSession) -> Run | None:
-    """Take the poses of a plan, or of one planned from the present posture; return the run, or None after a dry run."""
+    """Take the poses of a given plan, or of a plan from the present posture; return the run, None after a dry run."""
     options = session.options
     along = AlongPlan(session, lambda certifier, q_rad: session.task.plan(certifier, q_rad, options.poses))
     driven = _choose_pace(along)

@@ -32,7 +32,7 @@ Answer = Literal["ask", "no", "yes"]
 
 POSES: Final = 6
 QUICK_POSES: Final = 2
-# A pose nearer to an orientation of the calibration is not a new one.
+# A pose closer than this to an orientation of the calibration does not count as new.
 FRESH_RAD: Final = float(np.radians(10))
 # The contact guard uses the calibration after this number of poses, if all their residuals are within the two limits.
 HOLDS_N, HOLDS_NM = 2.0, 0.2

@@ -91,7 +91,7 @@ class Watcher:
         self.check()
 
     def look_aside(self) -> None:
-        """Look for row 11 while no motion is watched, because a stop may be released before the operator answers.
+        """Look for row 11 stops while no motion is watched: a stop may be released before the operator answers.
 
         Shows nothing, because the screen may show a question.
         """

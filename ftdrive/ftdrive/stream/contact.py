@@ -33,7 +33,7 @@ _INEXACT_S = 0.005
 # Friction torque of wrist 3, which the force/torque sensor inside the arm measures too.
 _FRICTION_NM = 0.15
 # A contact begins after this many consecutive readings beyond the limit, and ends after as many within it. A single
-# longer mean would detect the begin later.
+# longer mean would detect the contact later.
 _IN_A_ROW = 3
 # Time between these readings; the shorter one if inertia is subtracted, because the stream then waits for later poses.
 _LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
@@ -191,7 +191,7 @@ def _hotelling_limit(rate: float, dof: float) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Contact:
-    """A contact from its begin to its end, or to the newest reading while it lasts.
+    """A contact from its start to its end, or to the newest reading while it lasts.
 
     Examples
     --------
@@ -214,7 +214,7 @@ class Contact:
 
     @property
     def t_s(self) -> float:
-        """Begin of the contact, on the clock of `Sample.t_s`."""
+        """Start of the contact, on the clock of `Sample.t_s`."""
         return self.begin_ns * 1e-9
 
     @property
@@ -246,7 +246,7 @@ class Contact:
 
 
 class ContactTracker:
-    """Joins readings to contacts: three in a row beyond the limit begin one, three in a row within it end it."""
+    """Joins readings to contacts: three in a row beyond the limit begin a contact, three within the limit end it."""
 
     def __init__(self, rate_Hz: float) -> None:
         self._lag, self._short_lag = (max(1, round(lag_s * rate_Hz)) for lag_s in (_LAG_S, _SHORT_LAG_S))
@@ -262,7 +262,7 @@ class ContactTracker:
     ) -> tuple[NDArray[np.bool_], list[Contact]]:
         """Return a mask of the samples in contact (n,), and the contacts that begin or end in these samples.
 
-        One of `readings` (n, 6), in the frame of the stream, ends at each sample; `beyond` tells whether it exceeds the
+        One of `readings` (n, 6), in the frame of the stream, ends at each sample; `beyond` is true where it exceeds the
         limit. `soon` marks samples at which a contact may begin after the shorter lag, because later poses show rest.
         """
         n, before = len(t_ns), len(self._earlier[0])

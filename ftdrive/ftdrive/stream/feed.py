@@ -1,4 +1,4 @@
-"""Data of a stream for the live screen and the page in the browser, and the requests that these may make."""
+"""Data of a stream for the live screen and the page in the browser, and the requests that both may make."""
 
 import math
 from collections import deque
@@ -129,7 +129,7 @@ class Feed(Sink):
         elif block is None:
             self.status = self.stream.status()
         for event in events:
-            # screen and page show the tracked values in their own place
+            # screen and page show the tracked values separately
             if event.kind != "tracked":
                 text = f'mark "{event.text}"' if event.kind == "mark" else event.text
                 self._add_note(FeedNote(event.t_host_ns, text, event.kind))
@@ -199,7 +199,7 @@ class Feed(Sink):
 
 
 class NoiseWatch(Sink):
-    """Compares the noise of a free tool at rest once with that in the poses of a calibration; `found` takes the check.
+    """Compares the noise of a free tool at rest once with that in the poses of a calibration; `found` receives it.
 
     The comparison uses two seconds in which the arm rests without contact.
     """

@@ -41,7 +41,7 @@ from ftdrive.stream.samples import Paired, StreamEvent, StreamInfo, Tracked
 
 # Parts of the state vector.
 _BIAS, _RATE, _LOCAL, _PART = slice(0, 6), slice(6, 12), slice(12, 18), slice(18, 22)
-# Scales of force and torque of a typical sensor, N and N·m: limits in N are converted to torques by them.
+# Scales of force and torque of a typical sensor, N and N·m, which convert limits in N to torques.
 _UNIT = np.repeat([1.0, 0.03], 3)
 ANY_BIAS = np.square(_UNIT)
 """Variance (6,) added when tracking begins, because the bias may have changed by more than the drift explains."""
@@ -65,7 +65,7 @@ _RUN, _LONGEST_RUN = 4, 24
 # A new part is accepted after gravity has turned by this angle in the sensor, or the arm has moved this far: a contact
 # stays in place. A steady force along gravity that moves with the arm looks like a part.
 _TURN_RAD, _TRAVEL_M = 0.25, 0.15
-# A window is used only after this many further windows fit the state, because the begin of a contact may be too small
+# A window is used only after this many further windows fit the state, because the start of a contact may be too small
 # to detect. A contact that begins slowly therefore does not change the bias.
 _GUARD = 2
 # Largest drift of the trusted bias within an hour, N: four sigmas of a typical drift. For sensors with a known larger
@@ -195,7 +195,7 @@ class FreeToolFilter:
         rate, sigma = self.force_rate_N_h
         worth = max(usual_N_h, _WARNED_SIGMAS * sigma)
         before = self._is_warned
-        # a drift ends at half the limit, so that a drift near the limit is reported once
+        # a drift ends at half the limit, so that a drift near the limit is reported only once
         self._is_warned = rate > (0.5 if before else 1.0) * worth
         if rate <= worth or before:
             return None
@@ -205,7 +205,7 @@ class FreeToolFilter:
     # -------------------------------------------------------------------------------------- other information
 
     def expect(self, variance: Array) -> None:
-        """Add `variance` (6,) to that of the bias, as after a time without measurements."""
+        """Add `variance` (6,) to the variance of the bias, as after a time without measurements."""
         for state in [self._state] if self._open_s is None else [self._state, self._held]:
             _diagonal(state.P)[:, _BIAS] += variance
         self._run = []
@@ -223,7 +223,7 @@ class FreeToolFilter:
         self.subtract(change)
 
     def tare(self, change: Array, noise: Array, systematic: Array, R_base_flange: Array) -> None:
-        """Register a tare of the free, empty tool by `change` (6,); `noise` (6, 6) is that of its reading."""
+        """Register a tare of the free, empty tool by `change` (6,); `noise` (6, 6) is the covariance of its reading."""
         self._untared.append((self._state._replace(x=self._state.x.copy(), P=self._state.P.copy()), self._trusted))
         self.subtract(change)
         self.hold(np.zeros(4), np.zeros((4, 4)))

@@ -34,19 +34,19 @@ STATES = 1 + len(SPEEDS_RAD_S) + 1 + SLOW
 _STILL_RAD, _STILL_M = 2e-4, 2e-4
 # Displacement of the centre of mass, m, from which its inertial wrench is considered. Joint angles show motion later.
 _FELT_M = 4e-5
-# Rest begins, and a state of motion ends, this long after its last sample, because links ring, s.
+# Rest begins, and a state of motion ends, these times after the last sample in motion, s, because the links ring.
 _HOLD_S, _RINGS_S = 0.5, 0.4
 _LEVER_M = 0.5
 _SPEEDS = np.array(SPEEDS_RAD_S)
 
-# Consecutive readings of a window at rest, and of one in motion or of a short rest.
+# Number of consecutive readings in a window at rest, and in a window in motion or in a short rest.
 _WINDOW, _SHORT = 25, 8
-# Readings before a detected motion, which are not used for the rest before it.
+# Number of readings before a detected motion that are not used for the rest before it.
 _UNSEEN = 4
 _WINDOWS = 60
 # A window whose noise exceeds the median by this factor contains a touch or a jolt, and is not used.
 _LOUD = {True: 1.5, False: 4.0}
-# A larger step between the means of two windows is the begin or end of a contact.
+# A larger step between the means of two windows is the start or end of a contact.
 _STEP_SIGMAS = 5.0
 # Noise in motion until it is known: this multiple of the noise at rest, plus that of an acceleration.
 _FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
@@ -81,7 +81,7 @@ class MotionTracker:
         self._classes = np.zeros(round(_RINGS_S * rate_Hz), np.int8)
 
     def follow(self, R_base_flange: Array, p_base_flange_m: Array) -> tuple[NDArray[np.int8], Array]:
-        """Return the states (n,), `REST` or a class of motion, and the inertial wrench (n, 6) if it shows.
+        """Return the states (n,), `REST` or a class of motion, and the inertial wrench (n, 6) of visible motion.
 
         The wrench is in N and N·m, sensor axes; zero without visible motion. An unknown position is taken as constant.
         """
@@ -147,11 +147,11 @@ class SensorNoise:
     """Covariances of the white and coloured sensor noise, N and N·m, sensor axes."""
 
     sample: Array
-    """(6, 6) of one sample."""
+    """(6, 6) covariance of one sample."""
     reading: Array
-    """(6, 6) of the mean over `READING_S`, about its trend over half a second."""
+    """(6, 6) covariance of the mean over `READING_S`, about its trend over half a second."""
     wander: Array
-    """(6, 6) of the slower part, from one half second to the next."""
+    """(6, 6) covariance of the slower part, from one half second to the next."""
     dof: float
     """Number of independent readings in the estimate."""
 

@@ -26,7 +26,7 @@ _PASSES = 4
 _ROUNDS = 10
 # Pairing of a recording is repeated until its delay changes by less than this.
 _CONVERGED_S = 1e-8
-# A pose is extrapolated by at most one interval of a CB3 controller with some delay: waiting for the next pose would
+# A pose is extrapolated by at most one interval of a CB3 controller plus some delay: waiting for the next pose would
 # delay a block by one interval and split it.
 _MOST_AHEAD_NS = 10_000_000
 # Poses are kept this long for late samples.
@@ -66,7 +66,7 @@ class PoseTrack:
 
     def __init__(self) -> None:
         self._t_ns = np.empty(0, np.int64)
-        # unit quaternion x y z w, position, joint angles, half the angle to the next
+        # unit quaternion x y z w, position, joint angles, half the angle to the next pose
         self._columns = np.empty((0, 14))
 
     @property
@@ -92,7 +92,7 @@ class PoseTrack:
         self._t_ns = np.concatenate([self._t_ns, t_host_ns[later]])
         self._columns = np.concatenate([self._columns, new])
         quat = self._columns[start:, :4]
-        # q and -q are one orientation: take the one on the side of its predecessor
+        # q and -q are one orientation: take the sign nearer to the previous pose
         side = np.where((quat[1:] * quat[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         quat[1:] *= np.cumprod(side)[:, None]
         chord = np.sqrt(np.square(quat[1:] - quat[:-1]).sum(axis=1))
@@ -163,7 +163,7 @@ class DelayEstimator:
     def add(self, paired: Paired) -> None:
         """Update the estimate with samples that were paired with `delay_s`."""
         pieces = self._whole_seconds(paired)
-        # part of these samples was paired with the previous delay
+        # some of these samples were paired with the previous delay
         if pieces and self._settling:
             self._settling = False
         elif sum(map(self._learn, pieces)):

@@ -1,4 +1,4 @@
-"""Processing of paired samples to blocks: the stages in order, and the estimates of noise, contact and drift.
+"""Processing of paired samples into blocks: the stages in order, and the estimates of noise, contact and drift.
 
 `Processor` runs the stages, also for a sensor alone. `ToolMonitor` is used with a calibration: it follows the free
 tool, its motion, contacts, drift and the held part.
@@ -92,7 +92,7 @@ class ToolMonitor:
         self._tracker = ContactTracker(info.sensor_rate_Hz)
         self.following = Following(info, self.tool.bias_growth)
         self.contacts: list[Contact] = []
-        """Contacts that began or ended and are not taken yet."""
+        """Contacts that began or ended and have not been taken yet."""
         self._is_learning = True
         self.state = REST
         self._newest_ns = 0
@@ -268,13 +268,13 @@ class Processor:
         *,
         temperature: BiasTemperature | None = None,
     ) -> None:
-        # other threads may set frame, stages and tare
+        # other threads may set frame and stages, and tare
         self._lock = RLock()
         self.info, self._frame, self._settings = info, frame, settings or standard_stages(info)
         self.stages: tuple[Stage, ...] = stages_of(self._settings, frame, info)
         """The stages applied to the raw wrench, in order."""
         self.events: list[StreamEvent] = []
-        """Events that are not taken yet."""
+        """Events that have not been taken yet."""
         moved = np.zeros((6, 3))
         if not info.is_raw:
             moved = wrench_by_acceleration(info.calibration.mass_kg, info.calibration.parameters.p_sensor_com_m)
@@ -420,7 +420,7 @@ class Processor:
 
         NaN until the noise is known. `R_base_flange` (3, 3) is the orientation at the sample. The result grows with the
         age of the bias, if earlier runs of the sensor show how the bias changes. With `loaded` it contains the errors
-        of the sensor under the present contact; without, it applies to a free tool.
+        of the sensor under the present contact; otherwise it applies to a free tool.
         """
         monitor = self._monitor
         noise = self._noise.of(REST if monitor is None else monitor.state)

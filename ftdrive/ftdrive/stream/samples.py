@@ -25,7 +25,7 @@ from ftdrivers.interfaces import Array, Columns, DeviceInfo
 Axes = Literal["sensor", "flange", "base", "tcp"]
 Point = Literal["sensor", "flange", "tcp"]
 Ns = NDArray[np.int64]
-# A height from motion with a smaller sigma is used.
+# A sensor height from a calibration in motion is used if its sigma is smaller.
 _KNOWN_HEIGHT_M = 3e-3
 
 
@@ -207,7 +207,7 @@ EventKind = Literal[
 
 @dataclass(frozen=True, slots=True)
 class StreamEvent:
-    """Something that happened at one time of a stream."""
+    """An event at one time of a stream."""
 
     t_host_ns: int
     kind: EventKind
@@ -251,7 +251,7 @@ class Tracked(Displayed):
     moment: tuple[Array, Array]
     """Mass and mass times centre of mass of the part (4,), kg and kg m, sensor axes, and their covariance."""
     events: tuple[StreamEvent, ...] = ()
-    """Grasps, releases and contacts decided since the last update, with the time of their begin."""
+    """Grasps, releases and contacts decided since the last update, with their start times."""
 
     def to_dict(self) -> dict[str, JSON]:
         """Return the tracked values as JSON; `last_seen_s` is None before the first observation."""

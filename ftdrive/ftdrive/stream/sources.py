@@ -36,7 +36,7 @@ STALE_S = 0.3
 
 # Time between two attempts to reconnect, s.
 _RETRY_S = 0.2
-# Both rates are measured over this time after opening, s.
+# The rates of sensor and arm are measured over this time after opening, s.
 _RATE_S = 0.5
 _RATE_WINDOW_NS = 1_000_000_000
 _ALONE = DeviceInfo("", "", "")
@@ -203,7 +203,7 @@ class CellSource(SampleSource):
             arm=arm,
             sensor=self._sensor.identify(),
             tool=self.cell.tool.name,
-            # anchor of all times in files
+            # reference of all times in files
             utc_offset_ns=time.time_ns() - self.clock.now_ns(),
             sensor_rate_Hz=math.nan,
             arm_rate_Hz=0.0,
@@ -303,7 +303,7 @@ class CellSource(SampleSource):
         texts = {} if self._failure is None else {self._failure[0]: str(self._failure[1])}
         error = texts.get("sensor", "")
         sensor = LinkStatus(health.rate_Hz, self.info.sensor_rate_Hz, health.lost, health.age_s, error)
-        # without an arm, its age is 0
+        # a missing arm has the age 0
         arm = LinkStatus(0.0, 0.0, 0, 0.0)
         if self._arm is not None:
             now_ns = self.clock.now_ns()

@@ -37,7 +37,7 @@ TARE_S = 0.5
 TARE_DRIFT_N, TARE_DRIFT_NM = 0.5, 0.015
 """Standard deviation of the drift of the bias since the calibration or the last tare that a tare accepts."""
 
-# The acceleration comes from poses at this spacing over twice this reach: longer ones blur and delay moves.
+# The acceleration comes from poses at this spacing over twice this reach: a longer reach blurs and delays moves.
 _KNOT_S, _REACH_S = 0.002, 0.015
 # Largest motion of the flange during a tare.
 _STILL_RAD, _STILL_M = 5e-4, 5e-4
@@ -65,7 +65,7 @@ class Stage(ABC):
     is_of_free_tool: ClassVar = False
     """Whether the stage subtracts the wrench of the free tool: contact is judged after the last of these stages."""
     power_gain = 1.0
-    """Factor on the noise variance of a sample; nonlinear stages give it too."""
+    """Factor on the noise variance of a sample, also for nonlinear stages."""
 
     @classmethod
     @abstractmethod
@@ -212,7 +212,7 @@ class FrameChange(Stage):
 class _Deadband(Stage):
     """Shorten force and torque vectors by the deadband; vectors shorter than the deadband become zero.
 
-    The norm of the vector is compared, so that the deadband is equal in all directions. The noise of longer vectors
+    The norm of the vector is compared, so the deadband is equal in all directions. The noise of longer vectors
     does not change.
     """
 

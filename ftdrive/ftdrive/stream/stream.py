@@ -1,6 +1,6 @@
 """The compensated stream, the loop that reads it, and the interface of its sinks: recorders, servers, scale, screen.
 
-A stream has a source and a processor. It knows neither screen nor file.
+A stream has a source and a processor. It does not depend on screens or files.
 """
 
 from abc import ABC, abstractmethod
@@ -27,7 +27,7 @@ from ftdrivers.errors import DeviceError
 
 RECOVER_S: Final = 10.0
 """Default time-out, s: the loop ends after a longer interruption."""
-# Tolerated delay of a sink, s, because a busy computer can stop any of them for a moment.
+# Tolerated delay of a sink, s, because a busy computer can stop any sink for a moment.
 _LATE_S: Final = 1.0
 
 
@@ -48,7 +48,7 @@ class Stream(Displayed):
     track : "off", "show" or "apply"
         Whether bias and held part are tracked, and applied; may be set at any time. See `StreamStatus.tracked`.
     on_contact : callable
-        Called by the reading thread 40 to 60 ms after the begin of a contact and again at its end. May be set at any
+        Called by the reading thread 40 to 60 ms after the start of a contact and again at its end. May be set at any
         time.
 
     Raises
@@ -368,7 +368,7 @@ def pump(
     patience_s : float
         Longest duration of a failure; 0 raises the first one.
     say : callable
-        Receives a sentence if a sink fails or has missed samples; with `meanwhile` also at the begin and end of an
+        Receives a sentence if a sink fails or has missed samples; with `meanwhile` also at the start and end of an
         interruption.
     meanwhile : str
         What happens during an interruption, in one sentence.

@@ -130,7 +130,7 @@ class Scale:
         Raises `CannotWeigh` if arm or reading is not at rest, or differs too much from that of the empty tool.
         """
         self._rest(since_ns)
-        # A zero is refused wherever a tare is, because otherwise the contact wrench would keep the old bias.
+        # A zero is refused whenever a tare is, because otherwise the contact wrench would keep the old bias.
         event = self._stream.tare()
         if event.kind != "tare":
             raise CannotWeigh("not-empty")
@@ -242,7 +242,7 @@ def weigh(stream: Stream, *, poses: int = 1, moving: bool = False, timeout_s: fl
 
 
 def first_success(stream: Stream, attempt: Callable[[int], T], timeout_s: float) -> T:
-    """Read a stream until `attempt` succeeds, which receives the time of the first sample; return its result.
+    """Read a stream until `attempt`, called with the time of the first sample, succeeds; return its result.
 
     After the time-out, raise the last `CannotWeigh` of `attempt`.
     """
@@ -334,7 +334,7 @@ class Weighing(Sink):
     ) -> None:
         self.stream, self.part_kg, self.joins, self.moving = stream, part_kg, joins, moving
         self._scale, self._keep = Scale(stream), keep
-        # Weight of the present load; None since the reading was last not at rest.
+        # Weight of the present load; None if nothing was weighed since the reading was last not at rest.
         self._last: Weight | None = None
         self._due_s = stream.clock.now_s() + _STEP_S
         # Time of a zero request on the clock of the cell; set by another thread.
@@ -418,7 +418,7 @@ class Weighing(Sink):
     def given_up(self, shown: ScaleState) -> CannotWeigh:
         """Return the error for a single weighing that did not succeed within `PATIENCE_S`."""
         code = shown.refusal or "samples"
-        # faults have been kept when they occurred
+        # faults were passed to `keep` when they occurred
         if code not in _FAULTS:
             self._keep({"refused": code})
         return CannotWeigh(code, shown.weight)

@@ -72,7 +72,7 @@ def day_row(one: WeighingDay) -> tuple[str, ...]:
 def result_table(
     results: Iterable[StoredResult], last: Mapping[str, VerificationRecord], now: datetime
 ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
-    """Return titles and rows of a table of results; `last` has the last verification of each by its id."""
+    """Return titles and rows of a table of results; `last` has the last verification of each result by its id."""
     rows = [_history_row(one, last.get(one.id), now) for one in results]
     shown = [n for n, title in enumerate(_TITLES) if title not in _OPTIONAL or any(row[n] for row in rows)]
     return [_TITLES[n] for n in shown], [[row[n] for n in shown] for row in rows]

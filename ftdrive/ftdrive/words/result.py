@@ -34,7 +34,7 @@ SIGMA_OF_THE_TOOL = (
 def estimate_rows(
     document: Mapping[str, Any], truth: Mapping[str, Any] | None = None
 ) -> Iterator[tuple[str, int, str, str, str, str]]:
-    """Yield each number in the JSON of a result: key, axis, name with unit, truth if known, value, sigma."""
+    """Yield each number in the JSON of a result: key, axis, name with unit, true value if known, value, sigma."""
     for one in shown_estimates(document):
         label, scale, unit, key, values, sigmas, fixed = one
         truths = values_of(truth[key], key) * scale if truth is not None and key in truth else None

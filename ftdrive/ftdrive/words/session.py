@@ -72,7 +72,7 @@ class SessionText:
         self._passed = list[str]()
 
     def lines(self, event: Event) -> list[TextLine]:
-        """Return the lines to print for an event, after those that waited for it."""
+        """Return the lines to print for an event, preceded by the lines that waited for it."""
         if isinstance(event, Checked) and event.passed and not self._verbose:
             heading = [] if self._passed else self._heading("Checks")
             self._passed.append(event.name)
@@ -366,7 +366,7 @@ class SessionView:
                 self.note, self.tripped = event, True
 
     def shown(self, text: str) -> str:
-        """Return text in the terminal's encoding; this can lengthen it, so call it before measuring or cutting."""
+        """Return text in the terminal's encoding; the result can be longer, so convert before measuring or cutting."""
         return text.translate(_ASCII) if self.ascii_only else text
 
     @property

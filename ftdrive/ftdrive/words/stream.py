@@ -1,4 +1,4 @@
-"""The state and the words of a stream that its faces show: a `StreamSummary` makes a `View` of a `Feed`."""
+"""State and texts of a stream for screens and pages: a `StreamSummary` makes a `View` of a `Feed`."""
 
 import json
 from collections import deque
@@ -32,7 +32,7 @@ _MOST_NOTES = 200
 _MARKS = ("tare", "tare-undone", "stages", "gap", "mark")
 # Values below this number of sigmas may be noise, which has no direction and no line of action.
 _SIGNIFICANT = 4.0
-# If a command's output is blocked for longer than this, s, it does not read the stream.
+# If a command's output is blocked for longer than this, s, the command is not reading the stream.
 _HELD_S = 2.0
 CONTACT, FREE, NOISE_UNKNOWN, WAITING = "contact", "free", "noise not known yet", "waiting for the first sample"
 """Results of `state`."""
@@ -488,7 +488,7 @@ def full_scale(columns: PlotColumns, reading: ShownWrench | None, first: int) ->
 # -- the screen and page of a scale
 
 NO_MASS = "- - -"
-# A larger smallest mass, kg, is caused by drift since the calibration, and a zero helps.
+# If the smallest mass exceeds this, kg, drift since the calibration is the cause, and a zero helps.
 _UNZEROED_KG = 0.1
 
 
@@ -499,7 +499,7 @@ def worth_of(weight: Weight) -> str:
 
 
 def zero_in_words(weighing: Weighing) -> tuple[str, bool]:
-    """Return the age of the zero, and whether another one would help; empty if the bias is tracked."""
+    """Return the age of the zero, and whether another zero would help; empty if the bias is tracked."""
     if weighing.moving:
         return "", False
     zeroed_s, weight = weighing.stream.processor.monitor.reference()[1], weighing.shown.measured

@@ -112,7 +112,7 @@ def separation(a: Bodies, b: Bodies, enough_m: Array) -> Array:
 
 
 def separation_from_box(bodies: Bodies, low_m: Array, high_m: Array, enough_m: Array) -> Array:
-    """Return a lower bound (k,) of the distance of each body to a box, m; those of `enough_m` (k,) are not refined."""
+    """Return a lower bound (k,) of the distance of each body to a box, m, which is refined up to `enough_m` (k,)."""
     centre, half = (low_m + high_m) / 2, (high_m - low_m) / 2
     point = bodies.centre_m
     # For a body that intersects the box the bound is -1 m, because the depth is not computed.
@@ -165,7 +165,7 @@ def _nearest(bodies: Bodies, point: Array) -> Array:
 def _between_axes(a: Bodies, b: Bodies) -> tuple[Array, Array]:
     """Return the point (k, 3) of each axis segment b nearest to segment a, and the distance (k,) of the segments, m.
 
-    The distance is convex in the two positions, so that the unconstrained solution, clipped to one segment and then to
+    The distance is convex in the two positions, so the unconstrained solution, clipped to one segment and then to
     the other, is exact (Ericson, Real-Time Collision Detection, 2005, section 5.1.9).
     """
     gap = a.centre_m - b.centre_m

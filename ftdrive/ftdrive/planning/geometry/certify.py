@@ -45,13 +45,13 @@ class Certificate:
     self_clearance_m: Array
     """(m,) lower bound of the distance between parts of arm and tool; an upper bound if the move is not clear."""
     scene_clearance_m: Array
-    """(m,) such a bound of the distance to planes and boxes; infinite if there are none."""
+    """(m,) the same bound of the distance to planes and boxes; infinite if there are none."""
     limited_by: tuple[str, ...]
     """(m,) the pair of bodies whose distance comes closest to the margin."""
 
     @property
     def clearance_m(self) -> Array:
-        """(m,) smaller one of the two clearances."""
+        """(m,) the smaller of the two clearances."""
         return np.minimum(self.self_clearance_m, self.scene_clearance_m)
 
 
@@ -98,7 +98,7 @@ class Certifier:
         return Certifier(ArmModel(arm.name, arm.tool, own), self.scene, self.margins)
 
     def reach_m(self, off_rad: Array) -> float:
-        """Return a bound of the approach of any two bodies if each joint is off by up to `off_rad` (6,), m."""
+        """Return a bound of how far any two bodies approach if each joint is off by up to `off_rad` (6,), m."""
         return float((self._lever_m @ np.abs(off_rad)).max())
 
     def keeping(self, more_m: float) -> "Certifier":

@@ -1,4 +1,4 @@
-"""Tours of chosen poses: the most informative ones, ones far from those of a calibration, sets, or tilts of a load.
+"""Tours of chosen poses: the most informative poses, poses far from a calibration's, sets, or tilts of a load.
 
 Informative poses are chosen by `ftcalib.poses.selection`, which excludes a second solution and gravity directions in
 one plane.
@@ -22,13 +22,13 @@ from ftdrivers.ur.kinematics import Array
 
 # Numbers of tool directions, and of turns about the tool axis for each of them.
 DIRECTIONS, SPINS = 150, 8
-# Fewer for a tool that is not round about the axis of joint 6, because each turn needs its own collision check.
+# Fewer of both for a tool that is not round about the axis of joint 6: each turn needs its own collision check.
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
 # Largest number of disconnected parts of free space that are tried.
 MOST_PARTS = 2
 # Number of the nearest joint vectors of each part to which a straight move is tried.
 FROM_HERE = 6
-# No other posture is tried if the predicted error is within this factor of the best poses of the cone.
+# No other posture is tried if the predicted error is within this factor of that of the best poses of the cone.
 NEARLY = 1.05
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
@@ -159,7 +159,7 @@ def hung_tour(
 ) -> tuple[tuple[int, ...], Array, Array] | None:
     """Return a short closed tour through tilts with a load on a string, spread evenly about straight down.
 
-    The hook is at the same point in all tilts, near its present position and with the tool turned little. Returns
+    The hook is at the same point in all tilts, near its present position, and the tool is turned little. Returns
     numbers from 101, in the order of choice, joint vectors (n, 6) in the order of travel, and the hook (3,) in base, m;
     None if too few poses are reachable.
     """
@@ -197,7 +197,7 @@ class _SteadyHook(Certifier):
 
 
 def _hooks(certifier: Certifier, q_now: Array) -> list[tuple[Array, float]]:
-    """Return positions (3,) of the hook with the most reachable tilts, m, each with turns about the tool axis, rad."""
+    """Return positions (3,) of the hook with the most reachable tilts, m, each with a turn about the tool axis, rad."""
     down, at = certifier.scene.down_base, certifier.arm.frames(q_now)
     present_rad = _heading(at.R_base_flange[0], down)
     looks = tilted_candidates(np.radians(HUNG_TILTS_DEG), LOOKS_OF_A_TILT, present_rad, down)

@@ -93,7 +93,7 @@ def _at_places(
 
 
 def distinct(certifier: Certifier, q_rad: Array) -> tuple[Array, Nodes]:
-    """Return the joint vectors (k, 6) with different shapes, and the index (n,) of each given one among them.
+    """Return the joint vectors (k, 6) with different shapes, and the index (n,) of each given vector among them.
 
     Joint angles that move no body are set to zero, such as that of joint 6 with a tool that is round about its axis.
     """
@@ -162,7 +162,7 @@ def with_room(certifier: Certifier, q_rad: Array) -> Iterator[Array]:
 
 
 # Orientation number in the paper, then psi = q2 + q3 + q4, q5 and q6 in degrees. Every order of 90° moves takes 54 s at
-# 60 °/s. This one has only eight moves of the whole wrist, which the limit of the tip speed slows down.
+# 60 °/s. This order has only eight moves of the whole wrist, which the limit of the tip speed slows down.
 _TOUR_DEG = (
     (1, -90, 90, 45),
     (10, -90, 90, -45),
@@ -220,10 +220,10 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     array
         Joint vectors in the order of travel; all joints within one turn of zero.
     """
-    # Wrist 3 turns between -135° and 180°; if it is outside of -20° to 65° now, another order is used elsewhere.
+    # Wrist 3 turns between -135° and 180°; if it is now outside -20° to 65°, the planner uses another order.
     q = checked_joints(q_rad)
     psi, q5, q6 = np.radians(_TOUR_DEG)[:, 1:].T
-    # One number of full turns for the whole tour; joint 4 turns by 90 degrees only, so that one always fits.
+    # One number of full turns for the whole tour; joint 4 turns by 90 degrees only, so one always fits.
     q4 = psi - q[1] - q[2] + 2 * np.pi * np.arange(-3, 4)[:, None]
     room = _ROOM_RAD if kinematics is not _NOMINAL else -1e-9
     inside = q4[(np.abs(q4) <= 2 * np.pi - room).all(axis=1)]

@@ -20,19 +20,19 @@ from ftdrivers.ur.kinematics import Array
 FORBIDDEN_S = 1e6
 # Cost per radian, summed over the joints: it prefers less motion among equally fast tours.
 COST_OF_TRAVEL_S = 0.02
-# Number of perturbations of the final search, and of each round before.
+# Number of perturbations of the final search, and of each earlier round.
 SHAKES = 150
 SHAKES_A_ROUND = 10
 # Largest number of rounds; each proves the moves of a tour and excludes those that are not clear.
 ROUNDS = 60
-# Up to this number of joint vectors all moves are considered; otherwise those to the nearest ones of each group.
+# Up to this number of joint vectors all moves are considered; otherwise only those to the nearest ones of each group.
 FEW = 120
 NEAREST_OF_EACH = 2
 # From this number of groups on, only moves to the nearest joint vectors of all groups are considered.
 MANY_GROUPS, NEAREST_OF_ALL = 60, 40
 # Approximate number of neighbours in all layers together.
 NEIGHBOURS = 10
-# Number of nodes of each group that are used; the larger one if the first ones are not connected.
+# Number of nodes of each group that are used; the larger number if the first nodes are not connected.
 MOST_NODES = (25, 60)
 
 
