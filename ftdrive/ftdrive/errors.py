@@ -38,7 +38,7 @@ class RecordingHasGaps(DataError):
 
 
 class NotAccepted(AcceptanceError):
-    """A check failed, or a result is rejected or does not equal the expected one."""
+    """A check failed, or a result is rejected or differs from the expected one."""
 
 
 class PlanRefused(NotAccepted):

@@ -123,12 +123,12 @@ def read_recording(
     calibration: CalibrationResult | None = None,
     table: TableOptions | None = None,
 ) -> Recording:
-    """Read a recording into memory; also the `.partial` file of an interrupted one.
+    """Read a recording into memory; also the `.partial` file of an interrupted recording.
 
     Parameters
     ----------
     source : str, Path, DataFrame or mapping
-        A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet. Or of another program:
+        A file of `ftdrive record`, with the format given by its suffix: .mcap, .csv or .parquet; or of another program:
         a bag, or a table with wrench and orientation as text, DataFrame or arrays by name.
     columns : collection of str
         Required fields of `Recording.rows`. Others may be left out, which makes reading faster.
@@ -142,7 +142,7 @@ def read_recording(
     ConfigError
         The suffix is unknown, a package is missing, or a recording of another program has no calibration.
     BadRecording, BadDataset
-        Damaged, empty or unknown. A truncated file is read to its end; `cut` gives the reason.
+        The file is damaged, empty or of an unknown format. A truncated file is read to its end; `cut` gives the reason.
     OSError
         The file does not exist or cannot be read.
 
@@ -366,7 +366,7 @@ def plan_tour(
     planes_mm : sequence of rows (nx, ny, nz, d)
         Walls: the arm stays where n·p >= d, base axes. The mounting surface is always included.
     boxes_mm : sequence of rows (x, y, z, x, y, z)
-        Blocks, two corners each, base axes.
+        Blocks given by two opposite corners, base axes.
     mass_kg : float, optional
         Mass of the tool for the predicted accuracy; default 1.
     posture_deg : sequence of 3 floats

@@ -21,7 +21,7 @@ class Kind(NamedTuple):
     lines: tuple[str, ...]
     """The usual commands for such a file, as typed."""
     others: tuple[str, ...] = ()
-    """Further commands that accept it."""
+    """Further commands that accept such a file."""
 
     @property
     def places(self) -> set[str]:

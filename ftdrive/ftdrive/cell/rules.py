@@ -140,7 +140,7 @@ def reject_mounting(value: str) -> str | None:
 
 
 def reject_cylinders(rows: Sequence[Sequence[float]]) -> str | None:
-    """Return the remedy for impossible cylinders, or for ones in other units; None for valid ones."""
+    """Return the remedy for impossible cylinders, or for cylinders in other units; None for valid ones."""
     for row in rows:
         if len(row) not in {3, 5} or not (0 <= row[0] < row[1] <= 2000 and 0 < row[2] <= 1000):
             return (
@@ -166,7 +166,7 @@ def reject_planes(rows: Sequence[Sequence[float]]) -> str | None:
 
 
 def reject_boxes(rows: Sequence[Sequence[float]]) -> str | None:
-    """Return the remedy for flat boxes, or for ones in other units; None for valid ones."""
+    """Return the remedy for flat boxes, or for boxes in other units; None for valid ones."""
     for row in rows:
         if len(row) != 6 or any(row[i] == row[i + 3] for i in range(3)):
             return f"{list(row)} is not a box: give two opposite corners [x, y, z, x, y, z] in mm"

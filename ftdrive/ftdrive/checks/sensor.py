@@ -235,7 +235,7 @@ def _check_lost(health: Health, address: SensorAddress) -> Check:
     gone = max(health.lost, health.malformed, health.out_of_order)
     if not gone and not health.duplicated:
         return Check("sensor.lost", "ok", found)
-    state: State = "failed" if gone > 0.01 * health.received else "warning"  # duplicates are no loss
+    state: State = "failed" if gone > 0.01 * health.received else "warning"  # duplicates are no losses
     fix = "check the cable, its shield and the termination of the bus" if address.host is None else _BETTER_NETWORK
     if address.scheme == "ati-can":  # the sensor is polled
         fix += ", or run fewer programs on this computer: an answer that is read too late is also lost"
@@ -351,14 +351,14 @@ def examine_push(
 ) -> tuple[Check, dict[str, Any] | None]:
     """Measure a push along +X of the base, and return the result of `check_push`.
 
-    An emulated cell pushes by itself. Otherwise `is_pushing` asks for the push, and returns whether there will be one.
+    An emulated cell pushes by itself. Otherwise `is_pushing` asks for the push, and returns whether it will follow.
     """
     if sensor is None:
         return Check("push.sign", "skipped", "the sensor does not measure"), None
     try:
         R_base_flange = None if arm is None else arm.state().R_base_flange
     except DeviceError:
-        R_base_flange = None  # robot.flange reports it
+        R_base_flange = None  # the check robot.flange reports this
     try:
         before = sensor.collect(1.0).wrench[:, :3].mean(axis=0)
         with ExitStack() as stack:

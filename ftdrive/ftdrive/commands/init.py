@@ -89,7 +89,7 @@ def init(output: Path, simulate: bool, yes: bool, view: ViewOptions, as_json: bo
                 described.clock = station.clock
                 interview.look(ROBOT, station.cell.robot.host)
                 interview.look(SENSOR, station.cell.sensor.url)
-            # The addresses of the station end with it.
+            # The addresses of the station are valid only while it runs.
             described.texts |= {ROBOT: ["emulated"], SENSOR: [EMULATED + emulated]}
         interview.take_options(given)
         if page is None:

@@ -90,7 +90,7 @@ def record(
 
 
 def _report_recording(recorder: Recorder, frame: WrenchFrame, name: str, *, as_json: bool) -> None:
-    # rate over all samples, because that of the first half second may differ much
+    # rate over all samples, because the rate in the first half second may differ much
     rate = f"{recorder.rate_Hz:.0f} Hz"
     for path in recorder.saved:
         samples = f"{recorder.samples} samples, {recorder.duration_s:.2f} s, {rate}, gaps: {recorder.gaps}"

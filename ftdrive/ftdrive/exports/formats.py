@@ -95,7 +95,7 @@ _OWN_READING: Final[tuple[Property, ...]] = ("tilt", "rotation", "response")
 # By name, as in `--format`. Above each row: project, file and version of the reader, and its formula.
 FORMATS: Mapping[str, ExportFormat] = {
     # kth-ros-pkg/force_torque_tools, gravity_compensation/src/gravity_compensation_node.cpp and
-    # gravity_compensation.cpp, master since pull request 18 (2021-05). With a the acceleration that its IMU reports,
+    # gravity_compensation.cpp, master since pull request 18 (2021-05). a is the acceleration that its IMU reports,
     # turned into the sensor frame, which points up at rest:
     #     force = raw - bias[:3] + gripper_mass a        torque = raw - bias[3:] + gripper_com x (gripper_mass a)
     "kth": ExportFormat(
@@ -116,7 +116,7 @@ FORMATS: Mapping[str, ExportFormat] = {
         elsewhere={"imu header.frame_id": "$base_frame", "imu linear_acceleration": "$minus_gravity_m_s2"},
     ),
     # ICube-Robotics/ft_tools_ros2, ft_tools/src/ft_parameters.cpp and ft_estimation.cpp, main. Signs are those of the
-    # code, which differ from its README. With g the parameter `gravity_in_reference_frame` in the sensor frame:
+    # code, which differ from its README. g is the parameter `gravity_in_reference_frame` in the sensor frame:
     #     force = raw - mass g - force_offset            torque = raw - com x (mass g) - torque_offset
     "ft-tools": ExportFormat(
         "ROS 2 node ft_estimation of ICube-Robotics/ft_tools_ros2",
@@ -149,7 +149,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # ros-controls/ros2_controllers, force_torque_sensor_broadcaster.cpp, 5.0 or newer (offset: 4.16;
     # sensor_filter_chain: September 2025), and ros-controls/control_toolbox, control_filters/gravity_compensation.hpp
-    # and .cpp, master (control_filters.md has older names). With g the vector `gravity_field`, turned from world_frame
+    # and .cpp, master (control_filters.md has older names). g is the vector `gravity_field`, turned from world_frame
     # into sensor_frame:
     #     force = raw + offset.force - mass g            torque = raw + offset.torque - CoG x (mass g)
     "ros2-control": ExportFormat(
@@ -219,7 +219,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     # jrl-umi3218/mc_rtc, src/mc_rbdyn/ForceSensor.cpp, master; Robot.cpp gives it the gravity of constants.h. 13
     # numbers, one a line: mass, rpy, com, offset. `rpy` turns the sensor of the model into the real one, here that of a
     # model whose sensor has the axes of the flange. `com` is in the axes of the sensor's parent body, from its origin:
-    # here the flange. The offset has the torque first. With g along -z of the world, and p the place of the sensor:
+    # here the flange. The offset has the torque first. g is along -z of the world, p is the sensor's position:
     #     force = raw - offset[3:] - mass g
     #     torque = raw - offset[:3] - (com - p) x (mass g), in sensor axes
     # White space must follow the last number. The reader stops there.
@@ -242,7 +242,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # xArm-Developer/xArm-Python-SDK, xarm/x3/ft_sensor.py, 1.11 or newer: mass (kg), centre of mass (mm), offsets of
     # force (N) and torque (N·m). The origin of `com` is that of the sensor: with `association_setting_tcp_load`, the
-    # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is taken to be, with g of the
+    # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is assumed to be, with g of the
     # calibration, and a sensor that has the axes of the flange:
     #     force = raw - offset[:3] - mass g              torque = raw - offset[3:] - com x (mass g)
     "xarm": ExportFormat(
@@ -278,7 +278,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # Universal Robots controller, URScript manual 5.10 or newer, set_target_payload(m, cog, inertia): kg, and m in
     # flange axes from the flange, no exponents. The payload is all that the flange carries. The statement zeroes the
-    # sensor of an e-Series arm. The formula of the controller is not public, and taken to be, with g of `set_gravity`:
+    # sensor of an e-Series arm. The formula of the controller is not public. It is assumed, with g of `set_gravity`:
     #     force on the flange = m g                      torque about the flange = cog x (m g)
     "ur-payload": ExportFormat(
         "Universal Robots URScript set_target_payload, with the mass of the sensor",
@@ -299,7 +299,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # URDF 1.0, ros/urdfdom, to be included below the flange of a robot. The tool link has the frame of the sensor, so
     # that `origin` of `inertial` is the centre of mass in the sensor frame. `rpy` is R = Rz(yaw) Ry(pitch) Rx(roll).
-    # With g the gravity of the simulation, in sensor axes:
+    # g is the gravity of the simulation, in sensor axes:
     #     force on the sensor = mass g                   torque about its origin = origin x (mass g)
     "urdf": ExportFormat(
         "URDF links and fixed joints of sensor and tool",
@@ -342,7 +342,7 @@ iyy="{J[4]!r}" iyz="{J[5]!r}" izz="{J[8]!r}" />
     # MuJoCo, whose element `attach` puts the body into the flange, and ros-controls/mujoco_ros2_control, which looks
     # for the sensors NAME_force and NAME_torque. The plugin is fts_grav_comp_plugin.cpp of mujoco_ros2_control_plugins,
     # pull request 308 of September 2026, newer than release 0.1.2 and wrong without the weight in the model. Without it
-    # the simulated sensor shows the weight, as a real one does. With g the gravity of the model in the axes of the
+    # the simulated sensor shows the weight, as a real one does. With the gravity g of the model in the axes of the
     # sensor's site, the tool at rest reads
     #     force = mass g                                 torque = pos x (mass g)
     # and the plugin gives, with the reading as the hardware interface has it, which is minus that of MuJoCo:

@@ -37,7 +37,7 @@ _FIELDS = (
 )
 
 
-# Valid inside a comment of XML too, where `--` is an error.
+# A name is also valid inside an XML comment, where `--` is an error.
 _NAME = re.compile(r"[A-Za-z_](-?[A-Za-z0-9_./])*")
 # From ur_description/urdf/ur_macro.xacro, joint base_link-base_fixed_joint: 180° about z. ROS users have base_link;
 # without this rotation a tilt would be wrong without a message.
@@ -281,7 +281,7 @@ class Exported:
     elsewhere: Mapping[str, JSON]
     """Values that the target reads from another place, by their names there."""
     max_force_error_N: float
-    """Largest difference to `CalibrationResult.compensate` of a free tool over all orientations, N."""
+    """Largest difference from `CalibrationResult.compensate` of a free tool over all orientations, N."""
     max_torque_error_Nm: float
 
 

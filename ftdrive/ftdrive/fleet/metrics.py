@@ -19,7 +19,7 @@ except ImportError:
 
 
 def _seconds(time: datetime | str | None) -> float | None:
-    # A time, because an age would not grow while the server hangs.
+    # Export a time, because an age would not grow while the server hangs.
     time = datetime.fromisoformat(time) if isinstance(time, str) else time
     return None if time is None else time.timestamp()
 

@@ -95,8 +95,8 @@ def _cell_state(cell: StoredCell, result: StoredResult, observed: Observed, stor
 
 
 SIGMAS: Final = 4.0
-# Centres of mass of one tool agree within the first distance, and that of a payload is wrong beyond the second one; or
-# within and beyond 4 sigma, if that is larger.
+# Centres of mass of one tool agree within the first distance, and that of a payload is wrong beyond the second.
+# A limit smaller than 4 sigma is replaced by 4 sigma.
 ALIKE_M, WRONG_M = 0.003, 0.005
 # The corresponding limits of the masses; a mass is wrong beyond the larger one of share and kg.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
@@ -236,7 +236,7 @@ def _tool_load(cell: str, result: StoredResult, payload_kg: float) -> _Load:
     """Return a tool with its payload; centred sensors and adapters do not change the moment about the flange axis."""
     R, covariance = result.parameters.R_flange_sensor, result.covariance
     arm_m = R @ result.parameters.p_sensor_com_m
-    J = np.concatenate([-skew(arm_m), R], axis=1)  # derivative by rotation about the flange axes, and by the centre
+    J = np.concatenate([-skew(arm_m), R], axis=1)  # derivative with respect to rotation and centre
     rows = np.r_[0:3, 9:12]
     sigma = np.sqrt(np.diag(J @ covariance[np.ix_(rows, rows)] @ J.T))
     com = result.payload_com_m
@@ -370,7 +370,7 @@ def _finding(model: str, sensors: Mapping[str, _SensorSums]) -> Iterator[FleetFi
 
 
 def _p_values(sums: _SensorSums) -> Array:
-    """Return the p-value (6,) of each component: the larger one of a chi-squared test and an F-test."""
+    """Return the p-value (6,) of each component: the larger one from a chi-squared test and an F-test."""
     usable = sums.xx > 0
     chi2 = np.where(usable, sums.xy**2 / np.where(usable, sums.xx, 1.0), 0.0)
     rest = np.maximum(sums.yy - chi2, 1e-12) / sums.dof

@@ -26,7 +26,7 @@ from ftdrive.stream.sources import Read, SampleSource
 from ftdrive.stream.stream import Sink, Stream, pump
 from ftdrivers.interfaces import Array
 
-# The noise is estimated from the beginning of a recording, s.
+# Time at the beginning of a recording from which the noise is estimated, s.
 _NOISE_S = 30.0
 _OF_FORCE_AND_TORQUE = np.kron(np.eye(2), np.ones((3, 1)))
 # Events that are copied to the compensated recording.
@@ -46,7 +46,7 @@ def source_to_compensate(
     everything: bool,
     say: Callable[[str], object],
 ) -> tuple[AnyRecording, dict[str, float] | None]:
-    """Return the recording with its calibration, and for one of another program the delay with its sigma.
+    """Return the recording with its calibration, and for a recording of another program the delay and its sigma.
 
     `name` names the calibration, `delay_s` is a number, "auto" or None. With `everything`, all columns are read. `say`
     receives a text about what was recognised in tables.
@@ -230,8 +230,8 @@ def estimated_bias(
 ) -> tuple[Header, dict[str, list[float]]]:
     """Estimate the bias from a recording of a mostly free tool; keep all other parameters and their uncertainty.
 
-    The estimate is the mean of readings of 0.1 s of what the calibration leaves. Readings far from the median, such as
-    contacts, do not count. Its covariance holds the error of the kept parameters at the mean orientation, and the
+    The estimate is the mean residual of the calibration in readings of 0.1 s. Readings far from the median, such as
+    contacts, do not count. Its covariance includes the error of the kept parameters at the mean orientation, and the
     scatter of the readings with its correlation in time. Returns the header with the new calibration, and
     `value`, new minus old bias, and `sigma`, one standard deviation of the new one: 6 numbers each, N and N·m. Raises
     `BadDataset` for a recording that is too short.
@@ -256,7 +256,7 @@ def estimated_bias(
         shortest_s = _LEAST_READINGS * _READING_S
         raise BadDataset(f"{seconds:.1f} s are too short for a bias: record at least {shortest_s:g} s")
     # The bias is that of the readings, which no sensor matrix has decoded. The wrench of a free tool is linear in R, so
-    # that means of R are as good as rotations.
+    # means of R are as good as rotations.
     free_tool = Compensator(calibration.parameters, response=calibration.response)
     left = np.asarray(free_tool.batch(reading, R), np.float64)
     free = _near_median(left)
@@ -274,7 +274,7 @@ def estimated_bias(
 
 
 def _near_median(reading: Array) -> NDArray[np.bool_]:
-    """Return which readings (n, 6) are near the median of those that are, in units of their own spread."""
+    """Return which readings (n, 6) are not outliers, by their distance from the median of the rest, iteratively."""
     free = np.ones(len(reading), bool)
     for _ in range(20):
         centre = np.median(reading[free], axis=0)

@@ -65,7 +65,7 @@ def require_new_recordings(paths: Sequence[Path]) -> None:
 
 
 class RecordingReader:
-    """A recording on disk, read in blocks; also the `.partial` of an interrupted one.
+    """A recording on disk, read in blocks; also the `.partial` file of an interrupted recording.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def is_recording(path: Path) -> bool:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a ROS 1 or ROS 2 bag: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
+    """Whether a path is a ROS 1 or ROS 2 bag: a rosbag2 folder, a .db3 or .bag, or an MCAP file of another program."""
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     if path.suffix in (".bag", ".db3"):
@@ -152,7 +152,7 @@ def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tu
         raise
     except ProtocolError as error:
         raise BadDataset(f"{path.name}: {error}") from error
-    except Exception as error:  # of rosbags, SQLite, zstd or YAML
+    except Exception as error:  # raised by rosbags, SQLite, zstd or YAML
         raise BadDataset(f"{path.name} cannot be read ({error}): it is damaged or has another version") from error
     origin_ns = min(int(wrench[0].min()), int(poses[0].min()))
     return (
@@ -262,7 +262,7 @@ def _pose_column(reader: "AnyReader", named: PoseReader, messages: Mapping[str, 
         raise BadDataset(f"the bag has no pose: {named.missing()}")
     times, *columns = zip(*found, strict=True)
     if isinstance(named, Joints):
-        # All poses at once, because one by one they take longer than reading the messages.
+        # Convert all poses at once, because converting them one by one takes longer than reading the messages.
         t_ns = np.array([stamp.sec * 1_000_000_000 + stamp.nanosec for stamp in times])
         R, p = named.chain.poses(dict(zip(named.chain.names, map(np.array, columns), strict=True)))
         (topic,) = named.topics
@@ -393,7 +393,7 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
         return number
     steps = np.diff(t_s) / period_s
     late = t_s / period_s - number
-    # minimum over each sample and those before
+    # minimum over each sample and those before it
     earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
     following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # over this row and those after it
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))

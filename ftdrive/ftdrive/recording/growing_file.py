@@ -42,7 +42,7 @@ class GrowingFile:
         """Write the end, sync the file to disk and rename it. Raises `OSError`, also if the name exists."""
         try:
             self._write_end()
-            # Before the lock is released by closing, because this may take seconds.
+            # Sync before closing releases the lock, because a sync may take seconds.
             os.fsync(self._file.fileno())
         finally:
             self._file.close()
@@ -50,7 +50,7 @@ class GrowingFile:
         self.partial.rename(self.path)
 
     def _write_end(self) -> None:
-        """Write the end of the format; here nothing."""
+        """Write the end of the format; this class writes nothing."""
 
     def discard(self) -> None:
         """Delete the file."""
@@ -90,7 +90,7 @@ def _lock_holder(file: IO[bytes]) -> str:
 def partial_of(path: Path, *, grows: bool) -> Path:
     """Return the name of an incomplete file. Raises `OSError` if it or the file exists, or the folder does not.
 
-    `grows` tells whether an incomplete file can be read.
+    `grows` is true if an incomplete file can be read.
     """
     partial = path.with_name(path.name + ".partial")
     require_new(path)

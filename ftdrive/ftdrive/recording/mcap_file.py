@@ -261,7 +261,7 @@ def _unpack_event(body: bytes, t_host_ns: int) -> StreamEvent:
         texts.append(body[place + 4 : place + 3 + length].decode())
         place += 4 + length + -length % 4
     kind, text, _, values = texts
-    return StreamEvent(t_host_ns, kind, text, parsed_json(values))  # type: ignore[arg-type]  # a newer version has more
+    return StreamEvent(t_host_ns, kind, text, parsed_json(values))  # type: ignore[arg-type]  # newer kinds
 
 
 def _bytes(*records: "McapRecord") -> bytes:
@@ -418,7 +418,7 @@ class _Content:
 
 
 def _read_index(messages: bytes, index: bytes) -> tuple[int, NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the channel of an index, and times, begins and ends (n,) of its messages, after comparing it with them."""
+    """Return the channel of an index, and times, starts and ends (n,) of its messages, after comparing it with them."""
     channel, size = struct.unpack_from("<HI", index)
     t_ns, places = np.frombuffer(index, "<i8", size // 8, 6).reshape(-1, 2).T
     heads = _gather(messages, places, _HEAD)

@@ -69,7 +69,7 @@ class RecordingFiles:
         """
         files, self._files, failure = self._files, [], None
         with _delay_signals():
-            # after an error there are no files
+            # after an error the list of files is empty
             for path, file in zip(self._paths, files, strict=False):
                 try:
                     file.complete()

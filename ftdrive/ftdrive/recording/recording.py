@@ -191,7 +191,7 @@ def _frame_from_dict(values: Mapping[str, Any]) -> WrenchFrame:
 
 
 def _stages_of(values: Mapping[str, Any]) -> Stages:
-    """Build stages from a header or an event; a stage that is not named did not exist, and was therefore off."""
+    """Build stages from a header or an event; a stage that is not named did not exist yet and was off."""
     usual: dict[str, Any] = {item.name: item.default for item in fields(Stages)}
     off = {name: None if value is None else type(value)() for name, value in usual.items()}
     if newer := [name for name, value in dict(values).items() if value and name not in off]:

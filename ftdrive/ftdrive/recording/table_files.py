@@ -145,7 +145,7 @@ def read_csv(path: Path, columns: Collection[str]) -> Generator[Piece, None, str
                     if len(lines) >= PIECE_ROWS:
                         yield piece()
                         lines, events = [], []
-            except BadRecording as error:  # the lines before it are valid
+            except BadRecording as error:  # the lines before the fault are valid
                 failure = error
             yield piece()
         except ValueError as error:

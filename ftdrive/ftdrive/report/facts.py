@@ -55,7 +55,7 @@ def comparison_facts(result: CalibrationResult, before: CalibrationResult) -> di
 
     `sensors` are the sources of the sensor errors, before and now. `parameters` have for each error coordinate its
     `name`, `change` (rad, N, m, N·m) and `sigmas`, null if exactly known in both. `groups` are tests. `same_data` means
-    that both use one dataset, so that the tests do not apply.
+    that both use one dataset, so the tests do not apply.
     """
     found = calibration_difference(before, result)
     data = [one.provenance.get("dataset_sha256") for one in (result, before)]

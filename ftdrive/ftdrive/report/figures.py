@@ -37,7 +37,7 @@ VARIABLES = {
 WIDTH_IN = 5.0
 # Longer durations are shown in minutes, s.
 LONG_S = 200
-# Largest number of dots in a figure, because each dot enlarges the file; of more poses, every n-th is drawn.
+# Largest number of dots in a figure, because each dot enlarges the file; with more poses, every n-th is drawn.
 MOST_DOTS = 400
 # Weaker correlations are not drawn.
 INVISIBLE = 0.02

@@ -1,15 +1,15 @@
 """A run folder: the plan, every pose with its raw samples, and the results.
 
-run.json          ftdrive.run/1: time, command line, versions, configuration, devices plan.json         ftdrive.plan/2:
-the plan that the arm followed; missing if the operator moved the arm events.ndjson     the events of the session, one
-object per line, see `ftdrive.session.events` motion.npz        ftdrive.motion/1: every sample of sensor and arm while
-the tool moved; later ones are motion-2.npz ... motion/1.npz ...  such a recording in parts, each on disk within
-seconds, for a recording that may end at any time poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk
-before the arm moves on; 01-2.npz replaces 01.npz dataset.json      ftdrive.dataset/1: means and covariances;
-dataset-2.json after poses were added or taken again calibration.json  ftdrive.calibration/2: the result, or the
-accepted update of a verification; later calibration-2.json verification.json ftdrive.verification/1: the outcome of a
-verification; see `ftdrive.runs.verification` solved-0.1.0.json ftdrive.calibration/2: the result of a later version;
-see `ftdrive.fleet.resolve` lock              the process that adds poses, or the last one that did
+run.json          ftdrive.run/1: time, command line, versions, configuration, devices
+plan.json         ftdrive.plan/2: the plan that the arm followed; missing if the operator moved the arm
+events.ndjson     the events of the session, one object per line, see `ftdrive.session.events`
+motion.npz        ftdrive.motion/1: all samples in motion, later motion-2.npz; motion/1.npz ... for a recording in parts
+poses/01.npz ...  ftdrive.recording/1: one file per pose, on disk before the arm moves on; 01-2.npz replaces 01.npz
+dataset.json      ftdrive.dataset/1: means and covariances; dataset-2.json after poses were added or taken again
+calibration.json  ftdrive.calibration/2: the result, or the accepted update of a verification; later calibration-2.json
+verification.json ftdrive.verification/1: the outcome of a verification; see `ftdrive.runs.verification`
+solved-0.1.0.json ftdrive.calibration/2: the result of a later version; see `ftdrive.fleet.resolve`
+lock              the process that adds poses, or the last one that did
 
 Damaged files are rejected: JSON files have a checksum, and each line of events.ndjson and each array a CRC-32.
 """

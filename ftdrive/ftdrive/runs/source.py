@@ -427,7 +427,7 @@ def read_dataset(
 
 
 def require_same_cell(earlier: CalibrationResult, provenance: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or of another cell.
+    """Raise `ConfigError` if an earlier result cannot be used for a new tool: it is rejected or of a different cell.
 
     Sensor, arm and mount are compared as far as both sides name them.
     """

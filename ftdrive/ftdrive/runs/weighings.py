@@ -23,7 +23,7 @@ from ftdrive.runs.numbers import append_lines, parse_line
 FORMAT: Final = "ftdrive.weighings/1"
 FOLDER: Final = "weighings"
 FILES: Final = "weighings-*.ndjson"
-# Reasons without a mass: the codes of `ftdrive.stream.weighing.WORDS`. Each code is a column of the store, so that a
+# Reasons without a mass: the codes of `ftdrive.stream.weighing.WORDS`. Each code is a column of the store, so a
 # change must increase `ftdrive.store.database.SCHEMA`.
 REFUSALS: Final = (
     *("samples", "moving", "unsteady", "contact", "cable", "changed", "lifted", "not-empty", "undecided", "count"),
@@ -79,7 +79,7 @@ class WeighingDay:
     size: int = 0
     """Number of bytes that were read; further bytes of the file are new."""
     weighings: int = 0
-    """Number of weighed parts, without those of an empty gripper."""
+    """Number of weighed parts; weighings of an empty gripper do not count."""
     refusals: Mapping[str, int]
     """Numbers of attempts without a mass, by the codes of `REFUSALS`."""
     last_utc: str | None = None

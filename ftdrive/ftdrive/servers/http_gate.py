@@ -30,7 +30,7 @@ Address = tuple[str, int]
 _HEAD_S: Final = 10.0
 _HEAD_BYTES: Final = 1 << 14
 _PIECE: Final = 1 << 16
-# Most connections without a complete head; a further one closes the oldest, to save descriptors.
+# Largest number of connections without a complete head; a further connection closes the oldest, to save descriptors.
 _WAITING: Final = 500
 # Number of refused requests that are logged; more would fill the terminal of a session.
 _LOGGED: Final = 5

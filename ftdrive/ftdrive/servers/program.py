@@ -83,7 +83,7 @@ class ProgramService(Sink):
     say : callable
         Receives sentences for the operator, from any thread.
     keep : callable
-        Receives each weighing and each refused one; see `WeighingLog.keep`.
+        Receives each weighing and each refused weighing; see `WeighingLog.keep`.
     """
 
     label, keeps_all = "registers", True

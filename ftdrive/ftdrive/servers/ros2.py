@@ -86,7 +86,7 @@ class TransformPublisher:
 class Averaged:
     """Means over the number of consecutive samples that gives at most `rate_Hz`; a single sample is not changed.
 
-    With lost samples, the mean is that of the others. Samples of an interval cut by an interruption are dropped,
+    With lost samples, the mean is that of the rest. Samples of an interval cut by an interruption are dropped,
     because their mean would be late.
     """
 
@@ -205,9 +205,9 @@ _BLOCK_S: Final = 0.008
 _CONTACT_S: Final = 0.1
 # Time until the other nodes of this computer and network are discovered, s.
 _DISCOVERY_S: Final = 1.0
-# Wait after a device did not open, s.
+# Waiting time after a device failed to open, s.
 _RETRY_S: Final = 2.0
-# Wait after the calibration did not fit, s: the operator must calibrate or select another tool.
+# Waiting time if the calibration does not fit the devices, s: the operator must calibrate or select another tool.
 _RETRY_CONFIG_S: Final = 10.0
 # History of a reliable topic, s, because Fast DDS requests lost messages every 3 s.
 _HISTORY_S: Final = 10.0
@@ -273,7 +273,7 @@ class Ros2Node(Sink):
 
     def _require_alone(self) -> None:
         received = Event()
-        # A killed node stays in the list of nodes for up to 20 s, so a running one is recognised by its reports.
+        # A killed node stays in the list of nodes for up to 20 s, so a running node is recognised by its reports.
         subscription = self.node.create_subscription(
             self._diagnostics.DiagnosticStatus, "~/status", lambda _: received.set(), 10
         )

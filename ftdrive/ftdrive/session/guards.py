@@ -68,7 +68,7 @@ class Limits:
     contact_N: float = 8.0
     contact_Nm: float = 0.8
     contact_sigmas: float = 5.0
-    """The contact limit is the larger of these values and of this number of standard deviations of the noise."""
+    """The contact limit is `contact_N` or `contact_Nm`, or this number of standard deviations of noise if larger."""
     unknown_N: float = 15.0
     unknown_Nm: float = 1.5
     """Added to twice the weight of the heaviest tool until the running fit is reliable."""
@@ -91,7 +91,7 @@ class Limits:
     link_usual_s: float = 0.02
     """Largest median response time of the arm. Waiting for the next state takes up to 8 ms."""
     link_asked_s: float = 0.04
-    """Added for a controller that reports its TCP only to a program: two requests, usually 24 ms."""
+    """Added to the limit for a controller that reports its TCP only to a program: two requests, usually 24 ms."""
     link_gap_s: float = 0.1
     """Response time that nine of ten answers must not exceed."""
     program_ends_s: float = 1.5

@@ -252,7 +252,7 @@ class Tour:
         self._now.arrive(index, driven_from=driven_from)
 
     def _own_speed(self, index: int) -> float | None:
-        """Return the planned speed of the move from the present pose to another, rad/s; None if the plan has none."""
+        """Return the planned speed of the move from the present pose to another, rad/s; None if the plan lacks it."""
         at, n = self._now.at, len(self._nodes)
         if at is None or (index - at) % n not in {1, n - 1}:
             return None

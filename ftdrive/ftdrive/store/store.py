@@ -144,7 +144,7 @@ class Store:
         return next(reversed(self.verifications(calibration_id)), None)
 
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:
-        """Return the weighings of the last `most` days with any, or with any of a tool, the oldest first."""
+        """Return the weighings of the last `most` days that have any, of all tools or of one tool, the oldest first."""
         table = database.weighings
         newest_first = (table.c.day.desc(), table.c.last_utc.desc().nulls_last(), table.c.id)
         query = select(table).where(*_is(table.c.tool, tool)).order_by(*newest_first).limit(most)

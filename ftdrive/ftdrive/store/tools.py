@@ -43,7 +43,7 @@ def calibration_of_tool(
 ) -> Tool:
     """Return the newest accepted calibration of a tool, a `[tool] name`, on these devices and this `[sensor] mount`.
 
-    With `force` and no calibration of these devices, it is the newest of any devices, even if edited by hand. `url` is
+    With `force` and no calibration of these devices, use the newest of any devices, even if edited by hand. `url` is
     the address of the store. Raises `ConfigError` without a calibration, and names the tools calibrated on these
     devices.
     """

@@ -16,7 +16,7 @@ from ftdrive.store.records import StoredResult
 
 # Significance level of a trend.
 SIGNIFICANT: Final = 0.01
-# Shortest time span of a trend; a change per 30 days from a shorter one would be extrapolated too far.
+# Shortest time span of a trend; a change per 30 days from a shorter span would be extrapolated too far.
 SHORTEST_DAYS: Final = 3.0
 
 _MONTH_DAYS = 30.0

@@ -179,7 +179,7 @@ class NoiseEstimator:
         self._first = _FIRST_M_S2**2 * accelerated @ accelerated.T
 
     def of(self, state: int) -> SensorNoise | None:
-        """Return the noise in a state, assumed until about 1 s of it is measured; None before the first half second."""
+        """Return the noise in a state, assumed until about 1 s is measured; None before the first half second."""
         known, rest = self._known.get(state), self._known.get(REST)
         other = rest or next(iter(self._known.values()), None)
         if state == REST or other is None:

@@ -24,14 +24,14 @@ from ftdrive.terminal.lines import FAINT, STRONG, Line
 from ftdrive.terminal.supervisor import Supervisor
 
 REFRESH_S = 0.1
-# A longer write could block on a terminal with room for only part of it.
+# Bytes per write; a longer write could block on a terminal with room for only part of it.
 _CHUNK = 256
 
 
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    `address` of the page in the browser is shown as a QR code by the key `v`; empty without a page.
+    The key `v` shows `address`, that of the page in the browser, as a QR code; it is empty without a page.
     """
 
     is_over = False
@@ -40,7 +40,7 @@ class Canvas(ABC):
     cover: Sequence[Line] = ()
     """Lines shown instead of the drawing until a key is pressed."""
     entry: tuple[Callable[[str], object], str, str] | None = None
-    """Function that takes the text typed in the last line, hint, and text so far."""
+    """Function that receives the text typed in the last line, its hint, and the text so far."""
 
     def __init__(self, address: str = "") -> None:
         self._address = address

@@ -56,7 +56,7 @@ class CommandConsole(Console):
 
 
 messages = CommandConsole(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=not sys.stderr.isatty())
-"""Folds between words on a terminal, but not in a file. Brackets and colons are printed unchanged, because paths
+"""Console on stderr: folds between words on a terminal, not in a file. Brackets and colons are kept, because paths
 contain them."""
 
 answer = CommandConsole(highlight=False, markup=False, emoji=False, soft_wrap=not sys.stdout.isatty())

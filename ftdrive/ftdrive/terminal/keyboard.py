@@ -20,9 +20,9 @@ _STROKE = re.compile(f"{_ESCAPE.pattern}|[^\x1b]")
 _NAMES = {"\x1b": "escape", "\n": "enter", "\r": "enter", "\x7f": "backspace", "\b": "backspace"}
 _NAMES |= {f"\x1b{mode}{letter}": name for mode in "[O" for letter, name in (("C", "right"), ("D", "left"))}
 _KEYS = {key.value: key for key in Key}
-# A letter within this time of another one belongs to a word, such as a late answer, s.
+# A letter within this time of another letter belongs to a word, such as a late answer, s.
 _WORD_S = 0.3
-# Keys that count within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
+# Keys that are obeyed even within a word, because an unnecessary stop is harmless; others become `Key.OTHER`.
 _ALWAYS = {Key.PAUSE, Key.STOP}
 
 
@@ -36,14 +36,14 @@ class Keyboard:
     def __init__(self, fd: int) -> None:
         self._fd = fd
         self._keys: deque[Key] = deque()
-        self._strokes: deque[str] = deque(maxlen=1000)  # a session does not read them
+        self._strokes: deque[str] = deque(maxlen=1000)  # a session does not read strokes
         self._before: list[int | list[bytes | int]] | None = None
         self._thread: Thread | None = None
         self._wake = -1
 
     @staticmethod
     def usable(fd: int) -> bool:
-        """Whether the keys of a descriptor can be read: a terminal in the foreground, no pipe and no background job.
+        """Whether the keys of a descriptor can be read: a terminal in the foreground, not a pipe or a background job.
 
         False on Windows, which has no `termios`.
         """

@@ -145,7 +145,7 @@ class PlainOperator(_Keyless):
         quiet, self._quiet, withheld, self._withheld = self._quiet, False, self._withheld, []
         self._write_lines(withheld)
         self._quiet = quiet
-        # Input from before the question could confirm a motion unread.
+        # Input typed before the question could confirm a motion that was not shown yet.
         if self._stdin.isatty():
             # Windows cannot discard early input, so no answer is read there
             import termios

@@ -40,7 +40,7 @@ def print_result(
     ----------
     result : CalibrationResult
     truth : mapping, optional
-        Truth with the keys of the result; truth and error are printed next to the estimates.
+        True values with the keys of the result; they and the errors are printed next to the estimates.
     drift : DriftCheck, optional
     records : sequence of PoseRecord
         Records of the dataset, for the names of poses and the explanation of bad fits.
@@ -122,7 +122,7 @@ def print_tests(titles: Sequence[str], rows: Sequence[tuple[Sequence[str], Metho
 
 
 def print_cases(cases: Sequence[tuple[int, str, str, MethodResult]], *, known: bool) -> None:
-    """Print Yu's Table III; `known` is true if the errors of weight and centre are those from an emulated cell."""
+    """Print Yu's Table III; `known` is true if the errors of weight and centre are known from an emulated cell."""
     reference = "the truth of the emulated cell" if known else "ml with all poses but those of D"
     heading = f"Table III of Yu et al. 2021: largest errors on the test set; mg and centre against {reference}:"
     every = max((data for _, data, _, _ in cases), key=len)

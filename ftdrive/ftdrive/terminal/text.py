@@ -16,7 +16,7 @@ from ftdrive.words.text import GLUE, as_typed, is_command, visible
 
 # Replaces hyphens in help, because click would break lines at them.
 _HYPHEN: Final = "\ue001"
-# Longer than any sentence.
+# A line width that no sentence exceeds.
 _WHOLE: Final = 1000
 _QUOTED = re.compile(r"`[^`\n]+`")
 

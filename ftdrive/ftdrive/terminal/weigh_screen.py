@@ -53,7 +53,7 @@ class WeighScreen(Canvas):
         return takewhile(lambda _: not self.is_over, self._turns)
 
     def act(self, key: str) -> None:
-        """Tare the empty gripper, or start or stop to combine the poses of one load."""
+        """Tare the empty gripper, or start or stop combining the poses of one load."""
         if key == "z" and not self._weighing.moving:
             self._weighing.request_zero()
         elif key == "p" and not self._weighing.moving:

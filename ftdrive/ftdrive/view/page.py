@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 # On a busy computer with delays, this period still gives 20 drawings per second.
 _PERIOD_S: Final = 0.045
-# A drawing that takes longer hangs.
+# A drawing that takes longer is considered to hang, s.
 HUNG_S: Final = 5.0
 _TEXT: Final = 10_000
 
@@ -113,7 +113,7 @@ def drawing(page: Page, draw: Callable[[], None], say: Callable[[str], object] =
     def run() -> None:
         due_s = monotonic()
         try:
-            # after a pause of the computer, no drawing is made up for
+            # drawings missed in a pause of the computer are not made up for
             while not ended.wait(max(0.0, due_s - monotonic())):
                 due_s = max(due_s + _PERIOD_S, monotonic())
                 draw()

@@ -60,7 +60,7 @@ def button(name: str, label: str, *, key: str = "", tone: str = "", disabled: bo
 
 
 def text_field(name: str, label: str, value: str, **more: Any) -> Part:
-    """Return a text field; `more` are `words` below it with a `tone`, and `disabled`, as for the fields below."""
+    """Return a text field; `more` can be `words` below it with a `tone`, and `disabled`, as for the fields below."""
     return {"name": name, "type": "text", "label": label, "value": value, **more}
 
 

@@ -30,7 +30,7 @@ class PlanTimeline:
     def __init__(self, plan: Plan, way_rad: ArrayLike = ()) -> None:
         self.plan, way, tour = plan, np.reshape(way_rad, (-1, 6)), [step.q_rad for step in plan.steps]
         slow, turns_rad = Speeds.first_run(), np.abs(np.diff(way, axis=0)).max(axis=1)
-        # The last segment of the approach has no duration: for a resumed run it ends at another pose than the first.
+        # The last segment of the approach has no duration: for a resumed run it ends at a pose other than the first.
         approach_s = [*move_duration_s(turns_rad, slow.joint_rad_s, slow.joint_rad_s2), *([0.0] if len(way) else [])]
         self._nodes_rad = np.array([*way, *tour, tour[0]])
         self._t_s = np.cumsum([0.0, *approach_s, *(step.duration_s for step in plan.steps)])

@@ -1,4 +1,4 @@
-"""Parts of a page for the three-dimensional view of the cell, drawn by `shell/scene.js`. In m and base axes."""
+"""Parts of a page for the three-dimensional view of the cell, drawn by `shell/scene.js`; m, base axes."""
 
 from collections.abc import Collection, Sequence
 from typing import Any, Final

@@ -42,7 +42,7 @@ _FRAME_S: Final = 0.05
 _REST_S: Final = 0.5
 # From this share of a limit on, a bar has the colour of a warning.
 _NEAR: Final = 0.8
-# Colour of a pose by the largest residual for this colour, in sigmas.
+# Colours of poses, each with the largest residual for which it is used, in sigmas.
 _COLOURS: Final = ((3.0, GOOD, "residual ≤ 3 sigma"), (5.0, WARN, "≤ 5 sigma"), (np.inf, BAD, "> 5 sigma"))
 _POSES: Final = [
     (name, "ball", f"pose, {words}") for _, name, words in (*_COLOURS, (0, scene.UNKNOWN, "no residual yet"))
@@ -76,7 +76,7 @@ class SessionPage:
     """An operator that shows the session of another operator on a page, on which any viewer may stop it.
 
     The other operator answers the questions. A thread draws the newest state while the page is open in a browser, so
-    that browsers do not delay the session. If it fails or hangs, the session continues and `pressed` reports it.
+    that browsers do not delay the session. If drawing fails or hangs, the session continues and `pressed` reports it.
     """
 
     def __init__(self, page: Page, operator: Operator, command: str) -> None:
@@ -86,7 +86,7 @@ class SessionPage:
         self._question: Question | None = None
         self._stopped_by = self._note = self._failure = ""
         self._is_reported = False
-        self._stop = 1  # the last stop, because a hold has none
+        self._stop = 1  # the last stop is kept, because a hold has none
         # Largest residual per stop, in sigmas.
         self._residuals: dict[int, float | None] = {}
         self._plan: events.Planned | None = None

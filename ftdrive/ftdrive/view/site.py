@@ -38,7 +38,7 @@ _VIEWERS: Final = 300
 # Largest body of a request, and its time-out, s.
 _BODY_BYTES: Final = 1 << 15
 _BODY_S: Final = 5.0
-# Nothing from other sites, no inline script, no embedding in other pages. uPlot sets styles of elements.
+# Policy: nothing from other sites, no inline script, no embedding in other pages. uPlot sets styles of elements.
 _SAFE: Final = (
     "Content-Security-Policy: default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
     "connect-src 'self'; img-src data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",

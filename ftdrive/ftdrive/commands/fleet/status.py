@@ -40,7 +40,7 @@ def status(url: str | None, page_path: Path | None, as_json: bool) -> None:
     """
     if page_path is not None:
         require_extra("fleet", "--html", "jinja2")
-    gc.freeze()  # without it, garbage collection of the imports takes a tenth of the time
+    gc.freeze()  # otherwise, garbage collection of the imports takes a tenth of the time
     found, now = open_store(url), datetime.now(UTC)
     observed = Observed.read(found, now)
     fleet = fleet_of(observed, found)

@@ -74,7 +74,7 @@ def fleet_verify(names: Sequence[str], due: bool, url: str | None) -> None:
     if failed:
         raise NotAccepted(f"the verification failed in {', '.join(failed)}: the lines above have the reasons")
     if errors:
-        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # its message is printed
+        raise click.exceptions.Exit(exit_code(errors[0]) or 1)  # the message of the error is printed already
 
 
 def _select_cells(cells: Sequence[StoredCell], names: Sequence[str]) -> list[StoredCell]:
@@ -136,7 +136,7 @@ def _is_attended(one: StoredCell, cell: CellConfig) -> bool:
 
 
 def _fixable_message(error: Exception) -> str:
-    """Return the message of an error that a user can fix; raise any other."""
+    """Return the message of an error that a user can fix; raise any other error."""
     if exit_code(error) is None:
         raise error
     return in_a_sentence(error)
