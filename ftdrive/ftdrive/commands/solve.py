@@ -241,7 +241,7 @@ def _solve_together(
             data = read_place(place, options)
             if not isinstance(data, RecordedData):
                 raise ConfigError(f"--together needs poses at rest, and {source} is in motion: leave it out")
-            # Without the earlier result of a new tool, which would otherwise be counted once per run.
+            # Leave out the earlier result of a new tool, which would otherwise be counted once per run.
             results.append(_solve_shown(replace(data, earlier=None), options))
     result = together(results)
     if as_json:

@@ -13,7 +13,7 @@ Comment = Literal["#", "# at the end", "<!-- -->", "none"]
 
 # Largest accepted force error, N, of an export format that cannot represent the whole calibration.
 MAX_FORCE_ERROR_N: Final = 0.1
-# From mc_rtc/constants.h. The force must be right, so the mass for this gravity differs by up to 0.3 %.
+# Gravity in mc_rtc/constants.h. The force must be right, so the exported mass differs by up to 0.3 %.
 MC_RTC_G_M_S2: Final = 9.80665
 
 _SPELLED: Final = str.maketrans({"°": " deg", "·": " ", "±": "+/-", "×": "x", "–": "-", "µ": "u", "²": "2"})
@@ -130,8 +130,8 @@ FORMATS: Mapping[str, ExportFormat] = {
         notes=(_FRAMES,),
         elsewhere=_FT_ESTIMATION,
     ),
-    # As ft-tools: ft_msgs/msg/FtCalibration.msg, as `ros2 service call` and `ros2 topic pub` take it; the only field
-    # of a request of ft_msgs/srv/SetCalibration.
+    # As ft-tools: ft_msgs/msg/FtCalibration.msg, as `ros2 service call` and `ros2 topic pub` accept it: the only field
+    # of a request to ft_msgs/srv/SetCalibration.
     "ros2-message": ExportFormat(
         "ROS 2 message ft_msgs/FtCalibration, for the service set_calibration",
         "calibration.yaml",

@@ -30,7 +30,7 @@ from ftdrive.stream.samples import sensor_origin_m
 
 FORMAT = "ftdrive.export/1"
 
-# Fields with the names and definitions of a calibration file.
+# Fields with the same names and definitions as in a calibration file.
 _FIELDS = (
     *("mass_kg", "g_m_s2", "weight_N", "gravity_force_base_N"),
     *("R_flange_sensor", "p_sensor_com_m", "force_bias_N", "torque_bias_Nm"),
@@ -202,7 +202,7 @@ def _payload_inertia(v: _Values) -> str:
     payload, Q, (tool_kg, p_sensor_com_m) = v.payload, v.calibration.R_flange_sensor, true_tool(v.calibration)
     tool_m = v.p_flange_sensor_m + Q @ p_sensor_com_m - payload.p_flange_com_m
     sensor_kg = payload.mass_kg - tool_kg
-    # Moments of the two points about their common centre.
+    # Moments of the two point masses about their common centre.
     reduced_kg = tool_kg + (tool_kg**2 / sensor_kg if sensor_kg > 0 else 0.0)
     total = Q @ J @ Q.T + reduced_kg * (tool_m @ tool_m * np.eye(3) - np.outer(tool_m, tool_m))
     return str(_FORMS["fixed"](total[_DIAGONAL_FIRST]))

@@ -179,7 +179,7 @@ def _require_exportable(plan: Plan) -> None:
 
 # Time without a change of the live counter after which the service is taken as stopped, s.
 STALE_S: Final = 0.06
-# Time-out of a request, s; then the states without an answer.
+# Time-out of a request, s, and the states of a request without an answer.
 LIMIT_S: Final = 2.0
 GONE, LATE, UNSEEN = -1, -2, -3
 

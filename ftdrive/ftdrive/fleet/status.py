@@ -98,7 +98,7 @@ SIGMAS: Final = 4.0
 # Centres of mass of one tool agree within the first distance, and that of a payload is wrong beyond the second.
 # A limit smaller than 4 sigma is replaced by 4 sigma.
 ALIKE_M, WRONG_M = 0.003, 0.005
-# The corresponding limits of the masses; a mass is wrong beyond the larger one of share and kg.
+# The corresponding limits of the masses; a mass is wrong beyond the larger of `WRONG_SHARE` and `WRONG_KG`.
 ALIKE_SHARE, WRONG_SHARE, WRONG_KG = 0.03, 0.1, 0.1
 # Largest mass of sensor and adapter, which the payload includes but the identified mass does not.
 MOST_SENSOR_KG: Final = 1.0
@@ -212,7 +212,7 @@ class _Load:
     cell: str
     mass_kg: float
     mass_sigma_kg: float
-    # (2,) identified centre of mass of the tool off the flange axis, flange axes.
+    # (2,) offset of the tool's identified centre of mass from the flange axis, flange axes.
     off_axis_m: Array
     off_axis_sigma_m: Array
     payload_kg: float

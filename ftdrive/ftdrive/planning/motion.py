@@ -9,7 +9,7 @@ from ftdrive.planning.geometry.arm_model import ArmModel
 from ftdrivers.ur.kinematics import Array
 
 SAMPLE_RAD = np.radians(0.5)
-# A joint that turns by less is considered at rest: no part of any arm then moves by 20 mm.
+# A joint that turns by less than this is considered at rest: no part of any arm then moves by 20 mm.
 STILL_RAD = float(np.radians(0.5))
 
 

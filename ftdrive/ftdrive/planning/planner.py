@@ -31,7 +31,7 @@ from ftdrive.planning.search.tours import clear_tour
 from ftdrive.planning.sweep_planner import plan_sweep
 from ftdrivers.ur.kinematics import MODELS, Array, Kinematics, model_named
 
-# Posture at which all models with usual tools have room for the constant tour; the wrist is at its first pose.
+# Posture at which all models with usual tools have room for the constant tour; the wrist is at the tour's first pose.
 USUAL_POSTURE_RAD = np.radians([45.0, -100.0, 60.0, -50.0, 90.0, 45.0])
 NUMBERS = {24: tuple(range(1, 25)), 12: T12, 6: SUBSET_6}
 # Number of poses for a new tool on a calibrated cell.
@@ -49,7 +49,7 @@ FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 _NOISE = 0.05, 0.003
 # A tour: numbers of the orientations and joint vectors (n, 6), in the order of travel.
 Found = tuple[Sequence[int], Array]
-# Kind of a tour, the reason for it, and the tour; None if there is none of this kind.
+# Kind of a tour, the reason for this kind, and the tour, which is None if there is none of this kind.
 Attempt = tuple[str, Sequence[str], Found | None]
 
 

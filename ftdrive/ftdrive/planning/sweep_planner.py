@@ -29,14 +29,14 @@ from ftdrive.planning.search.nodes import constant_tour, with_room
 from ftdrivers.sweep import WRISTS, Sweep
 from ftdrivers.ur.kinematics import Array
 
-# Range of the duration, s. After 20 s white noise limits the accuracy, and no estimator needs less data.
+# Range of the duration, s. After 20 s, white noise limits the accuracy of any estimator.
 SECONDS = (10.0, 120.0)
 RAMP_S = 3.0
 # Time between two steps of the plan, s.
 STEP_S = 0.2
 # Lag of the controller, s: its `lookahead_time`.
 SMOOTHED_S = 0.1
-# Numbers of random and of changed curves that are tried.
+# Number of random curves that are tried, and number of changes to the best of them.
 RANDOM, CHANGED = 40, 200
 # Sizes of a change, as shares of a new random curve.
 STEPS = (0.03, 0.1, 0.3)

@@ -40,9 +40,9 @@ if TYPE_CHECKING:
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 _BAG: Final = b"#ROSBAG V2.0\n"
 _POSES: Final = "geometry_msgs/msg/PoseStamped"
-# Times in ns, and values.
+# A column: times in ns, and values.
 _Column = tuple[NDArray[np.int64], Array]
-# Time of receipt in ns, and content.
+# A message: time of receipt in ns, and content.
 _Message = tuple[int, bytes]
 
 T = TypeVar("T")
@@ -395,7 +395,7 @@ def _with_gaps(t_s: Array, period_s: float) -> NDArray[np.int64]:
     late = t_s / period_s - number
     # minimum over each sample and those before it
     earliest = minimum_filter1d(late, _NEAR, mode="nearest", origin=(_NEAR - 1) // 2)
-    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # over this row and those after it
+    following = minimum_filter1d(late, _NEAR, mode="nearest", origin=-_NEAR // 2)  # this row and later ones
     possible = np.flatnonzero((steps > 1.5) & (following[1:] - earliest[:-1] > 0.4))
     # largest steps first
     for last in possible[np.argsort(-steps[possible])].tolist():

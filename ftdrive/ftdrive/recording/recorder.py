@@ -26,7 +26,7 @@ from ftdrive.recording.recording import ROW, Header, Rows, read_ahead, split_pie
 from ftdrive.stream.samples import Block, StreamEvent, StreamInfo
 from ftdrive.stream.stream import Sink, Stream
 
-# The stream waits for a few ms while this much is written.
+# Duration of the samples in one write, ns; the stream waits for a few ms during each write.
 _FLUSH_NS = 200_000_000
 
 

@@ -35,11 +35,11 @@ VARIABLES = {
 }
 # Text stays readable on a phone, and two figures fit side by side on a desktop screen.
 WIDTH_IN = 5.0
-# Longer durations are shown in minutes, s.
+# Durations above this, s, are shown in minutes.
 LONG_S = 200
 # Largest number of dots in a figure, because each dot enlarges the file; with more poses, every n-th is drawn.
 MOST_DOTS = 400
-# Weaker correlations are not drawn.
+# Correlations below this are not drawn.
 INVISIBLE = 0.02
 _STYLE: Mapping[Any, Any] = {
     "svg.fonttype": "none",

@@ -20,7 +20,7 @@ Facts = Mapping[str, Any]
 # Root mean square over the six channels that one good pose in 1000 exceeds, in sigmas.
 SUSPICIOUS_SIGMAS = 1.9
 _AXES = "xyz"
-# A smaller sigma of a channel, N or N·m, means that it has no drift.
+# A channel whose sigma is below this, N or N·m, has no drift.
 _ROUNDING = 1e-9
 
 

@@ -1,9 +1,9 @@
 """A bundle: a run folder as one zip file without addresses and names, which `replay` and `solve` read.
 
 bundle.json         ftdrive.bundle/1: name of the run, whether it is emulated, what was redacted, what was left out
-environment.json    versions of all packages, and checks of the computer without devices sensor.json         the sensor
-matrices in the current folder, redacted <run>/...           the files of the run folder; text files are redacted, poses
-are copied byte by byte transcripts/...     the files of `ftdrive transcript record`, redacted
+environment.json    versions of all packages, and checks of the computer without devices
+sensor.json         the sensor matrices in the current folder; transcripts/... of `ftdrive transcript record`: redacted
+<run>/...           the files of the run folder; text files are redacted, poses are copied byte by byte
 """
 
 import getpass
@@ -54,7 +54,7 @@ _MAC = re.compile(r"(?<![\w:-])(?:[0-9A-Fa-f]{2}[:-]){5}[0-9A-Fa-f]{2}(?![\w:-])
 _HOST_FIELD = re.compile(r'"host": ?"([A-Za-z0-9.-]+)"|"said": ?{[^}]*"robot": ?"([A-Za-z0-9.-]+)"')
 # Endings of URL schemes whose host part is not a host of the cell.
 _NO_NETWORK = ("can", "emulated", "http", "https", "file")
-# Common names of accounts and hosts, which identify nobody; their home directories are redacted.
+# Common names of accounts and hosts, which identify no person; their home directories are redacted.
 _NOT_PERSONAL = {"root", "user", "robot", "ur", "admin", "ubuntu", "operator", "localhost"}
 # Fields whose groups of four numbers are versions, not addresses.
 _VERSIONS = ("versions", "packages", "firmware")

@@ -136,13 +136,13 @@ class ProgramService(Sink):
             self._wrench = block.wrench[-1].tolist()
             self._condition = self._judge(block)
             self._work(t_ns)
-            # Also in contact, because a program must be able to react to a contact force.
+            # Count also in contact, because a program must be able to react to a contact force.
             self._live = (self._live + 1) % _COUNT_LIMIT
             self._write()
 
     def end(self) -> None:
         """Write that the service has stopped, and close the registers."""
-        # Ctrl-C may come while the thread starts, which must end before the cell.
+        # Ctrl-C may come while the thread starts; the thread must end before the cell.
         self._ends.set()
         if self._watching.ident is not None:
             self._watching.join()
@@ -180,7 +180,7 @@ class ProgramService(Sink):
         integers = [self._state, self._code, self._condition, self._number or 0, self._live, tracking]
         tracked = self._tracked() if tracking else []
         try:
-            # All inputs go in one package, so that a program never reads part of an answer.
+            # All inputs are sent in one package, so that a program never reads part of an answer.
             self._registers.write(integers, [*self._wrench, *self._weight, *tracked])
         except DeviceError as error:
             if self._state is not ServiceState.STOPPED:

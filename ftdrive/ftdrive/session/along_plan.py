@@ -30,7 +30,7 @@ from ftdrivers.interfaces import NOT_REPORTED
 from ftdrivers.ur.kinematics import kinematics_of
 
 FORMAT = "ftdrive.completed/1"
-# File in the state folder of the user.
+# File of completed plans in the user's state folder.
 _COMPLETED = "completed.ndjson"
 
 

@@ -26,7 +26,7 @@ from ftdrivers.interfaces import ArmState, FtSamples
 # Standstill before a pose, s on the controller's clock, by joint speeds: `is_steady` is always false in freedrive.
 STILL_S: Final = 1.0
 STILL_RAD_S: Final = 0.002
-# A smaller rotation of the flange is a nudge, not a move.
+# A rotation of the flange below this is a nudge, not a move.
 LEFT_RAD: Final = radians(1)
 REPEAT_RAD: Final = radians(10)
 # Largest angle between the first pose of a program and its return there.

@@ -27,9 +27,9 @@ from ftdrive.cell.config import USUAL_KG
 from ftdrive.runs.load import Load
 from ftdrive.session.events import Estimated
 
-# Limits that correspond to gravity directions 50 to 60 degrees apart; see `ftcalib.poses.information.Prediction`.
+# Limits of green, as for gravity directions 50 to 60 degrees apart; see `ftcalib.poses.information.Prediction`.
 GREEN = {"cond9": 4.0, "cond_u1": 8.0}
-# Limits that correspond to gravity directions 30 to 45 degrees apart.
+# Limits of amber, as for gravity directions 30 to 45 degrees apart.
 AMBER = {"cond9": 8.0, "cond_u1": 25.0}
 # A run with a load is judged by cond_u1 alone: a hanging load limits the tilt, and the run of the tool covers cond9.
 OF_A_LOAD = ("cond_u1",)

@@ -40,7 +40,7 @@ KNOWN_S: Final = 3.0
 BEHIND_S: Final = 1.0
 # Standard deviation of one reading, including vibration and acceleration.
 _NOISE_N: Final = 2.0
-# A prediction with a larger sigma is not used.
+# A prediction whose sigma exceeds this is not used.
 _UNSURE_N: Final = 2.5
 
 

@@ -16,7 +16,7 @@ from ftdrive.store import database
 from ftdrive.store.database import Database, all_paths
 from ftdrive.store.records import STORED, Record, StoredCell, StoredResult, read_records, record_paths
 
-# Time-out for another writer, s.
+# Time-out for the lock of another writer, s.
 WAIT_S = 5.0
 
 _MOST = 5000
@@ -247,7 +247,7 @@ def _by_name(kind: Callable[..., _Stored]) -> Callable[[Row[Any]], _Stored]:
 
 
 def _to_verification(row: Sequence[Any]) -> VerificationRecord:
-    # By position, because access by name would double the time.
+    # Read columns by position, because access by name would double the time.
     wrenches = [None if row[k] is None else list(row[k : k + 6]) for k in (8, 14, 20)]
     return VerificationRecord._make((*row[:6], None, None, *row[6:8], *wrenches))
 

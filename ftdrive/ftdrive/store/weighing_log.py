@@ -21,7 +21,7 @@ _GOODBYE_S: Final = 6.0
 # Largest number of lines that wait for the disk; beyond it the oldest lines are lost.
 _MOST_WAITING: Final = 1000
 _NOT_INDEXED: Final = "Weighings are saved, but not yet in the history"
-# A line: day and content.
+# A line of the log: its day and its content.
 _Line = tuple[str, Mapping[str, JSON]]
 
 

@@ -26,16 +26,16 @@ from ftdrive.stream.samples import Ns, Paired
 
 # The covariance of the prediction is evaluated again after the tool has turned by this angle.
 _TURN_RAD = 0.02
-# Sigma of accelerations of a moving arm: without positions, predicted from past poses, and angular.
+# Sigmas of the acceleration of a moving arm: without positions, if predicted from past poses, and angular.
 _UNKNOWN_M_S2, _COARSE_M_S2, _UNKNOWN_RAD_S2 = 1.0, 0.3, 2.5
-# Error of the time of a predicted wrench besides that of the delay: accelerations are means over a similar time.
+# Error of the time of a predicted wrench besides the error of the delay: accelerations are means over such a time.
 _INEXACT_S = 0.005
 # Friction torque of wrist 3, which the force/torque sensor inside the arm measures too.
 _FRICTION_NM = 0.15
 # A contact begins after this many consecutive readings beyond the limit, and ends after as many within it. A single
 # longer mean would detect the contact later.
 _IN_A_ROW = 3
-# Time between these readings; the shorter one if inertia is subtracted, because the stream then waits for later poses.
+# Time between two counted readings; shorter if inertia is subtracted, because the stream then waits for later poses.
 _LAG_S, _SHORT_LAG_S = READING_S, READING_S / 2
 
 

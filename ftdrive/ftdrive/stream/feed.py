@@ -29,7 +29,7 @@ SPANS_S = (2, 10, 60, 600)
 # Bins per span. Twice as many are stored, because whole columns of a plot can be longer than the span.
 _BINS = 1024
 _STATUS_NS = 50_000_000
-# Cut-off of the low-pass filter that the key switches on, Hz.
+# Cut-off of the low-pass filter that a key of the screen switches on, Hz.
 _LOWPASS_HZ = 40.0
 # Blocks and notes that wait for a slow screen or page; the oldest are dropped. Recordings do not use these queues.
 _MOST_BLOCKS, _MOST_NOTES = 2000, 200

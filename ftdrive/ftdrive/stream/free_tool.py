@@ -47,7 +47,7 @@ ANY_BIAS = np.square(_UNIT)
 """Variance (6,) added when tracking begins, because the bias may have changed by more than the drift explains."""
 # Candidate random walks of the bias within an hour, one sigma, N; the last two for warming or worn sensors.
 WALKS_N = (0.03, 0.1, 0.3, 1.0, 3.0)
-# Time constant of forgetting for the likelihoods of the walks, because a warm sensor walks less.
+# Time constant of forgetting for the likelihoods of the walks, because the bias of a warm sensor walks less.
 _FORGET_S = 3600.0
 # Typical drift of the bias within an hour, one sigma, N; the drift rate may change by as much within an hour.
 _RATE_N = 5.0
@@ -60,7 +60,7 @@ _GATE = float(chdtri(6, 1e-4))
 _TAILS = 4.0
 # Limit of the squared distance between two parts, with four estimated parameters.
 _SAME = float(chdtri(4, 1e-3))
-# Fewest and most consecutive windows that determine a part; older windows are dropped.
+# Smallest and largest number of consecutive windows that determine a part; older windows are dropped.
 _RUN, _LONGEST_RUN = 4, 24
 # A new part is accepted after gravity has turned by this angle in the sensor, or the arm has moved this far: a contact
 # stays in place. A steady force along gravity that moves with the arm looks like a part.
@@ -94,7 +94,7 @@ _PART_READ = 0.02
 # The torque is linearised about the centre of mass of the part if its sigma is less than this.
 _PLACED_M = 0.03
 # Prior weight of the expected noise, in windows: small, because vibration is less in a window than in the readings from
-# which it is expected. The estimate averages over at most the second number of windows.
+# which the noise is expected. The estimate averages over at most the second number of windows.
 _FIRST_WINDOWS, _MOST_WINDOWS = 3, 200
 
 
@@ -163,7 +163,7 @@ class FreeToolFilter:
         self._subtracted = np.zeros(6)
         self.changes = 0
         """Counter of changes of the state."""
-        # States before each tare, to undo it.
+        # States before each tare, to undo the tare.
         self._untared: list[tuple[_State, Array]] = []
 
     # ------------------------------------------------------------------------------------------- prediction

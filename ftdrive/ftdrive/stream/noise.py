@@ -247,7 +247,7 @@ class NoiseEstimator:
         mean = reading[quiet].mean(axis=0) + np.diag(floor)
         steps = steps[np.isfinite(steps[:, 0])]
         if len(steps):
-            # 0.1015 is the same quantile of chi² with one degree of freedom
+            # 0.1015 is the 25 % quantile of chi² with one degree of freedom
             smallest = np.quantile(np.square(steps), 0.25, axis=0) / 0.1015
             usual = np.sqrt(smallest + np.diag(mean) / _WINDOW)
             steps = steps[(np.abs(steps) < _STEP_SIGMAS * usual).all(axis=1)]
@@ -281,9 +281,9 @@ WINDOW_S = 0.3
 """Duration of a window, s; windows overlap by half. Hann weights suppress the ringing of the links."""
 # The acceleration comes from poses at this spacing, with this many neighbours on each side.
 _KNOT_S, _REACH = 0.004, 5
-# Relative error of a calibrated inertia tensor of the tool, as a share of that of an unknown one.
+# Error of a calibrated inertia tensor of the tool, relative to the error of an unknown one.
 _TENSOR = 0.5
-# A window that takes longer by this factor has lost samples.
+# A window that is longer than usual by this factor has lost samples.
 _LATE = 1.2
 # Degrees of freedom of the noise below which windows are dropped: the first half second may contain a push.
 _LEAST_DOF = 10.0
@@ -297,7 +297,7 @@ _ROW = np.dtype(
     ],
     align=True,
 )
-# A larger change between two poses means lost samples.
+# A change between two poses above this means lost samples.
 _JUMP = 0.1
 # Sigma of the acceleration in motion of an arm that reports no positions, m/s².
 _UNKNOWN_M_S2 = 1.0

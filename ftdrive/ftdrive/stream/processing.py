@@ -53,9 +53,9 @@ from ftdrivers.interfaces import WRIST_SENSOR, Array
 SENSOR_FRAME = WrenchFrame()
 FALSE_ALARM_RATE = 1e-6
 """Share of independent readings of a free tool that exceed the contact limit."""
-# Longer blocks are processed in chunks that fit the cache.
+# Blocks with more samples than this are processed in chunks that fit the cache.
 _CHUNK_ROWS = 8192
-# A tracked bias with a larger sigma is not applied, N and N·m.
+# A tracked bias is not applied if its sigma exceeds this, N and N·m.
 _APPLIED = np.repeat([0.1, 0.003], 3)
 
 

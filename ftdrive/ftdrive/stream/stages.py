@@ -342,7 +342,7 @@ class Neighbours:
 class _Reference(NamedTuple):
     empty: Calibrated
     t_ns: int
-    # Sensor temperature at that time; NaN if unknown.
+    # Sensor temperature at the time `t_ns`; NaN if unknown.
     temperature_C: float
 
 

@@ -37,7 +37,7 @@ _STEP_S = 0.1
 _FEW: Final = 10.0
 # Largest age of the last window of a weighing in motion, s.
 _LATE_S: Final = 1.0
-# Poses with a larger angle between them add information on the centre of mass.
+# Poses that differ by more than this angle add information on the centre of mass.
 _NEW_POSE_RAD: Final = 0.17
 # Largest deviation from a whole number of parts.
 _WHOLE: Final = 0.1

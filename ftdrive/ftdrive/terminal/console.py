@@ -16,7 +16,7 @@ from rich.text import Text
 from ftdrive.terminal.text import NARROWEST, glue, unglue
 from ftdrive.words.text import as_typed, is_command, visible
 
-# A slower command prints what it is doing, even to a pipe.
+# A command that takes longer than this prints what it is doing, even to a pipe.
 _PATIENCE_S: Final = 2.0
 
 

@@ -20,7 +20,7 @@ from ftdrivers.interfaces import Array
 
 _STYLE = {"good": "bold green", "usable": "bold yellow", "rejected": "bold red"}
 _NO_LIMIT = 10_000
-# Rows that follow from mass and tilt.
+# Rows whose values follow from mass and tilt.
 _DERIVED = {"gravity_force_base_N"}
 
 

@@ -28,7 +28,7 @@ from ftdrivers.ur.kinematics import forward
 
 # Plots are redrawn less often than the rest, by this factor. A plot is about 250 pixels wide, two per column.
 _PLOT_EACH, _COLUMNS, _EVENTS = 5, 128, 30
-# An arm that has moved less is not redrawn.
+# An arm that has moved less than this is not redrawn.
 _STILL_RAD = 1e-4
 _SPEEDS = (0.25, 0.5, 1.0, 2.0, 4.0, 10.0)
 _M_PER_N, _M_PER_NM = 0.01, 0.1

@@ -15,7 +15,7 @@ log = logging.getLogger(__name__)
 
 # On a busy computer with delays, this period still gives 20 drawings per second.
 _PERIOD_S: Final = 0.045
-# A drawing that takes longer is considered to hang, s.
+# A drawing that takes longer than this, s, is considered to hang.
 HUNG_S: Final = 5.0
 _TEXT: Final = 10_000
 

@@ -23,7 +23,7 @@ _ELSEWHERE: Sequence[tuple[str, Literal["workspace", "hour"]]] = (
     ("in any orientation", "workspace"),
     ("after an hour", "hour"),
 )
-# Values below this are rounding errors, N, N·m or share of a mass.
+# Values below this, in N, N·m or as a share of a mass, are rounding errors.
 _ROUNDING = 1e-9
 SIGMA_OF_THE_TOOL = (
     "that of mounting, weight and centre of mass includes errors of sensor, arm and mounts; the "

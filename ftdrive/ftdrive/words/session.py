@@ -47,7 +47,7 @@ ESTIMATES = (
     ("tilt b deg", 180 / np.pi, "tilt_beta_rad", 6),
 )
 _NUMBER_WIDTH = 9
-# A smaller standard deviation, N or N·m, is a rounding error of a value that was not fitted.
+# A standard deviation below this, N or N·m, is a rounding error of a value that was not fitted.
 _ROUNDED = 1e-9
 OFF_SIGMA = 5.0
 """A pose that differs by more standard deviations is an outlier."""

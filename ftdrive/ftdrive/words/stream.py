@@ -38,10 +38,10 @@ CONTACT, FREE, NOISE_UNKNOWN, WAITING = "contact", "free", "noise not known yet"
 """Results of `state`."""
 # Smallest full scale in sigmas, so that the plot of a still tool shows noise as noise.
 _LEAST_FULL_SIGMA = 10.0
-# Larger test values and limits are not shown: such a limit comes from an unusable noise estimate.
+# Test values and limits above this are not shown: such a limit comes from an unusable noise estimate.
 _MOST_CHI2 = 1e5
 _FRAMES = (WrenchFrame(), WrenchFrame("flange", "flange"), WrenchFrame("base", "tcp"), WrenchFrame("tcp", "tcp"))
-# Delay estimates with a larger sigma are shown as not measured, s.
+# Delay estimates whose sigma exceeds this, s, are shown as not measured.
 _MEASURED_S = 0.03
 
 

@@ -20,7 +20,7 @@ from ftdrive.planning.search.nodes import Nodes, grid, hung_nodes, wrist_nodes
 from ftdrive.planning.search.tours import clear_tour, connected
 from ftdrivers.ur.kinematics import Array
 
-# Numbers of tool directions, and of turns about the tool axis for each of them.
+# Number of tool directions, and number of turns about the tool axis for each direction.
 DIRECTIONS, SPINS = 150, 8
 # Fewer of both for a tool that is not round about the axis of joint 6: each turn needs its own collision check.
 DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
