@@ -55,7 +55,7 @@ class SensorAddress:
 
     @property
     def serial_port(self) -> Path | None:
-        """Serial port of the sensor or of its slcan adapter; None without one."""
+        """Serial port of the sensor or of its slcan adapter; None if there is none."""
         if self.scheme.endswith("-can") and self.options.get("interface") == "slcan":
             return Path(self.address.split("@")[0])
         is_path = self.address.startswith("/") and self.scheme != "ros2"
@@ -63,7 +63,7 @@ class SensorAddress:
 
     @property
     def can_interface(self) -> str | None:
-        """CAN interface of the kernel; None without one."""
+        """CAN interface of the kernel; None if there is none."""
         on_socketcan = self.scheme.endswith("-can") and self.options.get("interface", "socketcan") == "socketcan"
         return self.address if on_socketcan else None
 
@@ -167,7 +167,7 @@ def check_serial_port(port: Path, *, sys: Path = SYS, dev: Path = DEV) -> list[C
 
 
 def name_by_id(port: Path, *, dev: Path = DEV) -> Path | None:
-    """Return the permanent name of a serial port, which survives replugging; None without one."""
+    """Return the permanent name of a serial port, which survives replugging; None if there is none."""
     by_id, real = dev / "serial" / "by-id", os.path.realpath(port)
     links = sorted(by_id.iterdir()) if by_id.is_dir() else []
     return next((link for link in links if os.path.realpath(link) == real), None)

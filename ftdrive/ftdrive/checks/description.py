@@ -247,7 +247,7 @@ class Description:
         return {name: self.reports.get(key, _SILENT) for name, key in (("robot", ROBOT), ("sensor", SENSOR))}
 
     def file(self) -> str:
-        """Return the configuration file; raises as `cell`."""
+        """Return the configuration file; raises the errors of `cell`."""
         return cell_file(self.cell(), [f"{name.capitalize()}: {words}." for name, words in self.found().items()])
 
     def save(self, draft: Path) -> None:

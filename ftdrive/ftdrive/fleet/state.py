@@ -53,7 +53,7 @@ class CellState:
     drift: BiasDrift | None = None
     """Drift of the bias; None with too few verifications."""
     weighings: WeighingDay | None = None
-    """The last weighing day; None without one in the last 90 days."""
+    """The last weighing day; None if there is none in the last 90 days."""
     emulated: bool = False
     """Whether the calibration was made in an emulated cell."""
 
@@ -107,7 +107,7 @@ class Fleet:
         return not states or any(state.is_due(now) for state in states)
 
     def id_of(self, cell: str, tool: str) -> str | None:
-        """Return the id of the newest accepted calibration of a tool; None without one."""
+        """Return the id of the newest accepted calibration of a tool; None if there is none."""
         return next((state.calibration_id for state in self.cells if (state.cell, state.tool) == (cell, tool)), None)
 
 

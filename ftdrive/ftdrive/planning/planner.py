@@ -386,7 +386,7 @@ def plan_for(
 
 
 def sweep_for(cell: CellConfig, certifier: Certifier, q_rad: ArrayLike, seconds: float) -> Plan:
-    """Plan a sweep for a cell and its certifier, near joint angles `q_rad` (6,); raises as `plan_sweep`."""
+    """Plan a sweep for a cell and its certifier, near joint angles `q_rad` (6,); raises the errors of `plan_sweep`."""
     made = plan_sweep(
         certifier,
         q_rad,

@@ -110,7 +110,7 @@ class RecordingReader:
             raise BadRecording("it contains no sample: the file was cut, or the stream ended at once", self.path)
 
     def blocks(self) -> Iterator[Measured]:
-        """Yield the samples as measured: wrench and pose with their times. Raises as `pieces`."""
+        """Yield the samples as measured: wrench and pose with their times. Raises the errors of `pieces`."""
         return in_blocks(piece.measured() for piece in self.pieces())
 
     def _pieces(self) -> Generator[Piece, None, None]:

@@ -107,7 +107,7 @@ def tables_of(
 
 
 def moving_source(source: Any, options: SolveOptions) -> Path | tuple[Table, Table] | None:
-    """Return the input of `solve_recording`; None for poses at rest. Raises as `tables_of`."""
+    """Return the input of `solve_recording`; None for poses at rest. Raises the errors of `tables_of`."""
     if options.pair is None and isinstance(source, Path):
         # A run folder or a dataset has poses at rest.
         has_poses = source.is_dir() or source.suffix == ".json"

@@ -31,7 +31,7 @@ _FLUSH_NS = 200_000_000
 
 
 class RecordingFiles:
-    """New files that are written together, each with all samples. Raises as `Recorder`."""
+    """New files that are written together, each with all samples. Raises the errors of `Recorder`."""
 
     def __init__(self, paths: Sequence[Path], header: Header) -> None:
         self.saved: list[Path] = []
@@ -163,7 +163,7 @@ class Recorder(Sink):
         self._stream = None if self._is_repeatable else stream
 
     def add(self, block: Block | None, events: Sequence[StreamEvent]) -> None:
-        """Record the samples within the limits. Raises as `RecordingFiles.append`."""
+        """Record the samples within the limits. Raises the errors of `RecordingFiles.append`."""
         if block:
             left = len(block) if self._count is None else self._count - self.samples
             if self._duration_s is not None:
@@ -190,7 +190,7 @@ class Recorder(Sink):
             self.is_complete |= self.samples == self._count
 
     def end(self) -> None:
-        """Complete the files; without a sample there are none. Raises as `RecordingFiles.complete`."""
+        """Complete the files; without a sample there are none. Raises the errors of `RecordingFiles.complete`."""
         if self._stream is not None:
             status = self._stream.status()
             values = {"value": status.delay_s, "sigma": status.delay_sigma_s}
@@ -258,7 +258,7 @@ _RAW_ROW: Final = "{:.6f}," + ",".join(["{:.7g}"] * 6) + "\n"
 class RawTable(Sink):
     """A new .csv file: time in UTC seconds, then the raw wrench in N and N·m, sensor axes, about the sensor origin.
 
-    Tares are not subtracted, and events are not stored. Raises as `GrowingFile`.
+    Tares are not subtracted, and events are not stored. Raises the errors of `GrowingFile`.
     """
 
     label, keeps_all = "recording", True

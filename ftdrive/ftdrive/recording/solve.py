@@ -113,7 +113,7 @@ def solve_recording(
 
 
 def _read_in_motion(source: Path | Recording) -> tuple[Means, Means, Header]:
-    """Return wrench, poses (with positions, if any) and header. Raises as `RecordingReader.pieces`."""
+    """Return wrench, poses (with positions, if any) and header. Raises the errors of `RecordingReader.pieces`."""
     reader = source if isinstance(source, Recording) else RecordingReader(source, NEEDED)
     wrench, poses = Means(), Means()
     if isinstance(source, Recording) and (missing := {*NEEDED} - {*(source.rows.dtype.names or ())}):

@@ -77,7 +77,7 @@ class Load(KnownLoad):
 
     @classmethod
     def of_header(cls, header: Mapping[str, Any]) -> Self | None:
-        """Return the load of run.json or of a dataset's `meta`; None without one."""
+        """Return the load of run.json or of a dataset's `meta`; None if there is none."""
         stored = header.get("load")
         if stored is None:
             return None

@@ -163,7 +163,7 @@ class SolveOptions:
 
 
 def known_values(mass_kg: float | None, level_deg: float | None, mounting_deg: str | None) -> Known | None:
-    """Return the known values of the options in degrees; None without any. Raises `ConfigError`."""
+    """Return the known values of the options in degrees; None if there are none. Raises `ConfigError`."""
     if mass_kg is None and level_deg is None and mounting_deg is None:
         return None
     R_flange_sensor = None

@@ -118,7 +118,7 @@ class VerificationRecord(NamedTuple):
 
 
 def verification_near(place: Path, calibration_id: str) -> VerificationRecord | None:
-    """Return the newest verification of a calibration, given its file or run folder; None without one."""
+    """Return the newest verification of a calibration, given its file or run folder; None if there is none."""
     # By id, because the calibration's own run folder is complete and gets no more files.
     folder, records = place.absolute() if place.is_dir() else place.absolute().parent, list[VerificationRecord]()
     for parent in dict.fromkeys((folder.parent, folder / "runs", Path("runs").absolute())):

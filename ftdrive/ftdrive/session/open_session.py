@@ -213,7 +213,7 @@ class Journal:
         return self._operator.has_keys
 
     def pressed(self) -> Key | None:
-        """Return the newest key pressed; None without one."""
+        """Return the newest key pressed; None if there is none."""
         return self._operator.pressed()
 
     @property

@@ -337,7 +337,7 @@ def _differences(sent: ControllerSettings, read_back: ControllerSettings | None)
 
 
 def restore(cell: CellConfig, arm: RobotArm, receipt: Receipt) -> Push:
-    """Return the push that restores the old values of a receipt; raises as `propose`."""
+    """Return the push that restores the old values of a receipt; raises the errors of `propose`."""
     info = arm.identify()
     made = receipt.devices["arm"]["model"], receipt.devices["arm"]["serial"]
     if made != (info.model, info.serial):

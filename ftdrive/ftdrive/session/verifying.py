@@ -77,7 +77,7 @@ class Verifying:
 
     @classmethod
     def of(cls, cell: CellConfig, path: Path, options: SessionOptions) -> Self:
-        """Return the task for a calibration file or a run folder. Raises as `read_calibration`."""
+        """Return the task for a calibration file or a run folder. Raises the errors of `read_calibration`."""
         calibration = read_calibration(path)
         path = Run(path).calibration_path if path.is_dir() else path
         # A noise record of 12 s would take longer than the poses.

@@ -140,7 +140,7 @@ class Store:
         return self._read(_oldest_first(table).where(*_is(table.c.calibration_id, calibration_id)), _to_verification)
 
     def last_verification(self, calibration_id: str) -> VerificationRecord | None:
-        """Return the newest verification of a calibration; None without one."""
+        """Return the newest verification of a calibration; None if there is none."""
         return next(reversed(self.verifications(calibration_id)), None)
 
     def weighings(self, most: int, tool: str | None = None) -> list[WeighingDay]:

@@ -47,7 +47,7 @@ class _TextFormat(NamedTuple):
     first_line: int
     """Number of the first row of numbers, from 1."""
     words: str
-    """Differences from a table with commas, decimal points and one row of names; empty without any."""
+    """Differences from a table with commas, decimal points and one row of names; empty if there are none."""
 
 
 class TextTable:

@@ -69,7 +69,7 @@ class Interview:
                 self._described.answered.add(question.key)
 
     def look(self, key: str, text: str) -> None:
-        """Read a device, and print its report. Raises as `Description.look`."""
+        """Read a device, and print its report. Raises the errors of `Description.look`."""
         say(self._described.look(key, text), "  ✔ ")
 
     def run(self) -> None:
@@ -210,7 +210,7 @@ class Interview:
     def _until(
         self, words: str, usual: str | None, what: str, accept: Callable[[str], None], *, back: bool = True
     ) -> str:
-        """Ask until an answer is accepted. Raises as `_prompt`, and `_Back` for "back"."""
+        """Ask until an answer is accepted. Raises the errors of `_prompt`, and `_Back` for "back"."""
         while True:
             answer = self._prompt(words, usual, what)
             if back and answer.strip().lower() == "back":

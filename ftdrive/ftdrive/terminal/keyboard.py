@@ -62,11 +62,11 @@ class Keyboard:
         self._stop()
 
     def pressed(self) -> Key | None:
-        """Return the oldest unread request; None without one."""
+        """Return the oldest unread request; None if there is none."""
         return self._keys.popleft() if self._keys else None
 
     def stroke(self) -> str | None:
-        """Return the oldest unread keystroke, a character or a name such as "left"; None without one."""
+        """Return the oldest unread keystroke, a character or a name such as "left"; None if there is none."""
         return self._strokes.popleft() if self._strokes else None
 
     @property

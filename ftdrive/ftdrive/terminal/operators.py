@@ -54,7 +54,7 @@ def not_an_answer(question: Question, typed: str) -> str:
 
 
 def read_answer(supervisor: Supervisor, question: Question) -> str:
-    """Read one line. Raises as `Supervisor.read_line`."""
+    """Read one line. Raises the errors of `Supervisor.read_line`."""
     return supervisor.read_line(
         f"no answer to '{prompt(question).strip()}': run it in a terminal, or send the answer to standard input"
     )

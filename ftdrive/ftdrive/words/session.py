@@ -217,7 +217,7 @@ def _estimate_in_words(event: Estimated) -> str:
 
 
 def residual_in_words(event: Estimated) -> str:
-    """Return the residual of the newest pose from the previous fit; empty without one."""
+    """Return the residual of the newest pose from the previous fit; empty if there is none."""
     if event.residual_sigma is None or event.residual_force_N is None:
         return ""
     return f"{event.residual_force_N:.3f} N from the previous fit, {event.residual_sigma:.1f} sigma"
