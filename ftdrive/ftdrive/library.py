@@ -218,7 +218,7 @@ def open_arm(host: str, *, model: str | None = None, driver: str = "ur") -> Robo
     Raises
     ------
     UsageError
-        There is no such driver.
+        The driver does not exist.
     DeviceError
         The arm does not answer.
 

@@ -16,7 +16,7 @@ from ftdrivers.ur.timing import STRICT, UrTiming
 
 
 def build_arm(cell: CellConfig) -> RobotArm:
-    """Return the driver of the arm, not yet open; its default speed is that of the cell."""
+    """Return the driver of the arm, not yet open; its default speed comes from the cell."""
     robot = cell.robot
     try:
         by_topic = robot.driver == "ur" and robot.host.startswith("ros2:")

@@ -222,7 +222,7 @@ def _with_values(cell: CellConfig, values: Mapping[str, Any]) -> CellConfig:
 
 
 def sensor_reached(url: str, clock: Clock = REAL) -> tuple[str, Clock]:
-    """Return address and clock for a driver; for emulated://NAME those of an emulated sensor, which is started once.
+    """Return address and clock for a driver; emulated://NAME gives those of an emulated sensor, started once.
 
     The orientation of the sensor is constant; emulated:// alone is an ATI sensor on CAN. Any other address is returned
     unchanged with the given clock. Raises `ConfigError` for an unknown name.

@@ -106,7 +106,7 @@ class EmulatedClock(Clock):
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Stop the clock during the block, as far as it waits for this thread."""
+        """Stop the clock during the block, if the clock waits for this thread."""
         self._own.held = True
         try:
             yield

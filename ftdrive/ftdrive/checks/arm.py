@@ -59,7 +59,7 @@ def check_arm(info: DeviceInfo, robot: RobotConfig) -> Check:
 
 
 def check_kinematics(info: DeviceInfo) -> Check:
-    """Check that an arm reports its kinematics, and compare them with those of its nominal model."""
+    """Check that an arm reports its kinematics, and compare them with its nominal model."""
     name, own = "robot.kinematics", kinematics_of(info)
     if info.model not in MODELS:
         return Check(name, "skipped", f"the nominal kinematics of a {info.model} are unknown")
@@ -193,7 +193,7 @@ def _answers_s(arm: RobotArm, clock: Clock) -> list[float]:
 
 
 def check_clock(arm: RobotArm, clock: Clock) -> Check:
-    """Compare the rate of the controller's clock with that of this computer, from differences of each clock alone."""
+    """Compare the rates of the clocks of controller and computer, from differences of each clock alone."""
     t_host_ns, t_device_s = list[int](), list[float]()
     try:
         with clock.keeping_up():

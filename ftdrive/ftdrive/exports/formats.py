@@ -50,7 +50,7 @@ class ExportFormat:
 
     @property
     def has_own_reading(self) -> bool:
-        """Whether the target reads another sensor or none, so that bias and response of this sensor do not matter."""
+        """Whether the target reads another sensor or none, so bias and response of this sensor do not matter."""
         return "bias" not in self.subtracts and "response" in self.expresses
 
 

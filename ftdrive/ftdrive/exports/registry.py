@@ -438,7 +438,7 @@ def _undecoded(name: str, calibration: CalibrationResult) -> Iterator[str]:
 
 
 def _lossless_formats(calibration: CalibrationResult, target: ExportFormat) -> Iterator[str]:
-    """Yield the formats that lose nothing, subtract as much, and read this sensor if the target does."""
+    """Yield lossless formats that subtract at least as much as the target, and read this sensor if the target does."""
     for name, other in FORMATS.items():
         as_much = set(other.subtracts) >= set(target.subtracts) and other.has_own_reading <= target.has_own_reading
         if as_much and not list(_lost(calibration, other)):

@@ -114,7 +114,7 @@ class Comparison:
     """Comparison of the result of this version with the calibration of the run."""
 
     verdict_before: str | None
-    """Verdict of the calibration of the run; None if it was rejected or not observable, and so not saved."""
+    """Verdict of the calibration of the run; None if none was saved, because it was rejected or not observable."""
     verdict: str
     finding: Finding | None
     """First finding of the new result; None if its verdict is good."""

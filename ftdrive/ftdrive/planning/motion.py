@@ -29,7 +29,7 @@ class Speeds:
 
     @classmethod
     def with_hung_load(cls) -> "Speeds":
-        """Return the limits with a load on a string: slow compared with its period of 1 s, so that it hardly swings."""
+        """Return the limits with a load on a string: slow compared with its period of 1 s, so it hardly swings."""
         return cls(float(np.radians(15)), float(np.radians(20)), 0.1)
 
     def limited(self, other: "Speeds") -> "Speeds":

@@ -42,7 +42,7 @@ BOX_HALF_SIZE_M = 0.1
 FEWEST_CHOSEN = 6
 # Number of spare orientations of a random set, in case some are out of reach.
 SPARE = 100
-# Upper limit of the speeds, whatever a plan or an old configuration contains.
+# Upper limit of the speeds, even if a plan or an old configuration contains higher ones.
 FASTEST = Speeds(joint_rad_s2=float(np.radians(300)))
 
 # Assumed standard deviation of one axis of the mean of a pose, N and N·m.
@@ -141,7 +141,7 @@ def _plan_tool(certifier: Certifier, q_rad: ArrayLike, *, speeds: Speeds, guess:
     """Plan a tour of the four most informative reachable poses, for a new tool on a calibrated cell.
 
     The poses determine all parameters, not only weight, centre of mass and bias of the tool. Their error is 3 % above
-    that of a tetrahedron of gravity directions.
+    the error of a tetrahedron of gravity directions.
     """
     tour = chosen_tour(certifier, checked_joints(q_rad), TOOL_POSES, np.pi, speeds, guess)
     if tour is None:

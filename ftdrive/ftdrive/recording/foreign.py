@@ -126,7 +126,7 @@ def table_words(tables: tuple[Table, Table]) -> str:
 
 
 def read_bag(path: Path, wrench_topic: str | None, pose_topic: str | None) -> tuple[Table, Table]:
-    """Read wrench and pose; the times are those of the headers, from the earliest time of both.
+    """Read wrench and pose; the times come from the headers and count from the earliest of both.
 
     The topics of WrenchStamped and PoseStamped may be omitted if there is only one of each. `pose_topic` may also be
     like the address of an arm: ``tf?base=base&flange=tool0`` or ``/joint_states?urdf=arm.urdf&flange=tool0``. Raises
@@ -379,7 +379,7 @@ def sample_numbers(t_s: Array) -> NDArray[np.int64]:
         if steps.min() >= 1 and np.abs(steps_s / step_s - steps).max() < _REGULAR:
             return np.concatenate([[0], np.cumsum(steps)]).astype(np.int64)
     number = np.arange(len(t_s))
-    # the period is estimated from all samples, missing ones included
+    # the period is estimated from all samples, including missing ones
     for _ in range(_ROUNDS):
         before, number = number, _with_gaps(t_s, float(t_s[-1] - t_s[0]) / int(number[-1]))
         if np.array_equal(number, before):

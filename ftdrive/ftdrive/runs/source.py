@@ -83,7 +83,7 @@ class SolveOptions:
     known: Known | None = None
     """Known values. A known direction of gravity means that the base is level with respect to its mounting."""
     up_in_base: Sequence[float] | None = None
-    """(3,) declared up direction in base, which replaces that of the mounting in a run."""
+    """(3,) declared up direction in base, which replaces the direction of the mounting in a run."""
     as_published: bool = False
     earlier: CalibrationResult | None = None
     """Earlier result, from which a new tool takes mounting, gravity direction and gain."""

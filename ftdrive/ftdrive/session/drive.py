@@ -166,7 +166,7 @@ class GuardedCell:
         self._sensor_events.show_new()
 
     def cause(self, error: Exception, *, moving: bool) -> Tripped | None:
-        """Return the trip behind an error: that of a guard, or one with the matching hazard; None if there is none."""
+        """Return the trip that caused an error: of a guard, or one with the matching hazard; None if there is none."""
         self.watcher.unseen = False
         self._cause = self._row_of(error, moving=moving)
         if self._cause is not None:

@@ -447,13 +447,13 @@ class ContactGuard(Guard):
     _turns_rad_s: list[float] = field(default_factory=list, init=False)
 
     def begin(self, seen: Seen) -> None:
-        """Take the first wrench of the session as that of the free tool; after a stop the contact may still exist."""
+        """Use the first wrench of the session for the free tool; after a stop the contact may still exist."""
         if self._start is None:
             self._start = seen.wrench
         self._residual = None
 
     def forget(self) -> None:
-        """Take the next wrench as that of the free tool, because the zero of a reopened sensor may differ."""
+        """Take the next wrench as the wrench of the free tool, because the zero of a reopened sensor may differ."""
         self._start = None
 
     def look(self, seen: Seen) -> None:

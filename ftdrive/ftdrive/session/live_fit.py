@@ -231,7 +231,7 @@ def _light(coverage: Prediction, *, loaded: bool = False) -> str:
 
 
 def _surprise(result: CalibrationResult | None, record: PoseRecord) -> tuple[float, float] | None:
-    """Return the residual of a new pose in the fit of the earlier ones: sigmas of the worst channel, and norm in N."""
+    """Return the residual of a new pose in the fit of the earlier poses: sigmas of the worst channel, and norm in N."""
     if result is None:
         return None
     R_base_flange = record.before.R_base_flange

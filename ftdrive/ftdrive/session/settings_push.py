@@ -113,7 +113,7 @@ class Push:
     lean: Lean | None = None
     """Tilt of the base relative to the controller's gravity, or to the configured mounting if that is unknown."""
     contact: Array | None = None
-    """(6,) reading minus that of a free tool, N and N·m: contact, or drift since the calibration."""
+    """(6,) reading minus the reading of a free tool, N and N·m: contact, or drift since the calibration."""
 
     @property
     def settings(self) -> list[str]:

@@ -206,7 +206,7 @@ def on_script_path(cell: CellConfig) -> CellConfig:
 
 
 def _choose_speed(before: Before, *, slow: bool) -> tuple[Before, Sweep]:
-    """Return plan and curve, slowed down by the present speed slider. Raises `NotAccepted` if it is too low."""
+    """Return plan and curve, slowed down as the speed slider now demands. Raises `NotAccepted` if it is too low."""
     cell, slider = before.cell, before.cell.arm.status().speed_slider
     if slider < LEAST_SLIDER:
         raise NotAccepted(

@@ -21,7 +21,7 @@ def store_url() -> str | None:
 
 
 def open_store(url: str | None = None) -> "Store":
-    """Return the store at an address, by default at that of environment and files."""
+    """Return the store at an address, by default the address in environment and files."""
     from ftdrive.store.store import Store
 
     return Store(url or store_url())

@@ -80,7 +80,7 @@ def calibration_of_tool(
 
 
 def _may_belong(result: StoredResult, arm: DeviceInfo, sensor: DeviceInfo) -> bool:
-    """Return whether the serial numbers of a stored result may be those of the devices."""
+    """Return whether the serial numbers of a stored result may belong to the devices."""
     pairs: Iterable[tuple[str | None, str]] = ((result.arm_serial, arm.serial), (result.sensor_serial, sensor.serial))
     return all(made == now or made in {None, NOT_REPORTED} or now == NOT_REPORTED for made, now in pairs)
 

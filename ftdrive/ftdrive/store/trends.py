@@ -129,7 +129,7 @@ def sensor_biases(
 
     The change is the standard deviation (6,), N and N·m, of a random walk, from at least three pairs of successive runs
     of one tool that are 15 min to 6 h apart. The estimate is a median over pairs and axes, separately for force and
-    torque, so that it is robust against a moved cable.
+    torque, which makes it robust against a moved cable.
     """
     runs = _runs(results, verifications)
     return {mounted: (_temperature(series), _hour_change(series)) for mounted, series in runs.items()}

@@ -59,7 +59,7 @@ class ContactTest:
     from data.
 
     The mean reading of a free tool comes from the free-tool filter, which estimates drift and the local error of the
-    calibration. `beyond` (6,) is a variance added to that of the prediction, N² and (N·m)². `friction_axis` (3,) is the
+    calibration. `beyond` (6,) is added to the variance of the prediction, N² and (N·m)². `friction_axis` (3,) is the
     axis of wrist 3 in sensor axes, if the sensor measures its friction torque.
     """
 

@@ -48,7 +48,7 @@ _WINDOWS = 60
 _LOUD = {True: 1.5, False: 4.0}
 # A larger step between the means of two windows is the start or end of a contact.
 _STEP_SIGMAS = 5.0
-# Noise in motion until it is known: this multiple of the noise at rest, plus that of an acceleration.
+# Noise in motion until it is known: this multiple of the noise at rest, plus the noise of an acceleration.
 _FIRST_MOTION, _FIRST_M_S2 = 10.0, 1.0
 _ENOUGH_DOF = 25.0
 # Degrees of freedom per reading, less than 1 because low-pass filters of sensors correlate consecutive readings.
@@ -63,7 +63,7 @@ def samples_in_reading(rate_Hz: float) -> int:
 class MotionTracker:
     """Classify each sample as at rest or in motion, from poses averaged over each reading of the sensor.
 
-    Rest begins after 0.5 s without motion. The motion includes that of the centre of mass of the tool. If the position
+    Rest begins after 0.5 s without motion. The motion includes the motion of the tool's centre of mass. If the position
     of the sensor is unknown (NaN), its origin is taken to be that of the flange.
     """
 
@@ -264,7 +264,7 @@ def _about_line(n: int) -> Array:
 
 
 def variance_at_next_use(calibration: CalibrationResult) -> Array:
-    """Return the variance (6,) of each axis in any orientation beyond that of the prediction: misfit and drift."""
+    """Return the variance (6,) of each axis in any orientation beyond the predicted variance: misfit and drift."""
     excess = np.square(calibration.likely_error("workspace")) - np.square(calibration.predicted_error())
     return np.repeat(excess.clip(0.0) / 3, 3)
 
@@ -301,7 +301,7 @@ _ROW = np.dtype(
 _JUMP = 0.1
 # Sigma of the acceleration in motion of an arm that reports no positions, m/s².
 _UNKNOWN_M_S2 = 1.0
-# Variance of a window's mean over that of a reading for white noise; for vibration the ratio is smaller.
+# Ratio of the variances of a window's mean and of a reading for white noise; for vibration the ratio is smaller.
 _LIKE_WHITE = 1.5 * READING_S / WINDOW_S
 
 

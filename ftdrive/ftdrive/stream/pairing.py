@@ -48,7 +48,7 @@ _SLOWEST_RAD_S = 0.02
 _PRIOR_S, _SAME_LINKS_S = 0.05, 0.005
 # Change of the bias since the calibration, one standard deviation.
 _BIAS_N = 0.5
-# Weight of a held part relative to that of the tool, one standard deviation.
+# Weight of a held part relative to the weight of the tool, one standard deviation.
 _HELD = 0.05
 # Sigma of the configured sensor origin; `_ANY_LEVER_M` if it is not configured.
 _LEVER_M = 0.005
@@ -156,7 +156,7 @@ class DelayEstimator:
         self._settling = False
         motion = calibration.motion
         self.delay_s = 0.0 if motion is None else min(max(motion.delay_s, -MOST_DELAY_S), MOST_DELAY_S)
-        """Delay used for pairing: that of the calibration, then the estimate once it is accurate enough."""
+        """Delay used for pairing: the delay in the calibration, then the estimate once it is accurate enough."""
         self.sigma_s = _PRIOR_S if motion is None else _SAME_LINKS_S
         """Standard deviation of the delay."""
 

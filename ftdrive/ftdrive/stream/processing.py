@@ -480,7 +480,7 @@ class Processor:
     def tare(self) -> StreamEvent:
         """Change the bias so that the free tool reads zero over the last half second, or refuse; see `try_tare`.
 
-        For a sensor alone the mean is subtracted, whatever load it carries.
+        For a sensor alone the mean is subtracted, even if the sensor carries a load.
         """
         with self._lock:
             if (rows := self.recent()) is None:

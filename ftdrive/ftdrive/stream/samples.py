@@ -176,7 +176,7 @@ def mean_rate_Hz(t_ns: NDArray[np.int64]) -> float:
 def sensor_origin_m(height_mm: float | None, calibration: CalibrationResult | None = None) -> Array:
     """Return `p_flange_sensor_m` (3,) of a sensor with this height above the flange face; NaN if unknown.
 
-    If no height is configured, that of a calibration in motion is used if it is accurate.
+    If no height is configured, the height from a calibration in motion is used if accurate.
     """
     motion = None if calibration is None else calibration.motion
     if height_mm is None and motion is not None and float(motion.covariance[HEIGHT, HEIGHT]) < _KNOWN_HEIGHT_M**2:

@@ -340,7 +340,7 @@ class Sink(ABC):
         """
 
     def end(self) -> None:  # noqa: B027 - most have nothing to complete
-        """Complete the output, whatever has ended the loop; also called after an error of `begin` or `add`."""
+        """Complete the output, for whatever reason the loop ended; also called after an error of `begin` or `add`."""
 
 
 def pump(
@@ -362,7 +362,7 @@ def pump(
     stream : Stream
         Open; its `read` reconnects after a failure.
     sinks : list of Sink
-        Between two reads the caller may add a sink, or end and remove one. The end of the loop ends the others.
+        Between two reads the caller may add a sink, or end and remove one. At its end the loop ends the other sinks.
     until : callable, optional
         Ends the loop before a read if it returns true; by default the loop ends with the recording.
     patience_s : float

@@ -127,7 +127,7 @@ class Scale:
     def zero(self, since_ns: int = 0) -> StreamEvent:
         """Tare the empty gripper over the last half second, which removes the drift of the bias so far.
 
-        Raises `CannotWeigh` if arm or reading is not at rest, or differs too much from that of the empty tool.
+        Raises `CannotWeigh` if arm or reading is not at rest, or differs too much from the reading of the empty tool.
         """
         self._rest(since_ns)
         # A zero is refused whenever a tare is, because otherwise the contact wrench would keep the old bias.

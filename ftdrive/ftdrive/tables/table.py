@@ -88,7 +88,7 @@ class TableOptions:
     euler: str = ""
     """Order of three angles: rpy, ABC, WPR, OAT, or three axes, such as ZYX (tool axes) or xyz (base axes)."""
     wrench_axes: WrenchAxes | None = None
-    """Axes and reference point of the wrench; None means those of the program, usually the sensor."""
+    """Axes and reference point of the wrench; None means the convention of the program, usually the sensor."""
     R_flange_tcp: Array = field(default_factory=lambda: np.eye(3))
     """(3, 3) orientation of the TCP, if the table has poses of the TCP."""
     p_flange_tcp_m: Array = field(default_factory=lambda: np.zeros(3))
@@ -170,7 +170,7 @@ class Table:
     source : Path, DataFrame or mapping
     options : TableOptions, optional
     name : str
-        Name in messages; by default that of the file, or of the type of the source.
+        Name in messages; by default the name of the file, or of the type of the source.
 
     Raises
     ------

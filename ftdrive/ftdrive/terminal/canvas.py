@@ -31,7 +31,7 @@ _CHUNK = 256
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    The key `v` shows `address`, that of the page in the browser, as a QR code; it is empty without a page.
+    The key `v` shows `address`, of the page in the browser, as a QR code; `address` is empty without a page.
     """
 
     is_over = False
@@ -100,7 +100,7 @@ class Canvas(ABC):
             self.act(key)
 
     def run(self, keys: TextIO | None = None, output: TextIO | None = None) -> None:
-        """Show the screen until `q` or Ctrl-C, then restore the terminal and print what stderr received meanwhile.
+        """Show the screen until `q` or Ctrl-C, then restore the terminal and print what stderr has received.
 
         Raises
         ------
@@ -117,7 +117,7 @@ class Canvas(ABC):
             stack.enter_context(redirect_stderr(held))
             stack.enter_context(console.screen())
             keyboard = stack.enter_context(Keyboard(keys.fileno()))
-            # last, because a blocked terminal may delay the others
+            # entered last, because a blocked terminal may delay the other contexts
             stack.enter_context(self.reading())
             while not self.is_over:
                 rest = _send(fd, rest or self._changes(console, fd))

@@ -107,7 +107,7 @@ class InitPage:
                 self._look()
                 self._refresh()
             self._asked.clear()
-            # judge everything typed meanwhile together
+            # judge everything that was typed in the meantime together
             for _ in range(max(1, self._todo.qsize())):
                 self._todo.get()()
 

@@ -28,7 +28,7 @@ DIRECTIONS_OF_A_LUMP, SPINS_OF_A_LUMP = 60, 4
 MOST_PARTS = 2
 # Number of the nearest joint vectors of each part to which a straight move is tried.
 FROM_HERE = 6
-# No other posture is tried if the predicted error is within this factor of that of the best poses of the cone.
+# No other posture is tried if the predicted error is within this factor of the error of the best poses of the cone.
 NEARLY = 1.05
 OTHER_POSTURES = 2
 POSTURE_STEP_DEG = 20
@@ -115,7 +115,7 @@ def _clear_candidates(
 def verification_tour(
     certifier: Certifier, q_rad: ArrayLike, poses: int, R_fitted: Array, speeds: Speeds
 ) -> tuple[tuple[int, ...], Array] | None:
-    """Return a short closed tour through two or more poses far from `R_fitted` (k, 3, 3), those of a calibration.
+    """Return a short closed tour through two or more poses far from `R_fitted` (k, 3, 3), the poses of a calibration.
 
     Joints 1 to 3 move only if the wrist alone has no such tour. Returns numbers from 101, in the order of choice, and
     joint vectors (n, 6) in the order of travel; None if too few poses are reachable.
@@ -138,7 +138,7 @@ def tour_of_sets(
 ) -> tuple[Nodes, Array] | None:
     """Return a short closed tour through orientations of several kinds.
 
-    Each kind has orientations (m, 3, 3) and a number; the tour has this number of them, the first reachable ones.
+    Each kind has orientations (m, 3, 3) and a number; the tour has the first reachable ones up to this number.
     Returns, in the order of travel, the indices of the selected orientations over all kinds, and joint vectors (n, 6).
     None if too few poses of a kind are reachable.
     """

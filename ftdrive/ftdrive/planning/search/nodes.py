@@ -205,7 +205,7 @@ def constant_tour(q_rad: ArrayLike, kinematics: Kinematics = _NOMINAL) -> Array:
     """Return the joint vectors (24, 6) of the constant tour at the present posture of joints 1 to 3.
 
     Joints 1 to 3 keep their angles. The flange orientation of a pose is `Rz(q1 - 45 deg) @ R_i.T` with the paper's
-    matrix R_i, so that at another base angle than 45 degrees the whole set is turned about the base z axis. The wrist
+    matrix R_i, so at a base angle other than 45 degrees the whole set is turned about the base z axis. The wrist
     angles of a real arm differ from the table by up to a few degrees.
 
     Parameters

@@ -25,7 +25,7 @@ SHAKES = 150
 SHAKES_A_ROUND = 10
 # Largest number of rounds; each proves the moves of a tour and excludes those that are not clear.
 ROUNDS = 60
-# Up to this number of joint vectors all moves are considered; otherwise only those to the nearest ones of each group.
+# Up to this number of joint vectors all moves are considered; otherwise only moves to the nearest in each group.
 FEW = 120
 NEAREST_OF_EACH = 2
 # From this number of groups on, only moves to the nearest joint vectors of all groups are considered.
@@ -171,13 +171,13 @@ class _Proof:
 
 
 def _to_neighbours(q_rad: Array, count: int, among: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the moves (start, end) from every node to its nearest ones among some nodes."""
+    """Return the moves (start, end) from every node to its nearest nodes in `among`."""
     near = cKDTree(q_rad[among]).query(q_rad, range(1, min(count, len(among)) + 1), p=np.inf)[1]
     return np.repeat(np.arange(len(q_rad)), near.shape[1]), among[near.ravel()]
 
 
 def _to_every_group(q_rad: Array, group: Nodes, count: int) -> tuple[Nodes, Nodes]:
-    """Return the moves (start, end) from every node to its nearest ones of each group."""
+    """Return the moves (start, end) from every node to its nearest nodes in each group."""
     start, end = np.hstack([_to_neighbours(q_rad, count, np.flatnonzero(group == g)) for g in range(group.max() + 1)])
     return start, end
 
