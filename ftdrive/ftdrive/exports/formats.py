@@ -242,7 +242,7 @@ FORMATS: Mapping[str, ExportFormat] = {
     ),
     # xArm-Developer/xArm-Python-SDK, xarm/x3/ft_sensor.py, 1.11 or newer: mass (kg), centre of mass (mm), offsets of
     # force (N) and torque (N·m). The origin of `com` is that of the sensor: with `association_setting_tcp_load`, the
-    # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is assumed to be, with g of the
+    # SDK adds 32 mm to reach the flange. The formula of the firmware is not public. It is assumed here, with g of the
     # calibration, and a sensor that has the axes of the flange:
     #     force = raw - offset[:3] - mass g              torque = raw - offset[3:] - com x (mass g)
     "xarm": ExportFormat(

@@ -34,7 +34,7 @@ def trust_facts(
 
     last, error = verification_near(source, result.id), ""
     try:
-        # The later verification of folder and store, because a store may be new and a folder may have moved.
+        # The later verification in folder and store, because a store may be new and a folder may have moved.
         last = newest(filter(None, (last, Store(store_url()).last_verification(result.id))))
     except (BadStore, ConfigError) as unreadable:
         error = str(unreadable)

@@ -4,7 +4,7 @@ verification.json   ftdrive.verification/1, in the run folder of the poses: cali
 calibration.json    in the same folder, if the operator accepted an update; its provenance names the parent
 
 A verification belongs to a calibration by the id, regardless of paths. `verification_near` searches the run folders
-next to the calibration's, those in `runs` next to the calibration file, and those in `runs` of the current
+next to that of the calibration, those in `runs` next to the calibration file, and those in `runs` of the current
 folder.
 """
 

@@ -231,7 +231,7 @@ class AlongPlan:
                 if before.certifier.arm.hung is not None:
                     words = "Is the weight off the tool? You hang it when the arm stands at the first pose."
                     cell.journal.require(words, assumed=before.known and not options.real)
-                questions.ask(way, assumed=before.known and not arm_moves(way))  # an approach of the arm is new
+                questions.ask(way, assumed=before.known and not arm_moves(way))  # approaches that move the arm are new
             run = self._session.resumed or self._keep_plan()
             book = PoseBook(cell, run, self.judge, before.certifier.scene.down_base)
             guarded = GuardedCell(cell, watcher, contact=contact, load=load, recheck=recheck)

@@ -174,7 +174,7 @@ class GuardedCell:
         return self._cause
 
     def require_answers(self) -> None:
-        """Raise the last emergency or safeguard stop unless the safety questions were answered after it."""
+        """Raise the last row 11 stop, however short, unless the safety questions were answered after it."""
         self.watcher.look_aside()
         stop = self.watcher.safety_stop
         if stop is not None and stop is not self._answered:

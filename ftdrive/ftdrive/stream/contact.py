@@ -114,7 +114,7 @@ class ContactTest:
         delay_sigma_s: float,
         inertia: Inertia,
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Return readings (n, 6), squared distances (n,), NaN while the noise is unknown, and which exceed it (n,).
+        """Return readings (n, 6), squared distances (n,), NaN until noise is known, and which exceed the limit (n,).
 
         `residual` is the measured minus the predicted wrench (n, 6), `motion` the result of `MotionTracker.follow`, and
         `inertia` the accuracy of the predicted inertial wrench. Pass the samples to the free-tool filter as well.

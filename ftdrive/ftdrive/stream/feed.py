@@ -199,7 +199,7 @@ class Feed(Sink):
 
 
 class NoiseWatch(Sink):
-    """Compares the noise of a free tool at rest once with that in the poses of a calibration; `found` receives it.
+    """Compares the noise of a free tool at rest once with that in the poses of a calibration; `found` gets the check.
 
     The comparison uses two seconds in which the arm rests without contact.
     """

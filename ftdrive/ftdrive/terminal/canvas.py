@@ -31,7 +31,7 @@ _CHUNK = 256
 class Canvas(ABC):
     """A screen that covers the terminal until `q` or Ctrl-C.
 
-    The key `v` shows `address`, of the page in the browser, as a QR code; `address` is empty without a page.
+    The key `v` shows the `address` of the page in the browser as a QR code; it is empty without a page.
     """
 
     is_over = False

@@ -1,4 +1,4 @@
-"""Tours of chosen poses: the most informative poses, poses far from a calibration's, sets, or tilts of a load.
+"""Tours of chosen poses: the most informative poses, poses far from those of a calibration, sets, or load tilts.
 
 Informative poses are chosen by `ftcalib.poses.selection`, which excludes a second solution and gravity directions in
 one plane.
