@@ -659,5 +659,4 @@ def out_of_line(residual_sigma: Array, used: NDArray[np.bool_]) -> list[int]:
 
 
 def _rms_norm(vectors: Array) -> float:
-    """Return the rms norm of vectors (n, 3)."""
     return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1))))
