@@ -191,7 +191,7 @@ def test_requests_to_begin_with() -> None:
         (["--sensor", "ur-ft", "--sensor-mass-kg", "0.2"], "leave --sensor-mass-kg out"),
         (["--sensor", "lab"], "invalid choice"),
         (["--inertia", "1,1,3,0,0,0"], "no body has"),
-        (["--imperfections", "ripples=1"], "no setting of a real cell"),
+        (["--imperfections", "ripples=1"], "is not a setting of a real cell"),
         (["--load", "2.0"], "KG@x,y,z"),
         (["--recording", "README.md", "--gain", "1"], "leave --gain"),
         (["--recording", "missing.csv"], "cannot read the recording"),

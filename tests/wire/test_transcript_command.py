@@ -44,7 +44,7 @@ def test_a_file_that_cannot_be_made_is_refused_before_the_sensor_is_opened(
     name: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "there").touch()
-    monkeypatch.setattr(transcript, "_record", lambda *_, **__: pytest.fail("it was recorded"))
+    monkeypatch.setattr(transcript, "_record_bytes", lambda *_, **__: pytest.fail("it was recorded"))
     error = run("record", "--sensor", "bota-serial:///dev/none", "-o", str(tmp_path / name)).exception
     assert isinstance(error, ConfigError)
     assert words in str(error)
