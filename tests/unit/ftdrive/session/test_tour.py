@@ -340,7 +340,7 @@ def test_step_mode_says_what_enter_does(lab: Lab) -> None:
     lab.take_poses(mode="step")
     steps = Plan.load(lab.run().plan_path).steps
     asked = [question.text for question in lab.operator.asked if question.text.startswith("Pose")]
-    assert "Enter plans the approach" in asked[0]
+    assert "Enter plans and shows the approach" in asked[0]
     for text, start, goal in ((asked[1], 0, 1), (asked[4], 1, 2), (asked[5], 2, 3)):
         turn_deg = np.degrees(np.abs(np.subtract(steps[goal].q_rad, steps[start].q_rad)))
         joints = ", ".join(str(joint + 1) for joint in np.flatnonzero(turn_deg > 0.5))
